@@ -1,0 +1,1 @@
+"""The sliding window; the only part that knows GTSAM."""

@@ -1,0 +1,309 @@
+"""Every parameter, with its unit, range, default and meaning.
+
+The models are frozen and refuse unknown keys. `load_configuration` reads YAML and
+`section.key=value` settings; `describe_configuration` prints all of it as commented YAML.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gvo.errors import ConfigurationError
+
+
+def _parameter(
+    default: object,
+    meaning: str,
+    unit: str = "",
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+) -> Any:  # noqa: ANN401 - pydantic types its own Field so
+    return Field(
+        default, ge=ge, gt=gt, le=le, description=meaning, json_schema_extra={"unit": unit}
+    )
+
+
+class Section(BaseModel):
+    """A group of parameters: frozen, no unknown keys, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class SyncConfig(Section):
+    """Which images make one frame."""
+
+    max_difference_ms: float = _parameter(
+        20.0, "largest difference between the stamps of colour and depth", "ms", ge=0
+    )
+    stereo_tolerance_ms: float = _parameter(
+        0.0, "largest difference between the stamps of left and right; 0: equal stamps", "ms", ge=0
+    )
+
+
+class DepthConfig(Section):
+    """Depth images of RGB-D cameras."""
+
+    scale: float | None = _parameter(
+        None,
+        "counts per metre of integer depth; null: 5000 for TUM folders, 1000 else",
+        "1/m",
+        gt=0,
+    )
+    min_depth_m: float = _parameter(0.3, "nearest depth that counts as valid", "m", gt=0)
+    max_depth_m: float = _parameter(8.0, "farthest depth that counts as valid", "m", gt=0)
+    max_edge_step: float = _parameter(
+        0.03, "largest spread of depth around a keypoint, relative to its depth", ge=0
+    )
+    edge_radius_px: int = _parameter(2, "half size of the window of that check", "px", ge=0, le=10)
+    virtual_baseline_m: float = _parameter(
+        0.075, "baseline of the stereo camera that the depth camera is seen as", "m", gt=0
+    )
+    sigma_px: float = _parameter(0.5, "noise of the virtual disparity", "px", gt=0)
+
+
+class FeaturesConfig(Section):
+    """Keypoints and descriptors."""
+
+    kind: Literal["orb", "sift", "fast", "gftt"] = _parameter(
+        "orb", "orb and sift bring their own descriptors; fast and gftt corners get ORB's"
+    )
+    n_features: int = _parameter(1200, "keypoints kept per image", ge=50, le=20000)
+    n_octaves: int = _parameter(2, "pyramid levels (orb, fast, gftt)", ge=1, le=12)
+    scale_factor: float = _parameter(1.3, "size ratio of two pyramid levels", gt=1, le=4)
+    fast_threshold: int = _parameter(10, "contrast of a corner (orb, fast)", "grey", ge=1, le=200)
+    cell_size_px: int = _parameter(40, "size of the grid cells that share the budget", "px", ge=8)
+
+
+class StereoConfig(Section):
+    """Matching of left and right."""
+
+    min_depth_m: float = _parameter(0.5, "nearest depth that is searched", "m", gt=0)
+    max_depth_m: float = _parameter(200.0, "farthest depth that is searched", "m", gt=0)
+    row_tolerance_px: float = _parameter(1.5, "rows that left and right may differ", "px", ge=0)
+    max_distance: float = _parameter(
+        0.3, "largest descriptor distance, as a share of the largest possible", gt=0, le=1
+    )
+    subpixel: Literal["parabola", "none"] = _parameter(
+        "parabola", "fit over the patch differences, or the difference of the keypoints"
+    )
+    patch_radius_px: int = _parameter(5, "half size of the patches", "px", ge=1, le=20)
+    search_radius_px: int = _parameter(3, "columns searched on either side", "px", ge=1, le=20)
+    sigma_px: float = _parameter(0.3, "noise of the disparity", "px", gt=0)
+
+
+class TemporalConfig(Section):
+    """Matching of a reference and the current frame."""
+
+    radius_px: float = _parameter(30.0, "search radius around a predicted pixel", "px", gt=0)
+    wide_radius_px: float = _parameter(
+        80.0, "search radius where there is no prediction, or it found too little", "px", gt=0
+    )
+    max_distance: float = _parameter(
+        0.25, "largest descriptor distance, as a share of the largest possible", gt=0, le=1
+    )
+
+
+class RansacConfig(Section):
+    """Minimal samples of three points."""
+
+    n_hypotheses: int = _parameter(256, "samples drawn", ge=1, le=100000)
+    inlier_metric: Literal["reprojection", "distance"] = _parameter(
+        "reprojection", "residual in the image (u, v, disparity), or between the points"
+    )
+    inlier_threshold_px: float = _parameter(2.0, "of the reprojection metric", "px", gt=0)
+    inlier_threshold_m: float = _parameter(0.3, "of the distance metric", "m", gt=0)
+    min_inliers: int = _parameter(12, "fewer mean failure", ge=3)
+    seed: int = _parameter(0, "of the random generator", ge=0)
+
+
+class RegistrationConfig(Section):
+    """Pose from 3D-3D correspondences."""
+
+    weighting: Literal["inverse_depth", "none"] = _parameter(
+        "inverse_depth", "weights of Umeyama's fit to the inliers: 1/z^2, or none"
+    )
+    refine: Literal["gauss_newton", "none"] = _parameter(
+        "gauss_newton", "pose over (u, v, disparity) residuals after RANSAC, or not"
+    )
+    n_iterations: int = _parameter(10, "at most, of the refinement", ge=1, le=100)
+    huber: float = _parameter(1.5, "threshold of the robust kernel, in sigmas", gt=0)
+    pixel_sigma_px: float = _parameter(0.7, "noise of a keypoint's pixel", "px", gt=0)
+
+
+class WindowConfig(Section):
+    """Sliding-window smoothing."""
+
+    n_recent: int = _parameter(5, "recent frames in the window", ge=2, le=100)
+    n_keyframes: int = _parameter(12, "keyframes kept beside them", ge=0, le=100)
+    n_links: int = _parameter(3, "registrations per frame: predecessor and keyframes", ge=1, le=20)
+    min_overlap: float = _parameter(
+        0.3, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
+    )
+    keyframe_overlap: float = _parameter(
+        0.75, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
+    )
+    link_sigma_factor: float = _parameter(
+        1.0, "factor on the sigmas of links to keyframes", gt=0
+    )
+    kernel: Literal["huber", "none"] = _parameter("huber", "robust kernel of the edges")
+    kernel_threshold: float = _parameter(
+        3.55, "of the kernel, on the norm of the whitened 6-vector", gt=0
+    )
+    coasting_sigma_deg: float = _parameter(
+        3.0, "rotation sigma of a frame without registration", "deg", gt=0
+    )
+    coasting_sigma_m: float = _parameter(
+        0.3, "translation sigma of a frame without registration", "m", gt=0
+    )
+    lost_after_s: float = _parameter(2.0, "coasting longer is called lost", "s", gt=0)
+
+
+class RuntimeConfig(Section):
+    """How the work is done."""
+
+    threads: int = _parameter(2, "threads for images; 1: none beside the main one", ge=1, le=64)
+
+
+class Config(Section):
+    """The whole configuration."""
+
+    sync: SyncConfig = SyncConfig()
+    depth: DepthConfig = DepthConfig()
+    features: FeaturesConfig = FeaturesConfig()
+    stereo: StereoConfig = StereoConfig()
+    temporal: TemporalConfig = TemporalConfig()
+    ransac: RansacConfig = RansacConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    window: WindowConfig = WindowConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
+
+
+def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """Read the configuration from a YAML file and settings, later ones winning.
+
+    Parameters
+    ----------
+    path : Path, optional
+        YAML file of sections; what it leaves out keeps its default.
+    settings : sequence of str
+        `section.key=value`, the value in YAML.
+
+    Raises
+    ------
+    ConfigurationError
+        Unreadable file, unknown key (the nearest one is named), value out of range.
+    """
+    values = _read_yaml(path) if path is not None else {}
+    for setting in settings:
+        key, separator, text = setting.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot:
+            raise ConfigurationError(
+                f"--set {setting}: expected section.key=value, for example window.n_links=3"
+            )
+        values.setdefault(section, {})[name] = _parse_value(setting, text)
+    return _validate(values)
+
+
+def _parse_value(setting: str, text: str) -> object:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"--set {setting}: the value is no YAML") from error
+
+
+def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        line = getattr(getattr(error, "problem_mark", None), "line", -1) + 1
+        raise ConfigurationError(f"{path}: no YAML (line {line})") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"{path}: expected sections with keys, see `gvo config`")
+    for section, keys in content.items():
+        if section in Config.model_fields and not isinstance(keys, dict):
+            raise ConfigurationError(f"{path}: {section} must hold keys, see `gvo config`")
+    return content
+
+
+def _validate(values: Mapping[str, object]) -> Config:
+    try:
+        config = Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigurationError(_explain(error)) from error
+    for section in ("depth", "stereo"):
+        limits = getattr(config, section)
+        if limits.min_depth_m >= limits.max_depth_m:
+            raise ConfigurationError(
+                f"{section}.min_depth_m={limits.min_depth_m} must be below "
+                f"{section}.max_depth_m={limits.max_depth_m}"
+            )
+    return config
+
+
+def _explain(error: ValidationError) -> str:
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if first["type"] != "extra_forbidden":
+        return f"{name}={first['input']!r}: {first['msg'].lower()}; see `gvo config`"
+    nearest = difflib.get_close_matches(name, _known_keys(), n=1, cutoff=0.0)[0]
+    return f"unknown key {name}: did you mean {nearest}? `gvo config` lists all"
+
+
+def _known_keys() -> list[str]:
+    return [
+        f"{section}.{key}"
+        for section, group in _sections().items()
+        for key in group.model_fields
+    ]
+
+
+def _sections() -> dict[str, type[Section]]:
+    return {
+        name: field.annotation
+        for name, field in Config.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
+    }
+
+
+def describe_configuration(config: Config) -> str:
+    """Return the configuration as YAML, each key with unit, range and meaning."""
+    lines: list[str] = []
+    for section, group in _sections().items():
+        lines += ["", f"# {group.__doc__}".rstrip("."), f"{section}:"]
+        values = getattr(config, section)
+        for key, field in group.model_fields.items():
+            text = yaml.safe_dump(getattr(values, key)).splitlines()[0]
+            notes = ", ".join(filter(None, [_unit(field), _choices(field)]))
+            comment = f"{field.description}" + (f" [{notes}]" if notes else "")
+            lines.append(f"  {key}: {text}".ljust(34) + f"  # {comment}")
+    return "\n".join(lines[1:]) + "\n"
+
+
+def _unit(field: Any) -> str:  # noqa: ANN401
+    extra = field.json_schema_extra or {}
+    return str(extra.get("unit", ""))
+
+
+def _choices(field: Any) -> str:  # noqa: ANN401
+    choices = getattr(field.annotation, "__args__", ())
+    if choices and all(isinstance(choice, str) for choice in choices):
+        return " | ".join(choices)
+    signs = {"Ge": ">=", "Gt": ">", "Le": "<="}
+    return ", ".join(
+        f"{signs[type(limit).__name__]} {getattr(limit, type(limit).__name__.lower()):g}"
+        for limit in field.metadata
+        if type(limit).__name__ in signs
+    )

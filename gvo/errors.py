@@ -1,0 +1,24 @@
+"""Errors that mean a wrong world: a file, a topic, a configuration, a calibration."""
+
+
+class GvoError(Exception):
+    """A fault of the input that the user can mend.
+
+    The message is one line: what, where, expected and got, what to do.
+    """
+
+
+class RecordingError(GvoError):
+    """A recording is missing, unreadable, or does not hold what is needed."""
+
+
+class CalibrationError(GvoError):
+    """A calibration is missing or does not describe a usable camera."""
+
+
+class ConfigurationError(GvoError):
+    """A configuration file or setting is unknown, malformed or out of range."""
+
+
+class TrajectoryError(GvoError):
+    """A trajectory file is missing, malformed or cannot be associated."""

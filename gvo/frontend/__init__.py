@@ -1,0 +1,1 @@
+"""Images to observations to relative poses."""

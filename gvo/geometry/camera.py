@@ -1,0 +1,313 @@
+"""Pinhole and rectified stereo cameras, and the maps that rectify raw images.
+
+Pixel (0, 0) is the centre of the first pixel; x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.errors import CalibrationError
+from gvo.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PinholeCamera:
+    """An undistorted pinhole camera.
+
+    Parameters
+    ----------
+    fx, fy, cx, cy : float
+        Focal lengths and principal point, pixels.
+    width, height : int
+        Image size, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is no camera."""
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not np.all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
+            raise CalibrationError(
+                f"focal lengths must be positive and finite, got fx={self.fx} fy={self.fy}"
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
+
+    @property
+    def K(self) -> FloatArray:
+        """The calibration matrix, shape (3, 3), pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points_cam: FloatArray) -> FloatArray:
+        """Project points in front of the camera.
+
+        Parameters
+        ----------
+        points_cam : ndarray of float64, shape (..., 3)
+            Points in the `cam` frame, metres, with positive depth.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., 2)
+            Pixels (u, v).
+        """
+        x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
+    def unproject(self, pixels: FloatArray) -> FloatArray:
+        """Return the rays with unit depth through pixels.
+
+        Parameters
+        ----------
+        pixels : ndarray of float64, shape (..., 2)
+            Pixels (u, v).
+
+        Returns
+        -------
+        ndarray of float64, shape (..., 3)
+            Points of depth one in the `cam` frame.
+        """
+        x = (pixels[..., 0] - self.cx) / self.fx
+        y = (pixels[..., 1] - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StereoCamera(PinholeCamera):
+    """A rectified stereo pair, or an RGB-D camera seen as one by a virtual baseline.
+
+    Parameters
+    ----------
+    baseline : float
+        Distance of the right camera along the left camera's x axis, metres.
+
+    Examples
+    --------
+    >>> camera = StereoCamera(fx=700, fy=700, cx=600, cy=180, width=1226, height=370, baseline=0.5)
+    >>> float(camera.depth_to_disparity(10.0))
+    35.0
+    """
+
+    baseline: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no stereo camera."""
+        PinholeCamera.__post_init__(self)
+        if not np.isfinite(self.baseline) or self.baseline <= 0:
+            raise CalibrationError(
+                f"the baseline must be positive, got {self.baseline} m "
+                "(are left and right exchanged?)"
+            )
+
+    def depth_to_disparity(self, depths: FloatArray | float) -> FloatArray:
+        """Return the disparity in pixels of depths in metres, any shape."""
+        return np.asarray(self.fx * self.baseline / np.asarray(depths))
+
+    def disparity_to_depth(self, disparities: FloatArray | float) -> FloatArray:
+        """Return the depth in metres of disparities in pixels, any shape."""
+        return np.asarray(self.fx * self.baseline / np.asarray(disparities))
+
+    def project_stereo(self, points_cam: FloatArray) -> FloatArray:
+        """Project points to (u, v, disparity).
+
+        Parameters
+        ----------
+        points_cam : ndarray of float64, shape (..., 3)
+            Points in the `cam` frame, metres, with positive depth.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., 3)
+            Pixel in the left image and disparity, pixels.
+        """
+        disparities = self.depth_to_disparity(points_cam[..., 2])
+        return np.concatenate([self.project(points_cam), disparities[..., np.newaxis]], axis=-1)
+
+    def unproject_stereo(self, keypoints: FloatArray, disparities: FloatArray) -> FloatArray:
+        """Back-project pixels with disparity into the left camera frame.
+
+        Parameters
+        ----------
+        keypoints : ndarray of float64, shape (..., 2)
+            Pixels (u, v) in the left image.
+        disparities : ndarray of float64, shape (...)
+            u_left - u_right in pixels, positive.
+
+        Returns
+        -------
+        ndarray of float64, shape (..., 3)
+            Points in the `cam` frame, metres.
+        """
+        depths = self.disparity_to_depth(disparities)
+        return self.unproject(keypoints) * depths[..., np.newaxis]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibration:
+    """One camera as `sensor_msgs/CameraInfo` describes it.
+
+    Parameters
+    ----------
+    width, height : int
+        Image size, pixels.
+    K : ndarray of float64, shape (3, 3)
+        Intrinsics of the raw image, pixels.
+    D : ndarray of float64, shape (5,)
+        Distortion k1, k2, p1, p2, k3 (`plumb_bob`).
+    R : ndarray of float64, shape (3, 3)
+        Rotation from the raw camera to the rectified one.
+    P : ndarray of float64, shape (3, 4)
+        Projection of the rectified image; P[0, 3] = -fx * baseline for a right camera.
+    is_rectified : bool
+        The images are rectified already: only P counts.
+    """
+
+    width: int
+    height: int
+    K: FloatArray
+    D: FloatArray
+    R: FloatArray
+    P: FloatArray
+    is_rectified: bool
+
+    @classmethod
+    def from_camera(cls, camera: PinholeCamera, *, baseline: float = 0.0) -> Calibration:
+        """Describe an ideal camera; with a baseline, the right one of a pair."""
+        P = np.hstack([camera.K, [[-camera.fx * baseline], [0.0], [0.0]]])
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            K=camera.K,
+            D=np.zeros(5),
+            R=np.eye(3),
+            P=P,
+            is_rectified=True,
+        )
+
+    def pinhole(self) -> PinholeCamera:
+        """Return the camera of the rectified image."""
+        P = self.P
+        return PinholeCamera(
+            fx=float(P[0, 0]),
+            fy=float(P[1, 1]),
+            cx=float(P[0, 2]),
+            cy=float(P[1, 2]),
+            width=self.width,
+            height=self.height,
+        )
+
+
+def stereo_camera(left: Calibration, right: Calibration) -> StereoCamera:
+    """Return the rectified stereo camera that two calibrations describe.
+
+    Raises
+    ------
+    CalibrationError
+        When sizes differ, the rectified intrinsics differ, or there is no baseline.
+    """
+    if (left.width, left.height) != (right.width, right.height):
+        raise CalibrationError(
+            f"left and right images must be of one size, got {left.width}x{left.height} "
+            f"and {right.width}x{right.height}"
+        )
+    if not np.allclose(left.P[:, :3], right.P[:, :3], rtol=1e-6, atol=1e-6):
+        raise CalibrationError(
+            "left and right are not rectified to one camera: their P differ in the first three "
+            "columns; give a calibration of the rectified pair"
+        )
+    pinhole = left.pinhole()
+    return StereoCamera(
+        fx=pinhole.fx,
+        fy=pinhole.fy,
+        cx=pinhole.cx,
+        cy=pinhole.cy,
+        width=pinhole.width,
+        height=pinhole.height,
+        baseline=float(left.P[0, 3] - right.P[0, 3]) / pinhole.fx,
+    )
+
+
+RectificationMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+def rectification_maps(calibration: Calibration) -> RectificationMaps | None:
+    """Return the maps for `cv2.remap` from the raw to the rectified image.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With `plumb_bob` distortion.
+
+    Returns
+    -------
+    tuple of two ndarrays of float32, shape (height, width), or None
+        u and v in the raw image for each rectified pixel; None where nothing is to be done.
+    """
+    is_identity = (
+        not np.any(calibration.D)
+        and np.array_equal(calibration.R, np.eye(3))
+        and np.array_equal(calibration.K, calibration.P[:, :3])
+    )
+    if calibration.is_rectified or is_identity:
+        return None
+    map_u, map_v = cv2.initUndistortRectifyMap(
+        calibration.K,
+        calibration.D,
+        calibration.R,
+        calibration.P[:, :3],
+        (calibration.width, calibration.height),
+        cv2.CV_32FC1,
+    )
+    return np.asarray(map_u, dtype=np.float32), np.asarray(map_v, dtype=np.float32)
+
+
+def rectify_stereo(
+    left: Calibration, right: Calibration, T_left_right: FloatArray
+) -> tuple[Calibration, Calibration]:
+    """Choose the rectification of a raw pair.
+
+    Parameters
+    ----------
+    left, right : Calibration
+        Raw cameras; their R and P are not read.
+    T_left_right : ndarray of float64, shape (4, 4)
+        Maps coordinates of the right raw camera to the left one, metres.
+
+    Returns
+    -------
+    tuple of two Calibration
+        The same K and D with R and P set (Bouguet's algorithm, `cv2.stereoRectify`, alpha 0).
+    """
+    T_right_left = np.linalg.inv(T_left_right)
+    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+        left.K,
+        left.D,
+        right.K,
+        right.D,
+        (left.width, left.height),
+        T_right_left[:3, :3],
+        T_right_left[:3, 3],
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0,
+    )
+    return (
+        _with_rectification(left, np.asarray(R_left), np.asarray(P_left)),
+        _with_rectification(right, np.asarray(R_right), np.asarray(P_right)),
+    )
+
+
+def _with_rectification(raw: Calibration, R: FloatArray, P: FloatArray) -> Calibration:
+    return Calibration(
+        width=raw.width, height=raw.height, K=raw.K, D=raw.D, R=R, P=P, is_rectified=False
+    )

@@ -1,0 +1,144 @@
+"""Rigid transforms in 3-D, batched over leading dimensions.
+
+A twist is (rx, ry, rz, tx, ty, tz); perturbations act on the right:
+T(xi) = T @ exp(xi). This is the order of GTSAM's Pose3.
+
+References
+----------
+J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,
+doi:10.48550/arXiv.1812.01537.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gvo.types import FloatArray
+
+
+def make_transform(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Return T, shape (..., 4, 4), of a rotation (..., 3, 3) and a translation (..., 3)."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def invert(T: FloatArray) -> FloatArray:
+    """Return the inverse of rigid transforms, shape (..., 4, 4)."""
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    t_inverse = -(R_inverse @ T[..., :3, 3, np.newaxis])[..., 0]
+    return make_transform(R_inverse, t_inverse)
+
+
+def transform_points(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
+    """Map points (..., n, 3) of frame b to frame a by T_a_b (..., 4, 4)."""
+    R, t = T_a_b[..., :3, :3], T_a_b[..., :3, 3]
+    return points_b @ np.swapaxes(R, -1, -2) + t[..., np.newaxis, :]
+
+
+def skew(v: FloatArray) -> FloatArray:
+    """Return the matrices [v]_x, shape (..., 3, 3), with [v]_x w = v x w."""
+    S = np.zeros((*v.shape[:-1], 3, 3))
+    S[..., 0, 1], S[..., 0, 2] = -v[..., 2], v[..., 1]
+    S[..., 1, 0], S[..., 1, 2] = v[..., 2], -v[..., 0]
+    S[..., 2, 0], S[..., 2, 1] = -v[..., 1], v[..., 0]
+    return S
+
+
+def exp(xi: FloatArray) -> FloatArray:
+    """Return the transform of a twist (Sola 2018, eq. 172).
+
+    Parameters
+    ----------
+    xi : ndarray of float64, shape (..., 6)
+        Twists (rx, ry, rz, tx, ty, tz), radians and metres.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 4, 4)
+    """
+    omega, rho = xi[..., :3], xi[..., 3:]
+    angle = np.linalg.norm(omega, axis=-1)[..., np.newaxis, np.newaxis]
+    is_small = angle < 1e-5
+    safe = np.where(is_small, 1.0, angle)
+    a = np.where(is_small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
+    b = np.where(is_small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    c = np.where(is_small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    W = skew(omega)
+    W2 = W @ W
+    R = np.eye(3) + a * W + b * W2
+    V = np.eye(3) + b * W + c * W2  # eq. 174
+    return make_transform(R, (V @ rho[..., np.newaxis])[..., 0])
+
+
+def log(T: FloatArray) -> FloatArray:
+    """Return the twist of a transform (Sola 2018, eq. 173); the inverse of `exp`.
+
+    Parameters
+    ----------
+    T : ndarray of float64, shape (..., 4, 4)
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 6)
+        Twists (rx, ry, rz, tx, ty, tz), rotation angle in [0, pi].
+    """
+    flat = T.reshape(-1, 4, 4)
+    omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
+    angle = np.linalg.norm(omega, axis=-1)[:, np.newaxis, np.newaxis]
+    is_small = angle < 1e-4
+    safe = np.where(is_small, 1.0, angle)
+    half = 0.5 * safe
+    c = np.where(
+        is_small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2
+    )
+    W = skew(omega)
+    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
+    rho = (V_inverse @ flat[:, :3, 3, np.newaxis])[..., 0]
+    return np.concatenate([omega, rho], axis=-1).reshape(*T.shape[:-2], 6)
+
+
+def adjoint(T: FloatArray) -> FloatArray:
+    """Return Ad_T, shape (..., 6, 6): T @ exp(xi) = exp(Ad_T xi) @ T (Sola 2018, eq. 175)."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    Ad = np.zeros((*T.shape[:-2], 6, 6))
+    Ad[..., :3, :3] = R
+    Ad[..., 3:, 3:] = R
+    Ad[..., 3:, :3] = skew(t) @ R
+    return Ad
+
+
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """Return the rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(M)
+    signs = np.ones((*M.shape[:-2], 3))
+    signs[..., 2] = np.linalg.det(U @ Vt)
+    return np.asarray((U * signs[..., np.newaxis, :]) @ Vt)
+
+
+def normalize(T: FloatArray) -> FloatArray:
+    """Return transforms (..., 4, 4) with their rotation made orthonormal again."""
+    return make_transform(nearest_rotation(T[..., :3, :3]), T[..., :3, 3])
+
+
+def compose_covariance(
+    covariance_a_b: FloatArray, T_b_c: FloatArray, covariance_b_c: FloatArray
+) -> FloatArray:
+    """Return the covariance (6, 6) of T_a_b @ T_b_c, independent errors, first order."""
+    Ad = adjoint(invert(T_b_c))
+    return np.asarray(Ad @ covariance_a_b @ Ad.T + covariance_b_c)
+
+
+def rotation_angle(T: FloatArray) -> FloatArray:
+    """Return the rotation angles in radians, shape (...), of transforms (..., 4, 4)."""
+    R = T[..., :3, :3]
+    vee = np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(vee, axis=-1)
+    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))

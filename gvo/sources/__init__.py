@@ -1,0 +1,1 @@
+"""Recordings: folders, bags and rendered worlds, read as frames."""

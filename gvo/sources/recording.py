@@ -1,0 +1,83 @@
+"""What every recording gives: two streams of raw images, their calibrations, the truth.
+
+A source knows files or messages, nothing of pairing or rectification. `frames` is the one
+way from any source to frames: pair by stamp, decode, check, make grey, rectify.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from numpy.typing import NDArray
+
+from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
+from gvo.trajectory import Trajectory
+
+Sensor = Literal["stereo", "rgbd"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StampedImage:
+    """An image of one stream, not decoded yet.
+
+    Parameters
+    ----------
+    stream : int
+        0: left or colour; 1: right or depth.
+    stamp_ns : int
+        Of the header, nanoseconds.
+    load : callable
+        Returns the raw pixels: uint8 (h, w) grey or (h, w, 3) in BGR order; depth as float32
+        metres (h, w), NaN = unknown. Raises `RecordingError` where the image is faulty.
+    """
+
+    stream: int
+    stamp_ns: int
+    load: Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordingInfo:
+    """What a source found out before the first image.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder or file.
+    sensor : {"stereo", "rgbd"}
+    calibrations : tuple of Calibration
+        Of stream 0 and, for stereo, of stream 1.
+    n_images : int
+        Announced images of stream 0.
+    decisions : list of str
+        What was chosen and why, a line each.
+    """
+
+    name: str
+    sensor: Sensor
+    calibrations: tuple[Calibration, ...]
+    n_images: int
+    decisions: list[str] = field(default_factory=list)
+
+    @property
+    def camera(self) -> StereoCamera | PinholeCamera:
+        """The camera of the rectified frames."""
+        if self.sensor == "stereo":
+            return stereo_camera(*self.calibrations)
+        return self.calibrations[0].pinhole()
+
+
+class Source(Protocol):
+    """A recording on disk."""
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What is known before the first image."""
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images of both streams in the order of the recording."""
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of stream 0's rectified camera, where the recording holds it."""

@@ -1,0 +1,239 @@
+"""The frozen values that travel between the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+ImageArray: TypeAlias = NDArray[np.uint8]
+DepthArray: TypeAlias = NDArray[np.float32]
+FrameId: TypeAlias = Hashable
+
+
+class Status(StrEnum):
+    """What ties a frame's pose to the frames before it."""
+
+    OK = "ok"
+    """At least one registration against an earlier frame."""
+    COASTING = "coasting"
+    """No registration: the pose continues the last velocity, its covariance inflated."""
+    LOST = "lost"
+    """Coasting for longer than `window.lost_after_s`."""
+    RESUMED = "resumed"
+    """The first registered frame after coasting or lost ones."""
+    SKIPPED = "skipped"
+    """A faulty frame: no pose."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """This data has no answer; falsy, so that `if result:` reads well.
+
+    Parameters
+    ----------
+    reason : str
+        One line: what was missing, with its numbers.
+    n_matches, n_inliers : int
+        How far it came.
+    """
+
+    reason: str
+    n_matches: int = 0
+    n_inliers: int = 0
+
+    def __bool__(self) -> bool:
+        """Tell that there is no result."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StereoFrame:
+    """One rectified stereo pair.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the left image, nanoseconds.
+    left, right : ndarray of uint8, shape (height, width)
+        Rectified grey images: a point lies on the same row of both.
+    """
+
+    stamp_ns: int
+    left: ImageArray
+    right: ImageArray
+
+    def __post_init__(self) -> None:
+        """Check the shapes once."""
+        if self.left.ndim != 2 or self.left.shape != self.right.shape:
+            raise ValueError(
+                f"left and right must be grey images of one size, "
+                f"got {self.left.shape} and {self.right.shape}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RgbdFrame:
+    """One undistorted grey image with its depth.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the colour image, nanoseconds.
+    image : ndarray of uint8, shape (height, width)
+        Grey image made of the colour image.
+    depth : ndarray of float32, shape (height, width)
+        Metres along the optical axis, NaN = unknown.
+    """
+
+    stamp_ns: int
+    image: ImageArray
+    depth: DepthArray
+
+    def __post_init__(self) -> None:
+        """Check the shapes once."""
+        if self.image.ndim != 2 or self.image.shape != self.depth.shape:
+            raise ValueError(
+                f"image must be grey and depth of its size, "
+                f"got {self.image.shape} and {self.depth.shape}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaultyFrame:
+    """A frame of the recording that cannot be used; it is skipped and counted.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the faulty frame, nanoseconds.
+    reason : str
+        One line: what, where.
+    """
+
+    stamp_ns: int
+    reason: str
+
+
+Frame: TypeAlias = StereoFrame | RgbdFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Observations:
+    """What a front-end keeps of one frame: n points, seen and measured in 3-D.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the frame, nanoseconds.
+    keypoints : ndarray of float64, shape (n, 2)
+        Pixels (u, v) in the left or colour image.
+    disparities : ndarray of float64, shape (n,)
+        Disparity in pixels; for RGB-D the virtual one, fx * baseline / depth.
+    points_cam : ndarray of float64, shape (n, 3)
+        Points in the `cam` frame, metres.
+    sigmas : ndarray of float64, shape (n, 3)
+        Standard deviations of (u, v, disparity), pixels.
+    descriptors_left : ndarray of uint8 or float32, shape (n, m)
+        Binary descriptors (Hamming distance) or real ones (Euclidean distance).
+    descriptors_right : ndarray or None
+        The same of the matched pixels in the right image; None for RGB-D.
+    n_keypoints : int
+        Keypoints detected before matching and filtering.
+    """
+
+    stamp_ns: int
+    keypoints: FloatArray
+    disparities: FloatArray
+    points_cam: FloatArray
+    sigmas: FloatArray
+    descriptors_left: NDArray[np.uint8] | NDArray[np.float32]
+    descriptors_right: NDArray[np.uint8] | NDArray[np.float32] | None = None
+    n_keypoints: int = 0
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RelativePose:
+    """A registration's result.
+
+    Parameters
+    ----------
+    T_reference_current : ndarray of float64, shape (4, 4)
+        Maps coordinates of the current camera to the reference camera, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the current camera frame.
+    matches : ndarray of int64, shape (n, 2)
+        Indices into the observations of reference and current.
+    inliers : ndarray of bool, shape (n,)
+        Which matches the pose rests on.
+    """
+
+    T_reference_current: FloatArray
+    covariance: FloatArray
+    matches: IntArray
+    inliers: BoolArray
+
+    @property
+    def n_matches(self) -> int:
+        """Number of temporal matches."""
+        return len(self.matches)
+
+    @property
+    def n_inliers(self) -> int:
+        """Number of matches the pose rests on."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Edge:
+    """A relative pose to a frame that is already in the window.
+
+    Parameters
+    ----------
+    reference_id : hashable
+        The frame the measurement refers to.
+    T_reference_frame : ndarray of float64, shape (4, 4)
+        Maps coordinates of the new frame to the reference frame, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the new frame.
+    """
+
+    reference_id: FrameId
+    T_reference_frame: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """A pose with its covariance and what it rests on.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the frame, nanoseconds.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Maps camera coordinates to the world, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+    status : Status
+        What ties the pose to the frames before it.
+    frame_id : hashable
+        The caller's name of the frame.
+    """
+
+    stamp_ns: int
+    T_world_cam: FloatArray
+    covariance: FloatArray
+    status: Status = Status.OK
+    frame_id: FrameId = field(default=None)
