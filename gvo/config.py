@@ -76,9 +76,15 @@ class FeaturesConfig(Section):
         "orb", "orb and sift bring their own descriptors; fast and gftt corners get ORB's"
     )
     n_features: int = _parameter(1200, "keypoints kept per image", ge=50, le=20000)
-    n_octaves: int = _parameter(2, "pyramid levels (orb, fast, gftt)", ge=1, le=12)
+    n_octaves: int = _parameter(1, "pyramid levels (orb, fast, gftt)", ge=1, le=12)
     scale_factor: float = _parameter(1.3, "size ratio of two pyramid levels", gt=1, le=4)
-    fast_threshold: int = _parameter(10, "contrast of a corner (orb, fast)", "grey", ge=1, le=200)
+    fast_threshold: int = _parameter(20, "contrast of a corner (orb, fast)", "grey", ge=1, le=200)
+    low_fast_threshold: int = _parameter(
+        7, "tried where the first leaves the budget unfilled", "grey", ge=1, le=200
+    )
+    upright: bool = _parameter(
+        True, "describe without rotation: surer while the camera rolls less than some 20 degrees"
+    )
     cell_size_px: int = _parameter(40, "size of the grid cells that share the budget", "px", ge=8)
 
 
@@ -118,9 +124,12 @@ class RansacConfig(Section):
     inlier_metric: Literal["reprojection", "distance"] = _parameter(
         "reprojection", "residual in the image (u, v, disparity), or between the points"
     )
-    inlier_threshold_px: float = _parameter(2.0, "of the reprojection metric", "px", gt=0)
+    inlier_threshold_px: float = _parameter(3.0, "of the reprojection metric", "px", gt=0)
     inlier_threshold_m: float = _parameter(0.3, "of the distance metric", "m", gt=0)
     min_inliers: int = _parameter(12, "fewer mean failure", ge=3)
+    min_disparity_px: float = _parameter(
+        12.0, "points with less are counted but not fitted: depth noise grows with z^2", "px", ge=0
+    )
     seed: int = _parameter(0, "of the random generator", ge=0)
 
 
@@ -134,7 +143,12 @@ class RegistrationConfig(Section):
         "gauss_newton", "pose over (u, v, disparity) residuals after RANSAC, or not"
     )
     n_iterations: int = _parameter(10, "at most, of the refinement", ge=1, le=100)
-    huber: float = _parameter(1.5, "threshold of the robust kernel, in sigmas", gt=0)
+    huber: float = _parameter(
+        2.8, "threshold of the robust kernel, on a match's residual", "sigma", gt=0
+    )
+    gate: float = _parameter(
+        4.0, "matches nearer to the refined pose than this become its inliers", "sigma", gt=0
+    )
     pixel_sigma_px: float = _parameter(0.7, "noise of a keypoint's pixel", "px", gt=0)
 
 

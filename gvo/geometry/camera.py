@@ -297,7 +297,7 @@ def rectify_stereo(
         right.D,
         (left.width, left.height),
         T_right_left[:3, :3],
-        T_right_left[:3, 3],
+        T_right_left[:3, 3:],
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=0,
     )

@@ -1,0 +1,164 @@
+"""The front-end of descriptors: sparse stereo or depth, windowed matching, registration."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.frontend.features import FeatureExtractor, Features
+from gvo.frontend.registration import register_matches
+from gvo.frontend.rgbd import sample_depth
+from gvo.frontend.stereo import match_stereo, refine_disparities
+from gvo.frontend.temporal import match_temporal, predict_pixels
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.types import (
+    Failure,
+    FloatArray,
+    Frame,
+    IntArray,
+    Observations,
+    RelativePose,
+    RgbdFrame,
+    StereoFrame,
+)
+
+
+class DescriptorFrontend:
+    """Extracts observations from frames and registers two frames' observations.
+
+    Parameters
+    ----------
+    camera : StereoCamera or PinholeCamera
+        Stereo pair, or the colour camera of an RGB-D sensor.
+    config : Config
+    """
+
+    def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
+        self.camera = as_stereo(camera, config)
+        self._config = config
+        self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
+        self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
+
+    def extract(self, frame: Frame) -> Observations:
+        """Return the points of a frame that are seen and measured in 3-D.
+
+        Parameters
+        ----------
+        frame : StereoFrame or RgbdFrame
+        """
+        if isinstance(frame, StereoFrame):
+            return self._extract_stereo(frame)
+        return self._extract_rgbd(frame)
+
+    def _extract_stereo(self, frame: StereoFrame) -> Observations:
+        first, second = self._extractors
+        if self._pool is not None:
+            pending = self._pool.submit(second.extract, frame.right)
+            left, right = first.extract(frame.left), pending.result()
+        else:
+            left, right = first.extract(frame.left), second.extract(frame.right)
+        config = self._config.stereo
+        pairs = match_stereo(left, right, self.camera, config)
+        disparities, is_valid = refine_disparities(
+            (frame.left, frame.right),
+            left.keypoints[pairs[:, 0]],
+            right.keypoints[pairs[:, 1]],
+            config,
+        )
+        depths = self.camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
+        with np.errstate(invalid="ignore"):
+            is_valid &= (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
+        return self._observe(
+            frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid]
+        )
+
+    def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
+        features = self._extractors[0].extract(frame.image)
+        depths, is_valid = sample_depth(frame.depth, features.keypoints, self._config.depth)
+        chosen = np.flatnonzero(is_valid)
+        disparities = self.camera.depth_to_disparity(depths[chosen])
+        pairs = np.stack([chosen, chosen], axis=1)
+        return self._observe(frame.stamp_ns, features, None, pairs, disparities)
+
+    def _observe(
+        self,
+        stamp_ns: int,
+        left: Features,
+        right: Features | None,
+        pairs: IntArray,
+        disparities: FloatArray,
+    ) -> Observations:
+        keypoints = left.keypoints[pairs[:, 0]]
+        return Observations(
+            stamp_ns=stamp_ns,
+            keypoints=keypoints,
+            disparities=disparities,
+            points_cam=self.camera.unproject_stereo(keypoints, disparities),
+            sigmas=self._sigmas(left.octaves[pairs[:, 0]], is_stereo=right is not None),
+            descriptors_left=left.descriptors[pairs[:, 0]],
+            descriptors_right=None if right is None else right.descriptors[pairs[:, 1]],
+            n_keypoints=len(left),
+        )
+
+    def _sigmas(self, octaves: IntArray, *, is_stereo: bool) -> FloatArray:
+        config = self._config
+        pixel = config.registration.pixel_sigma_px * config.features.scale_factor**octaves
+        disparity = config.stereo.sigma_px if is_stereo else config.depth.sigma_px
+        return np.column_stack([pixel, pixel, np.full(len(octaves), disparity)])
+
+    def register(
+        self, reference: Observations, current: Observations, prior: FloatArray | None = None
+    ) -> RelativePose | Failure:
+        """Estimate the motion from the reference to the current frame.
+
+        Parameters
+        ----------
+        reference, current : Observations
+        prior : ndarray of float64, shape (4, 4), optional
+            Predicted T_reference_current; matches are searched around the pixels it predicts.
+            Without it, or where it leads to nothing, a wider window is searched.
+
+        Returns
+        -------
+        RelativePose or Failure
+        """
+        temporal = self._config.temporal
+        result: RelativePose | Failure = Failure(reason="not tried")
+        if prior is not None:
+            result = self._register_within(reference, current, prior, temporal.radius_px)
+        if not result:
+            result = self._register_within(reference, current, prior, temporal.wide_radius_px)
+        return result
+
+    def _register_within(
+        self,
+        reference: Observations,
+        current: Observations,
+        prior: FloatArray | None,
+        radius_px: float,
+    ) -> RelativePose | Failure:
+        matches = match_temporal(
+            reference,
+            current,
+            predict_pixels(reference, prior, self.camera),
+            radius_px=radius_px,
+            max_distance=self._config.temporal.max_distance,
+        )
+        return register_matches(reference, current, matches, self.camera, self._config)
+
+
+def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCamera:
+    """Return a stereo camera; an RGB-D camera gets the virtual baseline."""
+    if isinstance(camera, StereoCamera):
+        return camera
+    return StereoCamera(
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
+        baseline=config.depth.virtual_baseline_m,
+    )

@@ -1,0 +1,155 @@
+"""Keypoints spread over the image, with descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.config import FeaturesConfig
+from gvo.types import FloatArray, ImageArray, IntArray
+
+Descriptors = NDArray[np.uint8] | NDArray[np.float32]
+
+# Border that the descriptors' patch needs (31 px with its rotation), at the first octave.
+_BORDER_PX = 19
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints of one image.
+
+    Parameters
+    ----------
+    keypoints : ndarray of float64, shape (n, 2)
+        Pixels (u, v).
+    octaves : ndarray of int64, shape (n,)
+        Pyramid level of each.
+    descriptors : ndarray of uint8 or float32, shape (n, m)
+    """
+
+    keypoints: FloatArray
+    octaves: IntArray
+    descriptors: Descriptors
+
+    def __len__(self) -> int:
+        """Return the number of keypoints."""
+        return len(self.keypoints)
+
+
+class FeatureExtractor:
+    """Detects and describes; holds the OpenCV objects between images.
+
+    Not to be shared between threads: OpenCV's detectors keep state.
+
+    Parameters
+    ----------
+    config : FeaturesConfig
+    """
+
+    def __init__(self, config: FeaturesConfig) -> None:
+        self._config = config
+        self._orb = _make_orb(config, config.fast_threshold)
+        self._detectors = _make_detectors(config, self._orb)
+
+    def extract(self, image: ImageArray) -> Features:
+        """Return the keypoints of a grey image, spread over a grid, with descriptors.
+
+        Parameters
+        ----------
+        image : ndarray of uint8, shape (height, width)
+        """
+        found = self._detect(image)
+        found = _spread(found, image.shape, self._config)
+        if self._config.upright:
+            for point in found:
+                point.angle = 0.0
+        describer = self._detectors[0] if self._config.kind == "sift" else self._orb
+        found, descriptors = describer.compute(image, found)
+        if descriptors is None or len(found) == 0:
+            return _no_features(self._config.kind)
+        return Features(
+            keypoints=np.array([point.pt for point in found], dtype=np.float64),
+            octaves=np.array([point.octave & 0xFF for point in found], dtype=np.int64),
+            descriptors=descriptors,
+        )
+
+
+    def _detect(self, image: ImageArray) -> Sequence[cv2.KeyPoint]:
+        """Detect with the first detector that fills the budget, or the last one."""
+        found: Sequence[cv2.KeyPoint] = ()
+        for detector in self._detectors:
+            found = detector.detect(image)
+            if len(found) >= self._config.n_features:
+                break
+        return found
+
+
+def _make_orb(config: FeaturesConfig, threshold: int) -> cv2.Feature2D:
+    # Four times the budget, so that the grid has something to choose from.
+    orb: cv2.Feature2D = cv2.ORB_create(  # type: ignore[attr-defined]
+        nfeatures=4 * config.n_features,
+        scaleFactor=config.scale_factor,
+        nlevels=config.n_octaves,
+        edgeThreshold=_BORDER_PX,
+        fastThreshold=threshold,
+    )
+    return orb
+
+
+def _make_detectors(config: FeaturesConfig, orb: cv2.Feature2D) -> list[cv2.Feature2D]:
+    n_candidates = 4 * config.n_features
+    if config.kind == "sift":
+        return [cv2.SIFT_create(nfeatures=n_candidates)]  # type: ignore[attr-defined]
+    if config.kind == "gftt":
+        return [
+            cv2.GFTTDetector_create(  # type: ignore[attr-defined]
+                maxCorners=n_candidates, qualityLevel=0.001, minDistance=3
+            )
+        ]
+    low = min(config.low_fast_threshold, config.fast_threshold)
+    if config.kind == "fast":
+        return [
+            cv2.FastFeatureDetector_create(threshold=threshold)  # type: ignore[attr-defined]
+            for threshold in (config.fast_threshold, low)
+        ]
+    return [orb, _make_orb(config, low)]
+
+
+def _no_features(kind: str) -> Features:
+    is_real = kind == "sift"
+    descriptors: Descriptors = (
+        np.zeros((0, 128), np.float32) if is_real else np.zeros((0, 32), np.uint8)
+    )
+    return Features(
+        keypoints=np.zeros((0, 2)), octaves=np.zeros(0, np.int64), descriptors=descriptors
+    )
+
+
+def _spread(
+    found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], config: FeaturesConfig
+) -> list[cv2.KeyPoint]:
+    """Keep the strongest of each grid cell, round by round, up to the budget."""
+    if len(found) == 0:
+        return []
+    pixels = np.array([point.pt for point in found])
+    responses = np.array([point.response for point in found])
+    columns = -(-shape[1] // config.cell_size_px)
+    cells = (pixels // config.cell_size_px).astype(np.int64) @ [1, columns]
+    order = np.lexsort((np.arange(len(found)), -responses, cells))
+    ranks = rank_in_group(cells[order])
+    # The first of every cell before the second of any: the weakest rank is cut by response.
+    chosen = order[np.lexsort((-responses[order], ranks))[: config.n_features]]
+    return [found[index] for index in np.sort(chosen)]
+
+
+def rank_in_group(sorted_groups: IntArray) -> IntArray:
+    """Number the members of each run of equal values, from zero, shape (n,)."""
+    n = len(sorted_groups)
+    is_first = np.ones(n, dtype=np.bool_)
+    is_first[1:] = sorted_groups[1:] != sorted_groups[:-1]
+    starts = np.flatnonzero(is_first)
+    return np.asarray(np.arange(n) - starts[np.cumsum(is_first) - 1])

@@ -1,0 +1,78 @@
+"""Descriptor distances over candidate pairs, and their mutual best."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.types import FloatArray, IntArray
+
+# Real descriptors of SIFT have this length, so that two can be no farther apart than twice it.
+_SIFT_NORM = 512.0
+
+
+def descriptor_distances(
+    first: NDArray[np.uint8] | NDArray[np.float32],
+    second: NDArray[np.uint8] | NDArray[np.float32],
+    pairs: IntArray,
+) -> FloatArray:
+    """Return the distances of pairs of descriptors, as a share of the largest possible.
+
+    Parameters
+    ----------
+    first, second : ndarray of uint8 or float32, shape (n, m)
+        Binary descriptors (Hamming distance) or real ones (Euclidean distance).
+    pairs : ndarray of int64, shape (k, 2)
+        Indices into both.
+
+    Returns
+    -------
+    ndarray of float64, shape (k,)
+        In [0, 1].
+    """
+    a, b = first[pairs[:, 0]], second[pairs[:, 1]]
+    if first.dtype == np.uint8:
+        words_a, words_b = a.view(np.uint64), b.view(np.uint64)
+        bits = np.bitwise_count(words_a ^ words_b).sum(axis=1, dtype=np.int64)
+        return np.asarray(bits / (8.0 * first.shape[1]))
+    return np.asarray(np.linalg.norm(a - b, axis=1) / (2.0 * _SIFT_NORM), dtype=np.float64)
+
+
+def mutual_best(pairs: IntArray, distances: FloatArray, n_first: int, n_second: int) -> IntArray:
+    """Keep the pairs that are the best of both of their members.
+
+    Parameters
+    ----------
+    pairs : ndarray of int64, shape (k, 2)
+        Candidate pairs of indices below `n_first` and `n_second`.
+    distances : ndarray of float64, shape (k,)
+        Smaller is better; of equal ones the earlier pair wins.
+
+    Returns
+    -------
+    ndarray of int64, shape (m,)
+        Positions in `pairs`, sorted by the first member; no index occurs twice.
+    """
+    k = len(pairs)
+    ranks = np.empty(k, dtype=np.int64)
+    ranks[np.argsort(distances, kind="stable")] = np.arange(k)
+    best_of_first = np.full(n_first, k, dtype=np.int64)
+    best_of_second = np.full(n_second, k, dtype=np.int64)
+    np.minimum.at(best_of_first, pairs[:, 0], ranks)
+    np.minimum.at(best_of_second, pairs[:, 1], ranks)
+    is_mutual = (ranks == best_of_first[pairs[:, 0]]) & (ranks == best_of_second[pairs[:, 1]])
+    chosen = np.flatnonzero(is_mutual)
+    return np.asarray(chosen[np.argsort(pairs[chosen, 0], kind="stable")])
+
+
+def expand_ranges(starts: IntArray, stops: IntArray) -> tuple[IntArray, IntArray]:
+    """List all (row, position) of half-open ranges of positions, one range a row.
+
+    Returns
+    -------
+    rows, positions : ndarray of int64, shape (sum of lengths,)
+    """
+    lengths = np.maximum(stops - starts, 0)
+    rows = np.repeat(np.arange(len(starts)), lengths)
+    offsets = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return rows, np.asarray(starts[rows] + offsets)

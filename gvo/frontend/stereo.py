@@ -1,0 +1,173 @@
+"""Sparse stereo matching along epipolar lines, with sub-pixel disparity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from gvo.config import StereoConfig
+from gvo.frontend.features import Features
+from gvo.frontend.matching import descriptor_distances, expand_ranges, mutual_best
+from gvo.geometry.camera import StereoCamera
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+
+
+def candidate_pairs(
+    left: Features, right: Features, camera: StereoCamera, config: StereoConfig
+) -> IntArray:
+    """List the pairs that obey the epipolar constraint and the depth limits.
+
+    A row lookup table over the right keypoints, sorted by row and then by column, gives for
+    each left keypoint and each row within the tolerance one range of columns; no descriptor
+    has been looked at yet.
+
+    Returns
+    -------
+    ndarray of int64, shape (k, 2)
+        Indices into left and right.
+    """
+    if len(left) == 0 or len(right) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    min_disparity = float(camera.depth_to_disparity(config.max_depth_m))
+    max_disparity = float(camera.depth_to_disparity(config.min_depth_m))
+    order, keys = _row_table(right.keypoints, camera.width)
+    reach = int(np.ceil(config.row_tolerance_px))
+    rows_left = np.rint(left.keypoints[:, 1]).astype(np.int64)
+    rows = rows_left[:, np.newaxis] + np.arange(-reach, reach + 1)
+    u_left = left.keypoints[:, :1]
+    base = rows * (2.0 * camera.width)
+    starts = np.searchsorted(keys, base + np.maximum(u_left - max_disparity, 0.0), "left")
+    stops = np.searchsorted(keys, base + np.maximum(u_left - min_disparity, -1.0), "right")
+    flat, positions = expand_ranges(starts.ravel(), stops.ravel())
+    pairs = np.stack([flat // rows.shape[1], order[positions]], axis=1)
+    row_differences = left.keypoints[pairs[:, 0], 1] - right.keypoints[pairs[:, 1], 1]
+    return np.asarray(pairs[np.abs(row_differences) <= config.row_tolerance_px])
+
+
+def _row_table(keypoints: FloatArray, width: int) -> tuple[IntArray, FloatArray]:
+    """Sort keypoints by row, then column; the key holds both in one number."""
+    keys = np.rint(keypoints[:, 1]) * (2.0 * width) + keypoints[:, 0]
+    order = np.argsort(keys, kind="stable")
+    return order, keys[order]
+
+
+def match_stereo(
+    left: Features, right: Features, camera: StereoCamera, config: StereoConfig
+) -> IntArray:
+    """Match left and right keypoints: epipolar candidates, descriptor distance, reciprocal.
+
+    Returns
+    -------
+    ndarray of int64, shape (m, 2)
+        Indices into left and right, each at most once.
+    """
+    pairs = candidate_pairs(left, right, camera, config)
+    octave_steps = left.octaves[pairs[:, 0]] - right.octaves[pairs[:, 1]]
+    pairs = pairs[np.abs(octave_steps) <= 1]
+    distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
+    is_close = distances <= config.max_distance
+    pairs, distances = pairs[is_close], distances[is_close]
+    return pairs[mutual_best(pairs, distances, len(left), len(right))]
+
+
+def refine_disparities(
+    images: tuple[ImageArray, ImageArray],
+    pixels_left: FloatArray,
+    pixels_right: FloatArray,
+    config: StereoConfig,
+) -> tuple[FloatArray, BoolArray]:
+    """Fit the disparity of matches to a fraction of a pixel.
+
+    A patch around the left pixel is compared with patches of the right image on the same row,
+    `search_radius_px` columns to either side; a parabola through the sum of squared
+    differences (patch means removed) at the best column and its neighbours gives the fraction.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+    pixels_left, pixels_right : ndarray of float64, shape (n, 2)
+        Matched pixels.
+
+    Returns
+    -------
+    disparities : ndarray of float64, shape (n,)
+    is_valid : ndarray of bool, shape (n,)
+        False where a patch leaves the image or the best column is the last one searched.
+    """
+    if config.subpixel == "none":
+        disparities = pixels_left[:, 0] - pixels_right[:, 0]
+        return disparities, np.ones(len(disparities), dtype=np.bool_)
+    radius, reach = config.patch_radius_px, config.search_radius_px
+    height, width = images[0].shape
+    column_left, row = np.rint(pixels_left).astype(np.int64).T
+    column_right = np.rint(pixels_right[:, 0]).astype(np.int64)
+    is_valid = (
+        (row >= radius)
+        & (row < height - radius)
+        & (column_left >= radius)
+        & (column_left < width - radius)
+        & (column_right >= radius + reach)
+        & (column_right < width - radius - reach)
+    )
+    disparities = np.full(len(row), np.nan)
+    chosen = np.flatnonzero(is_valid)
+    ssd = _patch_ssd(
+        images, row[chosen], column_left[chosen], column_right[chosen], radius=radius, reach=reach
+    )
+    offsets, is_minimum = parabola_minimum(ssd)
+    disparities[chosen] = column_left[chosen] - column_right[chosen] - (offsets - reach)
+    is_valid[chosen] = is_minimum
+    return disparities, is_valid
+
+
+def _patch_ssd(
+    images: tuple[ImageArray, ImageArray],
+    row: IntArray,
+    column_left: IntArray,
+    column_right: IntArray,
+    *,
+    radius: int,
+    reach: int,
+) -> NDArray[np.float32]:
+    """Return the sums of squared differences less their mean, shape (n, 2 * reach + 1).
+
+    Without the mean, so that a pair of unequal exposure gives the same disparities.
+    """
+    size, n_offsets = 2 * radius + 1, 2 * reach + 1
+    left_windows = sliding_window_view(images[0], (size, size))
+    right_windows = sliding_window_view(images[1], (size, size + 2 * reach))
+    patches = left_windows[row - radius, column_left - radius].astype(np.float32)
+    strips = right_windows[row - radius, column_right - radius - reach].astype(np.float32)
+    ssd = np.empty((len(row), n_offsets), dtype=np.float32)
+    for offset in range(n_offsets):
+        difference = strips[:, :, offset : offset + size] - patches
+        squares = np.einsum("nij,nij->n", difference, difference)
+        ssd[:, offset] = squares - difference.sum(axis=(1, 2)) ** 2 / size**2
+    return ssd
+
+
+def parabola_minimum(values: NDArray[np.float32]) -> tuple[FloatArray, BoolArray]:
+    """Locate the minimum of sampled curves between samples.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (n, m)
+        Curves at 0 .. m - 1.
+
+    Returns
+    -------
+    positions : ndarray of float64, shape (n,)
+    is_minimum : ndarray of bool, shape (n,)
+        False where the smallest sample is the first or last.
+    """
+    n, m = values.shape
+    best = np.argmin(values, axis=1)
+    is_minimum = (best > 0) & (best < m - 1)
+    inner = np.clip(best, 1, m - 2)
+    index = np.arange(n)
+    before, at, after = (values[index, inner + step].astype(np.float64) for step in (-1, 0, 1))
+    curvature = before - 2.0 * at + after
+    is_minimum &= curvature > 0
+    shift = 0.5 * (before - after) / np.where(curvature > 0, curvature, 1.0)
+    return inner + shift, is_minimum

@@ -1,0 +1,107 @@
+"""The rigid transform between two sets of corresponding points, in closed form.
+
+References
+----------
+S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+IEEE TPAMI 13(4), 1991, doi:10.1109/34.88573. The scale is fixed to one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gvo.geometry.se3 import make_transform
+from gvo.types import BoolArray, Failure, FloatArray
+
+# Spread across the main direction over spread along it (standard deviations squared): below
+# this, points lie on a line to 0.1 % and the rotation about it is noise.
+_MIN_VARIANCE_RATIO = 1e-6
+
+
+def fit_rigid_batch(
+    source_points: FloatArray, target_points: FloatArray, *, weights: FloatArray | None = None
+) -> tuple[FloatArray, BoolArray]:
+    """Fit one rigid transform to each of many sets of corresponding points.
+
+    Parameters
+    ----------
+    source_points, target_points : ndarray of float64, shape (..., n, 3)
+        Corresponding points in two frames, metres.
+    weights : ndarray of float64, shape (..., n), optional
+        Not negative; equal weights where omitted.
+
+    Returns
+    -------
+    T_target_source : ndarray of float64, shape (..., 4, 4)
+        Minimizes the weighted sum of squared distances; never a reflection. The identity
+        rotation stands where there is no answer.
+    is_valid : ndarray of bool, shape (...)
+        False for fewer than three points with weight, for points on a line, for NaN.
+    """
+    if source_points.shape != target_points.shape or source_points.shape[-1] != 3:
+        raise ValueError(
+            f"expected two arrays (..., n, 3), got {source_points.shape}, {target_points.shape}"
+        )
+    if source_points.shape[-2] < 3:
+        T = np.broadcast_to(np.eye(4), (*source_points.shape[:-2], 4, 4)).copy()
+        return T, np.zeros(source_points.shape[:-2], dtype=np.bool_)
+    w = _normalized_weights(source_points, weights)
+    source_mean = np.sum(w * source_points, axis=-2, keepdims=True)
+    target_mean = np.sum(w * target_points, axis=-2, keepdims=True)
+    source_centred = source_points - source_mean
+    # eq. 38: cross-covariance of the two sets
+    cross = np.swapaxes(w * (target_points - target_mean), -1, -2) @ source_centred
+    is_finite = np.isfinite(cross).all(axis=(-1, -2))
+    U, singular_values, Vt = np.linalg.svd(np.where(is_finite[..., None, None], cross, 0.0))
+    is_valid = is_finite & (
+        singular_values[..., 1] > _MIN_VARIANCE_RATIO * singular_values[..., 0]
+    )
+    signs = np.ones_like(singular_values)
+    signs[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # eq. 39: no reflection
+    R = (U * signs[..., np.newaxis, :]) @ Vt  # eq. 40
+    R = np.where(is_valid[..., None, None], R, np.eye(3))
+    t = (target_mean - source_mean @ np.swapaxes(R, -1, -2))[..., 0, :]  # eq. 41
+    return make_transform(R, t), is_valid
+
+
+def fit_rigid(
+    source_points: FloatArray, target_points: FloatArray, *, weights: FloatArray | None = None
+) -> FloatArray | Failure:
+    """Fit the rigid transform between two sets of corresponding points.
+
+    Parameters
+    ----------
+    source_points, target_points : ndarray of float64, shape (n, 3)
+        Corresponding points in two frames, metres.
+    weights : ndarray of float64, shape (n,), optional
+        Not negative; equal weights where omitted.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4), or Failure
+        T_target_source; a failure for fewer than three points or points on a line.
+
+    Examples
+    --------
+    >>> points = np.eye(3)
+    >>> T = fit_rigid(points, points + [1.0, 2.0, 3.0])
+    >>> T[:3, 3].round(6).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    n = len(source_points)
+    if n < 3:
+        return Failure(reason=f"a rigid fit needs three points, got {n}", n_matches=n)
+    T, is_valid = fit_rigid_batch(source_points, target_points, weights=weights)
+    if not is_valid:
+        return Failure(reason=f"{n} points lie on a line", n_matches=n)
+    return T
+
+
+def _normalized_weights(points: FloatArray, weights: FloatArray | None) -> FloatArray:
+    if weights is None:
+        return np.full((1, 1), 1.0 / points.shape[-2])
+    if np.any(weights < 0):
+        raise ValueError("weights must not be negative")
+    total = np.sum(weights, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((weights / total)[..., np.newaxis])
