@@ -164,9 +164,7 @@ class WindowConfig(Section):
     keyframe_overlap: float = _parameter(
         0.75, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
     )
-    link_sigma_factor: float = _parameter(
-        1.0, "factor on the sigmas of links to keyframes", gt=0
-    )
+    link_sigma_factor: float = _parameter(1.0, "factor on the sigmas of links to keyframes", gt=0)
     kernel: Literal["huber", "none"] = _parameter("huber", "robust kernel of the edges")
     kernel_threshold: float = _parameter(
         3.55, "of the kernel, on the norm of the whitened 6-vector", gt=0
@@ -278,9 +276,7 @@ def _explain(error: ValidationError) -> str:
 
 def _known_keys() -> list[str]:
     return [
-        f"{section}.{key}"
-        for section, group in _sections().items()
-        for key in group.model_fields
+        f"{section}.{key}" for section, group in _sections().items() for key in group.model_fields
     ]
 
 

@@ -96,9 +96,7 @@ class Keyframes:
     def choose_released(self, overlaps: dict[int, float]) -> list[int]:
         """Choose the keyframes to let go: out of view, and the least seen beyond the limit."""
         out_of_view = [
-            stamp_ns
-            for stamp_ns, overlap in overlaps.items()
-            if overlap < self._config.min_overlap
+            stamp_ns for stamp_ns, overlap in overlaps.items() if overlap < self._config.min_overlap
         ]
         rest = sorted(set(overlaps) - set(out_of_view), key=lambda stamp: (overlaps[stamp], stamp))
         n_over = max(len(self._kept) - len(out_of_view) - self._config.n_keyframes, 0)

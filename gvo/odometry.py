@@ -73,9 +73,7 @@ class Odometry:
     config : Config, optional
     """
 
-    def __init__(
-        self, camera: StereoCamera | PinholeCamera, config: Config | None = None
-    ) -> None:
+    def __init__(self, camera: StereoCamera | PinholeCamera, config: Config | None = None) -> None:
         self._config = config or Config()
         self._frontend = DescriptorFrontend(camera, self._config)
         self._chain = RawChain(self._frontend, self._config.window)
@@ -149,9 +147,7 @@ class Odometry:
         ]
         return [first, *(link for link in links if link is not None)], overlaps
 
-    def _link(
-        self, stamp_ns: int, observations: Observations, prior: FloatArray
-    ) -> Edge | None:
+    def _link(self, stamp_ns: int, observations: Observations, prior: FloatArray) -> Edge | None:
         result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
         if isinstance(result, Failure):
             return None

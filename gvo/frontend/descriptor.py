@@ -70,9 +70,7 @@ class DescriptorFrontend:
         depths = self.camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
         with np.errstate(invalid="ignore"):
             is_valid &= (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
-        return self._observe(
-            frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid]
-        )
+        return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
 
     def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
         features = self._extractors[0].extract(frame.image)

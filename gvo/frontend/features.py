@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -74,9 +75,8 @@ class FeatureExtractor:
         return Features(
             keypoints=np.array([point.pt for point in found], dtype=np.float64),
             octaves=np.array([point.octave & 0xFF for point in found], dtype=np.int64),
-            descriptors=descriptors,
+            descriptors=_typed(descriptors, self._config.kind),
         )
-
 
     def _detect(self, image: ImageArray) -> Sequence[cv2.KeyPoint]:
         """Detect with the first detector that fills the budget, or the last one."""
@@ -140,16 +140,22 @@ def _spread(
     columns = -(-shape[1] // config.cell_size_px)
     cells = (pixels // config.cell_size_px).astype(np.int64) @ [1, columns]
     order = np.lexsort((np.arange(len(found)), -responses, cells))
-    ranks = rank_in_group(cells[order])
+    ranks = rank_in_group(np.asarray(cells[order], dtype=np.int64))
     # The first of every cell before the second of any: the weakest rank is cut by response.
     chosen = order[np.lexsort((-responses[order], ranks))[: config.n_features]]
     return [found[index] for index in np.sort(chosen)]
 
 
 def rank_in_group(sorted_groups: IntArray) -> IntArray:
-    """Number the members of each run of equal values, from zero, shape (n,)."""
+    """Return the rank of the members of each run of equal values, from zero, shape (n,)."""
     n = len(sorted_groups)
     is_first = np.ones(n, dtype=np.bool_)
     is_first[1:] = sorted_groups[1:] != sorted_groups[:-1]
     starts = np.flatnonzero(is_first)
     return np.asarray(np.arange(n) - starts[np.cumsum(is_first) - 1])
+
+
+def _typed(descriptors: NDArray[Any], kind: str) -> Descriptors:
+    if kind == "sift":
+        return np.asarray(descriptors, dtype=np.float32)
+    return np.asarray(descriptors, dtype=np.uint8)

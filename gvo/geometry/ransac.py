@@ -82,9 +82,7 @@ def ransac_rigid(
 
 def _near(correspondences: Correspondences, config: RansacConfig) -> IntArray:
     """Return the indices of points to fit; all of them where too few are near."""
-    disparities = np.minimum(
-        correspondences.source_uvd[:, 2], correspondences.target_uvd[:, 2]
-    )
+    disparities = np.minimum(correspondences.source_uvd[:, 2], correspondences.target_uvd[:, 2])
     near = np.flatnonzero(disparities >= config.min_disparity_px)
     return near if len(near) >= config.min_inliers else np.arange(len(disparities))
 

@@ -77,7 +77,9 @@ def refine_pose(
     Refinement or Failure
         A failure where the residuals leave a direction of motion open.
     """
-    T: FloatArray | Failure = _gauss_newton(T_target_source, matches.select(inliers), camera, config)
+    T: FloatArray | Failure = _gauss_newton(
+        T_target_source, matches.select(inliers), camera, config
+    )
     if isinstance(T, Failure):
         return T
     chosen = _within_gate(T, matches, camera, config.gate)

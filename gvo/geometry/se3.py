@@ -92,9 +92,7 @@ def log(T: FloatArray) -> FloatArray:
     is_small = angle < 1e-4
     safe = np.where(is_small, 1.0, angle)
     half = 0.5 * safe
-    c = np.where(
-        is_small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2
-    )
+    c = np.where(is_small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2)
     W = skew(omega)
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
     rho = (V_inverse @ flat[:, :3, 3, np.newaxis])[..., 0]

@@ -53,9 +53,7 @@ def fit_rigid_batch(
     cross = np.swapaxes(w * (target_points - target_mean), -1, -2) @ source_centred
     is_finite = np.isfinite(cross).all(axis=(-1, -2))
     U, singular_values, Vt = np.linalg.svd(np.where(is_finite[..., None, None], cross, 0.0))
-    is_valid = is_finite & (
-        singular_values[..., 1] > _MIN_VARIANCE_RATIO * singular_values[..., 0]
-    )
+    is_valid = is_finite & (singular_values[..., 1] > _MIN_VARIANCE_RATIO * singular_values[..., 0])
     signs = np.ones_like(singular_values)
     signs[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # eq. 39: no reflection
     R = (U * signs[..., np.newaxis, :]) @ Vt  # eq. 40
