@@ -35,7 +35,7 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """This data has no answer; falsy, so that `if result:` reads well.
+    """An answer that the data do not hold; falsy, so that `if result:` reads well.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def match_stereo(
     distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
     is_close = distances <= config.max_distance
     pairs, distances = pairs[is_close], distances[is_close]
-    return pairs[mutual_best(pairs, distances, len(left), len(right))]
+    return np.asarray(pairs[mutual_best(pairs, distances, len(left), len(right))])
 
 
 def refine_disparities(

@@ -45,7 +45,7 @@ class PinholeCamera:
             raise CalibrationError(f"image size must be positive, got {self.width}x{self.height}")
 
     @property
-    def K(self) -> FloatArray:
+    def K(self) -> FloatArray:  # noqa: N802 - the field's name
         """The calibration matrix, shape (3, 3), pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 

@@ -152,7 +152,7 @@ def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) 
     )
     covariance = (J * matches.source_sigmas[:, np.newaxis] ** 2) @ np.swapaxes(J, 1, 2)
     covariance[:, range(3), range(3)] += matches.target_sigmas**2
-    return np.linalg.inv(covariance)
+    return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
 def _residuals(
