@@ -1,3 +1,89 @@
-"""Visual odometry for calibrated stereo and RGB-D cameras, with a sliding-window back-end."""
+"""Visual odometry for calibrated stereo and RGB-D cameras, with a sliding-window back-end.
+
+The public names are loaded when they are first used, so that the command line answers at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gvo.backend.window import SlidingWindow
+    from gvo.config import Config, load_configuration
+    from gvo.errors import GvoError
+    from gvo.evaluation import Evaluation, evaluate
+    from gvo.geometry.camera import PinholeCamera, StereoCamera
+    from gvo.odometry import FrameResult, Odometry
+    from gvo.outputs.bag_writer import convert
+    from gvo.outputs.plots import plot_trajectories
+    from gvo.outputs.tables import format_evaluations
+    from gvo.runs import RunResult, run_recording
+    from gvo.sources.frames import frames
+    from gvo.sources.opening import RecordingOptions, open_recording
+    from gvo.sources.synthetic import SyntheticRecording
+    from gvo.trajectory import Trajectory
+    from gvo.trajectory_files import read_trajectory
+    from gvo.types import Edge, Estimate, RgbdFrame, Status, StereoFrame
 
 __version__ = "0.1.0"
+
+_MODULES = {
+    "gvo.backend.window": ("SlidingWindow",),
+    "gvo.config": ("Config", "load_configuration"),
+    "gvo.errors": ("GvoError",),
+    "gvo.evaluation": ("Evaluation", "evaluate"),
+    "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
+    "gvo.odometry": ("FrameResult", "Odometry"),
+    "gvo.outputs.bag_writer": ("convert",),
+    "gvo.outputs.plots": ("plot_trajectories",),
+    "gvo.outputs.tables": ("format_evaluations",),
+    "gvo.runs": ("RunResult", "run_recording"),
+    "gvo.sources.frames": ("frames",),
+    "gvo.sources.opening": ("RecordingOptions", "open_recording"),
+    "gvo.sources.synthetic": ("SyntheticRecording",),
+    "gvo.trajectory": ("Trajectory",),
+    "gvo.trajectory_files": ("read_trajectory",),
+    "gvo.types": ("Edge", "Estimate", "RgbdFrame", "Status", "StereoFrame"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "Config",
+    "Edge",
+    "Estimate",
+    "Evaluation",
+    "FrameResult",
+    "GvoError",
+    "Odometry",
+    "PinholeCamera",
+    "RecordingOptions",
+    "RgbdFrame",
+    "RunResult",
+    "SlidingWindow",
+    "Status",
+    "StereoCamera",
+    "StereoFrame",
+    "SyntheticRecording",
+    "Trajectory",
+    "__version__",
+    "convert",
+    "evaluate",
+    "format_evaluations",
+    "frames",
+    "load_configuration",
+    "open_recording",
+    "plot_trajectories",
+    "read_trajectory",
+    "run_recording",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its module."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'gvo' has no attribute {name!r}")
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted([*globals(), *_MODULE_OF])

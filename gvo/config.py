@@ -228,7 +228,7 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
 def _parse_value(setting: str, text: str) -> object:
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2024-99-99
         raise ConfigurationError(f"--set {setting}: the value is no YAML") from error
 
 
@@ -237,15 +237,16 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        line = getattr(getattr(error, "problem_mark", None), "line", -1) + 1
-        raise ConfigurationError(f"{path}: no YAML (line {line})") from error
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}" if mark else f"{error}".splitlines()[0]
+        raise ConfigurationError(f"{path}: no YAML ({place})") from error
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigurationError(f"{path}: expected sections with keys, see `gvo config`")
     for section, keys in content.items():
-        if section in Config.model_fields and not isinstance(keys, dict):
+        if not isinstance(keys, dict):
             raise ConfigurationError(f"{path}: {section} must hold keys, see `gvo config`")
     return content
 
@@ -270,7 +271,8 @@ def _explain(error: ValidationError) -> str:
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] != "extra_forbidden":
         return f"{name}={first['input']!r}: {first['msg'].lower()}; see `gvo config`"
-    nearest = difflib.get_close_matches(name, _known_keys(), n=1, cutoff=0.0)[0]
+    known = _known_keys() if "." in name else list(_sections())
+    nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config` lists all"
 
 

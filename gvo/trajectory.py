@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
 from gvo.types import FloatArray, IntArray
+
+StampsFrom = Literal["file", "times", "rows"]
+
+_ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory:
     """Poses over time, sorted by stamp.
+
+    The arrays are copied and read-only.
 
     Parameters
     ----------
@@ -19,12 +31,168 @@ class Trajectory:
         Map camera coordinates to the world, metres.
     covariances : ndarray of float64, shape (n, 6, 6), optional
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+    stamps_from : {"file", "times", "rows"}
+        Where the stamps come from: measured with the poses; a list of stamps beside rows of
+        poses; made up of the row numbers, a second each.
+
+    Raises
+    ------
+    ValueError
+        Where shapes do not fit, values are not finite, stamps do not increase, or a pose is
+        no rigid transform.
     """
 
     stamps_ns: IntArray
     T_world_cam: FloatArray
     covariances: FloatArray | None = None
+    stamps_from: StampsFrom = "file"
+
+    def __post_init__(self) -> None:
+        """Check once, then keep copies that nobody can write to."""
+        if self.stamps_from not in get_args(StampsFrom):
+            raise ValueError(f"stamps_from must be one of {get_args(StampsFrom)}")
+        stamps_ns = _checked_stamps(self.stamps_ns)
+        n = len(stamps_ns)
+        object.__setattr__(self, "stamps_ns", stamps_ns)
+        poses = _checked_array("T_world_cam", self.T_world_cam, (n, 4, 4))
+        _check_rigid(poses)
+        object.__setattr__(self, "T_world_cam", poses)
+        if self.covariances is not None:
+            covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
+            object.__setattr__(self, "covariances", covariances)
 
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.stamps_ns)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Camera centres in the world, shape (n, 3), metres."""
+        return self.T_world_cam[:, :3, 3]
+
+    def distances(self) -> FloatArray:
+        """Return the path travelled up to each pose, shape (n,), metres, from zero."""
+        steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
+        return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(steps)])
+
+    def select(self, indices: ArrayLike | slice) -> Trajectory:
+        """Return the poses at increasing indices, of a mask or of a slice."""
+        chosen = indices if isinstance(indices, slice) else np.asarray(indices)
+        if not isinstance(chosen, slice) and chosen.size == 0:
+            chosen = np.empty(0, dtype=np.int64)  # an empty list would be an array of floats
+        covariances = self.covariances
+        return Trajectory(
+            stamps_ns=self.stamps_ns[chosen],
+            T_world_cam=self.T_world_cam[chosen],
+            covariances=None if covariances is None else covariances[chosen],
+            stamps_from=self.stamps_from,
+        )
+
+    def transformed(self, T_cam_body: FloatArray) -> Trajectory:
+        """Return the trajectory of another frame that is fixed to the camera.
+
+        Parameters
+        ----------
+        T_cam_body : ndarray of float64, shape (4, 4)
+            Maps coordinates of the new frame to the present one, metres.
+
+        Returns
+        -------
+        Trajectory
+            T_world_cam @ T_cam_body, the covariances in the new frame.
+        """
+        T_cam_body = np.asarray(T_cam_body, dtype=np.float64)
+        covariances = self.covariances
+        if covariances is not None:
+            # T exp(xi) B = T B exp(Ad(B^-1) xi)
+            Ad = se3.adjoint(se3.invert(T_cam_body))
+            covariances = Ad @ covariances @ Ad.T
+        return Trajectory(
+            stamps_ns=self.stamps_ns,
+            T_world_cam=self.T_world_cam @ T_cam_body,
+            covariances=covariances,
+            stamps_from=self.stamps_from,
+        )
+
+    def interpolate(self, stamps_ns: IntArray) -> Trajectory:
+        """Return the poses between the neighbours of given stamps.
+
+        Positions are interpolated linearly, rotations along the shortest arc (SLERP).
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int64, shape (m,)
+            Strictly increasing, nanoseconds. Those before the first or after the last pose
+            are left out: nothing is extrapolated.
+
+        Returns
+        -------
+        Trajectory
+            At most m poses, without covariances.
+        """
+        wanted = _checked_stamps(stamps_ns)
+        if len(self) == 0 or len(wanted) == 0:
+            return Trajectory(stamps_ns=np.empty(0, np.int64), T_world_cam=np.empty((0, 4, 4)))
+        wanted = wanted[(wanted >= self.stamps_ns[0]) & (wanted <= self.stamps_ns[-1])]
+        after = np.searchsorted(self.stamps_ns, wanted)
+        before = np.maximum(after - 1, 0)
+        # at the first pose both neighbours are that pose, their span zero
+        spans = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
+        shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
+        poses = _between(self.T_world_cam[before], self.T_world_cam[after], shares)
+        return Trajectory(stamps_ns=wanted, T_world_cam=poses, stamps_from=self.stamps_from)
+
+
+def _checked_stamps(stamps_ns: IntArray) -> IntArray:
+    stamps = np.asarray(stamps_ns)
+    if stamps.ndim != 1 or (stamps.dtype.kind not in "iu" and len(stamps) > 0):
+        raise ValueError(
+            f"stamps_ns must be integers of shape (n,), got {stamps.dtype} {stamps.shape}"
+        )
+    stamps = np.array(stamps, dtype=np.int64)
+    falls = np.flatnonzero(stamps[1:] <= stamps[:-1])
+    if len(falls) > 0:
+        raise ValueError(f"stamps_ns must increase strictly, not so after index {falls[0]}")
+    stamps.flags.writeable = False
+    return stamps
+
+
+def _checked_array(name: str, values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} must be finite")
+    array.flags.writeable = False
+    return array
+
+
+def _check_rigid(poses: FloatArray) -> None:
+    R = poses[:, :3, :3]
+    is_rigid = (
+        np.all(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) < _ROTATION_TOLERANCE, axis=(1, 2))
+        & (np.linalg.det(R) > 0)
+        & np.all(poses[:, 3] == (0.0, 0.0, 0.0, 1.0), axis=1)
+    )
+    if not np.all(is_rigid):
+        raise ValueError(f"T_world_cam[{np.flatnonzero(~is_rigid)[0]}] is no rigid transform")
+
+
+def _between(T_before: FloatArray, T_after: FloatArray, shares: FloatArray) -> FloatArray:
+    if len(shares) == 0:
+        return np.empty((0, 4, 4))
+    start = Rotation.from_matrix(T_before[:, :3, :3])
+    arcs = (start.inv() * Rotation.from_matrix(T_after[:, :3, :3])).as_rotvec()
+    R = (start * Rotation.from_rotvec(shares * arcs)).as_matrix()
+    t = (1.0 - shares) * T_before[:, :3, 3] + shares * T_after[:, :3, 3]
+    return se3.make_transform(np.asarray(R), t)
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Return a stamp in seconds with nine decimals, without loss.
+
+    >>> format_stamp(1403636579763555584)
+    '1403636579.763555584'
+    """
+    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"

@@ -116,10 +116,13 @@ class FaultyFrame:
         Stamp of the faulty frame, nanoseconds.
     reason : str
         One line: what, where.
+    is_unpaired : bool
+        Nothing is wrong with the image but that it has no partner.
     """
 
     stamp_ns: int
     reason: str
+    is_unpaired: bool = False
 
 
 Frame: TypeAlias = StereoFrame | RgbdFrame

@@ -65,7 +65,8 @@ def exp(xi: FloatArray) -> FloatArray:
     is_small = angle < 1e-5
     safe = np.where(is_small, 1.0, angle)
     a = np.where(is_small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
-    b = np.where(is_small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    # (1 - cos) by the half angle: the difference itself loses the digits of small angles.
+    b = np.where(is_small, 0.5 - angle**2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
     c = np.where(is_small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     W = skew(omega)
     W2 = W @ W

@@ -1,0 +1,294 @@
+"""The `gvo` command: parses, calls, prints; computes nothing."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from gvo import __version__
+from gvo.errors import ConfigurationError, GvoError
+
+if TYPE_CHECKING:
+    from gvo.config import Config
+    from gvo.runs import Progress, RunResult
+
+_EXIT_INTERRUPTED = 130
+_EXIT_TERMINATED = 143
+
+app = typer.Typer(
+    name="gvo",
+    help="Visual odometry: a stereo or RGB-D recording in, trajectories with covariances out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
+]
+_ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
+]
+_CalibrationFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Camera, ROS camera_info YAML; replaces the recording's."),
+]
+
+
+class _Align(StrEnum):
+    NONE = "none"
+    ORIGIN = "origin"
+    SE3 = "se3"
+    SIM3 = "sim3"
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"gvo {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+    ] = False,
+) -> None:
+    """Take the options that stand before a command."""
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
+) -> None:
+    """Render a drive, write it as a bag, run on it, compare with the exact truth."""
+    from gvo.demo import BAG_NAME, run_demo
+
+    typer.echo(f"rendering a drive into {out / BAG_NAME}", err=True)
+    with _signals(), _progress("demo") as on_progress:
+        result = run_demo(out, on_progress=on_progress)
+    _report(result, out)
+
+
+@app.command()
+def run(
+    recording: Annotated[Path, typer.Argument(help="Bag, MCAP, or data-set folder.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    config: _ConfigFile = None,
+    set_: _Settings = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Poses of the camera: TUM, KITTI, EuRoC.")
+    ] = None,
+    calibration: _CalibrationFile = None,
+    left: Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")] = None,
+    right: Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")] = None,
+    color: Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")] = None,
+    depth: Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")] = None,
+) -> None:
+    """Estimate the trajectory of a recording; write it with covariances, summary and picture."""
+    from gvo.runs import read_ground_truth, run_recording
+    from gvo.sources.opening import RecordingOptions, open_recording
+
+    parameters = _load(config, set_)
+    options = RecordingOptions(
+        calibration=calibration, left=left, right=right, color=color, depth=depth
+    )
+    source = open_recording(recording, config=parameters, options=options)
+    for decision in source.info.decisions:
+        typer.echo(decision)
+    truth = None if ground_truth is None else read_ground_truth(ground_truth)
+    with _signals(), _progress(source.info.name) as on_progress:
+        result = run_recording(
+            source, out, config=parameters, ground_truth=truth, on_progress=on_progress
+        )
+    _report(result, out)
+
+
+@app.command()
+def compare(
+    reference: Annotated[Path, typer.Argument(help="TUM, KITTI or EuRoC file, or a recording.")],
+    estimates: Annotated[list[Path], typer.Argument(help="Files of poses.")],
+    align: Annotated[_Align, typer.Option(help="What moves each estimate.")] = _Align.SE3,
+    segments: Annotated[
+        str | None, typer.Option(metavar="L,...", help="Lengths in m; 100,...,800 or 20,50.")
+    ] = None,
+    segment_step: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Every Nth pose a start; 10 or 1.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")
+    ] = None,
+) -> None:
+    """Measure trajectories against a reference: ATE, RPE, KITTI segment errors."""
+    from gvo.evaluation import evaluate
+    from gvo.outputs.plots import plot_trajectories
+    from gvo.outputs.tables import evaluations_json, format_evaluations
+    from gvo.runs import read_ground_truth
+    from gvo.trajectory_files import read_trajectory
+
+    truth = read_ground_truth(reference)
+    lengths = None if segments is None else _parse_lengths(segments)
+    trajectories = {
+        name: read_trajectory(path) for name, path in zip(_names(estimates), estimates, strict=True)
+    }
+    evaluations = [
+        evaluate(
+            truth,
+            trajectory,
+            name=name,
+            align=align.value,
+            segments=lengths,
+            segment_step=segment_step,
+        )
+        for name, trajectory in trajectories.items()
+    ]
+    if as_json:
+        typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
+    else:
+        typer.echo(format_evaluations(evaluations), nl=False)
+    if plot is not None:
+        plot_trajectories(plot, truth, trajectories, align=align.value)
+
+
+@app.command()
+def convert(
+    folder: Annotated[Path, typer.Argument(help="Data-set folder: KITTI, EuRoC, TUM RGB-D.")],
+    bag: Annotated[Path, typer.Argument(help=".bag, .mcap, or a ROS 2 folder to make.")],
+    rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
+    calibration: _CalibrationFile = None,
+    config: _ConfigFile = None,
+    set_: _Settings = None,
+) -> None:
+    """Write a data-set folder as a bag, pixels untouched, with the ground truth as tf."""
+    from gvo.outputs.bag_writer import convert as write_bag
+    from gvo.sources.opening import RecordingOptions, open_recording
+
+    options = RecordingOptions(calibration=calibration)
+    source = open_recording(folder, config=_load(config, set_), options=options)
+    with _signals():
+        written = write_bag(source, bag, rectify=rectify)
+    typer.echo(f"wrote {bag}: {written.n_images} images, {written.n_poses} true poses")
+    _warn(written.skipped)
+    raise typer.Exit(3 if written.skipped else 0)
+
+
+@app.command("config")
+def config_(config: _ConfigFile = None, set_: _Settings = None) -> None:
+    """Print all parameters as YAML, with units, ranges and meaning."""
+    from gvo.config import describe_configuration
+
+    typer.echo(describe_configuration(_load(config, set_)), nl=False)
+
+
+def _load(path: Path | None, settings: list[str] | None) -> Config:
+    from gvo.config import load_configuration
+
+    return load_configuration(path, settings or [])
+
+
+def _parse_lengths(text: str) -> list[float]:
+    try:
+        lengths = [float(part) for part in text.split(",")]
+    except ValueError:
+        lengths = []
+    if not lengths or not all(0 < length < float("inf") for length in lengths):
+        raise ConfigurationError(
+            f"--segments {text}: expected positive lengths in metres, such as 100,200"
+        )
+    return lengths
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Name estimates by their files, with folders where that is ambiguous."""
+    stems = [path.stem for path in paths]
+    names = [
+        stem if stems.count(stem) == 1 else f"{path.parent.name}/{stem}"
+        for stem, path in zip(stems, paths, strict=True)
+    ]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def _report(result: RunResult, out: Path) -> NoReturn:
+    from gvo.outputs.tables import format_evaluations
+
+    if result.evaluations:
+        typer.echo(format_evaluations(result.evaluations), nl=False)
+    frames, tracked = result.summary["frames"], result.summary["tracked"]
+    typer.echo(f"{tracked} of {frames} frames tracked; {out / 'trajectories.png'}")
+    _warn(result.warnings)
+    raise typer.Exit(result.exit_code)
+
+
+def _warn(warnings: Sequence[str]) -> None:
+    for warning in warnings:
+        typer.echo(f"gvo: warning: {warning}", err=True)
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Callable[[Progress], None] | None]:
+    """Give a callback that draws a bar on a terminal; None in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]:.1f} frames/s, {task.fields[tracked]:.0%} tracked,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, rate=0.0, tracked=1.0)
+
+        def update(progress: Progress) -> None:
+            elapsed = bar.tasks[0].elapsed or 1e-9
+            bar.update(
+                task,
+                completed=progress.n_done,
+                total=progress.n_total,
+                rate=progress.n_done / elapsed,
+                tracked=progress.n_tracked / max(progress.n_done, 1),
+            )
+
+        yield update
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """End with 130 on an interrupt and 143 on SIGTERM, after the files are closed."""
+
+    def terminate(number: int, frame: object) -> NoReturn:
+        raise SystemExit(_EXIT_TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise SystemExit(_EXIT_INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def main() -> None:
+    """Run the command; one line and exit code 2 for bad input."""
+    try:
+        app()
+    except GvoError as error:
+        typer.echo(f"gvo: error: {error}", err=True)
+        raise SystemExit(2) from None

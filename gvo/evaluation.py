@@ -1,0 +1,261 @@
+"""How far an estimated trajectory is from its reference: ATE, RPE, KITTI segment errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gvo.geometry import se3
+from gvo.trajectory import Trajectory
+from gvo.trajectory_alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, associate
+from gvo.types import FloatArray, IntArray
+
+KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+"""Segment lengths of the KITTI odometry benchmark, metres."""
+KITTI_STEP = 10
+"""Poses between two starts of segments in the KITTI odometry benchmark."""
+SHORT_SEGMENTS_M = (20.0, 50.0)
+"""Segment lengths where the path is shorter than the longest of KITTI's, metres."""
+SHORT_STEP = 1
+"""Poses between two starts of segments there: every pose starts one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evaluation:
+    """The errors of one estimate against a reference, over the associated poses.
+
+    Parameters
+    ----------
+    name : str
+        Of the estimate.
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the associated reference poses, nanoseconds.
+    errors_m : ndarray of float64, shape (n,)
+        Distance of each aligned position from the reference, metres.
+    rpe_m, rpe_deg : float or None
+        Relative pose error: RMSE of translation and rotation; None where no pair fits.
+    t_pct : float or None
+        Mean translation error of KITTI's segments, % of their length; None where none fits.
+    r_deg_per_100m : float or None
+        Mean rotation error of the same segments, degrees per 100 m.
+    n_segments : int
+        Segments that fit.
+    segments_m : tuple of float
+        Their nominal lengths, metres.
+    coverage : float
+        Share of the time between the first and the last reference pose that lies between the
+        first and the last associated one, 0 to 1.
+    path_ratio : float or None
+        Path length of the estimate, before any scaling, over that of the reference; None where
+        the reference does not move.
+    """
+
+    name: str
+    stamps_ns: IntArray
+    errors_m: FloatArray
+    rpe_m: float | None
+    rpe_deg: float | None
+    t_pct: float | None
+    r_deg_per_100m: float | None
+    n_segments: int
+    segments_m: tuple[float, ...]
+    coverage: float
+    path_ratio: float | None
+
+    @property
+    def n(self) -> int:
+        """Number of associated poses."""
+        return len(self.errors_m)
+
+    @property
+    def ate_m(self) -> float:
+        """Absolute trajectory error: root mean square of the position errors, metres."""
+        return float(np.sqrt(np.mean(self.errors_m**2)))
+
+    @property
+    def ate_mean_m(self) -> float:
+        """Mean position error, metres."""
+        return float(np.mean(self.errors_m))
+
+    @property
+    def ate_median_m(self) -> float:
+        """Median position error, metres."""
+        return float(np.median(self.errors_m))
+
+    @property
+    def ate_max_m(self) -> float:
+        """Largest position error, metres."""
+        return float(np.max(self.errors_m))
+
+
+def evaluate(
+    reference: Trajectory,
+    estimate: Trajectory,
+    *,
+    name: str,
+    align: AlignMode = "se3",
+    segments: Sequence[float] | None = None,
+    segment_step: int | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+    rpe_delta: int = 1,
+) -> Evaluation:
+    """Associate an estimate with its reference, align it and measure its errors.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+        Of the same frame: `Trajectory.transformed` changes it.
+    name : str
+        Of the estimate.
+    align : {"none", "origin", "se3", "sim3"}
+        What moves the estimate before all errors are taken; see `alignment`.
+    segments : sequence of float, optional
+        Segment lengths in metres; KITTI's 100 to 800 m where the associated part of the
+        reference is at least 800 m long, 20 and 50 m where it is shorter.
+    segment_step : int, optional
+        Poses between two starts of segments; 10 as in KITTI's, or every pose, likewise.
+    max_difference_ns : int
+        Largest difference of associated stamps, nanoseconds.
+    rpe_delta : int
+        Poses between the two of a pair of the relative pose error.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    TrajectoryError
+        Where nothing can be associated, or no scale be found for `sim3`.
+    ValueError
+        Where a segment length, the step or the delta is not positive.
+    """
+    indices, others = associate(reference, estimate, max_difference_ns=max_difference_ns, name=name)
+    ref, est = reference.select(indices), estimate.select(others)
+    aligned = alignment(ref, est, align).apply(est)
+    is_long = _path_length(ref) >= KITTI_SEGMENTS_M[-1]
+    if segments is None:
+        segments = KITTI_SEGMENTS_M if is_long else SHORT_SEGMENTS_M
+    if segment_step is None:
+        segment_step = KITTI_STEP if is_long else SHORT_STEP
+    pair_t, pair_r = relative_errors(ref, aligned, delta=rpe_delta)
+    shares, turns = segment_errors(ref, aligned, lengths_m=segments, step=segment_step)
+    return Evaluation(
+        name=name,
+        stamps_ns=ref.stamps_ns,
+        errors_m=np.linalg.norm(ref.positions - aligned.positions, axis=1),
+        rpe_m=_root(_mean(pair_t**2)),
+        rpe_deg=_root(_mean(np.rad2deg(pair_r) ** 2)),
+        t_pct=_mean(100.0 * shares),
+        r_deg_per_100m=_mean(100.0 * np.rad2deg(turns)),
+        n_segments=len(shares),
+        segments_m=tuple(float(length) for length in segments),
+        coverage=_coverage(reference, ref),
+        path_ratio=_path_ratio(ref, est),
+    )
+
+
+def relative_errors(
+    reference: Trajectory, estimate: Trajectory, *, delta: int = 1
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors of the relative poses of all pairs (i, i + delta).
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+        Associated: of one length.
+    delta : int
+        Poses between the two of a pair.
+
+    Returns
+    -------
+    translations : ndarray of float64, shape (m,)
+        Metres.
+    rotations : ndarray of float64, shape (m,)
+        Radians.
+
+    References
+    ----------
+    J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012,
+    doi:10.1109/IROS.2012.6385773.
+    """
+    if delta < 1:
+        raise ValueError(f"delta must be at least 1, got {delta}")
+    first = np.arange(max(len(reference) - delta, 0))
+    return _pair_errors(reference, estimate, first, first + delta)
+
+
+def segment_errors(
+    reference: Trajectory, estimate: Trajectory, *, lengths_m: Sequence[float], step: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors over segments of given path lengths, as KITTI's devkit takes them.
+
+    A segment ends at the first pose whose path from the start is longer than the length;
+    segments that the trajectory ends before are left out.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+        Associated: of one length. The path is the reference's.
+    lengths_m : sequence of float
+        Metres.
+    step : int
+        Poses between two starts.
+
+    Returns
+    -------
+    translations : ndarray of float64, shape (m,)
+        Translation error over the length of the segment.
+    rotations : ndarray of float64, shape (m,)
+        Rotation error over the length of the segment, radians per metre.
+
+    References
+    ----------
+    A. Geiger, P. Lenz, R. Urtasun, "Are we ready for autonomous driving? The KITTI vision
+    benchmark suite", CVPR 2012, doi:10.1109/CVPR.2012.6248074.
+    """
+    if step < 1 or not all(0 < length < np.inf for length in lengths_m):
+        raise ValueError(f"step and lengths must be positive, got {step} and {lengths_m}")
+    distances = reference.distances()
+    starts, lengths = np.meshgrid(np.arange(0, len(reference), step), np.array(lengths_m, float))
+    first, length = starts.ravel(), lengths.ravel()
+    last = np.searchsorted(distances, distances[first] + length, side="right")
+    fits = last < len(reference)
+    translations, rotations = _pair_errors(reference, estimate, first[fits], last[fits])
+    return translations / length[fits], rotations / length[fits]
+
+
+def _pair_errors(
+    reference: Trajectory, estimate: Trajectory, first: IntArray, last: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    T_ref, T_est = reference.T_world_cam, estimate.T_world_cam
+    motion_ref = se3.invert(T_ref[first]) @ T_ref[last]
+    motion_est = se3.invert(T_est[first]) @ T_est[last]
+    errors = se3.invert(motion_est) @ motion_ref
+    return np.linalg.norm(errors[:, :3, 3], axis=1), se3.rotation_angle(errors)
+
+
+def _mean(values: FloatArray) -> float | None:
+    return float(np.mean(values)) if len(values) > 0 else None
+
+
+def _root(value: float | None) -> float | None:
+    return None if value is None else float(np.sqrt(value))
+
+
+def _path_length(trajectory: Trajectory) -> float:
+    return float(trajectory.distances()[-1])
+
+
+def _path_ratio(reference: Trajectory, estimate: Trajectory) -> float | None:
+    length = _path_length(reference)
+    return _path_length(estimate) / length if length > 0 else None
+
+
+def _coverage(reference: Trajectory, associated: Trajectory) -> float:
+    if len(reference) == 1:
+        return 1.0
+    whole, part = (t.stamps_ns[-1] - t.stamps_ns[0] for t in (reference, associated))
+    return float(part / whole)

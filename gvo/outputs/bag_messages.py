@@ -1,0 +1,179 @@
+"""Messages of images, calibrations and poses, written to bags of ROS 1 or ROS 2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import RecordingError
+from gvo.geometry.camera import Calibration
+from gvo.sources.bag import TRUTH_FRAMES
+from gvo.sources.bag_reader import TF_TYPE, typestore
+from gvo.sources.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
+from gvo.types import FloatArray
+
+# Version 8 is read by more releases of ROS 2 than 9, and holds the same.
+_ROS2_VERSION: Final = 8
+_MAX_SECONDS_ROS1 = 2**32 - 1
+_MAX_SECONDS_ROS2 = 2**31 - 1
+
+
+class Header(NamedTuple):
+    """Stamp in nanoseconds and frame of a message."""
+
+    stamp_ns: int
+    frame_id: str
+
+
+class BagWriter:
+    """A new bag, open inside a `with` block.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag`: ROS 1. `.mcap` or `.db3`: a file of ROS 2, made inside a folder of the same
+        name without the suffix. No suffix: a ROS 2 bag folder.
+
+    Attributes
+    ----------
+    result : Path
+        The finished file or folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.is_ros1 = path.suffix == ".bag"
+        self.result = path
+        self._writer: Writer1 | Writer2
+        if self.is_ros1:
+            self._writer = Writer1(path)
+        else:
+            folder = path.with_suffix("")
+            is_mcap = path.suffix == ".mcap"
+            plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
+            self._writer = Writer2(folder, version=_ROS2_VERSION, storage_plugin=plugin)
+            if path.suffix:
+                self.result = folder / path.name
+        self._store = typestore(is_ros1=self.is_ros1)
+        self._connections: dict[str, Connection] = {}
+        self._log_time_ns = 0
+
+    def __enter__(self) -> BagWriter:
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self,
+        error_type: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(error_type, error, traceback)
+
+    def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
+        """Return a message of a type."""
+        make_message: Callable[..., Any] = self._store.types[type_]
+        return make_message(**fields)
+
+    def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
+        """Return the message of a header; `RecordingError` where its stamp does not fit."""
+        sec, nanosec = divmod(header.stamp_ns, 10**9)
+        max_seconds = _MAX_SECONDS_ROS1 if self.is_ros1 else _MAX_SECONDS_ROS2
+        if not 0 <= sec <= max_seconds:
+            raise RecordingError(
+                f"{self.result.name}: the stamp {header.stamp_ns} ns cannot be written, expected "
+                f"0 to {max_seconds} s"
+            )
+        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        sequence = {"seq": 0} if self.is_ros1 else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
+
+    def write(self, topic: str, type_: str, message: object, stamp_ns: int) -> None:
+        """Write a message; its log time is the stamp, but never goes back."""
+        # Readers sort by log time: a frame whose stamp goes back must stay where it was.
+        self._log_time_ns = max(self._log_time_ns, stamp_ns)
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, type_, typestore=self._store
+            )
+        serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
+        self._writer.write(self._connections[topic], self._log_time_ns, serialize(message, type_))
+
+
+def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
+    """Write an image.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    pixels : ndarray
+        uint8 (h, w): mono8; uint8 (h, w, 3): bgr8; float32 (h, w): 32FC1.
+    header : Header
+        Stamp and frame.
+    """
+    encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim]
+    if pixels.dtype == np.float32:
+        encoding = "32FC1"
+    height, width = pixels.shape[:2]
+    # Bags of both generations are little-endian, whatever the machine.
+    data = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
+    message = bag.make(
+        IMAGE_TYPE,
+        header=bag.header(header),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=data.nbytes // height,
+        data=data.view(np.uint8).ravel(),
+    )
+    bag.write(topic, IMAGE_TYPE, message, header.stamp_ns)
+
+
+def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
+    """Write a calibration as `CameraInfo`, all numbers without loss."""
+    matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
+    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    message = bag.make(
+        CAMERA_INFO_TYPE,
+        header=bag.header(header),
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model="plumb_bob",
+        binning_x=0,
+        binning_y=0,
+        roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
+        **{name if bag.is_ros1 else name.lower(): M for name, M in matrices.items()},
+    )
+    bag.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
+
+
+def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
+    """Write a pose of the ground truth, shape (4, 4), to `/tf`."""
+    parent, child = TRUTH_FRAMES
+    t = [float(value) for value in T_world_cam[:3, 3]]
+    q = [float(value) for value in Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()]
+    transform = bag.make(
+        "geometry_msgs/msg/Transform",
+        translation=bag.make("geometry_msgs/msg/Vector3", x=t[0], y=t[1], z=t[2]),
+        rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+    )
+    stamped = bag.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=bag.header(Header(stamp_ns, parent)),
+        child_frame_id=child,
+        transform=transform,
+    )
+    bag.write("/tf", TF_TYPE, bag.make(TF_TYPE, transforms=[stamped]), stamp_ns)

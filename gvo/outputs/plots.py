@@ -1,0 +1,265 @@
+"""Pictures of trajectories: the view from above and the errors over time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvo.errors import ConfigurationError, TrajectoryError
+from gvo.trajectory import Trajectory
+from gvo.trajectory_alignment import AlignMode, alignment, associate
+from gvo.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; black is the reference's
+_FIXED_COLOURS = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
+_FREE_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
+_LINE_STYLES = ("-", "-.", ":")
+_SIZE_INCHES = (11.0, 5.5)
+# a line ends where the next pose is later than so many median steps
+_GAP = 10.0
+_LEGEND_CHARACTERS = 135
+# equal input gives equal files: no dates, no versions
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    ".svg": {"Date": None, "Creator": None},
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Curve:
+    """An estimate in the world of the picture, with its errors where there is a reference."""
+
+    label: str
+    trajectory: Trajectory
+    indices: IntArray
+    errors_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Style:
+    """How all the lines of one estimate look."""
+
+    color: str
+    linestyle: str
+    linewidth: float = 1.2
+    zorder: float = 2.0
+
+
+_REFERENCE_STYLE = _Style(color="black", linestyle="--", zorder=3.0)
+
+
+def plot_trajectories(
+    path: str | Path,
+    reference: Trajectory | None,
+    estimates: Mapping[str, Trajectory],
+    *,
+    align: AlignMode = "se3",
+) -> None:
+    """Draw trajectories from above, and their errors (or positions) over time.
+
+    Equal input gives equal files.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in .png, .pdf or .svg.
+    reference : Trajectory or None
+        Without one the positions are drawn over time in place of the errors.
+    estimates : mapping of str to Trajectory
+        By name, at least one; "raw", "causal" and "smoothed" have colours of their own.
+    align : {"none", "origin", "se3", "sim3"}
+        What moves each estimate onto the reference.
+
+    Raises
+    ------
+    ConfigurationError
+        Where the file name ends otherwise.
+    TrajectoryError
+        Where an estimate has nothing in common with the reference, or the file cannot be
+        written.
+    ValueError
+        Where there is no estimate, or one without poses.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _METADATA:
+        raise ConfigurationError(
+            f"{path}: the plot's file name ends in {path.suffix!r}, "
+            f"expected one of {', '.join(_METADATA)}"
+        )
+    if not estimates or any(len(estimate) == 0 for estimate in estimates.values()):
+        raise ValueError("expected at least one estimate, and poses in each")
+    styles = _styles(estimates)
+    if reference is None:
+        figure = _figure_of_positions(estimates, styles)
+    else:
+        figure = _figure_of_errors(reference, estimates, styles, align)
+    _save(figure, path)
+
+
+def _styles(names: Iterable[str]) -> list[_Style]:
+    """Return a style per name: the fixed colour of its word, once, or the next free one."""
+    left = dict(_FIXED_COLOURS)
+    free = itertools.cycle(itertools.product(_LINE_STYLES, _FREE_COLOURS))
+    styles = []
+    for name in names:
+        word = next((w for w in re.findall("[a-z]+", name.lower()) if w in left), None)
+        linestyle, color = ("-", left.pop(word)) if word else next(free)
+        styles.append(_Style(color=color, linestyle=linestyle))
+    return styles
+
+
+def _figure_of_errors(
+    reference: Trajectory,
+    estimates: Mapping[str, Trajectory],
+    styles: Sequence[_Style],
+    align: AlignMode,
+) -> Figure:
+    curves = [_aligned(reference, name, estimate, align) for name, estimate in estimates.items()]
+    first = min(int(curve.indices[0]) for curve in curves)
+    last = max(int(curve.indices[-1]) for curve in curves)
+    shown = reference.select(slice(first, last + 1))
+    figure = _new_figure()
+    view, errors = figure.subplots(1, 2)
+    plane = _plane(reference)
+    _draw_path(view, shown, plane, _REFERENCE_STYLE, "reference")
+    for curve, style in zip(curves, styles, strict=True):
+        _draw_path(view, curve.trajectory, plane, style, curve.label)
+        stamps_ns = reference.stamps_ns[curve.indices]
+        _draw(errors, _elapsed(stamps_ns, shown), curve.errors_m, style)
+    _finish_view(view, shown, plane)
+    errors.set(xlabel=_stamp_label(shown), ylabel=f"position error [m], alignment: {align}")
+    errors.set_ylim(bottom=0.0)
+    errors.grid(alpha=0.3)
+    _add_legend(figure, view)
+    return figure
+
+
+def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[_Style]) -> Figure:
+    start = min(estimates.values(), key=lambda estimate: int(estimate.stamps_ns[0]))
+    figure = _new_figure()
+    axes = figure.subplot_mosaic([["view", axis] for axis in "xyz"])
+    view, panels = axes["view"], [axes[axis] for axis in "xyz"]
+    for (name, estimate), style in zip(estimates.items(), styles, strict=True):
+        _draw_path(view, estimate, (0, 2), style, _plain(name))
+        elapsed = _elapsed(estimate.stamps_ns, start)
+        for axis, panel in enumerate(panels):
+            _draw(panel, elapsed, estimate.positions[:, axis], style)
+    _finish_view(view, start, (0, 2))
+    for letter, panel in zip("xyz", panels, strict=True):
+        panel.set_ylabel(f"{letter} [m]")
+        panel.tick_params(labelbottom=letter == "z")
+        panel.grid(alpha=0.3)
+    figure.align_ylabels(panels)
+    panels[-1].set_xlabel(_stamp_label(start))
+    _add_legend(figure, view)
+    return figure
+
+
+def _aligned(reference: Trajectory, name: str, estimate: Trajectory, align: AlignMode) -> _Curve:
+    indices, others = associate(reference, estimate, name=name)
+    ref, est = reference.select(indices), estimate.select(others)
+    moved = alignment(ref, est, align).apply(estimate)
+    errors_m = np.linalg.norm(ref.positions - moved.positions[others], axis=1)
+    rmse = np.sqrt(np.mean(errors_m**2))
+    label = f"{_plain(name)} (ATE {rmse:.3g} m)"
+    return _Curve(label=label, trajectory=moved, indices=indices, errors_m=errors_m)
+
+
+def _plane(reference: Trajectory) -> tuple[int, int]:
+    """Return the axes to look at: x and z of a camera's world, else the two of most motion."""
+    if np.allclose(reference.T_world_cam[0], np.eye(4), atol=1e-3):
+        return 0, 2
+    extents = np.ptp(reference.positions, axis=0)
+    least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds
+    horizontal, vertical = (axis for axis in range(3) if axis != least)
+    return horizontal, vertical
+
+
+def _new_figure() -> Figure:
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    return Figure(figsize=_SIZE_INCHES, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06))
+
+
+def _draw_path(
+    view: Axes, trajectory: Trajectory, plane: tuple[int, int], style: _Style, label: str
+) -> None:
+    horizontal, vertical = _broken(trajectory.stamps_ns / 1e9, trajectory.positions[:, plane]).T
+    view.plot(horizontal, vertical, label=label, **asdict(style))
+
+
+def _draw(axes: Axes, elapsed: FloatArray, values: FloatArray, style: _Style) -> None:
+    axes.plot(*_broken(elapsed, np.column_stack([elapsed, values])).T, **asdict(style))
+
+
+def _broken(seconds: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the points with rows of NaN where poses are missing: lines end there."""
+    steps = np.diff(seconds)
+    if len(steps) == 0:
+        return points
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1
+    return np.insert(points, gaps, np.nan, axis=0)
+
+
+def _finish_view(view: Axes, start: Trajectory, plane: tuple[int, int]) -> None:
+    view.plot(
+        *start.positions[:1, plane].T, "o", mfc="white", mec="black", zorder=4.0, label="start"
+    )
+    horizontal, vertical = ("xyz"[axis] for axis in plane)
+    view.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]")
+    view.set_aspect("equal", adjustable="datalim")
+    view.ticklabel_format(useOffset=False)
+    view.grid(alpha=0.3)
+
+
+def _elapsed(stamps_ns: IntArray, start: Trajectory) -> FloatArray:
+    return np.asarray((stamps_ns - start.stamps_ns[0]) / 1e9)
+
+
+def _stamp_label(trajectory: Trajectory) -> str:
+    # made-up stamps are a second a row
+    return "row" if trajectory.stamps_from == "rows" else "elapsed [s]"
+
+
+def _plain(name: str) -> str:
+    """Return a name without what a legend takes for markup: dollars, a leading underscore."""
+    text = name.replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
+
+
+def _add_legend(figure: Figure, view: Axes) -> None:
+    handles, labels = view.get_legend_handles_labels()
+    n_fitting = max(1, _LEGEND_CHARACTERS // (max(map(len, labels)) + 8))
+    n_rows = math.ceil(len(labels) / n_fitting)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=math.ceil(len(labels) / n_rows),
+        frameon=False,
+    )
+
+
+def _save(figure: Figure, path: Path) -> None:
+    from matplotlib import rc_context
+
+    suffix = path.suffix.lower()
+    try:
+        # the salt of the ids in SVG is random by default; the setting ends with the block
+        with rc_context({"svg.hashsalt": "gvo"}):
+            figure.savefig(path, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
+    except OSError as error:
+        raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,146 @@
+"""The files of a run, written as the run goes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TextIO
+
+from gvo.errors import RecordingError
+from gvo.odometry import FrameResult
+from gvo.trajectory_files import COVARIANCE_HEADER, format_covariance_line, format_tum_line
+from gvo.types import Estimate, FaultyFrame, Status
+
+TRAJECTORIES = ("raw", "causal", "smoothed")
+FRAMES_HEADER = (
+    "stamp_ns",
+    "status",
+    "n_keypoints",
+    "n_points",
+    "n_matches",
+    "n_inliers",
+    "n_links",
+    "reason",
+)
+
+
+class RunFolder:
+    """Trajectories, covariances and the table of frames, appended line by line.
+
+    Smoothed poses come in the order in which they leave the window; `close` puts them in the
+    order of their stamps.
+
+    Parameters
+    ----------
+    path : Path
+        Folder to write into; made where it is missing. Files of an earlier run are replaced.
+
+    Raises
+    ------
+    RecordingError
+        When the folder cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._files: dict[str, TextIO] = {}
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            for name in TRAJECTORIES:
+                self._open(f"{name}.txt")
+                self._open(f"{name}_covariance.csv").write(f"{COVARIANCE_HEADER}\n")
+            self._open("frames.csv").write(_csv_line(FRAMES_HEADER))
+        except OSError as error:
+            self._close_files()
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+
+    def _open(self, name: str) -> TextIO:
+        file = (self.path / name).open("w", encoding="utf-8", newline="\n", buffering=1)
+        self._files[name] = file
+        return file
+
+    def add_frame(self, result: FrameResult) -> None:
+        """Write what one frame gave."""
+        self._add_pose("raw", result.raw)
+        self._add_pose("causal", result.causal)
+        self.add_smoothed(result.finished)
+        row = (
+            result.stamp_ns,
+            result.status,
+            result.n_keypoints,
+            result.n_points,
+            result.n_matches,
+            result.n_inliers,
+            result.n_links,
+            result.reason,
+        )
+        self._files["frames.csv"].write(_csv_line(row))
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write a row for a frame without a pose."""
+        row = (frame.stamp_ns, Status.SKIPPED, 0, 0, 0, 0, 0, frame.reason)
+        self._files["frames.csv"].write(_csv_line(row))
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses that are final."""
+        for estimate in estimates:
+            self._add_pose("smoothed", estimate)
+
+    def _add_pose(self, name: str, estimate: Estimate) -> None:
+        pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)
+        self._files[f"{name}.txt"].write(f"{pose}\n")
+        covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
+        self._files[f"{name}_covariance.csv"].write(f"{covariance}\n")
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write `summary.json`."""
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        (self.path / "summary.json").write_text(text, encoding="utf-8")
+
+    def close(self) -> None:
+        """Close all files and sort the smoothed poses by stamp."""
+        self._close_files()
+        _sort_lines(self.path / "smoothed.txt", n_header=0)
+        _sort_lines(self.path / "smoothed_covariance.csv", n_header=1)
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def __enter__(self) -> RunFolder:
+        """Return the folder, open for writing."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the files, also where the run was interrupted."""
+        self.close()
+
+
+def _sort_lines(path: Path, *, n_header: int) -> None:
+    """Sort the lines of a file by their stamp, the number at their start."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    header, body = lines[:n_header], lines[n_header:]
+    body.sort(key=_stamp_digits)
+    sorted_path = path.with_suffix(path.suffix + ".sorted")
+    sorted_path.write_text("".join(header + body), encoding="utf-8", newline="\n")
+    sorted_path.replace(path)
+
+
+def _stamp_digits(line: str) -> int:
+    # Seconds with nine decimals, or nanoseconds: without the point both are nanoseconds.
+    return int(line.replace(",", " ").split(" ", 1)[0].replace(".", ""))
+
+
+def _csv_line(row: Iterable[object]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(row)
+    return buffer.getvalue()

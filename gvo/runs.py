@@ -1,0 +1,318 @@
+"""One recording, one run folder: what `gvo run`, the scripts and batches call."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gvo import __version__
+from gvo.config import Config
+from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.evaluation import Evaluation, evaluate
+from gvo.odometry import FrameResult, Odometry
+from gvo.outputs.plots import plot_trajectories
+from gvo.outputs.run_folder import TRAJECTORIES, RunFolder
+from gvo.outputs.tables import evaluations_json
+from gvo.sources.frames import frames
+from gvo.sources.opening import BAG_SUFFIXES, open_recording
+from gvo.sources.recording import Source
+from gvo.trajectory import Trajectory
+from gvo.trajectory_files import read_trajectory
+from gvo.types import FaultyFrame, Frame, Status
+
+EXIT_COMPLETE = 0
+EXIT_NOTHING = 2
+EXIT_PARTLY = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far a run has come.
+
+    Parameters
+    ----------
+    n_done, n_total : int
+        Frames taken, and images announced by the recording.
+    n_tracked : int
+        Frames tied to earlier ones by a registration.
+    """
+
+    n_done: int
+    n_total: int
+    n_tracked: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunResult:
+    """What a run left.
+
+    Parameters
+    ----------
+    summary : dict
+        As written to `summary.json`.
+    evaluations : tuple of Evaluation
+        Of raw, causal and smoothed; empty without ground truth.
+    exit_code : int
+        0 complete, 3 partly.
+    warnings : tuple of str
+        What was skipped or broke off, a line each.
+    """
+
+    summary: dict[str, Any]
+    evaluations: tuple[Evaluation, ...]
+    exit_code: int
+    warnings: tuple[str, ...]
+
+
+@dataclass(slots=True, kw_only=True)
+class _Tally:
+    """Counts and times over the frames of a run."""
+
+    statuses: Counter[Status] = field(default_factory=Counter)
+    first_fault: str = ""
+    n_unpaired: int = 0
+    first_unpaired: str = ""
+    broken_off: str = ""
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def n_frames(self) -> int:
+        return sum(self.statuses.values())
+
+    @property
+    def n_tracked(self) -> int:
+        return self.statuses[Status.OK] + self.statuses[Status.RESUMED]
+
+    @property
+    def n_with_pose(self) -> int:
+        return self.n_frames - self.statuses[Status.SKIPPED]
+
+    @property
+    def n_faulty(self) -> int:
+        return self.statuses[Status.SKIPPED]
+
+    def progress(self, n_images: int) -> Progress:
+        return Progress(
+            n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
+        )
+
+    def add_result(self, result: FrameResult) -> None:
+        self.statuses[result.status] += 1
+        for stage, elapsed in result.stage_ms.items():
+            self.stage_ms.setdefault(stage, []).append(elapsed)
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        reason = f"frame at {frame.stamp_ns} ns: {frame.reason}"
+        if frame.is_unpaired:
+            self.n_unpaired += 1
+            self.first_unpaired = self.first_unpaired or reason
+        else:
+            self.statuses[Status.SKIPPED] += 1
+            self.first_fault = self.first_fault or reason
+
+
+def run_recording(
+    source: Source,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    ground_truth: Trajectory | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> RunResult:
+    """Run odometry over a recording and write a run folder.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_recording`, or a rendered one.
+    out : str or Path
+        Folder for the trajectories, covariances, table of frames, summary and picture.
+    config : Config, optional
+    ground_truth : Trajectory, optional
+        Poses of the recording's camera; the recording's own where omitted.
+    on_progress : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    RunResult
+
+    Raises
+    ------
+    RecordingError
+        When no frame is usable, or the folder cannot be written.
+    """
+    config = config or Config()
+    tally = _Tally()
+    odometry = Odometry(source.info.camera, config)
+    with RunFolder(Path(out)) as folder:
+        try:
+            for item in _read_frames(source, config, tally):
+                _take(item, odometry, folder, tally)
+                if on_progress is not None:
+                    on_progress(tally.progress(source.info.n_images))
+        finally:
+            # Also where the run is interrupted: what the window holds was computed.
+            folder.add_smoothed(odometry.finish())
+    truth = ground_truth if ground_truth is not None else source.ground_truth()
+    return _conclude(source, folder, tally, config=config, truth=truth)
+
+
+def read_ground_truth(path: str | Path) -> Trajectory:
+    """Read the true poses of a recording's camera.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file of poses (TUM, KITTI, EuRoC), a recording's folder, or a bag that holds them.
+
+    Raises
+    ------
+    TrajectoryError
+        When the file holds no poses, or the recording no ground truth.
+    """
+    path = Path(path)
+    if (path / "groundtruth.txt").is_file():
+        return read_trajectory(path / "groundtruth.txt")
+    if path.is_file() and path.suffix not in BAG_SUFFIXES:
+        return read_trajectory(path)
+    truth = open_recording(path).ground_truth()
+    if truth is None:
+        raise TrajectoryError(f"{path}: this recording holds no ground truth")
+    return truth
+
+
+def _read_frames(source: Source, config: Config, tally: _Tally) -> Iterator[Frame | FaultyFrame]:
+    """Yield frames, timing the reading; where the recording breaks off, note it and end."""
+    iterator = frames(source, config)
+    while True:
+        start = time.perf_counter()
+        try:
+            item = next(iterator)
+        except StopIteration:
+            return
+        except RecordingError as error:
+            tally.broken_off = str(error)
+            return
+        tally.stage_ms.setdefault("read", []).append(1e3 * (time.perf_counter() - start))
+        yield item
+
+
+def _take(item: Frame | FaultyFrame, odometry: Odometry, folder: RunFolder, tally: _Tally) -> None:
+    if isinstance(item, FaultyFrame):
+        tally.add_faulty(item)
+        if not item.is_unpaired:
+            folder.add_faulty(item)
+        return
+    result = odometry.track(item)
+    tally.add_result(result)
+    folder.add_frame(result)
+
+
+def _conclude(
+    source: Source,
+    folder: RunFolder,
+    tally: _Tally,
+    *,
+    config: Config,
+    truth: Trajectory | None,
+) -> RunResult:
+    if tally.n_with_pose == 0:
+        reason = (
+            tally.broken_off or tally.first_fault or tally.first_unpaired or "it holds no image"
+        )
+        raise RecordingError(f"{source.info.name}: no usable frame: {reason}")
+    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+    evaluations, warnings = _evaluate(truth, estimates)
+    warnings = _warnings(tally) + warnings
+    is_partly = bool(tally.n_faulty or tally.broken_off)
+    summary = _summary(source, tally, config=config, evaluations=evaluations, warnings=warnings)
+    folder.write_summary(summary)
+    is_known = bool(evaluations)
+    plot_trajectories(folder.path / "trajectories.png", truth if is_known else None, estimates)
+    return RunResult(
+        summary=summary,
+        evaluations=evaluations,
+        exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
+        warnings=tuple(warnings),
+    )
+
+
+def _evaluate(
+    truth: Trajectory | None, estimates: dict[str, Trajectory]
+) -> tuple[tuple[Evaluation, ...], list[str]]:
+    if truth is None:
+        return (), []
+    try:
+        evaluations = [evaluate(truth, T, name=name) for name, T in estimates.items()]
+    except GvoError as error:
+        return (), [f"not compared with the ground truth: {error}"]
+    return tuple(evaluations), []
+
+
+def _warnings(tally: _Tally) -> list[str]:
+    warnings = []
+    if tally.broken_off:
+        warnings.append(
+            f"the recording broke off after {tally.n_frames} frames: {tally.broken_off}"
+        )
+    if tally.n_faulty:
+        warnings.append(
+            f"{tally.n_faulty} of {tally.n_frames} frames are faulty and were skipped; "
+            f"the first: {tally.first_fault}"
+        )
+    if tally.n_unpaired:
+        warnings.append(
+            f"{tally.n_unpaired} images have no partner and make no frame "
+            "(sync.max_difference_ms, sync.stereo_tolerance_ms)"
+        )
+    n_untied = tally.n_with_pose - tally.n_tracked
+    if n_untied:
+        warnings.append(
+            f"{n_untied} of {tally.n_with_pose} poses continue the last velocity, without a "
+            "registration (frames.csv: coasting, lost)"
+        )
+    return warnings
+
+
+def _summary(
+    source: Source,
+    tally: _Tally,
+    *,
+    config: Config,
+    evaluations: tuple[Evaluation, ...],
+    warnings: list[str],
+) -> dict[str, Any]:
+    info = source.info
+    medians = {stage: round(float(np.median(ms)), 3) for stage, ms in tally.stage_ms.items()}
+    return {
+        "gvo_version": __version__,
+        "recording": info.name,
+        "sensor": info.sensor,
+        "decisions": list(info.decisions),
+        "frames": tally.n_frames,
+        "tracked": tally.n_tracked,
+        "coverage": tally.n_with_pose / tally.n_frames,
+        "status_counts": {status.value: tally.statuses[status] for status in Status},
+        "unpaired_images": tally.n_unpaired,
+        "median_ms": medians,
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "errors": evaluations_json(evaluations)["estimates"],
+        "warnings": warnings,
+        "configuration": config.model_dump(),
+    }
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident memory of this process so far, in 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = 1 if sys.platform == "darwin" else 1024
+    return peak * unit / 1e6

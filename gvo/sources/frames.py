@@ -1,0 +1,218 @@
+"""The one way from a recording to frames: pair, decode, check, make grey, rectify."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.config import Config
+from gvo.errors import GvoError, RecordingError
+from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.sources.sync import Pair, pair_images
+from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
+
+
+def frames(source: Source, config: Config) -> Iterator[Frame | FaultyFrame]:
+    """Read a recording as frames.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    config : Config
+        `sync` decides which images make one frame; with `runtime.threads` above one the images
+        of a frame are decoded side by side, one frame ahead. The result does not depend on the
+        number of threads.
+
+    Yields
+    ------
+    StereoFrame, RgbdFrame or FaultyFrame
+        One for each image of stream 0, in its order.
+
+    Raises
+    ------
+    RecordingError
+        When the recording cannot be read on; the frames before are yielded first.
+    """
+    info = source.info
+    pairs = pair_images(
+        source.images(), limit_ns=_limit_ns(info.sensor, config), partner=_partner(info.sensor)
+    )
+    preparers = _preparers(info)
+    if config.runtime.threads == 1:
+        yield from _one_by_one(pairs, preparers, info.sensor)
+    else:
+        yield from _ahead(pairs, preparers, info.sensor)
+
+
+class ImagePreparer:
+    """Make raw pixels of one stream what a frame holds: checked, grey, rectified.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the stream; depth images take that of the colour camera.
+    is_depth : bool
+        The stream holds depth: rectified by the nearest pixel, so that no depth is made up.
+    """
+
+    def __init__(self, calibration: Calibration, *, is_depth: bool = False) -> None:
+        self._size = (calibration.height, calibration.width)
+        self._is_depth = is_depth
+        self._maps = rectification_maps(calibration)
+        self._fixed_maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+        if self._maps is not None and not is_depth:
+            # Linear interpolation is faster with fixed-point maps, the nearest pixel is not.
+            fixed = cv2.convertMaps(*self._maps, cv2.CV_16SC2)
+            self._fixed_maps = (np.asarray(fixed[0]), np.asarray(fixed[1]))
+
+    def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the image of the frame.
+
+        Parameters
+        ----------
+        pixels : ndarray
+            uint8 (h, w) or (h, w, 3) in BGR order; or depth as float32 (h, w), metres.
+
+        Returns
+        -------
+        ndarray of uint8 or float32, shape (h, w)
+
+        Raises
+        ------
+        RecordingError
+            When size or type are not what the calibration says.
+        """
+        if pixels.shape[:2] != self._size:
+            raise RecordingError(
+                f"expected {_size_text(self._size)} pixels by the calibration, got "
+                f"{_size_text(pixels.shape)}"
+            )
+        return self._depth(pixels) if self._is_depth else self._grey(pixels)
+
+    def _depth(self, depth: NDArray[Any]) -> DepthArray:
+        if self._maps is not None:
+            depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan))
+        if not np.any(np.isfinite(depth)):
+            raise RecordingError("no pixel of the depth image is known")
+        return np.asarray(depth, dtype=np.float32)
+
+    def _grey(self, pixels: NDArray[Any]) -> ImageArray:
+        if pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        if self._fixed_maps is not None:
+            pixels = cv2.remap(pixels, *self._fixed_maps, cv2.INTER_LINEAR)
+        return np.asarray(pixels, dtype=np.uint8)
+
+
+_Preparers = tuple[ImagePreparer, ImagePreparer]
+_Item = Pair | FaultyFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Started:
+    item: _Item
+    results: tuple[Future[NDArray[Any] | str], ...]
+
+
+def _preparers(info: RecordingInfo) -> _Preparers:
+    first = ImagePreparer(info.calibrations[0])
+    if info.sensor == "stereo":
+        return first, ImagePreparer(info.calibrations[1])
+    return first, ImagePreparer(info.calibrations[0], is_depth=True)
+
+
+def _one_by_one(
+    items: Iterable[_Item], preparers: _Preparers, sensor: Sensor
+) -> Iterator[Frame | FaultyFrame]:
+    for item in items:
+        if isinstance(item, FaultyFrame):
+            yield item
+        else:
+            results = [_prepare(*job, sensor) for job in zip(item, preparers, strict=True)]
+            yield _make_frame(item, results, sensor)
+
+
+def _ahead(
+    items: Iterator[_Item], preparers: _Preparers, sensor: Sensor
+) -> Iterator[Frame | FaultyFrame]:
+    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
+        started: deque[_Started] = deque()
+        fault: GvoError | None = None
+        while fault is None:
+            try:
+                item = next(items)
+            except StopIteration:
+                break
+            except GvoError as error:
+                fault = error  # what was read before it counts
+            else:
+                started.append(_start(pool.submit, item, preparers, sensor))
+                if len(started) > 1:
+                    yield _finish(started.popleft(), sensor)
+        while started:
+            yield _finish(started.popleft(), sensor)
+        if fault is not None:
+            raise fault
+
+
+def _start(
+    submit: Callable[..., Future[NDArray[Any] | str]],
+    item: _Item,
+    preparers: _Preparers,
+    sensor: Sensor,
+) -> _Started:
+    if isinstance(item, FaultyFrame):
+        return _Started(item=item, results=())
+    jobs = zip(item, preparers, strict=True)
+    return _Started(item=item, results=tuple(submit(_prepare, *job, sensor) for job in jobs))
+
+
+def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
+    if isinstance(started.item, FaultyFrame):
+        return started.item
+    return _make_frame(started.item, [result.result() for result in started.results], sensor)
+
+
+def _prepare(image: StampedImage, preparer: ImagePreparer, sensor: Sensor) -> NDArray[Any] | str:
+    """Return the prepared image, or one line on what is wrong with it."""
+    try:
+        return preparer(image.load())
+    except RecordingError as error:
+        name = ("left", "right") if sensor == "stereo" else ("colour", "depth")
+        return f"{name[image.stream]} image: {error}"
+
+
+def _make_frame(
+    pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
+) -> Frame | FaultyFrame:
+    stamp_ns = pair[0].stamp_ns
+    first, second = results
+    if isinstance(first, str) or isinstance(second, str):
+        reasons = [result for result in results if isinstance(result, str)]
+        return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
+    if sensor == "stereo":
+        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
+    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
+
+
+def _limit_ns(sensor: Sensor, config: Config) -> int:
+    sync = config.sync
+    limit_ms = sync.stereo_tolerance_ms if sensor == "stereo" else sync.max_difference_ms
+    return round(limit_ms * 1e6)
+
+
+def _partner(sensor: Sensor) -> str:
+    return "right" if sensor == "stereo" else "depth"
+
+
+def _size_text(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"

@@ -1,0 +1,185 @@
+"""Folders of the KITTI odometry benchmark: rectified stereo pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gvo.errors import CalibrationError, RecordingError
+from gvo.geometry import se3
+from gvo.geometry.camera import Calibration
+from gvo.sources.calibration import check_camera, read_stereo_file, stereo_baseline
+from gvo.sources.folders import StampedPath, first_image_size, merge_streams
+from gvo.sources.recording import RecordingInfo, StampedImage
+from gvo.sources.tables import parse_seconds, read_rows
+from gvo.trajectory import Trajectory
+from gvo.trajectory_files import read_trajectory
+from gvo.types import FloatArray
+
+_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class KittiSource:
+    """A sequence folder: `calib.txt`, `times.txt`, `image_0` and `image_1`.
+
+    Where the grey cameras are missing, the colour cameras `image_2` and `image_3` are read. An
+    image's number is its row in `times.txt` and in `poses.txt`, so that missing images shift
+    nothing.
+
+    Parameters
+    ----------
+    folder : Path
+        Such a folder.
+    calibration : Path, optional
+        YAML of `left` and `right` that replaces `calib.txt`.
+
+    Raises
+    ------
+    RecordingError, CalibrationError
+        When files are missing or malformed.
+    """
+
+    def __init__(self, folder: Path, *, calibration: Path | None = None) -> None:
+        self._folder = folder
+        rows = read_rows(folder / "times.txt", n_fields=1)
+        self._stamps_ns = [
+            parse_seconds(fields[0], f"{folder / 'times.txt'}, line {number}")
+            for number, fields in rows
+        ]
+        names = _find_pair(folder)
+        self._left, self._right = (self._list_images(name) for name in names)
+        calibrations = self._calibrations(names, calibration)
+        self._t_cam0_cam = _camera_offset(calibrations[0])
+        file = calibration or folder / "calib.txt"
+        decisions = [
+            f"stereo: {names[0]} + {names[1]} ({len(self._left)} + {len(self._right)} images)",
+            f"calibration: {file.name}, rectified",
+            f"baseline: {stereo_baseline(calibrations, str(file)):.4f} m",
+        ]
+        self._info = RecordingInfo(
+            name=folder.resolve().name,
+            sensor="stereo",
+            calibrations=calibrations,
+            n_images=len(self._left),
+            decisions=decisions,
+        )
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What is known before the first image."""
+        return self._info
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images of both cameras by stamp."""
+        return merge_streams(self._left, self._right)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of the left camera; the world is the first grey left camera.
+
+        Raises
+        ------
+        TrajectoryError
+            When the file is malformed.
+        RecordingError
+            When it does not have a row per row of `times.txt`.
+        """
+        official = self._folder.resolve().parents[1] / "poses" / f"{self._info.name}.txt"
+        for path in (self._folder / "poses.txt", official):
+            if path.is_file():
+                return self._read_truth(path)
+        return None
+
+    def _read_truth(self, path: Path) -> Trajectory:
+        T_world_cam0 = read_trajectory(path).T_world_cam
+        if len(T_world_cam0) != len(self._stamps_ns):
+            raise RecordingError(
+                f"{path}: expected {len(self._stamps_ns)} rows as in times.txt, got "
+                f"{len(T_world_cam0)}; cut both to the same rows"
+            )
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        T_cam0_cam = se3.make_transform(np.eye(3), self._t_cam0_cam)
+        is_later = np.concatenate([[True], stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1]])
+        return Trajectory(
+            stamps_ns=stamps_ns[is_later],
+            T_world_cam=(T_world_cam0 @ T_cam0_cam)[is_later],
+            stamps_from="times",
+        )
+
+    def _list_images(self, name: str) -> list[StampedPath]:
+        folder = self._folder / name
+        paths = sorted(path for path in folder.iterdir() if path.suffix in _IMAGE_SUFFIXES)
+        if not paths:
+            raise RecordingError(f"{folder}: holds no .png or .jpg images")
+        return [(self._stamp_of(path), path) for path in paths]
+
+    def _stamp_of(self, path: Path) -> int:
+        n_rows = len(self._stamps_ns)
+        if not path.stem.isascii() or not path.stem.isdigit() or int(path.stem) >= n_rows:
+            raise RecordingError(
+                f"{path}: expected an image number below {n_rows}, the rows of times.txt"
+            )
+        return self._stamps_ns[int(path.stem)]
+
+    def _calibrations(
+        self, names: tuple[str, str], file: Path | None
+    ) -> tuple[Calibration, Calibration]:
+        if file is not None:
+            return read_stereo_file(file, is_rectified=True)
+        path = self._folder / "calib.txt"
+        projections = _read_projections(path)
+        size = first_image_size([image for _, image in self._left], self._folder / names[0])
+        left, right = (
+            _rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names
+        )
+        return left, right
+
+
+def _find_pair(folder: Path) -> tuple[str, str]:
+    for pair in _PAIRS:
+        if all((folder / name).is_dir() for name in pair):
+            return pair
+    raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
+
+
+def _read_projections(path: Path) -> dict[str, FloatArray]:
+    projections = {}
+    for number, fields in read_rows(path, n_fields=1):
+        if not fields[0].startswith("P"):
+            continue
+        try:
+            projection = np.array([float(field) for field in fields[1:]])
+        except ValueError as error:
+            raise CalibrationError(f"{path}, line {number}: {error}") from error
+        if projection.size != 12 or not np.all(np.isfinite(projection)):
+            raise CalibrationError(
+                f"{path}, line {number}: expected 12 finite numbers, got {projection.size}"
+            )
+        projections[fields[0].rstrip(":")] = projection.reshape(3, 4)
+    return projections
+
+
+def _rectified(
+    projections: dict[str, FloatArray], key: str, *, size: tuple[int, int], path: Path
+) -> Calibration:
+    if key not in projections:
+        raise CalibrationError(f"{path}: lacks {key}")
+    P = projections[key]
+    calibration = Calibration(
+        width=size[0],
+        height=size[1],
+        K=P[:, :3].copy(),
+        D=np.zeros(5),
+        R=np.eye(3),
+        P=P,
+        is_rectified=True,
+    )
+    check_camera(calibration, f"{path}: {key}")
+    return calibration
+
+
+def _camera_offset(calibration: Calibration) -> FloatArray:
+    """Return the centre of the camera in the frame of cam0: P = K [I | -centre]."""
+    return np.asarray(-np.linalg.solve(calibration.P[:, :3], calibration.P[:, 3]))

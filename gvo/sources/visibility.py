@@ -1,0 +1,235 @@
+"""Which rectangle a camera sees at each pixel.
+
+A rectangle is a plane, so the inverse depth of its points is linear in the pixel, and so are
+its texture coordinates times the inverse depth. Everything is evaluated from these linear
+forms at each pixel; nothing is interpolated over triangles.
+
+References
+----------
+P. S. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989 (linear forms).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.geometry.camera import PinholeCamera
+from gvo.geometry.se3 import invert, transform_points
+from gvo.sources.scene import Scene
+from gvo.types import BoolArray, FloatArray, IntArray
+
+SampleArray: TypeAlias = NDArray[np.float32]
+IndexArray: TypeAlias = NDArray[np.int16]
+
+NOTHING = -1
+_NEAR_M = 0.05
+_SMALL_BOX = 20_000  # pixels: not worth a closer look
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """The rectangles one camera may see, as linear forms of the pixel (u, v, 1).
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : PinholeCamera
+    indices : ndarray of int64, shape (n,)
+        Of the rectangles in the scene.
+    inverse_depth : ndarray of float64, shape (n, 3)
+        1/z in 1/m.
+    texels_s, texels_t : ndarray of float64, shape (n, 3)
+        Texture coordinates over z, texels per metre.
+    inside : ndarray of float64, shape (n, 5, 3)
+        All not negative inside of the rectangle and beyond the near plane.
+    corners : ndarray of float64, shape (n, 4, 3)
+        In the camera frame, metres.
+    """
+
+    scene: Scene
+    camera: PinholeCamera
+    indices: IntArray
+    inverse_depth: FloatArray
+    texels_s: FloatArray
+    texels_t: FloatArray
+    inside: FloatArray
+    corners: FloatArray
+
+
+def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
+    """Keep the rectangles in view and express them as linear forms of the pixel."""
+    T_cam_map = invert(T_map_cam)
+    origins = transform_points(T_cam_map, scene.origins)
+    R = T_cam_map[:3, :3]
+    axes_s, axes_t = scene.axes_s @ R.T, scene.axes_t @ R.T
+    normals = np.cross(axes_s, axes_t)
+    distances = np.einsum("ij,ij->i", normals, origins)
+    faces = (distances > 1e-9) | (scene.is_two_sided & (distances < -1e-9))
+    corners = _corners(origins, axes_s * scene.sizes[:, :1], axes_t * scene.sizes[:, 1:])
+    keep = np.flatnonzero(faces & _is_in_frustum(corners, camera))
+    K_inverse = np.linalg.inv(camera.K)
+    inverse_depth = (normals[keep] / distances[keep, np.newaxis]) @ K_inverse
+
+    def coordinate(axes: FloatArray) -> FloatArray:
+        offsets = np.einsum("ij,ij->i", axes[keep], origins[keep])
+        return np.asarray(axes[keep] @ K_inverse - offsets[:, np.newaxis] * inverse_depth)
+
+    s, t = coordinate(axes_s), coordinate(axes_t)
+    width, height = scene.sizes[keep].T[..., np.newaxis]
+    near = np.array([0.0, 0.0, 1.0 / _NEAR_M]) - inverse_depth
+    scale, shift = scene.texels_per_m[keep], scene.texel_offsets[keep]
+    return View(
+        scene=scene,
+        camera=camera,
+        indices=keep,
+        inverse_depth=inverse_depth,
+        texels_s=scale[:, :1] * s + shift[:, :1] * inverse_depth,
+        texels_t=scale[:, 1:] * t + shift[:, 1:] * inverse_depth,
+        inside=np.stack(
+            [s, width * inverse_depth - s, t, height * inverse_depth - t, near], axis=1
+        ),
+        corners=corners[keep],
+    )
+
+
+def _corners(origins: FloatArray, edges_s: FloatArray, edges_t: FloatArray) -> FloatArray:
+    return np.stack(
+        [origins, origins + edges_s, origins + edges_s + edges_t, origins + edges_t], axis=1
+    )
+
+
+def _is_in_frustum(corners: FloatArray, camera: PinholeCamera) -> BoolArray:
+    """Tell the rectangles that do not lie wholly beyond one side of the frustum."""
+    x, y, z = np.moveaxis(corners, -1, 0)
+    u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+    sides = [u + z, camera.width * z - u, v + z, camera.height * z - v, z - _NEAR_M]
+    return np.asarray(np.all([np.any(side > 0, axis=1) for side in sides], axis=0))
+
+
+def refine(view: View) -> View:
+    """Return the view of an image of twice the width and height."""
+    M = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
+    camera = PinholeCamera(
+        fx=2 * view.camera.fx,
+        fy=2 * view.camera.fy,
+        cx=2 * view.camera.cx + 0.5,
+        cy=2 * view.camera.cy + 0.5,
+        width=2 * view.camera.width,
+        height=2 * view.camera.height,
+    )
+    return replace(
+        view,
+        camera=camera,
+        inverse_depth=view.inverse_depth @ M,
+        texels_s=view.texels_s @ M,
+        texels_t=view.texels_t @ M,
+        inside=view.inside @ M,
+    )
+
+
+def find_visible(view: View) -> IndexArray:
+    """Return the nearest rectangle at each pixel, as an index into the view; -1: nothing."""
+    nearest = np.zeros((view.camera.height, view.camera.width), dtype=np.float32)
+    visible = np.full(nearest.shape, NOTHING, dtype=np.int16)
+    first, last, upper_bounds = _bounds(view)
+    # Front to back, cut-outs last: what is hidden is found out early.
+    for k in np.lexsort((-upper_bounds, view.scene.has_mask[view.indices])):
+        box = slice(first[k, 1], last[k, 1]), slice(first[k, 0], last[k, 0])
+        behind = nearest[box]
+        if behind.size > 0 and behind.min() < upper_bounds[k]:
+            _draw(view, int(k), _shrink(view, int(k), box, nearest), nearest, visible)
+    return visible
+
+
+def _draw(
+    view: View, k: int, box: tuple[slice, slice], nearest: SampleArray, visible: IndexArray
+) -> None:
+    """Enter rectangle k into the buffers where it is the nearest one."""
+    v, u = (np.arange(part.start, part.stop) for part in box)
+    a, b, c = view.inverse_depth[k]
+    inverse_depths = np.add.outer((b * v + c).astype(np.float32), (a * u).astype(np.float32))
+    mask = inverse_depths > nearest[box]
+    left, right = _row_spans(view.inside[k], v, view.camera.width)
+    columns = u.astype(np.int16)
+    mask &= columns >= left[:, np.newaxis]
+    mask &= columns <= right[:, np.newaxis]
+    if view.scene.has_mask[view.indices[k]]:
+        _cut_out(view, k, (u, v), inverse_depths, mask)
+    np.copyto(nearest[box], inverse_depths, where=mask)
+    np.copyto(visible[box], np.int16(k), where=mask)
+
+
+def _shrink(
+    view: View, k: int, box: tuple[slice, slice], nearest: SampleArray
+) -> tuple[slice, slice]:
+    """Leave rows out, above and below, where all is nearer than the rectangle can be."""
+    rows, columns = box
+    if (rows.stop - rows.start) * (columns.stop - columns.start) < _SMALL_BOX:
+        return box
+    a, b, c = view.inverse_depth[k]
+    reach = b * np.arange(rows.start, rows.stop) + c
+    reach += max(a * columns.start, a * (columns.stop - 1))
+    used = np.flatnonzero(nearest[box].min(axis=1) < reach)
+    if len(used) == 0:
+        return slice(0, 0), columns
+    return slice(rows.start + int(used[0]), rows.start + int(used[-1]) + 1), columns
+
+
+def _bounds(view: View) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the boxes (u, v) around rectangles, shapes (n, 2), and their largest 1/z."""
+    nexts = np.roll(view.corners, -1, axis=1)
+    z, z_next = view.corners[..., 2:], nexts[..., 2:]
+    is_crossing = (z < _NEAR_M) != (z_next < _NEAR_M)
+    shares = (_NEAR_M - z) / np.where(is_crossing, z_next - z, 1.0)
+    crossings = view.corners + shares * (nexts - view.corners)
+    points = np.concatenate([view.corners, crossings], axis=1)
+    is_used = np.concatenate([z >= _NEAR_M, is_crossing], axis=1)
+    pixels = view.camera.project(np.where(is_used, points, [0.0, 0.0, 1.0]))
+    size = np.array([view.camera.width, view.camera.height])
+    first = np.floor(np.where(is_used, pixels, np.inf).min(axis=1)).clip(0, size)
+    last = np.ceil(np.where(is_used, pixels, -np.inf).max(axis=1) + 1).clip(0, size)
+    slopes = view.inverse_depth[:, :2]
+    over_box = np.maximum(slopes * first, slopes * last).sum(axis=1) + view.inverse_depth[:, 2]
+    over_points = (1.0 / np.where(is_used, points[..., 2:], np.inf)).max(axis=(1, 2))
+    return first.astype(np.int64), last.astype(np.int64), np.minimum(over_box, over_points)
+
+
+def _row_spans(inside: FloatArray, rows: IntArray, width: int) -> tuple[IndexArray, IndexArray]:
+    """Return the first and the last column inside of a rectangle for each row."""
+    a, b, c = inside.T[..., np.newaxis]
+    offsets = b * rows + c
+    slopes = np.where(a == 0, 1e-300, a)  # all of the row, or nothing
+    with np.errstate(over="ignore"):
+        bounds = -offsets / slopes
+    is_lower = slopes[:, 0] > 0
+    lower = bounds[is_lower].max(axis=0, initial=0.0)
+    upper = bounds[~is_lower].min(axis=0, initial=width - 1.0)
+    left, right = np.minimum(np.ceil(lower), width), np.maximum(np.floor(upper), -1)
+    return left.astype(np.int16), right.astype(np.int16)
+
+
+def _cut_out(
+    view: View,
+    k: int,
+    pixels: tuple[IntArray, IntArray],
+    inverse_depths: SampleArray,
+    mask: BoolArray,
+) -> None:
+    """Clear the mask over columns and rows where the texture of rectangle k is transparent."""
+    u, v = pixels
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # beyond the rectangle
+        depths = np.reciprocal(inverse_depths)
+        s, t = (
+            np.add.outer((b * v + c).astype(np.float32), (a * u).astype(np.float32)) * depths
+            for a, b, c in (view.texels_s[k], view.texels_t[k])
+        )
+        # One level for the whole rectangle: left and right then see the same outline.
+        per_pixel = np.linalg.norm([view.texels_s[k, :2], view.texels_t[k, :2]], axis=1).max()
+        level = round(np.log2(max(view.corners[k, :, 2].mean() * per_pixel, 1.0)))
+        mask &= view.scene.atlas.is_opaque(
+            int(view.scene.textures[view.indices[k]]), level, s, t
+        )

@@ -1,0 +1,117 @@
+"""How the camera moves: a drive around a block, a hand that looks around.
+
+Map axes: z up; a camera looks along its z axis, x to the right, y down.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from gvo.geometry.se3 import exp, make_transform
+from gvo.types import FloatArray
+
+CAMERA_HEIGHT_M = 1.65
+STRAIGHT_M = 50.0
+TURN_M = 50.0
+LAP_M = 4 * (STRAIGHT_M + TURN_M)
+_START_M = 30.0
+_R_MAP_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def heading(s: FloatArray | float) -> FloatArray:
+    """Return the heading of the road at arc lengths in metres; radians, left is positive."""
+    corner, along = np.divmod(np.asarray(s), STRAIGHT_M + TURN_M)
+    x = np.clip((along - STRAIGHT_M) / TURN_M, 0.0, 1.0)
+    return np.asarray(0.5 * np.pi * (corner + x * x * (3.0 - 2.0 * x)))
+
+
+def curvature(s: FloatArray | float) -> FloatArray:
+    """Return the derivative of the heading, 1/m."""
+    x = np.clip((np.asarray(s) % (STRAIGHT_M + TURN_M) - STRAIGHT_M) / TURN_M, 0.0, 1.0)
+    return np.asarray(3.0 * np.pi * x * (1.0 - x) / TURN_M)
+
+
+@lru_cache(maxsize=1)
+def _lap() -> CubicSpline:
+    s = np.linspace(0.0, LAP_M, 4001)
+    middle = heading(0.5 * (s[1:] + s[:-1]))
+    ends = heading(s)
+    step = s[1] - s[0]
+
+    def integrate(values: FloatArray, middles: FloatArray) -> FloatArray:
+        simpson = step / 6.0 * (values[:-1] + 4.0 * middles + values[1:])
+        return np.concatenate([[0.0], np.cumsum(simpson)])
+
+    x = integrate(-np.sin(ends), -np.sin(middle))
+    y = integrate(np.cos(ends), np.cos(middle))
+    return CubicSpline(s, np.stack([x, y], axis=1))
+
+
+def road_point(s: FloatArray | float, right: FloatArray | float = 0.0) -> FloatArray:
+    """Return points beside the driven line.
+
+    Parameters
+    ----------
+    s : float or ndarray of float64, shape (...)
+        Arc length, metres; the road is a closed lap.
+    right : float or ndarray of float64, shape (...)
+        Distance to the right of the driven line, metres.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 2)
+        x and y in the `map` frame.
+    """
+    psi = heading(s)
+    aside = np.stack([np.cos(psi), np.sin(psi)], axis=-1)
+    return np.asarray(_lap()(s % LAP_M) + aside * np.asarray(right)[..., np.newaxis])
+
+
+def drive(stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a car at 5 to 11 m/s on a slightly uneven road.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    t = stamps_s
+    # The integral of 8.2 + 2 sin(0.6 t) + 0.8 sin(1.7 t + 1) m/s.
+    s = _START_M + 8.2 * t - 2 / 0.6 * (np.cos(0.6 * t) - 1)
+    s -= 0.8 / 1.7 * (np.cos(1.7 * t + 1) - np.cos(1.0))
+    psi = heading(s)
+    zeros, ones = np.zeros_like(psi), np.ones_like(psi)
+    right = np.stack([np.cos(psi), np.sin(psi), zeros], axis=-1)
+    forward = np.stack([-np.sin(psi), np.cos(psi), zeros], axis=-1)
+    R = np.stack([right, np.stack([zeros, zeros, -ones], axis=-1), forward], axis=-1)
+    bounce = 0.012 * np.sin(8.1 * t) + 0.008 * np.sin(12.7 * t + 2)
+    position = np.column_stack([road_point(s), CAMERA_HEIGHT_M + bounce])
+    pitch = 0.004 * np.sin(7.3 * t + 1) + 0.003 * np.sin(2.1 * t)
+    roll = 0.004 * np.sin(5.9 * t) + 0.004 * np.sin(1.3 * t + 0.5)
+    shake = exp(np.stack([pitch, zeros, roll, zeros, zeros, zeros], axis=-1))
+    return np.asarray(make_transform(R, position) @ shake)
+
+
+def look_around(stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a camera held in the hand.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    t = stamps_s[:, np.newaxis]
+    amplitudes = np.array([0.22, 0.14, 0.12, 0.05, 0.05, 0.03])  # m
+    rates = np.array([0.9, 0.75, 1.1, 2.3, 2.0, 2.6])  # rad/s
+    waves = amplitudes * np.sin(rates * t + [0.0, 0.7, 1.9, 0.3, 2.2, 1.1])
+    position = np.array([0.0, -0.75, 1.35]) + waves[:, :3] + waves[:, 3:]
+    tilts = np.array([0.20, 0.48, 0.13, 0.03, 0.05, 0.03])  # rad about x, y, z of the camera
+    rates = np.array([1.1, 0.9, 1.3, 3.1, 2.7, 2.3])
+    turns = tilts * np.sin(rates * t + [0.4, 0.0, 1.2, 2.0, 0.9, 0.1])
+    turns = turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0]
+    rotation = exp(np.column_stack([turns, np.zeros_like(turns)]))
+    level = make_transform(np.broadcast_to(_R_MAP_LEVEL, (len(t), 3, 3)), position)
+    return np.asarray(level @ rotation)

@@ -1,0 +1,191 @@
+"""Two trajectories side by side: which poses belong together, and what moves one onto the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.trajectory import Trajectory, format_stamp
+from gvo.types import FloatArray, IntArray
+
+AlignMode = Literal["none", "origin", "se3", "sim3"]
+
+MAX_DIFFERENCE_NS = 10_000_000
+"""Largest difference of associated stamps, nanoseconds: the 10 ms of the TUM tools and evo."""
+
+
+def associate(
+    reference: Trajectory,
+    estimate: Trajectory,
+    *,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+    name: str = "estimate",
+) -> tuple[IntArray, IntArray]:
+    """Find the poses of two trajectories that belong together.
+
+    Each pose of the shorter trajectory takes the nearest one of the longer. Where two take
+    the same one, the nearer keeps it. Trajectories without stamps (`stamps_from="rows"`) are
+    associated row by row.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+    max_difference_ns : int
+        Largest difference of associated stamps, nanoseconds.
+    name : str
+        Of the estimate, for messages.
+
+    Returns
+    -------
+    tuple of two ndarrays of int64, shape (n,)
+        Increasing indices into reference and estimate, n >= 1.
+
+    Raises
+    ------
+    TrajectoryError
+        Where nothing can be associated.
+    """
+    if len(reference) == 0 or len(estimate) == 0:
+        empty = "the reference" if len(reference) == 0 else name
+        raise TrajectoryError(f"{empty} holds no poses, nothing can be associated")
+    if _is_associated_by_row(reference, estimate, name):
+        rows = np.arange(min(len(reference), len(estimate)))
+        return rows, rows.copy()
+    if len(estimate) > len(reference):
+        longer, shorter = _nearest(estimate.stamps_ns, reference.stamps_ns, max_difference_ns)
+        indices = shorter, longer
+    else:
+        indices = _nearest(reference.stamps_ns, estimate.stamps_ns, max_difference_ns)
+    if len(indices[0]) == 0:
+        raise TrajectoryError(
+            f"{name} and the reference share no stamps within {max_difference_ns / 1e6:g} ms: "
+            f"{name} {_range(estimate)}, reference {_range(reference)}; "
+            "give files of one recording and one clock"
+        )
+    return indices
+
+
+def _is_associated_by_row(reference: Trajectory, estimate: Trajectory, name: str) -> bool:
+    origins = (reference.stamps_from, estimate.stamps_from)
+    if "rows" not in origins:
+        return False
+    if origins == ("rows", "rows") or (
+        # as many stamps beside the one as there are rows in the other: frames of one sequence
+        "file" not in origins and len(reference) == len(estimate)
+    ):
+        return True
+    bare, stamped = (name, "the reference") if origins[1] == "rows" else ("the reference", name)
+    raise TrajectoryError(
+        f"{bare} holds rows of poses without stamps and cannot be associated with {stamped}, "
+        f"which has stamps ({len(estimate)} poses to {len(reference)} of the reference); "
+        "put a times.txt with one stamp in seconds per row beside the poses"
+    )
+
+
+def _nearest(
+    longer_ns: IntArray, shorter_ns: IntArray, max_difference_ns: int
+) -> tuple[IntArray, IntArray]:
+    after = np.clip(np.searchsorted(longer_ns, shorter_ns), 0, len(longer_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(shorter_ns - longer_ns[before]) <= np.abs(longer_ns[after] - shorter_ns)
+    nearest = np.where(is_before, before, after)
+    differences = np.abs(longer_ns[nearest] - shorter_ns)
+    # sorted by pose of the longer one, then by difference: the first of each group keeps it
+    order = np.lexsort([differences, nearest])
+    is_first = np.diff(nearest[order], prepend=-1) > 0
+    kept = np.sort(order[is_first & (differences[order] <= max_difference_ns)])
+    return nearest[kept], kept
+
+
+def _range(trajectory: Trajectory) -> str:
+    first, last = (format_stamp(int(trajectory.stamps_ns[i])) for i in (0, -1))
+    return f"{first} to {last} s"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Similarity:
+    """A rigid motion with a scale: p_a = scale * R_a_b @ p_b + t_a_b.
+
+    Parameters
+    ----------
+    T_a_b : ndarray of float64, shape (4, 4)
+        Rotation and translation, metres.
+    scale : float
+        Positive.
+    """
+
+    T_a_b: FloatArray
+    scale: float = 1.0
+
+    def apply(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory of world b in world a; scaled covariances where it has some."""
+        scaled = trajectory.T_world_cam.copy()
+        scaled[:, :3, 3] *= self.scale
+        covariances = trajectory.covariances
+        if covariances is not None:
+            factors = np.array([1.0] * 3 + [self.scale] * 3)
+            covariances = covariances * np.outer(factors, factors)
+        return Trajectory(
+            stamps_ns=trajectory.stamps_ns,
+            T_world_cam=self.T_a_b @ scaled,
+            covariances=covariances,
+            stamps_from=trajectory.stamps_from,
+        )
+
+
+def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> Similarity:
+    """Return what moves an estimate onto its reference, pose i onto pose i.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+        Associated: of one length, at least one pose.
+    mode : {"none", "origin", "se3", "sim3"}
+        Nothing; the first pose onto the first; least squares over the positions by a rigid
+        motion; the same with a scale.
+
+    Returns
+    -------
+    Similarity
+        From the world of the estimate to that of the reference.
+
+    Raises
+    ------
+    ValueError
+        Where the lengths differ or the mode is unknown.
+    TrajectoryError
+        Where a scale is asked for and the estimate does not move.
+
+    References
+    ----------
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", IEEE PAMI 13(4), 1991, doi:10.1109/34.88573.
+    """
+    if len(reference) != len(estimate) or len(reference) == 0:
+        raise ValueError(f"got {len(reference)} reference poses and {len(estimate)} estimates")
+    if mode == "none":
+        return Similarity(T_a_b=np.eye(4))
+    if mode == "origin":
+        return Similarity(T_a_b=reference.T_world_cam[0] @ se3.invert(estimate.T_world_cam[0]))
+    if mode not in ("se3", "sim3"):
+        raise ValueError(f"mode must be one of {get_args(AlignMode)}, got {mode!r}")
+    return _umeyama(reference.positions, estimate.positions, is_scaled=mode == "sim3")
+
+
+def _umeyama(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Similarity:
+    mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)  # eq. 34, 35
+    centred_a, centred_b = points_a - mean_a, points_b - mean_b
+    U, d, Vt = np.linalg.svd(centred_a.T @ centred_b / len(points_a))  # eq. 38
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # eq. 39, 43
+    R = (U * signs) @ Vt  # eq. 40
+    scale = 1.0
+    if is_scaled:
+        variance_b = np.mean(np.sum(centred_b**2, axis=1))  # eq. 37
+        scale = float(d @ signs / variance_b) if variance_b > 0 else 0.0  # eq. 42
+        if scale <= 0:
+            raise TrajectoryError("no scale can be estimated: the trajectories do not move alike")
+    return Similarity(T_a_b=se3.make_transform(R, mean_a - scale * R @ mean_b), scale=scale)  # 41

@@ -1,0 +1,228 @@
+"""Consensus over minimal samples, on points projected from known poses."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chisquare
+
+from gvo.config import RansacConfig
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.ransac import Consensus, draw_samples, find_inliers, ransac_rigid
+from gvo.types import BoolArray, Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+SETTINGS = RansacConfig(
+    n_hypotheses=200,
+    inlier_metric="reprojection",
+    inlier_threshold_px=2.0,
+    inlier_threshold_m=0.1,
+    min_inliers=12,
+    min_disparity_px=0.0,
+)
+
+
+def uvd(points: FloatArray) -> FloatArray:
+    x, y, z = points.T
+    return np.stack([500 * x / z + 320, 480 * y / z + 240, 500 * 0.2 / z], axis=1)
+
+
+def random_points(rng: np.random.Generator, n: int) -> FloatArray:
+    return np.column_stack([rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), rng.uniform(2, 9, n)])
+
+
+def random_motion(rng: np.random.Generator) -> FloatArray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = 0.2 * rng.normal(size=3)
+    return T
+
+
+def scene(
+    rng: np.random.Generator, n: int, n_outliers: int
+) -> tuple[FloatArray, Correspondences, BoolArray]:
+    """Return T_target_source, correspondences and which of them obey it."""
+    T = random_motion(rng)
+    source = random_points(rng, n)
+    target = source @ T[:3, :3].T + T[:3, 3]
+    is_inlier = rng.permutation(n) >= n_outliers
+    target[~is_inlier] = random_points(rng, n_outliers)
+    ones = np.ones((n, 3))
+    matches = Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=uvd(source),
+        target_uvd=uvd(target),
+        source_sigmas=ones,
+        target_sigmas=ones,
+    )
+    return T, matches, is_inlier
+
+
+def run(matches: Correspondences, config: RansacConfig, seed: int = 0) -> Consensus | Failure:
+    rng = np.random.default_rng(seed)
+    return ransac_rigid(matches, CAMERA, config, weights=None, rng=rng)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds, metric=st.sampled_from(["reprojection", "distance"]))
+def test_the_motion_is_found_among_six_outliers_in_ten(seed: int, metric: str) -> None:
+    T, matches, is_inlier = scene(np.random.default_rng(seed), 150, 90)
+    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": metric})
+    result = run(matches, config)
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=0.02)
+    assert result.inliers[is_inlier].mean() > 0.95
+    assert result.inliers[~is_inlier].mean() < 0.05
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_the_same_seed_gives_the_same_result(seed: int) -> None:
+    _, matches, _ = scene(np.random.default_rng(seed), 80, 40)
+    first, second = run(matches, SETTINGS, seed), run(matches, SETTINGS, seed)
+    assert isinstance(first, Consensus)
+    assert isinstance(second, Consensus)
+    assert first.T_target_source.tobytes() == second.T_target_source.tobytes()
+    assert first.inliers.tobytes() == second.inliers.tobytes()
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, metric=st.sampled_from(["reprojection", "distance"]))
+def test_inliers_are_those_within_the_threshold_of_the_metric(seed: int, metric: str) -> None:
+    rng = np.random.default_rng(seed)
+    _, matches, _ = scene(rng, 40, 10)
+    config = RansacConfig.model_validate(
+        SETTINGS.model_dump()
+        | {"inlier_metric": metric, "inlier_threshold_px": 30.0, "inlier_threshold_m": 0.4}
+    )
+    hypotheses = np.stack([random_motion(rng) for _ in range(4)])
+    found = find_inliers(hypotheses, matches, CAMERA, config)
+    assert found.shape == (4, 40)
+    for i, T in enumerate(hypotheses):
+        for j in range(40):
+            point = T[:3, :3] @ matches.source_points[j] + T[:3, 3]
+            if metric == "distance":
+                ratio = np.linalg.norm(point - matches.target_points[j]) / 0.4
+            else:
+                ratio = np.linalg.norm(uvd(point[None])[0] - matches.target_uvd[j]) / 30.0
+            if abs(ratio - 1.0) > 1e-4:  # single precision decides nearer than this
+                assert found[i, j] == (ratio < 1.0)
+
+
+@pytest.mark.parametrize("depth_sign", [1.0, -1.0])
+def test_points_behind_the_camera_are_no_inliers(depth_sign: float) -> None:
+    # Behind the camera the formulas of the projection fit as well as in front of it.
+    points = depth_sign * random_points(np.random.default_rng(0), 30)
+    matches = Correspondences(
+        source_points=points,
+        target_points=points,
+        source_uvd=uvd(points),
+        target_uvd=uvd(points),
+        source_sigmas=np.ones((30, 3)),
+        target_sigmas=np.ones((30, 3)),
+    )
+    found = find_inliers(np.eye(4)[np.newaxis], matches, CAMERA, SETTINGS)
+    assert found.all() if depth_sign > 0 else not found.any()
+
+
+@settings(deadline=None)
+@given(seed=seeds, n=st.integers(min_value=3, max_value=40))
+def test_samples_are_triples_of_distinct_indices(seed: int, n: int) -> None:
+    samples = draw_samples(n, 64, np.random.default_rng(seed))
+    assert samples.shape == (64, 3)
+    assert samples.min() >= 0
+    assert samples.max() < n
+    assert all(len(set(sample)) == 3 for sample in samples.tolist())
+
+
+def test_samples_are_uniform_over_all_ordered_triples() -> None:
+    samples = draw_samples(5, 60_000, np.random.default_rng(3))
+    counts = {triple: 0 for triple in permutations(range(5), 3)}
+    for triple in map(tuple, samples.tolist()):
+        counts[triple] += 1
+    assert chisquare(list(counts.values())).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("n", [0, 2, 11])
+def test_too_few_matches_are_a_falsy_failure_with_their_number(n: int) -> None:
+    _, matches, _ = scene(np.random.default_rng(0), n, 0)
+    result = run(matches, SETTINGS)
+    assert isinstance(result, Failure)
+    assert not result
+    assert result.n_matches == n
+    assert str(n) in result.reason
+
+
+def test_matches_without_a_common_motion_are_a_failure_with_counts() -> None:
+    _, matches, _ = scene(np.random.default_rng(0), 60, 60)
+    result = run(matches, SETTINGS)
+    assert isinstance(result, Failure)
+    assert result.n_matches == 60
+    assert 1 <= result.n_inliers < 12
+    assert f"{result.n_inliers} of 60" in result.reason
+
+
+def test_points_on_a_line_are_a_failure() -> None:
+    steps = np.linspace(2.0, 9.0, 30)[:, np.newaxis]
+    line = steps * [0.1, 0.05, 1.0]
+    matches = Correspondences(
+        source_points=line,
+        target_points=line + [0.0, 0.0, 0.5],
+        source_uvd=uvd(line),
+        target_uvd=uvd(line + [0.0, 0.0, 0.5]),
+        source_sigmas=np.ones((30, 3)),
+        target_sigmas=np.ones((30, 3)),
+    )
+    result = run(matches, SETTINGS)
+    assert isinstance(result, Failure)
+    assert result.n_matches == 30
+
+
+def test_far_points_are_counted_but_not_fitted() -> None:
+    rng = np.random.default_rng(4)
+    T, matches, _ = scene(rng, 80, 0)
+    depths = matches.source_points[:, 2]
+    is_far = matches.source_uvd[:, 2] < 25.0
+    assert 20 < is_far.sum() < 60
+    # Far points all too near by a tenth: fitted, they would pull the motion along.
+    spoilt = matches.target_points.copy()
+    spoilt[is_far] *= 0.9
+    spoilt_matches = Correspondences(
+        source_points=matches.source_points,
+        target_points=spoilt,
+        source_uvd=matches.source_uvd,
+        target_uvd=matches.target_uvd,
+        source_sigmas=matches.source_sigmas,
+        target_sigmas=matches.target_sigmas,
+    )
+    config = SETTINGS.model_copy(update={"min_disparity_px": 30.0, "inlier_threshold_px": 5.0})
+    result = run(spoilt_matches, config)
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
+    assert result.inliers[depths > 5.0].all()
+
+
+def test_weights_enter_the_last_fit() -> None:
+    rng = np.random.default_rng(6)
+    T, matches, _ = scene(rng, 60, 0)
+    shifted = matches.target_points.copy()
+    shifted[30:] += 0.05
+    noisy = Correspondences(
+        source_points=matches.source_points,
+        target_points=shifted,
+        source_uvd=matches.source_uvd,
+        target_uvd=matches.target_uvd,
+        source_sigmas=matches.source_sigmas,
+        target_sigmas=matches.target_sigmas,
+    )
+    config = SETTINGS.model_copy(update={"inlier_metric": "distance", "inlier_threshold_m": 1.0})
+    weights = np.repeat([1.0, 1e-12], 30)
+    result = ransac_rigid(noisy, CAMERA, config, weights=weights, rng=np.random.default_rng(0))
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)

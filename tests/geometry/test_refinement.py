@@ -1,0 +1,285 @@
+"""Refinement of a pose: derivatives, optimum, covariance, refusal."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime, least_squares
+from scipy.spatial.transform import Rotation
+
+from gvo.config import RegistrationConfig
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.refinement import (
+    Refinement,
+    fit_covariance,
+    pose_jacobian,
+    projection_jacobian,
+    refine_pose,
+    unprojection_jacobian,
+)
+from gvo.types import BoolArray, Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+SETTINGS = RegistrationConfig(n_iterations=20, huber=2.8, gate=4.0, pixel_sigma_px=0.7)
+SIGMAS = np.array([0.7, 0.7, 0.3])
+
+
+def project(points: FloatArray) -> FloatArray:
+    x, y, z = points.T
+    return np.stack([500 * x / z + 320, 480 * y / z + 240, 100 / z], axis=1)
+
+
+def unproject(uvd: FloatArray) -> FloatArray:
+    z = 100 / uvd[:, 2]
+    return np.stack([(uvd[:, 0] - 320) * z / 500, (uvd[:, 1] - 240) * z / 480, z], axis=1)
+
+
+def measure(
+    rng: np.random.Generator, n: int, noise: float = 1.0, *, sigmas: FloatArray = SIGMAS
+) -> tuple[FloatArray, Correspondences]:
+    """Return T_target_source and n matches, measured with noise in both frames."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.05 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = 0.3 * rng.normal(size=3)
+    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
+    target = source @ T[:3, :3].T + T[:3, 3]
+    source_uvd = project(source) + noise * sigmas * rng.normal(size=(n, 3))
+    target_uvd = project(target) + noise * sigmas * rng.normal(size=(n, 3))
+    return T, Correspondences(
+        source_points=unproject(source_uvd),
+        target_points=unproject(target_uvd),
+        source_uvd=source_uvd,
+        target_uvd=target_uvd,
+        source_sigmas=np.tile(sigmas, (n, 1)),
+        target_sigmas=np.tile(sigmas, (n, 1)),
+    )
+
+
+def all_of(matches: Correspondences) -> BoolArray:
+    return np.ones(len(matches), dtype=np.bool_)
+
+
+def refine(T_start: FloatArray, matches: Correspondences, inliers: BoolArray) -> Refinement:
+    result = refine_pose(T_start, matches, inliers, CAMERA, SETTINGS)
+    assert isinstance(result, Refinement), result
+    return result
+
+
+def error_of(result: Refinement, T: FloatArray) -> FloatArray:
+    """Return the left perturbation between result and truth."""
+    return se3.log(result.T_target_source @ np.linalg.inv(T))
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_jacobians_are_the_numerical_derivatives(seed: int) -> None:
+    point = np.random.default_rng(seed).uniform([-2, -2, 1], [2, 2, 9])
+    J_project = approx_fprime(point, lambda p: project(p[None])[0], 1e-7)
+    np.testing.assert_allclose(projection_jacobian(point[None], CAMERA)[0], J_project, atol=2e-3)
+    J_unproject = approx_fprime(project(point[None])[0], lambda m: unproject(m[None])[0], 1e-6)
+    np.testing.assert_allclose(
+        unprojection_jacobian(point[None], CAMERA)[0], J_unproject, rtol=1e-3, atol=1e-5
+    )
+
+    def perturbed(xi: FloatArray) -> FloatArray:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(xi[:3]).as_matrix()
+        return np.asarray(project((T[:3, :3] @ point + xi[3:])[None])[0])
+
+    J_pose = approx_fprime(np.zeros(6), perturbed, 1e-7)
+    np.testing.assert_allclose(pose_jacobian(point[None], CAMERA)[0], J_pose, atol=5e-3)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_exact_measurements_give_the_exact_pose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, matches = measure(rng, 40, noise=0.0)
+    T_start = se3.exp(0.02 * rng.normal(size=6)) @ T
+    result = refine(T_start, matches, all_of(matches))
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-7)
+    assert result.inliers.all()
+    assert np.isfinite(result.covariance).all()
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=seeds)
+def test_the_result_is_the_optimum_that_scipy_finds(seed: int) -> None:
+    # Noise in the target frame alone: there the cost's weights do not depend on the pose.
+    rng = np.random.default_rng(seed)
+    T, exact = measure(rng, 40, noise=0.0)
+    target_uvd = exact.target_uvd + SIGMAS * rng.normal(size=(40, 3))
+    matches = Correspondences(
+        source_points=exact.source_points,
+        target_points=unproject(target_uvd),
+        source_uvd=exact.source_uvd,
+        target_uvd=target_uvd,
+        source_sigmas=np.full((40, 3), 1e-9),
+        target_sigmas=exact.target_sigmas,
+    )
+    # Kernel and gate out of reach leave plain least squares.
+    wide = RegistrationConfig(n_iterations=50, huber=1e6, gate=1e6)
+    result = refine_pose(T, matches, all_of(matches), CAMERA, wide)
+    assert isinstance(result, Refinement)
+
+    def residuals(xi: FloatArray) -> FloatArray:
+        R = Rotation.from_rotvec(xi[:3]).as_matrix()
+        predicted = project(matches.source_points @ R.T + xi[3:])
+        return np.asarray(((target_uvd - predicted) / SIGMAS).ravel())
+
+    start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+    optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    R = Rotation.from_rotvec(optimum.x[:3]).as_matrix()
+    np.testing.assert_allclose(result.T_target_source[:3, :3], R, atol=2e-6)
+    np.testing.assert_allclose(result.T_target_source[:3, 3], optimum.x[3:], atol=2e-6)
+    expected_scale = np.sqrt(2 * optimum.cost / (3 * 40 - 6))
+    assert result.scale == pytest.approx(expected_scale, rel=1e-4)
+
+
+def nees(config: RegistrationConfig, noise: float, n_runs: int = 250) -> float:
+    """Return the mean of error^T covariance^-1 error per degree of freedom."""
+    rng = np.random.default_rng(11)
+    total = 0.0
+    for _ in range(n_runs):
+        T, matches = measure(rng, 80, noise)
+        result = refine_pose(T, matches, all_of(matches), CAMERA, config)
+        assert isinstance(result, Refinement)
+        error = error_of(result, T)
+        total += error @ np.linalg.solve(result.covariance, error)
+    return total / (6 * n_runs)
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0])
+def test_the_covariance_tells_the_errors_that_are_made(noise: float) -> None:
+    assert 0.7 < nees(SETTINGS, noise) < 1.4
+
+
+def test_the_covariance_leans_on_both_frames() -> None:
+    # All correlations, not only the overall size: errors whitened by it are uncorrelated.
+    rng = np.random.default_rng(12)
+    whitened = []
+    for _ in range(400):
+        T, matches = measure(rng, 60, sigmas=np.array([0.3, 0.3, 0.6]))
+        result = refine(T, matches, all_of(matches))
+        whitened.append(np.linalg.solve(np.linalg.cholesky(result.covariance), error_of(result, T)))
+    covariance = np.cov(np.array(whitened).T)
+    np.testing.assert_allclose(covariance, np.eye(6), atol=0.35)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_outliers_among_the_inliers_are_left_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, matches = measure(rng, 150)
+    is_outlier = rng.permutation(150) < 15
+    shifts = rng.choice([-1.0, 1.0], size=(15, 3)) * rng.uniform(10, 30, size=(15, 3))
+    spoilt_uvd = matches.target_uvd.copy()
+    spoilt_uvd[is_outlier] += shifts
+    spoilt = Correspondences(
+        source_points=matches.source_points,
+        target_points=matches.target_points,
+        source_uvd=matches.source_uvd,
+        target_uvd=spoilt_uvd,
+        source_sigmas=matches.source_sigmas,
+        target_sigmas=matches.target_sigmas,
+    )
+    result = refine(se3.exp(0.005 * rng.normal(size=6)) @ T, spoilt, all_of(spoilt))
+    clean = refine(T, matches, ~is_outlier)
+    assert not result.inliers[is_outlier].any()
+    assert result.inliers[~is_outlier].mean() > 0.93
+    difference = se3.log(result.T_target_source @ np.linalg.inv(clean.T_target_source))
+    # Less than the error that the noise makes anyway: 6 is the mean of that.
+    assert difference @ np.linalg.solve(clean.covariance, difference) < 6.0
+
+
+def test_inliers_that_the_sample_missed_are_chosen_again() -> None:
+    rng = np.random.default_rng(3)
+    T, matches = measure(rng, 100)
+    few = np.arange(100) < 20
+    result = refine(T, matches, few)
+    assert result.inliers.sum() > 90
+    fewer = refine_pose(
+        T, matches.select(few), np.ones(20, dtype=np.bool_), CAMERA, SETTINGS
+    )
+    assert isinstance(fewer, Refinement)
+    assert np.trace(result.covariance) < 0.5 * np.trace(fewer.covariance)
+
+
+def spoil(matches: Correspondences, kind: str) -> Correspondences:
+    """Return matches that leave the pose open or make no sense."""
+    points, uvd = matches.source_points.copy(), matches.target_uvd.copy()
+    if kind == "one point":
+        points[:], uvd[:] = points[0], uvd[0]
+    elif kind == "line":
+        points = np.linspace(0.0, 1.0, len(points))[:, None] * [0.4, 0.3, 4.0] + [0, 0, 3.0]
+        uvd = project(points)
+    elif kind == "behind":
+        points[:, 2] *= -1.0
+    elif kind == "unknown":
+        points[3] = np.nan
+    elif kind == "unknown measurement":
+        uvd[3] = np.nan
+    elif kind == "at the camera":
+        points[:] = 0.0
+    return Correspondences(
+        source_points=points,
+        target_points=matches.target_points,
+        source_uvd=matches.source_uvd,
+        target_uvd=uvd,
+        source_sigmas=matches.source_sigmas,
+        target_sigmas=matches.target_sigmas,
+    )
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["one point", "line", "behind", "unknown", "unknown measurement", "at the camera"],
+)
+@pytest.mark.parametrize("finish", [refine_pose, fit_covariance])
+def test_input_without_an_answer_is_a_failure(kind: str, finish: object) -> None:
+    _, matches = measure(np.random.default_rng(0), 30, noise=0.0)
+    spoilt = spoil(matches, kind)
+    assert callable(finish)
+    result = finish(np.eye(4), spoilt, all_of(spoilt), CAMERA, SETTINGS)
+    assert isinstance(result, Failure)
+    assert not result
+    assert result.reason
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_too_few_matches_are_a_failure(n: int) -> None:
+    _, matches = measure(np.random.default_rng(0), n)
+    for finish in (refine_pose, fit_covariance):
+        assert isinstance(finish(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS), Failure)
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=seeds, size=st.floats(min_value=0.0, max_value=3.0))
+def test_a_bad_start_gives_a_failure_or_a_finite_pose(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    T, matches = measure(rng, 12)
+    start = se3.exp(size * rng.normal(size=6)) @ T
+    result = refine_pose(start, matches, rng.random(12) < 0.6, CAMERA, SETTINGS)
+    if isinstance(result, Failure):
+        assert result.reason
+        return
+    assert np.isfinite(result.T_target_source).all()
+    assert np.isfinite(result.covariance).all()
+    assert np.linalg.eigvalsh(result.covariance)[0] > 0
+    R = result.T_target_source[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+def test_an_unrefined_pose_keeps_its_place_and_gets_the_covariance_of_its_residuals() -> None:
+    T, matches = measure(np.random.default_rng(8), 100)
+    inliers = np.arange(100) % 2 == 0
+    result = fit_covariance(T, matches, inliers, CAMERA, SETTINGS)
+    assert isinstance(result, Refinement)
+    assert result.T_target_source is T
+    np.testing.assert_array_equal(result.inliers, inliers)
+    refined = refine(T, matches.select(inliers), np.ones(50, dtype=np.bool_))
+    ratios = np.diag(result.covariance) / np.diag(refined.covariance)
+    assert np.all((ratios > 0.5) & (ratios < 2.0))

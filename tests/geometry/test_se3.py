@@ -1,0 +1,154 @@
+"""Rigid transforms against scipy, GTSAM and matrix exponentials."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
+from gvo.types import FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+# From exactly zero over the change of formulas to just below half a turn.
+angles = st.one_of(
+    st.just(0.0),
+    st.floats(min_value=-14.0, max_value=0.3).map(lambda exponent: 10.0**exponent),
+    st.floats(min_value=1e-9, max_value=1e-2).map(lambda rest: np.pi - rest),
+)
+
+
+def random_direction(rng: np.random.Generator) -> FloatArray:
+    direction = rng.normal(size=3)
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def twist(angle: float, seed: int, *, length: float = 3.0) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([angle * random_direction(rng), length * rng.normal(size=3)])
+
+
+def generator(xi: FloatArray) -> FloatArray:
+    """Return the 4x4 matrix of the Lie algebra, written down element by element."""
+    rx, ry, rz, tx, ty, tz = xi
+    return np.array([[0, -rz, ry, tx], [rz, 0, -rx, ty], [-ry, rx, 0, tz], [0, 0, 0, 0]])
+
+
+@settings(deadline=None)
+@given(angle=angles, seed=seeds)
+def test_exp_is_the_matrix_exponential(angle: float, seed: int) -> None:
+    xi = twist(angle, seed)
+    np.testing.assert_allclose(se3.exp(xi), expm(generator(xi)), rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(angle=angles, seed=seeds)
+def test_log_undoes_exp_from_zero_to_half_a_turn(angle: float, seed: int) -> None:
+    xi = twist(angle, seed)
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_exp_undoes_log_at_half_a_turn(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = Rotation.from_rotvec(np.pi * random_direction(rng)).as_matrix()
+    T = se3.make_transform(R, rng.normal(size=3))
+    xi = se3.log(T)
+    assert np.linalg.norm(xi[:3]) == pytest.approx(np.pi)
+    np.testing.assert_allclose(se3.exp(xi), T, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(angle=st.floats(min_value=0.0, max_value=3.0), seed=seeds)
+def test_order_and_side_of_twists_are_those_of_gtsam(angle: float, seed: int) -> None:
+    xi = twist(angle, seed)
+    theirs = gtsam.Pose3.Expmap(xi)
+    np.testing.assert_allclose(se3.exp(xi), theirs.matrix(), atol=1e-12)
+    np.testing.assert_allclose(se3.log(theirs.matrix()), gtsam.Pose3.Logmap(theirs), atol=1e-9)
+    np.testing.assert_allclose(se3.adjoint(theirs.matrix()), theirs.AdjointMap(), atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_the_adjoint_moves_a_perturbation_to_the_other_side(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, xi = se3.exp(rng.normal(size=6)), rng.normal(size=6)
+    np.testing.assert_allclose(
+        T @ se3.exp(xi), se3.exp(se3.adjoint(T) @ xi) @ T, rtol=1e-9, atol=1e-9
+    )
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_batches_equal_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xi = rng.normal(size=(2, 3, 6))
+    T = se3.exp(xi)
+    points = rng.normal(size=(2, 3, 5, 3))
+    assert T.shape == (2, 3, 4, 4)
+    for index in np.ndindex(2, 3):
+        np.testing.assert_allclose(T[index], se3.exp(xi[index]), atol=1e-15)
+        np.testing.assert_allclose(se3.log(T)[index], se3.log(T[index]), atol=1e-14)
+        np.testing.assert_allclose(se3.invert(T)[index], np.linalg.inv(T[index]), atol=1e-12)
+        np.testing.assert_allclose(se3.adjoint(T)[index], se3.adjoint(T[index]), atol=1e-15)
+        np.testing.assert_allclose(se3.rotation_angle(T)[index], se3.rotation_angle(T[index]))
+        homogeneous = np.column_stack([points[index], np.ones(5)]) @ T[index].T
+        np.testing.assert_allclose(
+            se3.transform_points(T, points)[index], homogeneous[:, :3], atol=1e-12
+        )
+
+
+def test_skew_is_the_cross_product() -> None:
+    rng = np.random.default_rng(0)
+    v, w = rng.normal(size=(2, 7, 3))
+    np.testing.assert_allclose((se3.skew(v) @ w[..., None])[..., 0], np.cross(v, w), atol=1e-14)
+
+
+@settings(deadline=None)
+@given(angle=angles, seed=seeds)
+def test_the_rotation_angle_is_the_length_of_the_rotation_vector(angle: float, seed: int) -> None:
+    T = se3.exp(twist(angle, seed))
+    assert float(se3.rotation_angle(T)) == pytest.approx(angle, abs=2e-8)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_normalizing_gives_the_nearest_rotation_and_keeps_the_translation(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = se3.exp(rng.normal(size=6))
+    spoilt = T.copy()
+    spoilt[:3, :3] += 0.1 * rng.normal(size=(3, 3))
+    normal = se3.normalize(spoilt)
+    # scipy solves the same problem (orthogonal Procrustes) by another way.
+    nearest = Rotation.align_vectors(spoilt[:3, :3].T, np.eye(3))[0].as_matrix()
+    np.testing.assert_allclose(normal[:3, :3], nearest, atol=1e-7)
+    np.testing.assert_allclose(normal[:3, :3] @ normal[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(normal[:, 3], T[:, 3])
+
+
+def test_a_reflection_is_normalized_to_a_rotation() -> None:
+    assert np.linalg.det(se3.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) == pytest.approx(1.0)
+    batch = se3.nearest_rotation(np.stack([np.diag([2.0, 3.0, -1.0]), np.eye(3)]))
+    np.testing.assert_allclose(batch, np.stack([np.eye(3), np.eye(3)]), atol=1e-12)
+
+
+def random_covariance(rng: np.random.Generator, sigma: float) -> FloatArray:
+    factor = sigma * rng.normal(size=(6, 6))
+    return np.asarray(factor @ factor.T)
+
+
+def test_composed_covariance_is_that_of_sampled_compositions() -> None:
+    rng = np.random.default_rng(5)
+    T_a_b, T_b_c = se3.exp(rng.normal(size=(2, 6)))
+    C_a_b, C_b_c = random_covariance(rng, 1e-3), random_covariance(rng, 1e-3)
+    n = 40_000
+    noisy_a_b = T_a_b @ se3.exp(rng.multivariate_normal(np.zeros(6), C_a_b, n))
+    noisy_b_c = T_b_c @ se3.exp(rng.multivariate_normal(np.zeros(6), C_b_c, n))
+    errors = se3.log(np.linalg.inv(T_a_b @ T_b_c) @ noisy_a_b @ noisy_b_c)
+    composed = se3.compose_covariance(C_a_b, T_b_c, C_b_c)
+    scale = np.sqrt(np.diag(composed))
+    deviation = (np.cov(errors.T) - composed) / np.outer(scale, scale)
+    assert np.abs(deviation).max() < 0.05

@@ -1,0 +1,161 @@
+"""The closed-form rigid fit against scipy and against what a least-squares fit must obey."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry.umeyama import fit_rigid, fit_rigid_batch
+from gvo.types import Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+
+
+def random_transform(rng: np.random.Generator) -> FloatArray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    T[:3, 3] = 10.0 * rng.normal(size=3)
+    return T
+
+
+def move(T: FloatArray, points: FloatArray) -> FloatArray:
+    return np.asarray((T[:3, :3] @ points.T).T + T[:3, 3])
+
+
+def fit(source: FloatArray, target: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    T = fit_rigid(source, target, weights=weights)
+    assert not isinstance(T, Failure), T
+    return T
+
+
+@settings(deadline=None)
+@given(seed=seeds, n=st.integers(min_value=4, max_value=30))
+def test_a_known_transform_is_recovered(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, source = random_transform(rng), rng.normal(size=(n, 3))
+    np.testing.assert_allclose(fit(source, move(T, source)), T, atol=1e-8)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_the_fit_to_noisy_points_is_that_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source, weights = rng.normal(size=(12, 3)), rng.uniform(0.1, 3.0, size=12)
+    target = move(random_transform(rng), source) + 0.05 * rng.normal(size=(12, 3))
+    T = fit(source, target, weights)
+    source_mean = np.average(source, axis=0, weights=weights)
+    target_mean = np.average(target, axis=0, weights=weights)
+    theirs = Rotation.align_vectors(target - target_mean, source - source_mean, weights=weights)[0]
+    np.testing.assert_allclose(T[:3, :3], theirs.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(T[:3, 3], target_mean - theirs.apply(source_mean), atol=1e-6)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_batch_equals_its_fits_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(2, 3, 6, 3))
+    target = source + 0.1 * rng.normal(size=source.shape)
+    weights = rng.uniform(0.0, 1.0, size=(2, 3, 6))
+    source[1, 2] = source[1, 2, :1]  # one of them has no answer
+    for w in (weights, None):
+        T, is_valid = fit_rigid_batch(source, target, weights=w)
+        assert is_valid.tolist() == [[True, True, True], [True, True, False]]
+        for index in np.argwhere(is_valid):
+            i, j = index
+            one = fit(source[i, j], target[i, j], None if w is None else w[i, j])
+            np.testing.assert_allclose(T[i, j], one, atol=1e-9)
+        np.testing.assert_array_equal(T[1, 2, :3, :3], np.eye(3))
+
+
+@settings(deadline=None)
+@given(seed=seeds, repeats=st.lists(st.integers(0, 4), min_size=8, max_size=8))
+def test_integer_weights_equal_repeated_points(seed: int, repeats: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    counts = np.maximum(repeats, [1, 1, 1, 1, 0, 0, 0, 0])
+    source = rng.normal(size=(8, 3))
+    target = move(random_transform(rng), source) + 0.1 * rng.normal(size=(8, 3))
+    weighted = fit(source, target, counts.astype(float))
+    repeated = fit(np.repeat(source, counts, axis=0), np.repeat(target, counts, axis=0))
+    np.testing.assert_allclose(weighted, repeated, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_points_of_a_plane_are_enough(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    flat = np.column_stack([rng.normal(size=(9, 2)), np.zeros(9)])
+    source = move(random_transform(rng), flat)
+    T = random_transform(rng)
+    np.testing.assert_allclose(fit(source, move(T, source)), T, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(seed=seeds, n=st.integers(min_value=3, max_value=10))
+def test_points_on_a_line_are_refused(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=3)
+    source = rng.normal(size=3) + rng.normal(size=(n, 1)) * direction
+    result = fit_rigid(source, move(random_transform(rng), source))
+    assert isinstance(result, Failure)
+    assert not result
+    assert "line" in result.reason
+    assert result.n_matches == n
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_three_points_are_refused(n: int) -> None:
+    points = np.random.default_rng(0).normal(size=(n, 3))
+    result = fit_rigid(points, points)
+    assert isinstance(result, Failure)
+    assert result.n_matches == n
+    T, is_valid = fit_rigid_batch(points[np.newaxis], points[np.newaxis])
+    assert T.shape == (1, 4, 4)
+    assert not is_valid.any()
+
+
+def test_weights_that_leave_two_points_are_refused() -> None:
+    points = np.random.default_rng(1).normal(size=(5, 3))
+    assert not isinstance(fit_rigid(points, points, weights=np.array([1.0, 1, 1, 0, 0])), Failure)
+    for left in ([1.0, 1, 0, 0, 0], [1.0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0]):
+        assert isinstance(fit_rigid(points, points, weights=np.array(left)), Failure)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_mirrored_target_gets_a_rotation(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(10, 3))
+    mirrored = source * [1.0, 1.0, -1.0]
+    T = fit(source, mirrored)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    # The best of the rotations: no small turn does better.
+    cost = np.sum((move(T, source) - mirrored) ** 2)
+    for turn in Rotation.from_rotvec(1e-3 * rng.normal(size=(20, 3))):
+        turned = T[:3, :3] @ turn.as_matrix()
+        moved = source @ turned.T + mirrored.mean(axis=0) - turned @ source.mean(axis=0)
+        assert np.sum((moved - mirrored) ** 2) >= cost - 1e-9
+
+
+def test_unknown_points_are_refused_and_leave_the_others_alone() -> None:
+    rng = np.random.default_rng(2)
+    source = rng.normal(size=(3, 5, 3))
+    target = source + 1.0
+    target[1, 2, 0] = np.nan
+    T, is_valid = fit_rigid_batch(source, target)
+    assert is_valid.tolist() == [True, False, True]
+    np.testing.assert_allclose(T[[0, 2], :3, 3], 1.0)
+
+
+@pytest.mark.parametrize("shapes", [((4, 3), (5, 3)), ((4, 2), (4, 2))])
+def test_arrays_that_do_not_correspond_are_misuse(shapes: tuple[tuple[int, ...], ...]) -> None:
+    with pytest.raises(ValueError, match="n, 3"):
+        fit_rigid_batch(np.zeros(shapes[0]), np.zeros(shapes[1]))
+
+
+def test_negative_weights_are_misuse() -> None:
+    points = np.eye(3)
+    with pytest.raises(ValueError, match="negative"):
+        fit_rigid(points, points, weights=np.array([1.0, -1.0, 1.0]))

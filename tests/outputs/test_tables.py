@@ -1,0 +1,91 @@
+"""Tables of evaluations."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from gvo.evaluation import Evaluation
+from gvo.outputs.tables import evaluations_json, format_evaluations
+
+FULL = Evaluation(
+    name="smoothed",
+    stamps_ns=np.arange(2),
+    errors_m=np.array([3.0, 4.0]),
+    rpe_m=0.0123456,
+    rpe_deg=0.25,
+    t_pct=0.7004,
+    r_deg_per_100m=0.2533,
+    n_segments=7,
+    segments_m=(100.0, 200.0, 800.0),
+    coverage=0.985,
+    path_ratio=1.01,
+)
+BARE = Evaluation(
+    name="a name that is longer than its header",
+    stamps_ns=np.arange(1),
+    errors_m=np.array([1234.5]),
+    rpe_m=None,
+    rpe_deg=None,
+    t_pct=None,
+    r_deg_per_100m=None,
+    n_segments=0,
+    segments_m=(20.0, 50.0),
+    coverage=1.0,
+    path_ratio=None,
+)
+
+
+def test_all_lines_of_the_table_are_equally_long_and_columns_end_together() -> None:
+    lines = format_evaluations([FULL, BARE]).splitlines()
+    assert len({len(line) for line in lines}) == 1
+    header, _, full, bare = lines
+    ends = [header.index(unit) + len(unit) for unit in ("[%]", "ATE RMSE [m]", "RPE [deg]")]
+    for row, values in [(full, ("98.5", "3.5355", "0.2500")), (bare, ("100.0", "1234.5000", "-"))]:
+        for end, value in zip(ends, values, strict=True):
+            assert row[:end].endswith(f" {value}")
+
+
+def test_units_stand_in_the_header_and_values_in_the_rows() -> None:
+    header, _, full, bare = format_evaluations([FULL, BARE]).splitlines()
+    for unit in ("[m]", "[deg]", "[%]", "[deg/100 m]"):
+        assert unit in header
+    values = "smoothed 2 98.5 3.5355 4.0000 0.0123 0.2500 100..800 0.700 0.253 1.010"
+    assert " ".join(full.split()) == values
+    bare_values = "1 100.0 1234.5000 1234.5000 - - - - - -"
+    assert " ".join(bare.removeprefix(BARE.name).split()) == bare_values
+
+
+def test_one_length_of_segments_is_written_once() -> None:
+    single = replace(FULL, segments_m=(30.0,))
+    assert " 30 " in format_evaluations([single]).splitlines()[2]
+
+
+def test_a_table_without_evaluations_is_its_header() -> None:
+    assert len(format_evaluations([]).splitlines()) == 2
+
+
+def test_the_json_holds_exactly_the_agreed_keys() -> None:
+    content = evaluations_json([FULL, BARE])
+    assert json.loads(json.dumps(content, allow_nan=False)) == {
+        "estimates": [
+            {
+                "name": "smoothed",
+                "n": 2,
+                "ate_m": 12.5**0.5,
+                "rpe_m": 0.0123456,
+                "rpe_deg": 0.25,
+                "t_pct": 0.7004,
+                "r_deg_per_100m": 0.2533,
+            },
+            {
+                "name": BARE.name,
+                "n": 1,
+                "ate_m": 1234.5,
+                "rpe_m": None,
+                "rpe_deg": None,
+                "t_pct": None,
+                "r_deg_per_100m": None,
+            },
+        ]
+    }

@@ -1,0 +1,163 @@
+"""Pairing by stamp."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from gvo.sources.recording import StampedImage
+from gvo.sources.sync import MAX_PENDING, pair_images
+from gvo.types import FaultyFrame
+
+_LIMIT = 20
+_stamps = st.lists(st.integers(0, 400), max_size=30)
+
+
+def _image(stream: int, stamp_ns: int) -> StampedImage:
+    return StampedImage(stream=stream, stamp_ns=stamp_ns, load=lambda: np.zeros((1, 1)))
+
+
+def _interleave(
+    first: list[int], second: list[int], order: Iterable[bool]
+) -> Iterator[StampedImage]:
+    waiting = [list(reversed(first)), list(reversed(second))]
+    for is_second in order:
+        if waiting[is_second]:
+            yield _image(int(is_second), waiting[is_second].pop())
+    for stream in (0, 1):
+        while waiting[stream]:
+            yield _image(stream, waiting[stream].pop())
+
+
+def _pair(
+    first: list[int], second: list[int], order: Iterable[bool] = (), limit_ns: int = _LIMIT
+) -> list[tuple[int, int] | str]:
+    """Return stamps of pairs, or what is wrong with an image of stream 0."""
+    found: list[tuple[int, int] | str] = []
+    images = _interleave(first, second, order)
+    for item in pair_images(images, limit_ns=limit_ns, partner="depth"):
+        if isinstance(item, FaultyFrame):
+            found.append(f"{item.stamp_ns}: {item.reason}")
+        else:
+            found.append((item[0].stamp_ns, item[1].stamp_ns))
+    return found
+
+
+def _increasing(stamps: list[int]) -> list[int]:
+    kept: list[int] = []
+    for stamp in stamps:
+        if not kept or stamp > kept[-1]:
+            kept.append(stamp)
+    return kept
+
+
+def _expected(first: list[int], second: list[int]) -> list[tuple[int, int]]:
+    """Apply the rule to complete, increasing lists of stamps."""
+    pairs, free = [], list(second)
+    for n, stamp in enumerate(first):
+        near = [other for other in free if abs(other - stamp) <= _LIMIT]
+        if not near:
+            continue
+        taken = min(near, key=lambda other: (abs(other - stamp), other))
+        earlier = [other for other in near if other < taken]
+        if earlier and n + 1 < len(first):
+            for_next = [o for o in free if o >= taken and abs(o - first[n + 1]) <= _LIMIT]
+            if for_next == [taken]:
+                taken = earlier[-1]
+        pairs.append((stamp, taken))
+        free = [other for other in free if other > taken]
+    return pairs
+
+
+@given(first=_stamps, second=_stamps, order=st.lists(st.booleans(), max_size=60))
+def test_the_interleaving_of_the_streams_does_not_matter(
+    first: list[int], second: list[int], order: list[bool]
+) -> None:
+    assert _pair(first, second, order) == _pair(first, second)
+
+
+@given(first=_stamps, second=_stamps, order=st.lists(st.booleans(), max_size=60))
+def test_pairs_are_those_of_the_rule(
+    first: list[int], second: list[int], order: list[bool]
+) -> None:
+    pairs = [item for item in _pair(first, second, order) if isinstance(item, tuple)]
+    assert pairs == _expected(_increasing(first), _increasing(second))
+
+
+@given(first=_stamps, second=_stamps)
+def test_every_image_of_the_first_stream_is_answered_once_and_in_order(
+    first: list[int], second: list[int]
+) -> None:
+    answers = [
+        item[0] if isinstance(item, tuple) else int(item.partition(":")[0])
+        for item in _pair(first, second)
+    ]
+    assert answers == first
+
+
+@given(stamps=st.lists(st.integers(0, 10**18), unique=True, max_size=20).map(sorted))
+def test_equal_stamps_pair_without_a_tolerance(stamps: list[int]) -> None:
+    assert _pair(stamps, stamps, limit_ns=0) == [(stamp, stamp) for stamp in stamps]
+
+
+def test_the_nearest_depth_is_taken_and_the_earlier_of_two_equally_near_ones() -> None:
+    assert _pair([100, 200], [92, 110, 190, 210]) == [(100, 92), (200, 190)]
+
+
+def test_a_partner_is_left_to_the_next_image_that_has_no_other() -> None:
+    # 112 is the nearest of both; 85 is good enough for the first image
+    assert _pair([100, 130], [85, 112]) == [(100, 85), (130, 112)]
+    assert _pair([100, 130], [85, 112, 131]) == [(100, 112), (130, 131)]
+
+
+def test_an_image_without_a_partner_says_how_far_the_nearest_is() -> None:
+    ms = 1_000_000
+    (answer,) = _pair([100 * ms], [50 * ms, 133 * ms], limit_ns=20 * ms)
+    assert answer == f"{100 * ms}: no depth image within 20 ms: the nearest is 33 ms away"
+    taken = _pair([0, 5 * ms], [4 * ms], limit_ns=20 * ms)[1]
+    assert isinstance(taken, str)
+    assert taken.endswith("1 ms away and belongs to another image")
+
+
+@pytest.mark.parametrize(("late", "word"), [(200, "repeats"), (150, "goes back from 200 to 150")])
+def test_a_stamp_that_repeats_or_goes_back_makes_the_late_image_faulty(
+    late: int, word: str
+) -> None:
+    pairs = _pair([100, 200, late, 300], [100, 200, late, 300], limit_ns=0)
+    assert pairs[:2] == [(100, 100), (200, 200)]
+    assert word in str(pairs[2])
+    assert pairs[3] == (300, 300)
+
+
+def test_one_stream_may_run_ahead_as_far_as_the_buffer_reaches() -> None:
+    stamps = list(range(MAX_PENDING))
+    assert _pair(stamps, stamps, [False] * MAX_PENDING, limit_ns=0) == [(s, s) for s in stamps]
+
+
+@pytest.mark.parametrize("stream", [0, 1])
+def test_few_images_are_kept_where_the_other_stream_ends(stream: int) -> None:
+    alive = 0
+
+    class Counted:
+        def __init__(self) -> None:
+            nonlocal alive
+            alive += 1
+
+        def __del__(self) -> None:
+            nonlocal alive
+            alive -= 1
+
+        def __call__(self) -> NDArray[np.uint8]:
+            return np.zeros((1, 1), np.uint8)
+
+    def images() -> Iterator[StampedImage]:
+        for stamp_ns in range(10 * MAX_PENDING):
+            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=Counted())
+            assert alive <= MAX_PENDING + 3
+
+    results = list(pair_images(images(), limit_ns=0, partner="right"))
+    assert len(results) == (10 * MAX_PENDING if stream == 0 else 0)
+    assert all(isinstance(result, FaultyFrame) for result in results)

@@ -1,0 +1,229 @@
+"""The configuration: reading, refusing, describing."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from gvo.config import Config, describe_configuration, load_configuration
+from gvo.errors import ConfigurationError
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "settings.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(path: Path | None = None, settings: tuple[str, ...] = ()) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(path, settings)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_nothing_given_is_the_default() -> None:
+    assert load_configuration() == Config()
+
+
+@pytest.mark.parametrize("text", ["", "# only a comment\n", "window: {}\n"])
+def test_a_file_that_sets_nothing_is_the_default(tmp_path: Path, text: str) -> None:
+    assert load_configuration(write(tmp_path, text)) == Config()
+
+
+def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
+    path = write(tmp_path, "window:\n  n_recent: 7\ndepth:\n  scale: 2000\n")
+    config = load_configuration(path)
+    assert config.window.n_recent == 7
+    assert config.depth.scale == 2000.0
+    assert config.window.n_keyframes == Config().window.n_keyframes
+
+
+def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:
+    path = write(tmp_path, "window:\n  n_recent: 7\n  n_links: 4\n")
+    config = load_configuration(path, ["window.n_recent=8", " window.n_recent = 9 "])
+    assert (config.window.n_recent, config.window.n_links) == (9, 4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("depth.scale=null", None),
+        ("depth.scale=1e3", 1000.0),
+        ("depth.scale=5000", 5000.0),
+    ],
+)
+def test_values_of_settings_are_yaml(setting: str, value: float | None) -> None:
+    assert load_configuration(settings=["depth.scale=7", setting]).depth.scale == value
+
+
+@pytest.mark.parametrize(
+    ("setting", "nearest"),
+    [
+        ("window.n_recnt=5", "window.n_recent"),
+        ("ransac.n_hypothesis=5", "ransac.n_hypotheses"),
+        ("features.n_feature=500", "features.n_features"),
+        ("stereo.sigma=1", "stereo.sigma_px"),
+    ],
+)
+def test_an_unknown_key_names_the_nearest(setting: str, nearest: str) -> None:
+    message = refusal(settings=(setting,))
+    assert setting.partition("=")[0] in message
+    assert f"did you mean {nearest}?" in message
+
+
+@pytest.mark.parametrize(
+    ("section", "nearest"), [("windw", "window"), ("feature", "features"), ("ransak", "ransac")]
+)
+def test_an_unknown_section_names_the_nearest(tmp_path: Path, section: str, nearest: str) -> None:
+    for message in (
+        refusal(write(tmp_path, f"{section}:\n  n_links: 3\n")),
+        refusal(settings=(f"{section}.n_links=3",)),
+    ):
+        assert section in message
+        assert f"did you mean {nearest}?" in message
+
+
+@pytest.mark.parametrize(
+    ("setting", "key"),
+    [
+        ("window.n_recent=1", "window.n_recent"),
+        ("window.min_overlap=1.5", "window.min_overlap"),
+        ("stereo.max_distance=0", "stereo.max_distance"),
+        ("depth.scale=-5", "depth.scale"),
+        ("depth.scale=.nan", "depth.scale"),
+        ("depth.scale=nan", "depth.scale"),
+        ("stereo.max_depth_m=.inf", "stereo.max_depth_m"),
+        ("ransac.seed=-1", "ransac.seed"),
+        ("ransac.seed=1.5", "ransac.seed"),
+        ("features.kind=akaze", "features.kind"),
+        ("window.n_recent=five", "window.n_recent"),
+        ("window.n_recent=[5]", "window.n_recent"),
+        ("window.n_recent=", "window.n_recent"),
+    ],
+)
+def test_values_out_of_range_are_refused_by_name(setting: str, key: str) -> None:
+    message = refusal(settings=(setting,))
+    assert message.startswith(f"{key}=")
+
+
+def test_a_choice_names_its_alternatives() -> None:
+    message = refusal(settings=("window.kernel=cauchy",))
+    assert "huber" in message
+    assert "none" in message
+
+
+@pytest.mark.parametrize("section", ["depth", "stereo"])
+def test_nearest_depth_must_lie_below_the_farthest(section: str) -> None:
+    message = refusal(settings=(f"{section}.min_depth_m=5", f"{section}.max_depth_m=5"))
+    assert f"{section}.min_depth_m=5.0" in message
+    assert f"{section}.max_depth_m=5.0" in message
+
+
+@pytest.mark.parametrize("setting", ["n_links=3", "window.n_links", "window", "", "=3"])
+def test_settings_of_another_form_are_refused_with_an_example(setting: str) -> None:
+    message = refusal(settings=(setting,))
+    assert "section.key=value" in message
+
+
+@pytest.mark.parametrize("value", ["[1", "{a", "2024-99-99", "'"])
+def test_settings_that_are_no_yaml_are_refused(value: str) -> None:
+    assert value in refusal(settings=(f"window.n_links={value}",))
+
+
+@pytest.mark.parametrize(
+    "text", ["window: [1\n", "a: b: c\n", "window:\n\tn_links: 3\n", "window: 2024-99-99\n"]
+)
+def test_a_file_that_is_no_yaml_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path, text)
+    assert str(path) in refusal(path)
+
+
+@pytest.mark.parametrize("text", ["- 1\n", "just text\n", "3\n", "window: 3\n", "window:\n"])
+def test_a_file_that_holds_no_sections_is_refused(tmp_path: Path, text: str) -> None:
+    assert "settings.yaml" in refusal(write(tmp_path, text))
+
+
+@pytest.mark.parametrize("text", ["1: {a: 2}\n", "windw: 3\n", "true: 1\n"])
+def test_strange_sections_are_refused_even_beside_settings(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path, text)
+    refusal(path)
+    refusal(path, ("windw.n_links=3",))
+
+
+def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
+    missing = tmp_path / "nowhere.yaml"
+    assert str(missing) in refusal(missing)
+    assert str(tmp_path) in refusal(tmp_path)
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00\x80")
+    assert str(binary) in refusal(binary)
+
+
+def all_keys() -> list[tuple[str, str]]:
+    return [
+        (section, key)
+        for section, values in Config().model_dump().items()
+        for key in values
+    ]
+
+
+def test_the_description_lists_every_key_with_a_meaning() -> None:
+    text = describe_configuration(Config())
+    for section, key in all_keys():
+        block = text.split(f"\n{section}:\n")[1] if f"\n{section}:\n" in text else text
+        line = next(line for line in block.splitlines() if line.startswith(f"  {key}: "))
+        assert len(line.partition("  # ")[2]) > 10, line
+    assert len(re.findall(r"^  \w+: ", text, re.MULTILINE)) == len(all_keys())
+    assert not re.search(r"\b(nan|inf|None)\b", text)
+
+
+def test_the_description_tells_unit_range_and_choices() -> None:
+    lines = {line.split(":")[0].strip(): line for line in describe_configuration(Config()).split("\n")}
+    assert "[1/m, > 0]" in lines["scale"]
+    assert "[px, >= 1, <= 20]" in lines["patch_radius_px"]
+    assert "huber | none" in lines["kernel"]
+
+
+changed = st.fixed_dictionaries(
+    {},
+    optional={
+        "depth": st.fixed_dictionaries({"scale": st.none() | st.floats(1e-9, 1e9)}),
+        "features": st.fixed_dictionaries(
+            {"kind": st.sampled_from(["orb", "sift", "fast", "gftt"]), "upright": st.booleans()}
+        ),
+        "stereo": st.fixed_dictionaries({"sigma_px": st.floats(1e-300, 1e300)}),
+        "window": st.fixed_dictionaries(
+            {
+                "n_recent": st.integers(2, 100),
+                "min_overlap": st.floats(0.0, 1.0),
+                "kernel": st.sampled_from(["huber", "none"]),
+            }
+        ),
+    },
+)
+
+
+@settings(deadline=None)
+@given(values=changed)
+def test_a_description_read_back_is_the_same_configuration(
+    values: dict[str, object], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    config = Config.model_validate(values)
+    path = write(tmp_path_factory.mktemp("described"), describe_configuration(config))
+    assert load_configuration(path) == config
+
+
+def test_the_description_is_plain_yaml() -> None:
+    assert yaml.safe_load(describe_configuration(Config())) == Config().model_dump()
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    config = Config()
+    with pytest.raises(ValidationError, match="frozen"):
+        config.window.n_recent = 4

@@ -1,0 +1,314 @@
+"""Errors of trajectories against the evo programs, KITTI's devkit and published figures."""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.errors import TrajectoryError
+from gvo.evaluation import Evaluation, evaluate, relative_errors, segment_errors
+from gvo.geometry import se3
+from gvo.trajectory import Trajectory
+from gvo.trajectory_alignment import AlignMode, Similarity
+from gvo.trajectory_files import read_trajectory, write_kitti, write_tum
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+
+
+def drive(n: int, step_m: float = 1.0, *, seed: int = 0) -> Trajectory:
+    """Return a winding drive along z at 10 Hz with steps of about equal length."""
+    twists = np.random.default_rng(seed).normal(size=(n, 6)) * [0.01, 0.05, 0.01, 0.02, 0.02, 0.1]
+    twists[:, 5] += step_m
+    poses = [np.eye(4)]
+    for step in se3.exp(twists[1:]):
+        poses.append(poses[-1] @ step)
+    return Trajectory(stamps_ns=10**18 + np.arange(n) * 100_000_000, T_world_cam=np.array(poses))
+
+
+def disturbed(trajectory: Trajectory, *, seed: int = 1, sigma: float = 0.005) -> Trajectory:
+    """Return the chain of the trajectory's steps, each with an error."""
+    T = trajectory.T_world_cam
+    twists = np.random.default_rng(seed).normal(size=(len(T), 6)) * sigma
+    poses = [T[0]]
+    for step, error in zip(se3.invert(T[:-1]) @ T[1:], se3.exp(twists[1:]), strict=True):
+        poses.append(poses[-1] @ step @ error)
+    return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_cam=np.array(poses))
+
+
+def straight(n: int, step_m: float) -> Trajectory:
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 2, 3] = np.arange(n) * step_m
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=poses)
+
+
+def measures(evaluation: Evaluation) -> list[float | None]:
+    return [
+        evaluation.ate_m,
+        evaluation.rpe_m,
+        evaluation.rpe_deg,
+        evaluation.t_pct,
+        evaluation.r_deg_per_100m,
+    ]
+
+
+def run_evo(folder: Path, *arguments: str | Path) -> float:
+    """Return the RMSE that an evo program computes, in full precision."""
+    program = Path(sys.executable).parent / str(arguments[0])
+    results = folder / "results.zip"
+    results.unlink(missing_ok=True)
+    subprocess.run(
+        [program, *arguments[1:], "--save_results", results],
+        check=True,
+        capture_output=True,
+        env={**os.environ, "HOME": str(folder)},
+    )
+    with zipfile.ZipFile(results) as archive:
+        return float(json.loads(archive.read("stats.json"))["rmse"])
+
+
+def without_ties(reference: Trajectory, estimate: Trajectory) -> Trajectory:
+    """Return the poses that are not midway between two others: evo decides those by rounding."""
+    after = np.clip(np.searchsorted(reference.stamps_ns, estimate.stamps_ns), 1, len(reference) - 1)
+    both = reference.stamps_ns[after] + reference.stamps_ns[after - 1]
+    return estimate.select(both != 2 * estimate.stamps_ns)
+
+
+def devkit_errors(
+    T_ref: np.ndarray, T_est: np.ndarray, lengths: list[float], step: int
+) -> tuple[float, float]:
+    """Return the mean errors by the loops of KITTI's evaluate_odometry.cpp."""
+    distances = [0.0]
+    for before, after in itertools.pairwise(T_ref):
+        distances.append(distances[-1] + float(np.linalg.norm(after[:3, 3] - before[:3, 3])))
+    t_errors, r_errors = [], []
+    for first in range(0, len(T_ref), step):
+        for length in lengths:
+            last = first
+            while last < len(T_ref) and distances[last] <= distances[first] + length:
+                last += 1
+            if last == len(T_ref):
+                continue
+            delta_ref = np.linalg.inv(T_ref[first]) @ T_ref[last]
+            delta_est = np.linalg.inv(T_est[first]) @ T_est[last]
+            error = np.linalg.inv(delta_est) @ delta_ref
+            cosine = np.clip(0.5 * (np.trace(error[:3, :3]) - 1.0), -1.0, 1.0)
+            r_errors.append(float(np.arccos(cosine)) / length)
+            t_errors.append(float(np.linalg.norm(error[:3, 3])) / length)
+    return 100.0 * float(np.mean(t_errors)), 100.0 * float(np.rad2deg(np.mean(r_errors)))
+
+
+@pytest.mark.parametrize(("n", "step_m"), [(200, 0.5), (700, 2.0)])
+def test_segment_errors_are_those_of_the_devkit(n: int, step_m: float) -> None:
+    reference = drive(n, step_m)
+    estimate = disturbed(reference)
+    is_long = n * step_m > 800
+    lengths = [100.0 * k for k in range(1, 9)] if is_long else [20.0, 50.0]
+    expected = devkit_errors(
+        reference.T_world_cam, estimate.T_world_cam, lengths, 10 if is_long else 1
+    )
+    evaluation = evaluate(reference, estimate, name="estimate")
+    assert (evaluation.t_pct, evaluation.r_deg_per_100m) == pytest.approx(expected, rel=1e-7)
+    assert evaluation.segments_m == tuple(lengths)
+
+
+def test_lengths_and_step_of_the_segments_can_be_given() -> None:
+    reference = drive(150)
+    estimate = disturbed(reference)
+    expected = devkit_errors(reference.T_world_cam, estimate.T_world_cam, [30.0], 7)
+    evaluation = evaluate(reference, estimate, name="e", segments=[30.0], segment_step=7)
+    assert (evaluation.t_pct, evaluation.r_deg_per_100m) == pytest.approx(expected, rel=1e-7)
+
+
+def test_a_segment_ends_at_the_first_pose_beyond_its_length() -> None:
+    # 20 m are reached by pose 20, passed by pose 21: 22 poses hold one segment, 21 none
+    lengths = {"lengths_m": [20.0], "step": 1}
+    for n, expected in [(21, 0), (22, 1), (24, 3)]:
+        shares, _ = segment_errors(straight(n, 1.0), straight(n, 1.0), **lengths)  # type: ignore[arg-type]
+        assert len(shares) == expected
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) -> None:
+    reference = drive(80, seed=seed)
+    T = se3.exp(np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 50, 50, 50])
+    evaluation = evaluate(reference, Similarity(T_a_b=T).apply(reference), name="same")
+    np.testing.assert_allclose(np.array(measures(evaluation), dtype=float), 0.0, atol=1e-5)
+    assert (evaluation.n, evaluation.coverage) == (80, 1.0)
+    assert evaluation.path_ratio == pytest.approx(1.0)
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_the_errors_do_not_depend_on_the_world_of_the_estimate(seed: int) -> None:
+    reference = drive(80)
+    estimate = disturbed(reference, seed=seed)
+    T = se3.exp(np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 50, 50, 50])
+    here = evaluate(reference, estimate, name="here")
+    there = evaluate(reference, Similarity(T_a_b=T).apply(estimate), name="there")
+    assert measures(there) == pytest.approx(measures(here), rel=1e-6)
+
+
+def test_a_wrong_scale_is_measured_and_taken_out_by_sim3() -> None:
+    reference = drive(300)
+    T = reference.T_world_cam.copy()
+    T[:, :3, 3] *= 1.02
+    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_cam=T)
+    rigid = evaluate(reference, estimate, name="scaled")
+    similar = evaluate(reference, estimate, name="scaled", align="sim3")
+    assert rigid.path_ratio == similar.path_ratio == pytest.approx(1.02)
+    assert rigid.ate_m > 0.1
+    assert measures(similar) == pytest.approx([0.0] * 5, abs=1e-5)
+
+
+def test_steps_that_are_too_long_give_their_share_on_a_straight_drive() -> None:
+    evaluation = evaluate(straight(101, 1.0), straight(101, 1.01), name="e", align="origin")
+    assert evaluation.rpe_m == pytest.approx(0.01)
+    assert evaluation.rpe_deg == pytest.approx(0.0, abs=1e-9)
+    # a segment of 20 m spans 21 steps, one of 50 m spans 51; 80 and 50 of them fit
+    assert evaluation.n_segments == 130
+    assert evaluation.t_pct == pytest.approx((80 * 21 / 20 + 50 * 51 / 50) / 130)
+    np.testing.assert_allclose(evaluation.errors_m, np.arange(101) * 0.01, atol=1e-12)
+    assert evaluation.ate_max_m == pytest.approx(1.0)
+    assert evaluation.ate_mean_m == pytest.approx(0.5)
+    assert evaluation.ate_median_m == pytest.approx(0.5)
+
+
+def test_a_pair_of_the_rpe_spans_delta_poses() -> None:
+    errors, turns = relative_errors(straight(10, 1.0), straight(10, 1.1), delta=4)
+    np.testing.assert_allclose(errors, [0.4] * 6, atol=1e-12)
+    np.testing.assert_array_equal(turns, [0.0] * 6)
+
+
+def test_what_cannot_be_measured_is_none() -> None:
+    one = straight(1, 1.0)
+    evaluation = evaluate(one, one, name="one")
+    assert measures(evaluation) == [0.0, None, None, None, None]
+    assert (evaluation.path_ratio, evaluation.coverage, evaluation.n_segments) == (None, 1.0, 0)
+    assert evaluate(straight(20, 1.0), straight(20, 1.0), name="short").t_pct is None
+
+
+def test_coverage_is_the_share_of_the_reference_that_the_estimate_reaches() -> None:
+    reference = drive(101)
+    half = reference.select(slice(25, 76, 2))
+    evaluation = evaluate(reference, half, name="half")
+    assert (evaluation.n, evaluation.coverage) == (26, 0.5)
+    np.testing.assert_array_equal(evaluation.stamps_ns, half.stamps_ns)
+
+
+def test_wrong_use_is_refused() -> None:
+    reference = drive(30)
+    with pytest.raises(ValueError, match="delta must be at least 1"):
+        evaluate(reference, reference, name="e", rpe_delta=0)
+    with pytest.raises(ValueError, match="step and lengths must be positive"):
+        evaluate(reference, reference, name="e", segment_step=0)
+    for length in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="step and lengths must be positive"):
+            evaluate(reference, reference, name="e", segments=[length])
+
+
+def test_an_estimate_of_another_recording_is_named() -> None:
+    other = Trajectory(stamps_ns=np.arange(3), T_world_cam=np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(TrajectoryError, match=r"^raw and the reference share no stamps"):
+        evaluate(drive(10), other, name="raw")
+
+
+@pytest.mark.parametrize(("align", "option"), [("se3", "-a"), ("sim3", "-as")])
+def test_ate_and_rpe_are_those_of_evo_on_tum_files(
+    tmp_path: Path, align: AlignMode, option: str
+) -> None:
+    reference = drive(200)
+    estimate = disturbed(reference).select(np.arange(5, 200, 3))
+    shifted = Trajectory(stamps_ns=estimate.stamps_ns + 3_000_000, T_world_cam=estimate.T_world_cam)
+    files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
+    write_tum(files[0], reference)
+    write_tum(files[1], shifted)
+    evaluation = evaluate(*map(read_trajectory, files), name="e", align=align)
+    rpe = ["-d", "1", "-u", "f", option]
+    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
+        [
+            run_evo(tmp_path, "evo_ape", "tum", *files, option),
+            run_evo(tmp_path, "evo_rpe", "tum", *files, *rpe),
+            run_evo(tmp_path, "evo_rpe", "tum", *files, *rpe, "-r", "angle_deg"),
+        ],
+        abs=1e-6,
+    )
+
+
+def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
+    reference = drive(150)
+    files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
+    write_kitti(files[0], reference)
+    write_kitti(files[1], disturbed(reference))
+    evaluation = evaluate(*map(read_trajectory, files), name="e", align="origin", rpe_delta=3)
+    rpe = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
+    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
+        [
+            run_evo(tmp_path, "evo_ape", "kitti", *files, "--align_origin"),
+            run_evo(tmp_path, "evo_rpe", "kitti", *files, *rpe),
+            run_evo(tmp_path, "evo_rpe", "kitti", *files, *rpe, "-r", "angle_deg"),
+        ],
+        abs=1e-6,
+    )
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    ("reference", "estimate", "kind"),
+    [
+        ("KITTI_00_gt", "KITTI_00_ORB", "kitti"),
+        ("fr2_desk_groundtruth", "fr2_desk_ORB", "tum"),
+    ],
+)
+def test_ate_and_rpe_of_published_trajectories_are_those_of_evo(
+    gvo_data: Path, tmp_path: Path, reference: str, estimate: str, kind: str
+) -> None:
+    files = [gvo_data / "trajectories" / f"{name}.txt" for name in (reference, estimate)]
+    if kind == "tum":
+        kept = without_ties(*map(read_trajectory, files))
+        files[1] = tmp_path / "estimate.txt"
+        write_tum(files[1], kept)
+    evaluation = evaluate(*map(read_trajectory, files), name=estimate)
+    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
+        [
+            run_evo(tmp_path, "evo_ape", kind, *files, "-a"),
+            run_evo(tmp_path, "evo_rpe", kind, *files),
+            run_evo(tmp_path, "evo_rpe", kind, *files, "-r", "angle_deg"),
+        ],
+        abs=1e-6,
+    )
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    ("reference", "estimate", "expected"),
+    [
+        ("KITTI_00_gt", "KITTI_00_ORB", (1.303, 0.700, 0.253)),
+        ("KITTI_00_gt", "KITTI_00_SPTAM", (3.74, 1.487, 0.558)),
+        ("fr2_desk_groundtruth", "fr2_desk_ORB", (0.0081, None, None)),
+    ],
+)
+def test_published_figures_are_met(
+    gvo_data: Path,
+    reference: str,
+    estimate: str,
+    expected: tuple[float, float | None, float | None],
+) -> None:
+    truth, result = (
+        read_trajectory(gvo_data / "trajectories" / f"{name}.txt") for name in (reference, estimate)
+    )
+    evaluation = evaluate(truth, result, name=estimate)
+    ate_m, t_pct, r_deg_per_100m = expected
+    assert evaluation.ate_m == pytest.approx(ate_m, rel=3e-3)
+    assert evaluation.t_pct == (None if t_pct is None else pytest.approx(t_pct, abs=5e-4))
+    assert evaluation.r_deg_per_100m == (
+        None if r_deg_per_100m is None else pytest.approx(r_deg_per_100m, abs=5e-4)
+    )

@@ -1,0 +1,169 @@
+"""The trajectory value: checks, frames, interpolation."""
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
+from gvo.trajectory import Trajectory, format_stamp
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+
+
+def random_trajectory(seed: int, n: int = 12, *, with_covariances: bool = False) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    factors = rng.normal(size=(n, 6, 6))
+    return Trajectory(
+        stamps_ns=1_305_031_101_000_000_000 + np.cumsum(rng.integers(1, 10**9, n)),
+        T_world_cam=se3.exp(rng.normal(size=(n, 6))),
+        covariances=factors @ factors.transpose(0, 2, 1) if with_covariances else None,
+    )
+
+
+def test_arrays_are_copies_that_nobody_can_write_to() -> None:
+    stamps, poses, covariances = np.arange(3), np.tile(np.eye(4), (3, 1, 1)), np.zeros((3, 6, 6))
+    trajectory = Trajectory(stamps_ns=stamps, T_world_cam=poses, covariances=covariances)
+    stamps[0], poses[0, 0, 3], covariances[0, 0, 0] = -1, 7.0, 7.0
+    assert trajectory.stamps_ns[0] == trajectory.positions[0, 0] == 0
+    assert trajectory.covariances is not None
+    assert trajectory.covariances[0, 0, 0] == 0
+    for array in (trajectory.stamps_ns, trajectory.T_world_cam, trajectory.covariances):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+def test_a_trajectory_may_be_empty() -> None:
+    empty = Trajectory(stamps_ns=np.array([], dtype=np.int64), T_world_cam=np.empty((0, 4, 4)))
+    assert len(empty) == len(empty.distances()) == len(empty.interpolate(np.array([1]))) == 0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "match"),
+    [
+        ([0, 2, 2], "after index 1"),
+        ([0, 3, 2], "after index 1"),
+        ([0.0, 1.0, 2.0], "integers"),
+        ([[0, 1, 2]], "shape"),
+        ([0, 1], "T_world_cam must have shape"),
+    ],
+)
+def test_wrong_stamps_are_refused(stamps: list[int], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        Trajectory(stamps_ns=np.array(stamps), T_world_cam=np.tile(np.eye(4), (3, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("position", "value", "match"),
+    [
+        ((1, 0, 3), np.nan, "finite"),
+        ((1, 0, 3), np.inf, "finite"),
+        ((1, 0, 0), -1.0, r"\[1\] is no rigid"),
+        ((1, 0, 0), 1.1, r"\[1\] is no rigid"),
+        ((1, 3, 3), 2.0, r"\[1\] is no rigid"),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused(
+    position: tuple[int, int, int], value: float, match: str
+) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[position] = value
+    with pytest.raises(ValueError, match=match):
+        Trajectory(stamps_ns=np.arange(3), T_world_cam=poses)
+
+
+def test_covariances_of_another_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="covariances must have shape"):
+        Trajectory(
+            stamps_ns=np.arange(1), T_world_cam=np.eye(4)[None], covariances=np.zeros((1, 3, 3))
+        )
+
+
+@given(st.integers(min_value=-(2**63) + 1, max_value=2**63 - 1))
+def test_a_stamp_is_written_without_loss(stamp_ns: int) -> None:
+    text = format_stamp(stamp_ns)
+    assert Decimal(text) * 10**9 == stamp_ns
+    assert len(text.partition(".")[2]) == 9
+
+
+def test_distances_add_up_the_steps() -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1:, :3, 3] = [[3.0, 4.0, 0.0], [3.0, 4.0, 2.0]]
+    trajectory = Trajectory(stamps_ns=np.arange(3), T_world_cam=poses)
+    assert trajectory.distances().tolist() == [0.0, 5.0, 7.0]
+
+
+@given(seeds)
+def test_changing_the_frame_back_and_forth_changes_nothing(seed: int) -> None:
+    trajectory = random_trajectory(seed, with_covariances=True)
+    T_cam_body = se3.exp(np.random.default_rng(seed + 1).normal(size=6))
+    back = trajectory.transformed(T_cam_body).transformed(se3.invert(T_cam_body))
+    assert trajectory.covariances is not None
+    assert back.covariances is not None
+    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-12)
+    np.testing.assert_allclose(back.covariances, trajectory.covariances, atol=1e-9, rtol=1e-7)
+
+
+def test_the_covariance_of_another_frame_is_that_of_moved_samples() -> None:
+    rng = np.random.default_rng(5)
+    covariance = np.diag([1.0, 4.0, 9.0, 2.0, 3.0, 5.0]) * 1e-6
+    T_world_cam, T_cam_body = se3.exp(rng.normal(size=(2, 6)))
+    samples = rng.multivariate_normal(np.zeros(6), covariance, size=40_000)
+    moved = T_world_cam @ se3.exp(samples) @ T_cam_body
+    twists = se3.log(se3.invert(T_world_cam @ T_cam_body) @ moved)
+    trajectory = Trajectory(
+        stamps_ns=np.array([0]), T_world_cam=T_world_cam[None], covariances=covariance[None]
+    ).transformed(T_cam_body)
+    assert trajectory.covariances is not None
+    np.testing.assert_allclose(trajectory.covariances[0], np.cov(twists.T), atol=6e-7)
+
+
+@given(seeds)
+def test_interpolating_at_the_stamps_returns_the_poses(seed: int) -> None:
+    trajectory = random_trajectory(seed)
+    same = trajectory.interpolate(trajectory.stamps_ns)
+    np.testing.assert_array_equal(same.stamps_ns, trajectory.stamps_ns)
+    np.testing.assert_allclose(same.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+
+
+@given(seeds, st.floats(min_value=0.0, max_value=1.0))
+def test_interpolation_follows_a_screw_about_a_fixed_axis(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    axis, velocity = rng.normal(size=3), rng.normal(size=3)
+    axis *= rng.uniform(0.0, 3.0) / np.linalg.norm(axis)
+    start = Rotation.random(rng=rng)
+    span = int(rng.integers(1, 10**10))
+
+    def pose(at: float) -> np.ndarray:
+        return se3.make_transform(
+            np.asarray((start * Rotation.from_rotvec(at * axis)).as_matrix()), at * velocity
+        )
+
+    trajectory = Trajectory(
+        stamps_ns=np.array([7, 7 + span]), T_world_cam=np.stack([pose(0.0), pose(1.0)])
+    )
+    wanted = round(share * span)
+    between = trajectory.interpolate(np.array([7 + wanted]))
+    np.testing.assert_allclose(between.T_world_cam[0], pose(wanted / span), atol=1e-9)
+
+
+def test_nothing_is_extrapolated() -> None:
+    trajectory = random_trajectory(0)
+    first, last = trajectory.stamps_ns[0], trajectory.stamps_ns[-1]
+    inside = trajectory.interpolate(np.array([first - 1, first, first + 1, last, last + 1]))
+    assert inside.stamps_ns.tolist() == [first, first + 1, last]
+    assert len(trajectory.interpolate(np.array([last + 1]))) == 0
+
+
+def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
+    trajectory = random_trajectory(1, with_covariances=True)
+    chosen = trajectory.select([2, 5])
+    assert trajectory.covariances is not None
+    assert chosen.covariances is not None
+    np.testing.assert_array_equal(chosen.stamps_ns, trajectory.stamps_ns[[2, 5]])
+    np.testing.assert_array_equal(chosen.T_world_cam, trajectory.T_world_cam[[2, 5]])
+    np.testing.assert_array_equal(chosen.covariances, trajectory.covariances[[2, 5]])
+    assert len(trajectory.select(trajectory.stamps_ns > trajectory.stamps_ns[8])) == 3

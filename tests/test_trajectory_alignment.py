@@ -1,0 +1,202 @@
+"""Association and alignment against brute force and known motions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.trajectory import StampsFrom, Trajectory
+from gvo.trajectory_alignment import AlignMode, Similarity, alignment, associate
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+stamp_lists = st.lists(st.integers(0, 200), min_size=1, max_size=30, unique=True).map(sorted)
+
+
+def still(stamps_ns: list[int], stamps_from: StampsFrom = "file") -> Trajectory:
+    return Trajectory(
+        stamps_ns=np.array(stamps_ns),
+        T_world_cam=np.tile(np.eye(4), (len(stamps_ns), 1, 1)),
+        stamps_from=stamps_from,
+    )
+
+
+def random_trajectory(seed: int, n: int = 12) -> Trajectory:
+    twists = np.random.default_rng(seed).normal(size=(n, 6))
+    return Trajectory(stamps_ns=np.arange(n), T_world_cam=se3.exp(twists))
+
+
+def random_similarity(seed: int) -> Similarity:
+    rng = np.random.default_rng(seed)
+    return Similarity(T_a_b=se3.exp(rng.normal(size=6)), scale=float(rng.uniform(0.2, 5.0)))
+
+
+@given(stamp_lists, stamp_lists, st.integers(0, 20))
+def test_each_pose_of_the_shorter_takes_the_nearest_that_no_nearer_one_takes(
+    reference: list[int], estimate: list[int], limit: int
+) -> None:
+    is_swapped = len(estimate) > len(reference)
+    longer, shorter = (estimate, reference) if is_swapped else (reference, estimate)
+    taken: dict[int, tuple[int, int]] = {}
+    for index, stamp in enumerate(shorter):
+        difference, nearest = min((abs(stamp - other), k) for k, other in enumerate(longer))
+        if difference <= limit:
+            taken[nearest] = min(taken.get(nearest, (limit + 1, 0)), (difference, index))
+    expected = [(nearest, index) for nearest, (_, index) in sorted(taken.items())]
+    if is_swapped:
+        expected = [(index, nearest) for nearest, index in expected]
+    if not expected:
+        with pytest.raises(TrajectoryError, match="share no stamps"):
+            associate(still(reference), still(estimate), max_difference_ns=limit)
+        return
+    rows, columns = associate(still(reference), still(estimate), max_difference_ns=limit)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
+
+
+def test_where_nothing_associates_both_ranges_are_named() -> None:
+    with pytest.raises(TrajectoryError) as caught:
+        associate(still([0, 10**9]), still([3 * 10**9, 4 * 10**9]), name="raw")
+    message = str(caught.value)
+    assert "raw 3.000000000 to 4.000000000 s, reference 0.000000000 to 1.000000000 s" in message
+    assert "within 10 ms" in message
+
+
+def test_an_empty_trajectory_is_named() -> None:
+    with pytest.raises(TrajectoryError, match="raw holds no poses"):
+        associate(still([0]), still([0]).select(slice(0, 0)), name="raw")
+    with pytest.raises(TrajectoryError, match="the reference holds no poses"):
+        associate(still([0]).select(slice(0, 0)), still([0]))
+
+
+@pytest.mark.parametrize(
+    ("origins", "n_reference", "n_estimate"),
+    [
+        (("rows", "rows"), 5, 5),
+        (("rows", "rows"), 5, 3),
+        (("rows", "rows"), 3, 5),
+        (("times", "rows"), 5, 5),
+        (("rows", "times"), 5, 5),
+    ],
+)
+def test_poses_without_stamps_are_associated_row_by_row(
+    origins: tuple[StampsFrom, StampsFrom], n_reference: int, n_estimate: int
+) -> None:
+    reference = still([7 * k for k in range(n_reference)], origins[0])
+    estimate = still([10**9 * k for k in range(n_estimate)], origins[1])
+    rows, columns = associate(reference, estimate)
+    assert rows.tolist() == columns.tolist() == list(range(min(n_reference, n_estimate)))
+
+
+def test_an_equal_number_of_poses_does_not_make_up_for_missing_stamps() -> None:
+    with pytest.raises(TrajectoryError, match="without stamps"):
+        associate(still([0, 1], "file"), still([0, 1], "rows"))
+
+
+@pytest.mark.parametrize(
+    ("origins", "match"),
+    [
+        (("file", "rows"), "^raw holds rows of poses without stamps.*with the reference"),
+        (("rows", "file"), "^the reference holds rows of poses without stamps.*with raw"),
+        (("times", "rows"), "^raw holds rows"),
+    ],
+)
+def test_poses_without_stamps_cannot_meet_stamped_ones(
+    origins: tuple[StampsFrom, StampsFrom], match: str
+) -> None:
+    with pytest.raises(TrajectoryError, match=match) as caught:
+        associate(still([0, 1, 2], origins[0]), still([0, 1], origins[1]), name="raw")
+    assert "times.txt" in str(caught.value)
+
+
+@given(seeds)
+def test_a_known_motion_is_found_again(seed: int) -> None:
+    estimate, truth = random_trajectory(seed), random_similarity(seed + 1)
+    found = alignment(truth.apply(estimate), estimate, "sim3")
+    np.testing.assert_allclose(found.T_a_b, truth.T_a_b, atol=1e-7)
+    assert found.scale == pytest.approx(truth.scale, rel=1e-7)
+    rigid = Similarity(T_a_b=truth.T_a_b)
+    np.testing.assert_allclose(
+        alignment(rigid.apply(estimate), estimate, "se3").T_a_b, truth.T_a_b, atol=1e-7
+    )
+
+
+@given(seeds)
+def test_the_first_pose_lies_on_the_first_after_alignment_of_the_origin(seed: int) -> None:
+    reference, estimate = random_trajectory(seed), random_trajectory(seed + 1)
+    aligned = alignment(reference, estimate, "origin").apply(estimate)
+    np.testing.assert_allclose(aligned.T_world_cam[0], reference.T_world_cam[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("mode", "is_scaled"), [("se3", False), ("sim3", True)])
+@pytest.mark.parametrize("seed", range(2))
+def test_an_optimiser_finds_no_better_alignment(
+    seed: int, mode: AlignMode, is_scaled: bool
+) -> None:
+    reference, estimate = random_trajectory(seed), random_trajectory(seed + 100)
+    aligned = alignment(reference, estimate, mode).apply(estimate)
+    cost = np.sum((aligned.positions - reference.positions) ** 2)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        R = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix())
+        scale = np.exp(x[6]) if is_scaled else 1.0
+        return np.ravel(scale * estimate.positions @ R.T + x[3:6] - reference.positions)
+
+    starts = np.random.default_rng(seed).normal(size=(8, 7)) * [2, 2, 2, 1, 1, 1, 0.3]
+    best = min(2.0 * least_squares(residuals, start).cost for start in starts)
+    assert cost == pytest.approx(best, rel=1e-6)
+
+
+def test_mirrored_points_are_aligned_by_a_rotation() -> None:
+    reference = random_trajectory(3)
+    mirrored = reference.T_world_cam.copy()
+    mirrored[:, 0, 3] *= -1.0
+    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_cam=mirrored)
+    for mode in ("se3", "sim3"):
+        found = alignment(reference, estimate, mode)
+        assert np.linalg.det(found.T_a_b[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_poses_on_a_line_are_aligned_as_well(n: int) -> None:
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, 3] = np.arange(n)[:, np.newaxis] * [1.0, 2.0, 0.5]
+    line = Trajectory(stamps_ns=np.arange(n), T_world_cam=poses)
+    moved = random_similarity(4)
+    reference = Similarity(T_a_b=moved.T_a_b).apply(line)
+    aligned = alignment(reference, line, "se3").apply(line)
+    np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-9)
+
+
+def test_a_scale_needs_motion() -> None:
+    with pytest.raises(TrajectoryError, match="no scale"):
+        alignment(random_trajectory(0, 3), still([0, 1, 2]), "sim3")
+    with pytest.raises(TrajectoryError, match="no scale"):
+        alignment(still([0, 1, 2]), random_trajectory(0, 3), "sim3")
+
+
+def test_wrong_use_of_alignment_is_refused() -> None:
+    with pytest.raises(ValueError, match="3 reference poses and 2"):
+        alignment(still([0, 1, 2]), still([0, 1]), "se3")
+    with pytest.raises(ValueError, match="mode must be one of"):
+        alignment(still([0]), still([0]), "affine")  # type: ignore[arg-type]
+
+
+def test_no_alignment_moves_nothing() -> None:
+    trajectory = random_trajectory(0)
+    same = alignment(random_trajectory(1), trajectory, "none").apply(trajectory)
+    np.testing.assert_array_equal(same.T_world_cam, trajectory.T_world_cam)
+
+
+def test_covariances_scale_with_the_positions() -> None:
+    covariance = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+    covariance[0, 3] = covariance[3, 0] = 0.5
+    trajectory = Trajectory(
+        stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None], covariances=covariance[None]
+    )
+    scaled = Similarity(T_a_b=np.eye(4), scale=3.0).apply(trajectory).covariances
+    assert scaled is not None
+    assert np.diag(scaled[0]).tolist() == [1.0, 1.0, 1.0, 18.0, 18.0, 18.0]
+    assert scaled[0, 0, 3] == scaled[0, 3, 0] == 1.5

@@ -1,0 +1,275 @@
+"""Trajectory files: round trips, published files, messages for broken ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.trajectory import Trajectory
+from gvo.trajectory_files import (
+    COVARIANCE_HEADER,
+    format_covariance_line,
+    format_tum_line,
+    read_covariances,
+    read_trajectory,
+    write_covariances,
+    write_kitti,
+    write_tum,
+)
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+GOOD = "1.0 0 0 0 0 0 0 1\n"
+
+
+def random_trajectory(seed: int, n: int = 8) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    factors = rng.normal(size=(n, 6, 6)) * 1e-3
+    return Trajectory(
+        stamps_ns=np.cumsum(rng.integers(1, 2 * 10**17, n)),
+        T_world_cam=se3.exp(rng.normal(size=(n, 6)) * [2, 2, 2, 500, 500, 500]),
+        covariances=factors @ factors.transpose(0, 2, 1),
+    )
+
+
+@settings(max_examples=30)
+@given(seeds)
+def test_a_tum_file_gives_back_stamps_exactly_and_poses_to_nanometres(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    path = tmp_path_factory.mktemp("tum") / "trajectory.txt"
+    trajectory = random_trajectory(seed)
+    write_tum(path, trajectory)
+    back = read_trajectory(path)
+    np.testing.assert_array_equal(back.stamps_ns, trajectory.stamps_ns)
+    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+    assert back.stamps_from == "file"
+
+
+@settings(max_examples=30)
+@given(seeds)
+def test_a_kitti_file_gives_back_the_poses(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    path = tmp_path_factory.mktemp("kitti") / "00.txt"
+    trajectory = random_trajectory(seed)
+    write_kitti(path, trajectory)
+    back = read_trajectory(path)
+    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+    assert back.stamps_from == "rows"
+    assert back.stamps_ns.tolist() == [n * 10**9 for n in range(8)]
+
+
+@settings(max_examples=30)
+@given(seeds)
+def test_covariances_come_back_without_loss(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    path = tmp_path_factory.mktemp("covariances") / "covariances.csv"
+    trajectory = random_trajectory(seed)
+    write_covariances(path, trajectory)
+    stamps_ns, covariances = read_covariances(path)
+    assert trajectory.covariances is not None
+    np.testing.assert_array_equal(stamps_ns, trajectory.stamps_ns)
+    upper = np.triu(trajectory.covariances)
+    np.testing.assert_array_equal(np.triu(covariances), upper)
+    np.testing.assert_array_equal(covariances, covariances.transpose(0, 2, 1))
+
+
+def test_the_covariance_line_holds_the_upper_triangle_row_by_row() -> None:
+    covariance = np.arange(36.0).reshape(6, 6)
+    names, values = COVARIANCE_HEADER.split(","), format_covariance_line(3, covariance).split(",")
+    assert len(names) == len(values) == 22
+    named = dict(zip(names, values, strict=True))
+    assert (named["stamp_ns"], named["rx_ry"], named["ry_ry"], named["rz_tx"]) == (
+        "3", "1.0", "7.0", "15.0",
+    )  # fmt: skip
+
+
+def test_an_empty_covariance_file_reads_as_none(tmp_path: Path) -> None:
+    path = tmp_path / "covariances.csv"
+    path.write_text(COVARIANCE_HEADER + "\n")
+    stamps_ns, covariances = read_covariances(path)
+    assert (stamps_ns.shape, covariances.shape) == ((0,), (0, 6, 6))
+    path.write_text("1,2,3\n")
+    with pytest.raises(TrajectoryError, match="expected the header"):
+        read_covariances(path)
+
+
+def test_writing_covariances_needs_some(tmp_path: Path) -> None:
+    bare = Trajectory(stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None])
+    with pytest.raises(ValueError, match="no covariances"):
+        write_covariances(tmp_path / "covariances.csv", bare)
+
+
+@given(seeds)
+def test_a_line_has_nine_decimals_of_the_stamp_and_no_negative_w(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = se3.exp(rng.normal(size=6) * 3)
+    fields = format_tum_line(1_403_636_579_763_555_584, T).split()
+    assert fields[0] == "1403636579.763555584"
+    assert float(fields[7]) >= 0
+    R = np.asarray(Rotation.from_quat([float(field) for field in fields[4:]]).as_matrix())
+    np.testing.assert_allclose(R, T[:3, :3], atol=1e-11)
+
+
+def test_a_line_holds_no_negative_zero() -> None:
+    T = np.eye(4)
+    T[:3, 3] = [-1e-12, -0.0, 0.0]
+    assert "-" not in format_tum_line(0, T)
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("1311868164.363181", 1_311_868_164_363_181_000),
+        ("1403636579.763555584", 1_403_636_579_763_555_584),
+        ("1.403636579763555584e+09", 1_403_636_579_763_555_584),
+        ("1403636579763555584e-9", 1_403_636_579_763_555_584),
+        ("9223372036.854775806", 2**63 - 2),
+        ("0", 0),
+        ("-0.5", -500_000_000),
+        ("0.0000000004", 0),
+    ],
+)
+def test_stamps_are_read_in_decimal_arithmetic(tmp_path: Path, text: str, stamp_ns: int) -> None:
+    path = tmp_path / "stamps.txt"
+    path.write_text(f"{text} 1 2 3 0 0 0 1\n")
+    assert read_trajectory(path).stamps_ns.tolist() == [stamp_ns]
+
+
+def test_commas_comments_blank_lines_and_a_byte_order_mark_are_no_hindrance(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "loose.csv"
+    lines = [
+        "\ufeff# stamp tx",
+        "",
+        "1,1,2,3,0,0,0,1",
+        "# more",
+        " 2.5\t1, 2 ,3 0 0 0 -1 # end",
+        "",
+    ]
+    path.write_bytes("\r\n".join(lines).encode())
+    trajectory = read_trajectory(path)
+    assert trajectory.stamps_ns.tolist() == [10**9, 2_500_000_000]
+    np.testing.assert_array_equal(trajectory.T_world_cam[1, :3, :3], np.eye(3))
+
+
+def test_of_repeated_stamps_in_a_tum_file_the_last_row_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "repeated.txt"
+    path.write_text("1 0 0 0 0 0 0 1\n2.0 5 0 0 0 0 0 1\n2.00 6 0 0 0 0 0 1\n3 7 0 0 0 0 0 1\n")
+    trajectory = read_trajectory(path)
+    assert trajectory.positions[:, 0].tolist() == [0.0, 6.0, 7.0]
+
+
+@pytest.mark.parametrize("columns", [8, 17])
+def test_a_euroc_file_is_told_by_its_header_or_its_17_columns(tmp_path: Path, columns: int) -> None:
+    path = tmp_path / "data.csv"
+    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x []\n"
+    quarter_turn_about_z = "0.707107,0,0,0.707107"
+    extra = ",9" * (columns - 8)
+    path.write_text(
+        (header if columns == 8 else "")
+        + f"1403636579763555584,1,2,3,{quarter_turn_about_z}{extra}\n"
+    )
+    trajectory = read_trajectory(path)
+    assert trajectory.stamps_ns.tolist() == [1_403_636_579_763_555_584]
+    T = trajectory.T_world_cam[0]
+    np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("place", ["poses/times.txt", "sequences/00/times.txt"])
+def test_kitti_poses_take_the_stamps_of_a_times_file_of_as_many_rows(
+    tmp_path: Path, place: str
+) -> None:
+    poses, times = tmp_path / "poses" / "00.txt", tmp_path / place
+    poses.parent.mkdir()
+    times.parent.mkdir(parents=True, exist_ok=True)
+    poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    times.write_text("0.000000e+00\n1.036224e-01\n2.072448e-01\n")
+    trajectory = read_trajectory(poses)
+    assert trajectory.stamps_ns.tolist() == [0, 103_622_400, 207_244_800]
+    assert trajectory.stamps_from == "times"
+    times.write_text("0\n1\n")
+    assert read_trajectory(poses).stamps_from == "rows"
+    times.write_text("0\n2\n1\n")
+    with pytest.raises(TrajectoryError, match=r"times\.txt:3: the stamp 1 is not after 2"):
+        read_trajectory(poses)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "holds no poses"),
+        ("# only\n# comments\n", "holds no poses"),
+        (GOOD + "hello world\n", r":2: expected 8 columns, got 2"),
+        ("hello world\n", r":1: expected 8 columns \(TUM.*got 2"),
+        (GOOD + "2 0 0 x 0 0 0 1\n", r":2: could not convert.*'x'.*expected 8 numbers"),
+        (GOOD + "two 0 0 0 0 0 0 1\n", r":2: the stamp 'two' is no number"),
+        (GOOD + "nan 0 0 0 0 0 0 1\n", r":2: the stamp nan is out of range"),
+        ("1403636579763555584 0 0 0 0 0 0 1\n", r":1: .*out of range; expected seconds"),
+        ("1e999999999999 0 0 0 0 0 0 1\n", r":1: the stamp"),
+        (GOOD + "2 0 0 nan 0 0 0 1\n", r":2: a number is not finite"),
+        (GOOD + "2 0 inf 0 0 0 0 1\n", r":2: a number is not finite"),
+        (GOOD + "2 0 0 0 0 0 0 0\n", r":2: the quaternion is not of length one"),
+        (GOOD + "2 0 0 0 0 0 1 1\n", r":2: the quaternion is not of length one"),
+        (GOOD + "\n0.5 0 0 0 0 0 0 1\n", r":3: the stamp 0.5 is not after 1.0 of line 1"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 0 0\n", r":2: the first three.*rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", r":1: the first three columns.*rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", r":2: expected 12 columns, got 3"),
+    ],
+)
+def test_a_broken_file_is_refused_with_its_line(tmp_path: Path, text: str, match: str) -> None:
+    path = tmp_path / "broken.txt"
+    path.write_text(text)
+    with pytest.raises(TrajectoryError, match=match) as caught:
+        read_trajectory(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.bag"
+    binary.write_bytes(b"#ROSBAG V2.0\n\xff\xfe\x00")
+    for path, match in [
+        (binary, "is no text"),
+        (tmp_path / "missing.txt", "No such file"),
+        (tmp_path, "directory"),
+    ]:
+        with pytest.raises(TrajectoryError, match=match):
+            read_trajectory(path)
+
+
+def test_a_folder_that_is_missing_is_named_when_writing(tmp_path: Path) -> None:
+    trajectory = random_trajectory(0)
+    for write in (write_tum, write_kitti, write_covariances):
+        with pytest.raises(TrajectoryError, match=r"nowhere.*cannot be written: No such file"):
+            write(tmp_path / "nowhere" / "file.txt", trajectory)
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    ("name", "n", "stamps_from"),
+    [
+        ("trajectories/KITTI_00_gt.txt", 4541, "rows"),
+        ("trajectories/KITTI_00_ORB.txt", 4541, "rows"),
+        ("trajectories/KITTI_00_SPTAM.txt", 4541, "rows"),
+        ("trajectories/fr2_desk_ORB.txt", 2893, "file"),
+        ("trajectories/fr2_desk_groundtruth.txt", 20956, "file"),
+        ("rgbd_dataset_freiburg1_xyz_start/groundtruth.txt", 324, "file"),
+        ("sevenscenes_start/groundtruth.txt", 300, "file"),
+        ("kitti_06_start/poses.txt", 51, "times"),
+        ("euroc_mh01_start/mav0/state_groundtruth_estimate0/data.csv", 510, "file"),
+    ],
+)
+def test_published_files_are_read_whole(
+    gvo_data: Path, name: str, n: int, stamps_from: str
+) -> None:
+    trajectory = read_trajectory(gvo_data / name)
+    assert (len(trajectory), trajectory.stamps_from) == (n, stamps_from)

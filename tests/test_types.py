@@ -1,0 +1,72 @@
+"""The values that travel between the stages."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gvo.types import Failure, FaultyFrame, Observations, RelativePose, RgbdFrame, StereoFrame
+
+
+def grey(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    return np.zeros(shape, dtype=np.uint8)
+
+
+def test_a_failure_is_falsy_and_keeps_its_numbers() -> None:
+    failure = Failure(reason="7 matches", n_matches=7, n_inliers=3)
+    assert not failure
+    assert (failure.reason, failure.n_matches, failure.n_inliers) == ("7 matches", 7, 3)
+
+
+def test_a_relative_pose_is_truthy_and_counts_its_matches() -> None:
+    pose = RelativePose(
+        T_reference_current=np.eye(4),
+        covariance=np.eye(6),
+        matches=np.array([[0, 1], [1, 0], [2, 2]]),
+        inliers=np.array([True, False, True]),
+    )
+    assert pose
+    assert (pose.n_matches, pose.n_inliers) == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"), [((4, 5), (4, 6)), ((4, 5), (5, 5)), ((4, 5, 3), (4, 5, 3)), ((5,), (5,))]
+)
+def test_a_stereo_frame_needs_two_grey_images_of_one_size(
+    left: tuple[int, ...], right: tuple[int, ...]
+) -> None:
+    with pytest.raises(ValueError, match="one size"):
+        StereoFrame(stamp_ns=0, left=grey(*left), right=grey(*right))
+
+
+@pytest.mark.parametrize(("image", "depth"), [((4, 5), (4, 6)), ((4, 5, 3), (4, 5, 3))])
+def test_an_rgbd_frame_needs_depth_of_the_size_of_its_grey_image(
+    image: tuple[int, ...], depth: tuple[int, ...]
+) -> None:
+    with pytest.raises(ValueError, match="size"):
+        RgbdFrame(stamp_ns=0, image=grey(*image), depth=np.zeros(depth, dtype=np.float32))
+
+
+def test_frames_of_stamp_zero_are_frames() -> None:
+    assert StereoFrame(stamp_ns=0, left=grey(2, 3), right=grey(2, 3)).stamp_ns == 0
+    depth = np.zeros((2, 3), dtype=np.float32)
+    assert RgbdFrame(stamp_ns=0, image=grey(2, 3), depth=depth).stamp_ns == 0
+
+
+def test_values_cannot_be_changed() -> None:
+    faulty = FaultyFrame(stamp_ns=1, reason="empty image")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        faulty.stamp_ns = 2  # type: ignore[misc]
+
+
+def test_observations_count_their_points() -> None:
+    observations = Observations(
+        stamp_ns=0,
+        keypoints=np.zeros((4, 2)),
+        disparities=np.ones(4),
+        points_cam=np.zeros((4, 3)),
+        sigmas=np.ones((4, 3)),
+        descriptors_left=np.zeros((4, 32), dtype=np.uint8),
+        n_keypoints=9,
+    )
+    assert len(observations) == 4
