@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from gvo.outputs.bag_writer import convert
     from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import format_evaluations
-    from gvo.runs import RunResult, run_recording
+    from gvo.runs import RunResult, read_ground_truth, run_recording
     from gvo.sources.frames import frames
     from gvo.sources.opening import RecordingOptions, open_recording
     from gvo.sources.synthetic import SyntheticRecording
     from gvo.trajectory import Trajectory
     from gvo.trajectory_files import read_trajectory
-    from gvo.types import Edge, Estimate, RgbdFrame, Status, StereoFrame
+    from gvo.types import Edge, Estimate, FaultyFrame, RgbdFrame, Status, StereoFrame
 
 __version__ = "0.1.0"
 
@@ -36,13 +36,13 @@ _MODULES = {
     "gvo.outputs.bag_writer": ("convert",),
     "gvo.outputs.plots": ("plot_trajectories",),
     "gvo.outputs.tables": ("format_evaluations",),
-    "gvo.runs": ("RunResult", "run_recording"),
+    "gvo.runs": ("RunResult", "read_ground_truth", "run_recording"),
     "gvo.sources.frames": ("frames",),
     "gvo.sources.opening": ("RecordingOptions", "open_recording"),
     "gvo.sources.synthetic": ("SyntheticRecording",),
     "gvo.trajectory": ("Trajectory",),
     "gvo.trajectory_files": ("read_trajectory",),
-    "gvo.types": ("Edge", "Estimate", "RgbdFrame", "Status", "StereoFrame"),
+    "gvo.types": ("Edge", "Estimate", "FaultyFrame", "RgbdFrame", "Status", "StereoFrame"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -51,6 +51,7 @@ __all__ = [
     "Edge",
     "Estimate",
     "Evaluation",
+    "FaultyFrame",
     "FrameResult",
     "GvoError",
     "Odometry",
@@ -72,6 +73,7 @@ __all__ = [
     "load_configuration",
     "open_recording",
     "plot_trajectories",
+    "read_ground_truth",
     "read_trajectory",
     "run_recording",
 ]

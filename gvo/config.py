@@ -66,7 +66,7 @@ class DepthConfig(Section):
     virtual_baseline_m: float = _parameter(
         0.075, "baseline of the stereo camera that the depth camera is seen as", "m", gt=0
     )
-    sigma_px: float = _parameter(0.5, "noise of the virtual disparity", "px", gt=0)
+    sigma_px: float = _parameter(1.0, "noise of the virtual disparity", "px", gt=0)
 
 
 class FeaturesConfig(Section):
@@ -162,9 +162,11 @@ class WindowConfig(Section):
         0.3, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
     )
     keyframe_overlap: float = _parameter(
-        0.75, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
+        0.9, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
     )
-    link_sigma_factor: float = _parameter(1.0, "factor on the sigmas of links to keyframes", gt=0)
+    link_sigma_factor: float = _parameter(
+        1.5, "factor on the sigmas of links to keyframes: a frame's links share its noise", gt=0
+    )
     kernel: Literal["huber", "none"] = _parameter("huber", "robust kernel of the edges")
     kernel_threshold: float = _parameter(
         3.55, "of the kernel, on the norm of the whitened 6-vector", gt=0

@@ -102,7 +102,9 @@ class DescriptorFrontend:
 
     def _sigmas(self, octaves: IntArray, *, is_stereo: bool) -> FloatArray:
         config = self._config
-        pixel = config.registration.pixel_sigma_px * config.features.scale_factor**octaves
+        is_sift = config.features.kind == "sift"
+        level_ratio = 2.0 if is_sift else config.features.scale_factor
+        pixel = config.registration.pixel_sigma_px * level_ratio**octaves
         disparity = config.stereo.sigma_px if is_stereo else config.depth.sigma_px
         return np.column_stack([pixel, pixel, np.full(len(octaves), disparity)])
 

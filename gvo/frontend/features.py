@@ -28,7 +28,7 @@ class Features:
     keypoints : ndarray of float64, shape (n, 2)
         Pixels (u, v).
     octaves : ndarray of int64, shape (n,)
-        Pyramid level of each.
+        Pyramid level of each; 0 is the image itself.
     descriptors : ndarray of uint8 or float32, shape (n, m)
     """
 
@@ -64,6 +64,8 @@ class FeatureExtractor:
         image : ndarray of uint8, shape (height, width)
         """
         found = self._detect(image)
+        if self._config.kind != "sift":
+            found = _inside(found, image.shape)
         found = _spread(found, image.shape, self._config)
         if self._config.upright:
             for point in found:
@@ -73,8 +75,8 @@ class FeatureExtractor:
         if descriptors is None or len(found) == 0:
             return _no_features(self._config.kind)
         return Features(
-            keypoints=np.array([point.pt for point in found], dtype=np.float64),
-            octaves=np.array([point.octave & 0xFF for point in found], dtype=np.int64),
+            keypoints=np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64),
+            octaves=_octaves(found),
             descriptors=_typed(descriptors, self._config.kind),
         )
 
@@ -129,13 +131,29 @@ def _no_features(kind: str) -> Features:
     )
 
 
+def _inside(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...]) -> list[cv2.KeyPoint]:
+    """Drop what has no room for a descriptor, before it takes a share of the budget."""
+    limit_u, limit_v = shape[1] - _BORDER_PX, shape[0] - _BORDER_PX
+    return [
+        point
+        for point in found
+        if _BORDER_PX <= point.pt[0] < limit_u and _BORDER_PX <= point.pt[1] < limit_v
+    ]
+
+
+def _octaves(found: Sequence[cv2.KeyPoint]) -> IntArray:
+    # The lowest byte is signed: SIFT starts at -1, an image of twice the size.
+    octaves = np.array([point.octave & 0xFF for point in found], dtype=np.uint8)
+    return octaves.view(np.int8).astype(np.int64)
+
+
 def _spread(
     found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], config: FeaturesConfig
 ) -> list[cv2.KeyPoint]:
     """Keep the strongest of each grid cell, round by round, up to the budget."""
     if len(found) == 0:
         return []
-    pixels = np.array([point.pt for point in found])
+    pixels = cv2.KeyPoint.convert(found)
     responses = np.array([point.response for point in found])
     columns = -(-shape[1] // config.cell_size_px)
     cells = (pixels // config.cell_size_px).astype(np.int64) @ [1, columns]

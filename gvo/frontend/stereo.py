@@ -33,7 +33,7 @@ def candidate_pairs(
     max_disparity = float(camera.depth_to_disparity(config.min_depth_m))
     order, keys = _row_table(right.keypoints, camera.width)
     reach = int(np.ceil(config.row_tolerance_px))
-    rows_left = np.rint(left.keypoints[:, 1]).astype(np.int64)
+    rows_left = _rows(left.keypoints)
     rows = rows_left[:, np.newaxis] + np.arange(-reach, reach + 1)
     u_left = left.keypoints[:, :1]
     base = rows * (2.0 * camera.width)
@@ -47,9 +47,14 @@ def candidate_pairs(
 
 def _row_table(keypoints: FloatArray, width: int) -> tuple[IntArray, FloatArray]:
     """Sort keypoints by row, then column; the key holds both in one number."""
-    keys = np.rint(keypoints[:, 1]) * (2.0 * width) + keypoints[:, 0]
+    keys = _rows(keypoints) * (2.0 * width) + keypoints[:, 0]
     order = np.argsort(keys, kind="stable")
     return order, keys[order]
+
+
+def _rows(keypoints: FloatArray) -> IntArray:
+    # Not rint: it rounds halves to even, so that 0.5 and 1.5 come two rows apart.
+    return np.asarray(np.floor(keypoints[:, 1] + 0.5).astype(np.int64))
 
 
 def match_stereo(
@@ -135,6 +140,8 @@ def _patch_ssd(
     Without the mean, so that a pair of unequal exposure gives the same disparities.
     """
     size, n_offsets = 2 * radius + 1, 2 * reach + 1
+    if len(row) == 0:  # also for images smaller than a patch, which have no windows
+        return np.zeros((0, n_offsets), dtype=np.float32)
     left_windows = sliding_window_view(images[0], (size, size))
     right_windows = sliding_window_view(images[1], (size, size + 2 * reach))
     patches = left_windows[row - radius, column_left - radius].astype(np.float32)

@@ -23,6 +23,8 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3
+# A step of the pose, radians and metres, that no longer matters.
+_CONVERGED = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,12 +135,12 @@ def _gauss_newton(
         step = _solve(H, g)
         if isinstance(step, Failure):
             return step
-        T = se3.normalize(se3.exp(step) @ T)
-        if np.abs(step).max() < 1e-7:
+        T = se3.exp(step) @ T
+        if np.abs(step).max() < _CONVERGED:
             break
     if not np.isfinite(T).all():
         return Failure(reason="the refinement diverged", n_matches=len(matches))
-    return T
+    return se3.normalize(T)
 
 
 def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
@@ -184,10 +186,10 @@ def _solve(H: FloatArray, g: FloatArray) -> FloatArray | Failure:
     scale = np.sqrt(np.diag(H))
     if not np.all(np.isfinite(scale)) or np.any(scale <= 0):
         return Failure(reason="the matches leave a direction of motion open")
-    H_scaled = H / np.outer(scale, scale)
-    if np.linalg.cond(H_scaled) > 1e10:
+    eigenvalues, V = np.linalg.eigh(H / np.outer(scale, scale))
+    if eigenvalues[0] < 1e-10 * eigenvalues[-1]:
         return Failure(reason="the matches leave a direction of motion open")
-    return np.asarray(np.linalg.solve(H_scaled, g / scale) / scale)
+    return np.asarray(V @ ((V.T @ (g / scale)) / eigenvalues) / scale)
 
 
 def _within_gate(

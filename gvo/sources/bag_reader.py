@@ -117,15 +117,10 @@ class BagReader:
         self._is_ros1 = path.is_file() and path.suffix == ".bag"
         self._files = [path]
         self.notes: list[str] = []
-        if path.is_dir() and not (path / "metadata.yaml").is_file():
-            self._read_inside("metadata.yaml is missing")
+        if path.is_dir():
+            self._check_folder()
         with self._opened() as readers:
-            is_silent = path.is_dir() and any(_is_silent(reader) for reader in readers)
             self.topics = _merge_topics(readers)
-        if is_silent and self._files == [path]:
-            self._read_inside("metadata.yaml does not fit the files")
-            with self._opened() as readers:
-                self.topics = _merge_topics(readers)
 
     def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
         """Yield the messages of some topics in the order of recording.
@@ -154,12 +149,21 @@ class BagReader:
                         is_ros1=self._is_ros1,
                     )
 
-    def _read_inside(self, reason: str) -> None:
+    def _check_folder(self) -> None:
+        """Read the files inside directly where the folder's metadata are of no use."""
         files = sorted(p for p in self._path.iterdir() if p.suffix in _STORAGE_SUFFIXES)
-        if not files:
-            raise RecordingError(f"{self._path}: {reason} and it holds no .mcap or .db3 file")
+        try:
+            with self._opened() as readers:
+                if not any(_is_silent(reader) for reader in readers):
+                    return
+            reason = "does not fit the files"
+        except RecordingError:
+            if not files:
+                raise
+            reason = "is missing or malformed"
+        names = ", ".join(file.name for file in files)
         self._files = files
-        self.notes.append(f"bag: {reason}: read {', '.join(file.name for file in files)} directly")
+        self.notes.append(f"bag: metadata.yaml {reason}: read {names} without it")
 
     @contextmanager
     def _opened(self) -> Iterator[list[_Reader]]:

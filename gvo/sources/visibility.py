@@ -44,8 +44,8 @@ class View:
         1/z in 1/m.
     texels_s, texels_t : ndarray of float64, shape (n, 3)
         Texture coordinates over z, texels per metre.
-    inside : ndarray of float64, shape (n, 5, 3)
-        All not negative inside of the rectangle and beyond the near plane.
+    inside : ndarray of float64, shape (n, 4, 3)
+        All not negative inside of the rectangle.
     corners : ndarray of float64, shape (n, 4, 3)
         In the camera frame, metres.
     """
@@ -80,7 +80,6 @@ def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
 
     s, t = coordinate(axes_s), coordinate(axes_t)
     width, height = scene.sizes[keep].T[..., np.newaxis]
-    near = np.array([0.0, 0.0, 1.0 / _NEAR_M]) - inverse_depth
     scale, shift = scene.texels_per_m[keep], scene.texel_offsets[keep]
     return View(
         scene=scene,
@@ -89,9 +88,7 @@ def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
         inverse_depth=inverse_depth,
         texels_s=scale[:, :1] * s + shift[:, :1] * inverse_depth,
         texels_t=scale[:, 1:] * t + shift[:, 1:] * inverse_depth,
-        inside=np.stack(
-            [s, width * inverse_depth - s, t, height * inverse_depth - t, near], axis=1
-        ),
+        inside=np.stack([s, width * inverse_depth - s, t, height * inverse_depth - t], axis=1),
         corners=corners[keep],
     )
 
@@ -230,6 +227,4 @@ def _cut_out(
         # One level for the whole rectangle: left and right then see the same outline.
         per_pixel = np.linalg.norm([view.texels_s[k, :2], view.texels_t[k, :2]], axis=1).max()
         level = round(np.log2(max(view.corners[k, :, 2].mean() * per_pixel, 1.0)))
-        mask &= view.scene.atlas.is_opaque(
-            int(view.scene.textures[view.indices[k]]), level, s, t
-        )
+        mask &= view.scene.atlas.is_opaque(int(view.scene.textures[view.indices[k]]), level, s, t)

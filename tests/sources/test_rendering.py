@@ -1,5 +1,7 @@
 """The renderer, against rays intersected one by one and pixels known in advance."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,20 +12,24 @@ from gvo.geometry.camera import PinholeCamera
 from gvo.geometry.se3 import make_transform
 from gvo.sources.rendering import render_depth, render_image, to_uint8
 from gvo.sources.scene import Light, Rectangle, Scene, Texture
+from gvo.types import FloatArray
 
 CAMERA = PinholeCamera(fx=50.0, fy=55.0, cx=31.3, cy=23.6, width=64, height=48)
 EVEN_LIGHT = Light(ambient=1.0, direct=0.0, haze_grey=7.0)
 
 
-def texture_of(pixels, size_m=(1.0, 1.0), mask=None):
+Triple = tuple[float, float, float]
+
+
+def texture_of(pixels: Any, size_m: tuple[float, float] = (1.0, 1.0), mask: Any = None) -> Texture:
     return Texture(pixels=np.asarray(pixels, dtype=np.uint8), size_m=size_m, mask=mask)
 
 
-def noise_texture(size=64, size_m=(1.0, 1.0)):
-    return texture_of(np.random.default_rng(5).integers(0, 256, (size, size)), size_m)
+def noise_texture() -> Texture:
+    return texture_of(np.random.default_rng(5).integers(0, 256, (64, 64)))
 
 
-def screen(z, *, half=2.0, texture="t", **options):
+def screen(z: float, *, half: float = 2.0, texture: str = "t", **options: Any) -> Rectangle:
     """Return a rectangle square to the optical axis."""
     return Rectangle(
         corner=(-half, -half, z),
@@ -34,11 +40,13 @@ def screen(z, *, half=2.0, texture="t", **options):
     )
 
 
-def scene_of(*rectangles, light=EVEN_LIGHT, **textures):
+def scene_of(*rectangles: Rectangle, light: Light = EVEN_LIGHT, **textures: Texture) -> Scene:
     return Scene(rectangles, textures or {"t": noise_texture()}, light=light)
 
 
-def intersect_one_by_one(rectangle, T_map_cam, camera):
+def intersect_one_by_one(
+    rectangle: Rectangle, T_map_cam: FloatArray, camera: PinholeCamera
+) -> tuple[FloatArray, FloatArray]:
     """Solve corner + a edge_s + b edge_t = z ray for each pixel; NaN outside of the rectangle."""
     depth = np.full((camera.height, camera.width), np.nan)
     margin = np.full(depth.shape, np.nan)
@@ -46,7 +54,7 @@ def intersect_one_by_one(rectangle, T_map_cam, camera):
     for v in range(camera.height):
         for u in range(camera.width):
             ray = R @ [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]
-            A = np.column_stack([rectangle.edge_s, rectangle.edge_t, -ray])
+            A = np.column_stack([np.asarray(rectangle.edge_s), np.asarray(rectangle.edge_t), -ray])
             a, b, z = np.linalg.solve(A, t - np.asarray(rectangle.corner))
             margin[v, u] = min(a, 1 - a, b, 1 - b) if z > 0 else -1.0
             if margin[v, u] >= 0:
@@ -59,7 +67,7 @@ def intersect_one_by_one(rectangle, T_map_cam, camera):
     angles=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
     position=st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)),
 )
-def test_depth_is_that_of_rays_intersected_one_by_one(angles, position):
+def test_depth_is_that_of_rays_intersected_one_by_one(angles: Triple, position: Triple) -> None:
     R = Rotation.from_rotvec(angles).as_matrix()
     rectangle = Rectangle(
         corner=R @ [-1.5, -1.0, 0.0] + [0, 0, 4.0],
@@ -77,7 +85,7 @@ def test_depth_is_that_of_rays_intersected_one_by_one(angles, position):
     np.testing.assert_allclose(depth[is_clear], expected[is_clear], rtol=2e-6)
 
 
-def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image():
+def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() -> None:
     ground = Rectangle(corner=(-50, 1.5, -50), edge_s=(100, 0, 0), edge_t=(0, 0, 100), texture="t")
     depth = render_depth(scene_of(_turned_up(ground)), np.eye(4), CAMERA)
     rows = np.arange(CAMERA.height)
@@ -86,7 +94,7 @@ def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image():
     assert np.all(np.isnan(depth[:24]))
 
 
-def _turned_up(ground):
+def _turned_up(ground: Rectangle) -> Rectangle:
     return Rectangle(
         corner=np.add(ground.corner, ground.edge_t),
         edge_s=ground.edge_s,
@@ -95,7 +103,7 @@ def _turned_up(ground):
     )
 
 
-def test_the_nearer_surface_hides_the_farther_in_any_order():
+def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
     near, far = screen(2.0, half=0.3), screen(5.0, half=20.0)
     depths = [
         render_depth(scene_of(*pair), np.eye(4), CAMERA) for pair in ((near, far), (far, near))
@@ -105,7 +113,7 @@ def test_the_nearer_surface_hides_the_farther_in_any_order():
     assert depths[0][2, 2] == 5.0
 
 
-def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides():
+def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
     turned = make_transform(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 5.0]))
     for is_two_sided in (False, True):
         scene = scene_of(screen(2.0, is_two_sided=is_two_sided))
@@ -113,25 +121,25 @@ def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides():
         assert np.any(np.isfinite(depth)) == is_two_sided
 
 
-def test_a_scene_without_anything_in_view_is_haze():
+def test_a_scene_without_anything_in_view_is_haze() -> None:
     away = make_transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
     assert np.all(render_image(scene_of(screen(2.0)), away, CAMERA) == 7.0)
     assert np.all(np.isnan(render_depth(scene_of(screen(2.0)), away, CAMERA)))
 
 
-def test_texels_as_large_as_pixels_come_out_unchanged():
+def test_texels_as_large_as_pixels_come_out_unchanged() -> None:
     # 64 texels per metre at a depth of 2 m and fx = 128: one texel per pixel.
     camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
-    texture = noise_texture(64)
+    texture = noise_texture()
     scene = scene_of(screen(2.0, half=0.5), t=texture)
     image = to_uint8(render_image(scene, np.eye(4), camera))
     np.testing.assert_array_equal(image, texture.pixels)
 
 
 @pytest.mark.parametrize("shift", [0.25, 0.5, 0.75])
-def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift):
+def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift: float) -> None:
     camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5 - shift, cy=31.5, width=64, height=64)
-    texture = noise_texture(64)
+    texture = noise_texture()
     scene = scene_of(screen(2.0, half=1.5), t=texture)
     image = render_image(scene, np.eye(4), camera)
     following = np.roll(texture.pixels, -1, axis=1)
@@ -141,16 +149,16 @@ def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift):
 
 
 @pytest.mark.parametrize("depth", [4.0, 9.0, 15.0])
-def test_far_textures_are_averaged_not_sampled(depth):
-    scene = scene_of(screen(depth, half=100.0), t=noise_texture(64))
+def test_far_textures_are_averaged_not_sampled(depth: float) -> None:
+    scene = scene_of(screen(depth, half=100.0), t=noise_texture())
     image = render_image(scene, np.eye(4), CAMERA)
     texels_per_pixel = 64 * depth / CAMERA.fx
-    near_std, mean = noise_texture(64).pixels.std(), noise_texture(64).pixels.mean()
+    near_std, mean = noise_texture().pixels.std(), noise_texture().pixels.mean()
     assert abs(image.mean() - mean) < 2.5
     assert image.std() < 1.6 * near_std / texels_per_pixel
 
 
-def test_a_grazing_surface_is_blurred_along_one_direction_only():
+def test_a_grazing_surface_is_blurred_along_one_direction_only() -> None:
     stripes = np.repeat(np.repeat([[0, 255]], 32, axis=1).reshape(1, 64), 64, axis=0)
     ground = Rectangle(corner=(-20, 1.0, 60), edge_s=(40, 0, 0), edge_t=(0, 0, -60), texture="t")
     scene = scene_of(ground, t=texture_of(stripes, (2.0, 2.0)))
@@ -159,19 +167,34 @@ def test_a_grazing_surface_is_blurred_along_one_direction_only():
     assert np.ptp(row) > 90
 
 
-def test_edges_are_mixed_by_the_share_of_the_pixel_they_cover():
-    camera = PinholeCamera(fx=100.0, fy=100.0, cx=31.5, cy=23.5, width=64, height=48)
-    white = texture_of(np.full((8, 8), 200))
-    scene = scene_of(screen(1.0, half=0.1), t=white)  # from 21.5 to 41.5, 13.5 to 33.5
-    half = make_transform(np.eye(3), np.array([0.005, 0.0, 0.0]))
-    image = render_image(scene, half, camera)
-    assert image[20, 20] == 7.0
-    assert image[20, 21] == pytest.approx((200 + 7) / 2)
-    assert image[20, 22] == 200.0
-    assert render_image(scene, half, camera, is_antialiased=False)[20, 21] in (7.0, 200.0)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_edges_are_mixed_by_the_share_of_the_pixel_they_cover(axis: int) -> None:
+    camera = PinholeCamera(fx=100.0, fy=100.0, cx=31.5, cy=31.5, width=64, height=64)
+    scene = scene_of(screen(1.0, half=0.1), t=texture_of(np.full((8, 8), 200)))
+    half_a_pixel = make_transform(np.eye(3), 0.005 * np.eye(3)[axis])
+    image = render_image(scene, half_a_pixel, camera)  # from 21 to 41 along the axis
+    line = image[:, 28] if axis else image[28]
+    assert line[20] == 7.0
+    assert line[21] == pytest.approx((200 + 7) / 2)
+    assert line[22] == 200.0
+    plain = render_image(scene, half_a_pixel, camera, is_antialiased=False)
+    assert set(np.unique(plain)) == {7.0, 200.0}
 
 
-def test_what_a_mask_leaves_out_shows_what_is_behind():
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mixed_pixel_sees_the_part_of_the_texture_that_it_covers(axis: int) -> None:
+    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
+    ramp = np.tile(4 * np.arange(64), (64, 1))
+    texture = texture_of(ramp.T if axis else ramp)
+    shift = make_transform(np.eye(3), 2.0 / 128 * 0.5 * np.eye(3)[axis])
+    image = render_image(scene_of(screen(2.0, half=0.25), t=texture), shift, camera)
+    line = image[:, 30] if axis else image[30]
+    # From 15 to 47; the pixel's quarter that is covered begins with the ramp at texel 0.
+    assert line[15] == pytest.approx(0.5 * 7.0 + 0.5 * line[17] - 0.5 * 4 * 1.75, abs=0.51)
+    assert line[47] == pytest.approx(0.5 * 7.0 + 0.5 * line[45] + 0.5 * 4 * 1.75, abs=0.51)
+
+
+def test_what_a_mask_leaves_out_shows_what_is_behind() -> None:
     is_left = np.zeros((64, 64), dtype=bool)
     is_left[:, :32] = True
     scene = scene_of(
@@ -186,7 +209,7 @@ def test_what_a_mask_leaves_out_shows_what_is_behind():
     assert np.all(depth[20:28, center + 2 : center + 8] == 4.0)
 
 
-def test_surfaces_that_face_the_light_are_brighter():
+def test_surfaces_that_face_the_light_are_brighter() -> None:
     grey = texture_of(np.full((8, 8), 100))
     images = [
         render_image(
@@ -199,7 +222,7 @@ def test_surfaces_that_face_the_light_are_brighter():
     assert images == pytest.approx([100.0, 50.0])
 
 
-def test_haze_hides_what_is_far():
+def test_haze_hides_what_is_far() -> None:
     grey = texture_of(np.full((8, 8), 100))
     light = Light(ambient=1.0, direct=0.0, haze_m=10.0, haze_grey=200.0)
     for z in (1.0, 10.0, 50.0):
@@ -207,24 +230,24 @@ def test_haze_hides_what_is_far():
         assert image[24, 31] == pytest.approx(200 - 100 * np.exp(-z / 10), abs=0.01)
 
 
-def test_grey_values_are_rounded_and_clipped():
+def test_grey_values_are_rounded_and_clipped() -> None:
     grey = np.array([[-3.0, 0.4, 0.6, 254.7, 300.0]], dtype=np.float32)
     np.testing.assert_array_equal(to_uint8(grey), [[0, 0, 1, 255, 255]])
 
 
 @pytest.mark.parametrize("edge_t", [(1.0, 1.0, 0.0), (0.0, 0.0, 0.0)])
-def test_a_rectangle_without_right_angles_is_refused(edge_t):
+def test_a_rectangle_without_right_angles_is_refused(edge_t: tuple[float, float, float]) -> None:
     with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="perpendicular"):
         scene_of(Rectangle(corner=(0, 0, 2), edge_s=(1, 0, 0), edge_t=edge_t, texture="t"))
 
 
 @pytest.mark.parametrize("shape", [(8, 16), (12, 12), (2, 2)])
-def test_a_texture_that_cannot_be_halved_is_refused(shape):
+def test_a_texture_that_cannot_be_halved_is_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="power of two"):
         texture_of(np.zeros(shape))
 
 
-def test_a_mask_or_a_texture_of_another_size_is_refused():
+def test_a_mask_or_a_texture_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match="mask"):
         texture_of(np.zeros((8, 8)), mask=np.ones((4, 4), dtype=bool))
     with pytest.raises(ValueError, match="one size"):

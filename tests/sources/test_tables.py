@@ -24,7 +24,7 @@ def test_exponents_are_understood() -> None:
 
 @pytest.mark.parametrize("text", ["", "nan", "inf", "1,5", "stamp", "1e40"])
 def test_what_is_no_stamp_is_refused_by_its_place(text: str) -> None:
-    with pytest.raises(RecordingError, match="rgb.txt, line 3"):
+    with pytest.raises(RecordingError, match=r"rgb\.txt, line 3"):
         parse_seconds(text, "rgb.txt, line 3")
 
 
@@ -45,7 +45,7 @@ def test_a_short_row_is_refused_with_its_line(tmp_path: Path) -> None:
 def test_an_empty_table_or_one_that_is_no_text_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "table.txt"
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match="table.txt"):
+    with pytest.raises(RecordingError, match=r"table\.txt"):
         read_rows(path, n_fields=1)
     with pytest.raises(RecordingError, match="missing"):
         read_rows(tmp_path / "none.txt", n_fields=1)

@@ -1,0 +1,142 @@
+"""Keypoints: budget, spread, border, descriptors, order of preference."""
+
+from typing import Literal
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.config import FeaturesConfig
+from gvo.frontend.features import FeatureExtractor, Features, rank_in_group
+from gvo.types import ImageArray
+
+Kind = Literal["orb", "sift", "fast", "gftt"]
+KINDS: list[Kind] = ["orb", "sift", "fast", "gftt"]
+
+
+def blobs(seed: int = 0, n: int = 500, size: tuple[int, int] = (240, 320)) -> ImageArray:
+    """Draw grey discs, smoothed a little, on a grey ground."""
+    rng = np.random.default_rng(seed)
+    image = np.full(size, 120, dtype=np.uint8)
+    for u, v, radius, grey in zip(
+        rng.integers(0, size[1], n),
+        rng.integers(0, size[0], n),
+        rng.integers(2, 9, n),
+        rng.integers(0, 256, n),
+        strict=True,
+    ):
+        cv2.circle(image, (int(u), int(v)), int(radius), int(grey), -1)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), dtype=np.uint8)
+
+
+def extract(image: ImageArray, kind: Kind = "orb", **changes: object) -> Features:
+    values = {"kind": kind, "n_features": 200, "n_octaves": 1, "cell_size_px": 40} | changes
+    return FeatureExtractor(FeaturesConfig.model_validate(values)).extract(image)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_keypoints_keep_to_the_budget_and_inside_the_image(kind: Kind) -> None:
+    features = extract(blobs(), kind)
+    assert 195 <= len(features) <= 200
+    assert len(features.keypoints) == len(features.octaves) == len(features.descriptors)
+    assert features.keypoints.min() >= 0
+    assert np.all(features.keypoints <= [319, 239])
+    if kind == "sift":
+        assert features.descriptors.dtype == np.float32
+        assert features.descriptors.shape[1] == 128
+    else:
+        assert features.descriptors.dtype == np.uint8
+        assert features.descriptors.shape[1] == 32
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_image_without_texture_gives_no_features(kind: Kind) -> None:
+    features = extract(np.full((240, 320), 90, dtype=np.uint8), kind)
+    assert len(features) == 0
+    assert features.keypoints.shape == (0, 2)
+    assert features.octaves.shape == (0,)
+    assert features.descriptors.shape == ((0, 128) if kind == "sift" else (0, 32))
+    assert features.descriptors.dtype == (np.float32 if kind == "sift" else np.uint8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_image_too_small_for_a_descriptor_gives_no_error(kind: Kind) -> None:
+    assert len(extract(blobs(size=(20, 24)), kind)) < 200
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_image_gives_the_same_features(kind: Kind) -> None:
+    extractor = FeatureExtractor(FeaturesConfig(kind=kind, n_features=200))
+    first = extractor.extract(blobs(0))
+    extractor.extract(blobs(1))
+    again = extractor.extract(blobs(0))
+    assert first.keypoints.tobytes() == again.keypoints.tobytes()
+    assert first.descriptors.tobytes() == again.descriptors.tobytes()
+
+
+def test_a_crowded_corner_does_not_take_the_whole_budget() -> None:
+    image = np.full((240, 320), 120, dtype=np.uint8)
+    image[:80, :80] = blobs(0, 200, (80, 80))
+    rest = blobs(1, 60)
+    # The rest of the image is fainter by far.
+    image[80:, 80:] = (120 + (rest[80:, 80:].astype(float) - 120) / 3).astype(np.uint8)
+    features = extract(image, "fast", n_features=100)
+    assert len(features) == 100
+    in_rest = np.all(features.keypoints >= 80, axis=1)
+    assert in_rest.mean() > 0.4
+    cells = set(map(tuple, (features.keypoints[in_rest] // 40).astype(int).tolist()))
+    assert len(cells) >= 15  # of 24
+
+
+def test_faint_images_are_tried_with_the_low_threshold() -> None:
+    faint = (120 + (blobs().astype(float) - 120) / 10).astype(np.uint8)
+    for kind in KINDS[::2]:
+        high = extract(faint, kind, fast_threshold=40, low_fast_threshold=40)
+        low = extract(faint, kind, fast_threshold=40, low_fast_threshold=3)
+        assert len(low) > len(high) + 50 or kind == "fast"
+        assert len(low) >= len(high)
+
+
+@pytest.mark.parametrize("kind", ["orb", "fast", "gftt"])
+def test_upright_descriptors_do_not_depend_on_detected_angles(kind: Kind) -> None:
+    image = blobs()
+    features = extract(image, kind, upright=True)
+    orb = cv2.ORB_create(nlevels=1, edgeThreshold=19)  # type: ignore[attr-defined]
+    points = [
+        cv2.KeyPoint(float(u), float(v), 31.0, 0.0, 0.0, 0) for u, v in features.keypoints[:20]
+    ]
+    found, expected = orb.compute(image, points)
+    assert len(found) == 20
+    np.testing.assert_array_equal(features.descriptors[:20], expected)
+
+
+def test_turned_images_are_described_alike_without_upright() -> None:
+    image = blobs(size=(240, 240))
+    turned = np.ascontiguousarray(np.rot90(image))
+    for upright in (False, True):
+        first = extract(image, upright=upright)
+        second = extract(turned, upright=upright)
+        # rot90 maps (u, v) to (v, 239 - u).
+        places = np.stack([first.keypoints[:, 1], 239 - first.keypoints[:, 0]], axis=1)
+        gaps = np.linalg.norm(places[:, None] - second.keypoints[None], axis=2)
+        i, j = np.nonzero(gaps < 0.5)
+        bits = np.bitwise_count(first.descriptors[i] ^ second.descriptors[j]).sum(axis=1)
+        assert len(bits) > 50
+        assert (np.median(bits) > 80) == upright
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_octaves_count_from_the_finest_level(kind: Kind) -> None:
+    octaves = extract(blobs(), kind, n_octaves=4, scale_factor=1.3).octaves
+    assert octaves.min() >= -1
+    assert octaves.max() < 10
+
+
+@settings(deadline=None)
+@given(groups=st.lists(st.integers(0, 5), max_size=30))
+def test_ranks_count_within_each_group(groups: list[int]) -> None:
+    ordered = sorted(groups)
+    expected = [ordered[:i].count(group) for i, group in enumerate(ordered)]
+    assert rank_in_group(np.array(ordered, dtype=np.int64)).tolist() == expected

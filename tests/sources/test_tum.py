@@ -1,0 +1,148 @@
+"""TUM RGB-D folders."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from gvo.config import Config
+from gvo.errors import CalibrationError, RecordingError
+from gvo.sources.frames import frames
+from gvo.sources.tum import TumSource
+from gvo.types import RgbdFrame
+
+_COLOR = ("1305031102.175304", "1305031102.211214")
+_DEPTH = ("1305031102.160407", "1305031102.194330")
+
+
+def test_images_come_by_stamp_in_metres_and_exact_nanoseconds(tmp_path: Path, tiny: Any) -> None:
+    source = TumSource(tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH))
+    images = list(source.images())
+    assert [(image.stream, image.stamp_ns) for image in images] == [
+        (1, 1305031102160407000),
+        (0, 1305031102175304000),
+        (1, 1305031102194330000),
+        (0, 1305031102211214000),
+    ]
+    np.testing.assert_array_equal(images[0].load(), tiny.depth(0))
+    np.testing.assert_array_equal(images[1].load(), tiny.texture(0, is_color=True))
+    assert source.info.n_images == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "fx", "k1"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", 517.306408, 0.262383),
+        ("fr2_desk", 520.908620, 0.231222),
+        ("Freiburg3_office", 535.433105, 0.0),
+    ],
+)
+def test_the_name_of_the_folder_tells_the_camera(
+    tmp_path: Path, tiny: Any, name: str, fx: float, k1: float
+) -> None:
+    folder = tiny.write_tum(tmp_path / name, _COLOR, _DEPTH)
+    (folder / "calibration.yaml").unlink()
+    (calibration,) = TumSource(folder).info.calibrations
+    assert (calibration.K[0, 0], calibration.D[0]) == (fx, k1)
+    np.testing.assert_array_equal(calibration.P[:, :3], calibration.K)
+    np.testing.assert_array_equal(calibration.R, np.eye(3))
+    assert (calibration.width, calibration.height) == (640, 480)
+
+
+def test_the_nearest_calibration_wins(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "freiburg1", _COLOR, _DEPTH)
+    assert TumSource(folder).info.camera.fx == tiny.camera.fx
+    K = [99.0, 0, 23.5, 0, 99.0, 15.5, 0, 0, 1]
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(tiny.ros_camera(camera_matrix={"data": K})))
+    info = TumSource(folder, calibration=path).info
+    assert info.camera.fx == 99.0
+    assert "calibration: mine.yaml" in info.decisions
+
+
+def test_without_any_calibration_the_message_says_what_to_give(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
+    (folder / "calibration.yaml").unlink()
+    with pytest.raises(CalibrationError, match="--calibration FILE"):
+        TumSource(folder)
+
+
+def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+
+    def largest(**options: Any) -> float:
+        return float(np.nanmax(next(TumSource(folder, **options).images()).load()))
+
+    at_5000 = largest()
+    (folder / "calibration.yaml").write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
+    assert largest() == pytest.approx(2 * at_5000)
+    assert largest(depth_scale=10000.0) == pytest.approx(0.5 * at_5000)
+
+
+def test_an_implausible_scale_is_doubted_and_not_changed(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    assert not any("implausible" in line for line in TumSource(folder).info.decisions)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
+    info = TumSource(folder).info
+    (doubt,) = [line for line in info.decisions if "implausible" in line]
+    assert "--set depth.scale=1000" in doubt
+    assert np.nanmedian(next(TumSource(folder).images()).load()) < 0.5
+    chosen = TumSource(folder, depth_scale=1000.0).info
+    assert not any("implausible" in line for line in chosen.decisions)
+
+
+def test_depth_and_colour_are_undistorted_with_the_same_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", ["1.0"], ["1.0"])
+    D = [0.3, -0.1, 0.001, -0.002, 0.0]
+    (folder / "calibration.yaml").write_text(
+        yaml.safe_dump(tiny.ros_camera(distortion_coefficients={"data": D}))
+    )
+    (frame,) = frames(TumSource(folder), Config())
+    assert isinstance(frame, RgbdFrame)
+    K = tiny.camera.K
+    grey = cv2.cvtColor(tiny.texture(0, is_color=True), cv2.COLOR_BGR2GRAY)
+    expected = np.asarray(cv2.undistort(grey, K, np.array(D)), dtype=np.int64)
+    assert np.abs(frame.image.astype(np.int64) - expected).max() <= 1
+    # each depth is one of the raw depths, at the pixel that the distortion model says
+    u, v = 30, 8
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    raw, _ = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), K, np.array(D))
+    column, row = np.rint(np.ravel(raw)).astype(int)
+    assert frame.depth[v, u] == tiny.depth(0)[row, column]
+
+
+def test_the_truth_is_read_where_there_is_one(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    assert TumSource(folder).ground_truth() is None
+    (folder / "groundtruth.txt").write_text("# truth\n1305031102.1753 1 2 3 0 0 0 1\n")
+    truth = TumSource(folder).ground_truth()
+    assert truth is not None
+    np.testing.assert_array_equal(truth.positions, [[1, 2, 3]])
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+def test_a_missing_list_is_refused(tmp_path: Path, tiny: Any, name: str) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    (folder / name).unlink()
+    with pytest.raises(RecordingError, match=name):
+        TumSource(folder)
+
+
+@pytest.mark.recorded
+def test_nearly_all_recorded_images_find_their_depth(gvo_data: Path) -> None:
+    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    items = list(frames(source, Config()))
+    assert len(items) == 80
+    assert sum(isinstance(item, RgbdFrame) for item in items) >= 78
+
+
+@pytest.mark.recorded
+def test_the_recorded_depth_in_millimetres_is_noticed(gvo_data: Path) -> None:
+    decisions = TumSource(gvo_data / "sevenscenes_start").info.decisions
+    assert any("--set depth.scale=1000" in decision for decision in decisions)
+    decisions = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start").info.decisions
+    assert not any("implausible" in decision for decision in decisions)
