@@ -108,7 +108,7 @@ class StereoConfig(Section):
 class TemporalConfig(Section):
     """Matching of a reference and the current frame."""
 
-    radius_px: float = _parameter(30.0, "search radius around a predicted pixel", "px", gt=0)
+    radius_px: float = _parameter(20.0, "search radius around a predicted pixel", "px", gt=0)
     wide_radius_px: float = _parameter(
         80.0, "search radius where there is no prediction, or it found too little", "px", gt=0
     )

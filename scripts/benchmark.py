@@ -36,7 +36,9 @@ def measure(path: Path, config: gvo.Config) -> None:
     """Run odometry over one recording and print its figures."""
     source = gvo.open_recording(path, config=config)
     odometry = gvo.Odometry(source.info.camera, config)
-    results, smoothed, yardsticks_ms = [], [], []
+    results: list[gvo.FrameResult] = []
+    smoothed: list[gvo.Estimate] = []
+    yardsticks_ms: list[float] = []
     stages: dict[str, list[float]] = {"read": []}
     cpu_s = 0.0
     items = gvo.frames(source, config)

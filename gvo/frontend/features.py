@@ -64,7 +64,7 @@ class FeatureExtractor:
         image : ndarray of uint8, shape (height, width)
         """
         found = self._detect(image)
-        if self._config.kind != "sift":
+        if self._config.kind in ("fast", "gftt"):
             found = _inside(found, image.shape)
         found = _spread(found, image.shape, self._config)
         if self._config.upright:
@@ -131,14 +131,14 @@ def _no_features(kind: str) -> Features:
     )
 
 
-def _inside(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...]) -> list[cv2.KeyPoint]:
-    """Drop what has no room for a descriptor, before it takes a share of the budget."""
-    limit_u, limit_v = shape[1] - _BORDER_PX, shape[0] - _BORDER_PX
-    return [
-        point
-        for point in found
-        if _BORDER_PX <= point.pt[0] < limit_u and _BORDER_PX <= point.pt[1] < limit_v
-    ]
+def _inside(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...]) -> Sequence[cv2.KeyPoint]:
+    """Drop corners without room for ORB's patch, before they take a share of the budget."""
+    if len(found) == 0:
+        return found
+    pixels = np.asarray(cv2.KeyPoint.convert(found))
+    limits = np.array([shape[1], shape[0]]) - _BORDER_PX
+    fits = np.all((pixels >= _BORDER_PX) & (pixels < limits), axis=1)
+    return [found[int(index)] for index in np.flatnonzero(fits)]
 
 
 def _octaves(found: Sequence[cv2.KeyPoint]) -> IntArray:
@@ -153,7 +153,7 @@ def _spread(
     """Keep the strongest of each grid cell, round by round, up to the budget."""
     if len(found) == 0:
         return []
-    pixels = cv2.KeyPoint.convert(found)
+    pixels = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64)
     responses = np.array([point.response for point in found])
     columns = -(-shape[1] // config.cell_size_px)
     cells = (pixels // config.cell_size_px).astype(np.int64) @ [1, columns]
@@ -161,7 +161,7 @@ def _spread(
     ranks = rank_in_group(np.asarray(cells[order], dtype=np.int64))
     # The first of every cell before the second of any: the weakest rank is cut by response.
     chosen = order[np.lexsort((-responses[order], ranks))[: config.n_features]]
-    return [found[index] for index in np.sort(chosen)]
+    return [found[int(index)] for index in np.sort(chosen)]
 
 
 def rank_in_group(sorted_groups: IntArray) -> IntArray:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
@@ -24,7 +25,9 @@ from gvo.types import BoolArray, Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3
 # A step of the pose, radians and metres, that no longer matters.
-_CONVERGED = 1e-6
+_CONVERGED = 1e-5
+# The first round only has to be good enough to choose the inliers again.
+_N_FIRST_ITERATIONS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +83,11 @@ def refine_pose(
         A failure where the residuals leave a direction of motion open.
     """
     T: FloatArray | Failure = _gauss_newton(
-        T_target_source, matches.select(inliers), camera, config
+        T_target_source,
+        matches.select(inliers),
+        camera,
+        huber=config.huber,
+        n_iterations=min(_N_FIRST_ITERATIONS, config.n_iterations),
     )
     if isinstance(T, Failure):
         return T
@@ -88,7 +95,7 @@ def refine_pose(
     if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
         chosen = inliers
     inlying = matches.select(chosen)
-    T = _gauss_newton(T, inlying, camera, config)
+    T = _gauss_newton(T, inlying, camera, huber=config.huber, n_iterations=config.n_iterations)
     if isinstance(T, Failure):
         return T
     covariance, scale = _covariance(T, inlying, camera, config)
@@ -124,18 +131,24 @@ def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
 
 
 def _gauss_newton(
-    T: FloatArray, matches: Correspondences, camera: StereoCamera, config: RegistrationConfig
+    T: FloatArray,
+    matches: Correspondences,
+    camera: StereoCamera,
+    *,
+    huber: float,
+    n_iterations: int,
 ) -> FloatArray | Failure:
     information = _information(T, matches, camera)
-    for _ in range(config.n_iterations):
+    for _ in range(n_iterations):
         points = se3.transform_points(T, matches.source_points)
         if np.any(points[:, 2] < _MIN_DEPTH_M):
             return Failure(reason="the motion puts points behind the camera")
-        H, g, _ = _normal_equations(points, matches, information, camera, huber=config.huber)
+        H, g, _ = _normal_equations(points, matches, information, camera, huber=huber)
         step = _solve(H, g)
         if isinstance(step, Failure):
             return step
-        T = se3.exp(step) @ T
+        # Not the exponential map but a retraction: the same to first order, and cheap.
+        T = se3.make_transform(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]) @ T
         if np.abs(step).max() < _CONVERGED:
             break
     if not np.isfinite(T).all():

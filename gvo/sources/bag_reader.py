@@ -53,6 +53,7 @@ _FAULTS = (
     EOFError,
     OSError,
     RuntimeError,
+    MemoryError,  # a damaged size
     struct.error,
     apsw.Error,
     ZstdError,
@@ -152,6 +153,8 @@ class BagReader:
     def _check_folder(self) -> None:
         """Read the files inside directly where the folder's metadata are of no use."""
         files = sorted(p for p in self._path.iterdir() if p.suffix in _STORAGE_SUFFIXES)
+        if not files and not (self._path / "metadata.yaml").is_file():
+            raise RecordingError(f"{self._path}: holds neither metadata.yaml nor a .mcap or .db3")
         try:
             with self._opened() as readers:
                 if not any(_is_silent(reader) for reader in readers):

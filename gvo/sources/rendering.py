@@ -98,7 +98,7 @@ def _shade(view: View, visible: IndexArray, u: SampleArray, v: SampleArray) -> S
     """Look the texture of the visible rectangles up at samples (u, v)."""
     scene = view.scene
     if len(view.indices) == 0:
-        return np.full(visible.shape, scene.haze_grey, dtype=np.float32)
+        return np.full(visible.shape, scene.light.haze_grey, dtype=np.float32)
 
     def gather(values: FloatArray) -> list[SampleArray]:
         # Where nothing is visible the last rectangle fills in, and is painted over.
@@ -116,10 +116,10 @@ def _shade(view: View, visible: IndexArray, u: SampleArray, v: SampleArray) -> S
         positions.append(scene.atlas.locate(texels, footprints) + corner)
     (gains,) = gather(scene.gains[view.indices, np.newaxis])
     grey = scene.atlas.sample(*positions) * gains
-    if np.isfinite(scene.haze_m):
-        clear = np.exp(depths * np.float32(-1.0 / scene.haze_m))
-        grey = scene.haze_grey + (grey - scene.haze_grey) * clear
-    grey[visible == NOTHING] = scene.haze_grey
+    if np.isfinite(scene.light.haze_m):
+        clear = np.exp(depths * np.float32(-1.0 / scene.light.haze_m))
+        grey = scene.light.haze_grey + (grey - scene.light.haze_grey) * clear
+    grey[visible == NOTHING] = scene.light.haze_grey
     return np.asarray(grey, dtype=np.float32)
 
 

@@ -79,15 +79,12 @@ def test_the_same_image_gives_the_same_features(kind: Kind) -> None:
 def test_a_crowded_corner_does_not_take_the_whole_budget() -> None:
     image = np.full((240, 320), 120, dtype=np.uint8)
     image[:80, :80] = blobs(0, 200, (80, 80))
-    rest = blobs(1, 60)
-    # The rest of the image is fainter by far.
-    image[80:, 80:] = (120 + (rest[80:, 80:].astype(float) - 120) / 3).astype(np.uint8)
+    # The rest of the image is fainter by half.
+    image[80:, 80:] = (120 + (blobs(1, 150)[80:, 80:].astype(float) - 120) / 2).astype(np.uint8)
     features = extract(image, "fast", n_features=100)
     assert len(features) == 100
     in_rest = np.all(features.keypoints >= 80, axis=1)
-    assert in_rest.mean() > 0.4
-    cells = set(map(tuple, (features.keypoints[in_rest] // 40).astype(int).tolist()))
-    assert len(cells) >= 15  # of 24
+    assert in_rest.mean() > 0.5  # by strength alone: a fifth
 
 
 def test_faint_images_are_tried_with_the_low_threshold() -> None:

@@ -22,7 +22,8 @@ PERFECT = SensorNoise.none()
 
 
 def perfect(world: Any, sensor: Any = "stereo", **options: Any) -> SyntheticRecording:
-    return SyntheticRecording(world, sensor, **({"scale": 0.5, "noise": PERFECT} | options))
+    defaults: dict[str, Any] = {"scale": 0.5, "noise": PERFECT}
+    return SyntheticRecording(world, sensor, **(defaults | options))
 
 
 def load(recording: Source, index: int, stream: int = 0) -> NDArray[Any]:

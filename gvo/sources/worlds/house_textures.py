@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvo.sources.scene import Texture
+from gvo.sources.atlas import Texture
 from gvo.sources.worlds import painting as paint
 from gvo.sources.worlds.painting import Box, Canvas
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from gvo.sources.scene import Texture
+from gvo.sources.atlas import Texture
 from gvo.types import BoolArray
 
 N_TEXELS = 1024

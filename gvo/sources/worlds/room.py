@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from gvo.sources.scene import Light, Rectangle, Scene
+from gvo.sources.scene import Light, Rectangle, Scene, make_scene
 from gvo.sources.worlds.building import box, ground_axes, plain, slab, stretched, wall
 from gvo.sources.worlds.room_textures import room_textures
 from gvo.types import FloatArray
@@ -38,7 +38,7 @@ def room(seed: int) -> Scene:
         *_coffee_table(np.array([-0.55, 0.75]), 0.2),
         *_plant(np.array([1.72, 1.66])),
     ]
-    return Scene(rectangles, room_textures(seed), light=_LAMP)
+    return make_scene(rectangles, room_textures(seed), _LAMP)
 
 
 def _at(x: float, y: float) -> FloatArray:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
-from gvo.sources.scene import Texture
+from gvo.sources.atlas import Texture
 from gvo.sources.worlds import painting as paint
 from gvo.sources.worlds.painting import Canvas
 
@@ -16,7 +14,6 @@ _WORDS = (
 )  # fmt: skip
 
 
-@lru_cache(maxsize=2)
 def room_textures(seed: int) -> dict[str, Texture]:
     """Paint the textures of the room; the same seed gives the same bytes."""
     painters = {

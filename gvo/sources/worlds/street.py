@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gvo.sources.scene import Light, Rectangle, Scene, TextureAtlas
+from gvo.sources.scene import Light, Rectangle, Scene, make_scene
 from gvo.sources.worlds.building import box, ground_axes, plain, slab, stretched, wall
 from gvo.sources.worlds.house_textures import HOUSES, SHOPS, STOREY_M
 from gvo.sources.worlds.motion import (
@@ -50,15 +50,13 @@ def street(seed: int) -> Scene:
     Scene
         Some 2000 rectangles, map axes with z up, the road at height 0.
     """
-    textures = street_textures(seed)
     rectangles = [*_backdrop(), *_road(), *_markings()]
     for side in (0, 1):
         rng = np.random.default_rng([seed, 2, side])
         rectangles += _houses(rng, side)
         rectangles += _parked_cars(rng, side)
         rectangles += _trees_and_posts(rng, side)
-    atlas = TextureAtlas(list(textures.values()))
-    return Scene(rectangles, textures, light=_DAYLIGHT, atlas=atlas)
+    return make_scene(rectangles, street_textures(seed), _DAYLIGHT)
 
 
 def _point(s: float, right: float) -> FloatArray:

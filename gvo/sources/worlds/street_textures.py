@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
-from gvo.sources.scene import Texture
+from gvo.sources.atlas import Texture
 from gvo.sources.worlds import house_textures as houses
 from gvo.sources.worlds import painting as paint
 
@@ -19,7 +18,6 @@ CAR_PROFILE = (  # (along, up) in metres from the rear bumper; the upper outline
 )  # fmt: skip
 
 
-@lru_cache(maxsize=2)
 def street_textures(seed: int) -> dict[str, Texture]:
     """Paint the textures of the street; the same seed gives the same bytes."""
     painters = {

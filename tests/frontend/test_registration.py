@@ -1,0 +1,162 @@
+"""Relative poses from matched observations of points at known places."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.config import Config
+from gvo.frontend.registration import register_matches
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.types import Failure, FloatArray, IntArray, Observations, RelativePose
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+SIGMAS = np.array([0.5, 0.5, 0.3])
+
+
+def configure(
+    refine: Literal["gauss_newton", "none"] = "gauss_newton",
+    weighting: Literal["inverse_depth", "none"] = "inverse_depth",
+    **ransac: object,
+) -> Config:
+    return Config.model_validate(
+        {
+            "ransac": {"n_hypotheses": 150, "min_inliers": 12, "min_disparity_px": 3.0} | ransac,
+            "registration": {"refine": refine, "weighting": weighting, "huber": 2.8, "gate": 4.0},
+        }
+    )
+
+
+def observe(stamp_ns: int, points: FloatArray, noise: float, rng: np.random.Generator) -> Observations:
+    n = len(points)
+    uvd = CAMERA.project_stereo(points) + noise * SIGMAS * rng.normal(size=(n, 3))
+    return Observations(
+        stamp_ns=stamp_ns,
+        keypoints=uvd[:, :2],
+        disparities=uvd[:, 2],
+        points_cam=CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2]),
+        sigmas=np.tile(SIGMAS, (n, 1)),
+        descriptors_left=np.zeros((n, 32), dtype=np.uint8),
+    )
+
+
+def two_frames(
+    seed: int, n: int = 120, n_outliers: int = 40, noise: float = 1.0, *, size: float = 1.0
+) -> tuple[FloatArray, Observations, Observations, IntArray]:
+    """Return T_reference_current, observations and matches, the first of them wrong."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.03 * size * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = 0.2 * size * rng.normal(size=3)
+    points_current = rng.uniform([-2, -1.5, 3], [2, 1.5, 12], size=(n, 3))
+    points_reference = points_current @ T[:3, :3].T + T[:3, 3]
+    order = rng.permutation(n)  # index in current of each match
+    partners = np.arange(n)
+    partners[:n_outliers] = np.roll(partners[:n_outliers], 1)
+    reference = observe(10, points_reference, noise, rng)
+    current = observe(20, points_current[np.argsort(order)], noise, rng)
+    return T, reference, current, np.stack([partners, order], axis=1)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds)
+def test_the_motion_of_the_current_frame_is_found_among_outliers(seed: int) -> None:
+    T, reference, current, matches = two_frames(seed)
+    result = register_matches(reference, current, matches, CAMERA, configure())
+    assert isinstance(result, RelativePose)
+    error = se3.log(np.linalg.inv(T) @ result.T_reference_current)
+    assert np.linalg.norm(error[:3]) < 0.01
+    assert np.linalg.norm(error[3:]) < 0.05
+    assert result.inliers[40:].mean() > 0.9
+    assert result.inliers[:40].mean() < 0.2
+    np.testing.assert_array_equal(result.matches, matches)
+    np.testing.assert_array_equal(result.covariance, result.covariance.T)
+
+
+def test_the_covariance_perturbs_the_pose_on_the_right() -> None:
+    # A motion so large that it matters on which side, and in which frame.
+    whitened = []
+    for seed in range(150):
+        T, reference, current, matches = two_frames(seed, n=80, n_outliers=0, size=6.0)
+        result = register_matches(reference, current, matches, CAMERA, configure())
+        assert isinstance(result, RelativePose)
+        error = se3.log(np.linalg.inv(T) @ result.T_reference_current)
+        whitened.append(error @ np.linalg.solve(result.covariance, error))
+    assert 0.7 < np.mean(whitened) / 6 < 1.4
+
+
+@pytest.mark.parametrize("weighting", ["inverse_depth", "none"])
+@pytest.mark.parametrize("refine", ["gauss_newton", "none"])
+def test_exact_points_give_the_exact_motion_whatever_the_method(
+    refine: Literal["gauss_newton", "none"], weighting: Literal["inverse_depth", "none"]
+) -> None:
+    T, reference, current, matches = two_frames(1, noise=0.0)
+    config = configure(refine, weighting)
+    result = register_matches(reference, current, matches, CAMERA, config)
+    assert isinstance(result, RelativePose)
+    np.testing.assert_allclose(result.T_reference_current, T, atol=1e-5)
+
+
+def test_refinement_and_weights_each_reduce_the_error() -> None:
+    variants = {
+        "plain": configure("none", "none"),
+        "weighted": configure("none", "inverse_depth"),
+        "refined": configure("gauss_newton", "none"),
+    }
+    squares = dict.fromkeys(variants, 0.0)
+    for seed in range(60):
+        T, reference, current, matches = two_frames(seed)
+        for name, config in variants.items():
+            result = register_matches(reference, current, matches, CAMERA, config)
+            assert isinstance(result, RelativePose)
+            squares[name] += float(np.sum((result.T_reference_current - T)[:3, 3] ** 2))
+    assert squares["refined"] < 0.8 * squares["weighted"] < 0.8 * squares["plain"]
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=seeds)
+def test_the_result_depends_on_the_frames_and_the_seed_alone(seed: int) -> None:
+    _, reference, current, matches = two_frames(seed)
+    results = [
+        register_matches(reference, current, matches, CAMERA, configure(seed=ransac_seed))
+        for ransac_seed in (0, 0, 1)
+    ]
+    poses = [r.T_reference_current.tobytes() for r in results if isinstance(r, RelativePose)]
+    assert len(poses) == 3
+    assert poses[0] == poses[1]
+
+
+def test_another_seed_draws_other_samples() -> None:
+    _, reference, current, matches = two_frames(0)
+    poses = set()
+    for ransac_seed in range(4):
+        config = configure("none", seed=ransac_seed, n_hypotheses=3, inlier_threshold_px=20.0)
+        result = register_matches(reference, current, matches, CAMERA, config)
+        poses.add(result.T_reference_current.tobytes() if isinstance(result, RelativePose) else b"")
+    assert len(poses) > 1
+
+
+@pytest.mark.parametrize("n", [0, 5, 11])
+def test_too_few_matches_are_a_failure(n: int) -> None:
+    _, reference, current, matches = two_frames(0)
+    result = register_matches(reference, current, matches[:n], CAMERA, configure())
+    assert isinstance(result, Failure)
+    assert result.n_matches == n
+
+
+def test_matches_without_a_common_motion_are_a_failure_that_counts_them() -> None:
+    rng = np.random.default_rng(0)
+    frames = [
+        observe(i, rng.uniform([-2, -1.5, 3], [2, 1.5, 12], size=(80, 3)), 0.0, rng)
+        for i in range(2)
+    ]
+    matches = np.stack([np.arange(80)] * 2, axis=1)
+    result = register_matches(*frames, matches, CAMERA, configure())
+    assert isinstance(result, Failure)
+    assert result.n_matches == 80
+    assert result.n_inliers < 12
