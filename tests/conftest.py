@@ -1,9 +1,26 @@
 """Fixtures that several test modules share."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+
+import gvo
+from gvo.cli import main
+from gvo.sources.synthetic import SyntheticRecording
+
+
+class Answer(NamedTuple):
+    """What a command gave."""
+
+    code: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Answer]
 
 
 @pytest.fixture(scope="session")
@@ -16,3 +33,34 @@ def gvo_data() -> Path:
     if not folder.is_dir():
         pytest.fail(f"GVO_DATA={name} is no folder")
     return folder
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Return a function that runs the `gvo` command with its arguments."""
+
+    def run(*arguments: object) -> Answer:
+        monkeypatch.setattr("sys.argv", ["gvo", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_info:
+            main()
+        captured = capsys.readouterr()
+        code = exit_info.value.code
+        return Answer(code if isinstance(code, int) else 0, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bag of a short rendered drive, a stereo camera at half size."""
+    path = tmp_path_factory.mktemp("bags") / "drive.mcap"
+    gvo.convert(SyntheticRecording("driving", "stereo", n_frames=20, scale=0.5), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bag of a short walk in a rendered room, an RGB-D camera at half size."""
+    path = tmp_path_factory.mktemp("bags") / "room.bag"
+    gvo.convert(SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5), path)
+    return path

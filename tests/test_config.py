@@ -166,11 +166,7 @@ def test_an_unreadable_file_is_refused_by_name(tmp_path: Path) -> None:
 
 
 def all_keys() -> list[tuple[str, str]]:
-    return [
-        (section, key)
-        for section, values in Config().model_dump().items()
-        for key in values
-    ]
+    return [(section, key) for section, values in Config().model_dump().items() for key in values]
 
 
 def test_the_description_lists_every_key_with_a_meaning() -> None:
@@ -184,7 +180,9 @@ def test_the_description_lists_every_key_with_a_meaning() -> None:
 
 
 def test_the_description_tells_unit_range_and_choices() -> None:
-    lines = {line.split(":")[0].strip(): line for line in describe_configuration(Config()).split("\n")}
+    lines = {
+        line.split(":")[0].strip(): line for line in describe_configuration(Config()).split("\n")
+    }
     assert "[1/m, > 0]" in lines["scale"]
     assert "[px, >= 1, <= 20]" in lines["patch_radius_px"]
     assert "huber | none" in lines["kernel"]

@@ -43,8 +43,12 @@ def check_covariance(covariance: FloatArray, name: str) -> None:
     """Raise ValueError for what is no covariance; GTSAM would die of it later."""
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
         raise ValueError(f"{name} must be a finite 6x6 matrix")
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0):
+    variances = np.diag(covariance)
+    if np.any(variances <= 0):
+        raise ValueError(f"{name} must be positive definite")
+    # Of correlations: rounding leaves elements that should be zero at any ratio to each other.
+    correlations = covariance / np.sqrt(np.outer(variances, variances))
+    if np.abs(correlations - correlations.T).max() > 1e-6:
         raise ValueError(f"{name} must be symmetric")
-    scale = np.sqrt(np.abs(np.diag(covariance)))
-    if np.any(scale <= 0) or np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] <= 1e-12:
+    if np.linalg.eigvalsh(correlations)[0] <= 1e-12:
         raise ValueError(f"{name} must be positive definite")

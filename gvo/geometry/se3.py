@@ -128,7 +128,8 @@ def compose_covariance(
 ) -> FloatArray:
     """Return the covariance (6, 6) of T_a_b @ T_b_c, independent errors, first order."""
     Ad = adjoint(invert(T_b_c))
-    return np.asarray(Ad @ covariance_a_b @ Ad.T + covariance_b_c)
+    moved = Ad @ covariance_a_b @ Ad.T
+    return np.asarray(0.5 * (moved + moved.T) + covariance_b_c)  # symmetric in spite of rounding
 
 
 def rotation_angle(T: FloatArray) -> FloatArray:

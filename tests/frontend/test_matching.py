@@ -21,9 +21,7 @@ def slow_mutual_best(pairs: IntArray, distances: FloatArray) -> set[tuple[int, i
     """Keep a pair if no other pair of either member is better, or equal and earlier."""
     kept = set()
     for k, (i, j) in enumerate(pairs):
-        rivals = [
-            other for other, (a, b) in enumerate(pairs) if other != k and (a == i or b == j)
-        ]
+        rivals = [other for other, (a, b) in enumerate(pairs) if other != k and (a == i or b == j)]
         if all((distances[k], k) < (distances[other], other) for other in rivals):
             kept.add((int(i), int(j)))
     return kept
@@ -75,9 +73,7 @@ def test_binary_distances_are_shares_of_differing_bits(seed: int, n_bytes: int) 
     second = rng.integers(0, 256, (4, n_bytes), dtype=np.uint8)
     pairs = random_pairs(rng, 5, 4)
     expected = [
-        sum(
-            bin(int(a) ^ int(b)).count("1") for a, b in zip(first[i], second[j], strict=True)
-        )
+        sum(bin(int(a) ^ int(b)).count("1") for a, b in zip(first[i], second[j], strict=True))
         / (8 * n_bytes)
         for i, j in pairs
     ]

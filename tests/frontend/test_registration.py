@@ -32,7 +32,9 @@ def configure(
     )
 
 
-def observe(stamp_ns: int, points: FloatArray, noise: float, rng: np.random.Generator) -> Observations:
+def observe(
+    stamp_ns: int, points: FloatArray, noise: float, rng: np.random.Generator
+) -> Observations:
     n = len(points)
     uvd = CAMERA.project_stereo(points) + noise * SIGMAS * rng.normal(size=(n, 3))
     return Observations(

@@ -21,9 +21,7 @@ def random_codes(rng: np.random.Generator, n: int) -> NDArray[np.uint8]:
     return rng.integers(0, 256, (n, 32), dtype=np.uint8)
 
 
-def flip(
-    codes: NDArray[np.uint8], n_bits: int, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def flip(codes: NDArray[np.uint8], n_bits: int, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Return descriptors with `n_bits` of 256 bits flipped in each."""
     bits = np.unpackbits(codes, axis=1)
     for row in bits:

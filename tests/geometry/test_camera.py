@@ -100,9 +100,15 @@ def test_a_pair_without_baseline_is_refused() -> None:
 
 def test_a_pair_of_different_intrinsics_is_refused() -> None:
     with pytest.raises(CalibrationError, match="rectified"):
-        stereo_camera(ideal(), Calibration.from_camera(CAMERA.__class__(
-            fx=501.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2
-        ), baseline=0.2))
+        stereo_camera(
+            ideal(),
+            Calibration.from_camera(
+                CAMERA.__class__(
+                    fx=501.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2
+                ),
+                baseline=0.2,
+            ),
+        )
 
 
 def test_a_pair_of_different_sizes_is_refused_with_both_sizes() -> None:
@@ -164,18 +170,14 @@ def test_points_seen_by_raw_cameras_land_on_one_row_at_the_disparity_of_their_de
     rotation, _ = cv2.Rodrigues(T_right_left[:3, :3])
     zero = np.zeros(3)
     seen_left, _ = cv2.projectPoints(points_left, zero, zero, LEFT.K, LEFT.D)
-    seen_right, _ = cv2.projectPoints(
-        points_left, rotation, T_right_left[:3, 3], RIGHT.K, RIGHT.D
-    )
+    seen_right, _ = cv2.projectPoints(points_left, rotation, T_right_left[:3, 3], RIGHT.K, RIGHT.D)
     pixels_left = rectified_pixels(left, np.asarray(seen_left)[:, 0])
     pixels_right = rectified_pixels(right, np.asarray(seen_right)[:, 0])
     np.testing.assert_allclose(pixels_left[:, 1], pixels_right[:, 1], atol=0.02)
     points_cam = points_left @ left.R.T
     expected = camera.project_stereo(points_cam)
     np.testing.assert_allclose(pixels_left, expected[:, :2], atol=0.02)
-    np.testing.assert_allclose(
-        pixels_left[:, 0] - pixels_right[:, 0], expected[:, 2], atol=0.03
-    )
+    np.testing.assert_allclose(pixels_left[:, 0] - pixels_right[:, 0], expected[:, 2], atol=0.03)
 
 
 def test_rectification_keeps_the_raw_calibrations() -> None:
@@ -218,9 +220,7 @@ def test_each_difference_between_raw_and_rectified_is_mapped(what: str) -> None:
         values["R"] = Rotation.from_rotvec([0.0, 0.0, 0.01]).as_matrix()
     else:
         values["P"][0, 2] += 5.0
-    maps = rectification_maps(
-        Calibration(width=640, height=480, is_rectified=False, **values)
-    )
+    maps = rectification_maps(Calibration(width=640, height=480, is_rectified=False, **values))
     assert maps is not None
     # Where a rectified pixel comes from, by OpenCV's projection of its ray.
     row, column = 100, 500

@@ -201,9 +201,7 @@ def test_inliers_that_the_sample_missed_are_chosen_again() -> None:
     few = np.arange(100) < 20
     result = refine(T, matches, few)
     assert result.inliers.sum() > 90
-    fewer = refine_pose(
-        T, matches.select(few), np.ones(20, dtype=np.bool_), CAMERA, SETTINGS
-    )
+    fewer = refine_pose(T, matches.select(few), np.ones(20, dtype=np.bool_), CAMERA, SETTINGS)
     assert isinstance(fewer, Refinement)
     assert np.trace(result.covariance) < 0.5 * np.trace(fewer.covariance)
 

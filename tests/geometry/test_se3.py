@@ -149,6 +149,7 @@ def test_composed_covariance_is_that_of_sampled_compositions() -> None:
     noisy_b_c = T_b_c @ se3.exp(rng.multivariate_normal(np.zeros(6), C_b_c, n))
     errors = se3.log(np.linalg.inv(T_a_b @ T_b_c) @ noisy_a_b @ noisy_b_c)
     composed = se3.compose_covariance(C_a_b, T_b_c, C_b_c)
+    np.testing.assert_array_equal(composed, composed.T)
     scale = np.sqrt(np.diag(composed))
     deviation = (np.cov(errors.T) - composed) / np.outer(scale, scale)
     assert np.abs(deviation).max() < 0.05

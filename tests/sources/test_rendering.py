@@ -13,6 +13,9 @@ from gvo.geometry.se3 import make_transform
 from gvo.sources.atlas import Texture
 from gvo.sources.rendering import render_depth, render_image, to_uint8
 from gvo.sources.scene import Light, Rectangle, Scene, make_scene
+from gvo.sources.worlds.motion import drive, look_around
+from gvo.sources.worlds.room import room
+from gvo.sources.worlds.street import street
 from gvo.types import FloatArray
 
 CAMERA = PinholeCamera(fx=50.0, fy=55.0, cx=31.3, cy=23.6, width=64, height=48)
@@ -95,6 +98,29 @@ def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() ->
     assert np.all(np.isnan(depth[:24]))
 
 
+@pytest.mark.parametrize(("build", "move"), [(street, drive), (room, look_around)])
+def test_in_a_whole_world_nothing_is_nearer_than_what_is_seen(build: Any, move: Any) -> None:
+    scene, T_map_cam = build(0), move(np.array([3.1]))[0]
+    camera = PinholeCamera(fx=500.0, fy=500.0, cx=420.0, cy=180.0, width=840, height=360)
+    depth = render_depth(scene, T_map_cam, camera)
+    v, u = np.random.default_rng(0).integers(0, (360, 840), (400, 2)).T
+    rays = camera.unproject(np.stack([u, v], axis=1).astype(float)) @ T_map_cam[:3, :3].T
+    to_origins = scene.origins - T_map_cam[:3, 3]
+    normals = np.cross(scene.axes_s, scene.axes_t)
+    slopes = rays @ normals.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.sum(normals * to_origins, axis=1) / slopes
+    hits = rays[:, np.newaxis] * z[..., np.newaxis] - to_origins
+    is_hit = (z > 0) & ((slopes > 0) | scene.is_two_sided) & ~scene.has_mask
+    for axes, sizes in ((scene.axes_s, scene.sizes[:, 0]), (scene.axes_t, scene.sizes[:, 1])):
+        along = np.sum(hits * axes, axis=-1)
+        is_hit &= (along >= 0) & (along <= sizes)
+    nearest = np.where(is_hit, z, np.inf).min(axis=1)
+    seen = depth[v, u]
+    assert np.all(seen <= nearest * (1 + 1e-5))
+    assert np.mean(np.abs(seen - nearest) < 1e-5 * nearest) > 0.8  # the rest: behind cut-outs
+
+
 def _turned_up(ground: Rectangle) -> Rectangle:
     return Rectangle(
         corner=np.add(ground.corner, ground.edge_t),
@@ -112,6 +138,22 @@ def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
     np.testing.assert_array_equal(depths[0], depths[1])
     assert depths[0][24, 31] == 2.0
     assert depths[0][2, 2] == 5.0
+
+
+def test_two_slanted_walls_hide_each_other_up_to_the_line_where_they_meet() -> None:
+    camera = PinholeCamera(fx=500.0, fy=500.0, cx=149.5, cy=99.5, width=300, height=200)
+    x = np.broadcast_to((np.arange(300) - 149.5) / 500.0, (200, 300))
+    inverse_depths, walls = [], []
+    for distance, slope in ((3.0, 0.5), (4.0, -0.8)):
+        inverse_depths.append((1.0 + slope * x) / distance)
+        along = np.array([1.0, 0.0, -slope])  # z = distance - slope X
+        corner = np.array([0.0, -3.0, distance]) - 3.0 * along
+        walls.append(Rectangle(corner=corner, edge_s=6.0 * along, edge_t=(0, 6, 0), texture="t"))
+    expected = 1.0 / np.maximum(*inverse_depths)
+    assert 0.05 < np.mean(inverse_depths[0] < inverse_depths[1]) < 0.5
+    for pair in (walls, walls[::-1]):
+        depth = render_depth(scene_of(*pair), np.eye(4), camera)
+        np.testing.assert_allclose(depth, expected, rtol=1e-5)
 
 
 def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
@@ -185,15 +227,15 @@ def test_edges_are_mixed_by_the_share_of_the_pixel_they_cover(axis: int) -> None
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_mixed_pixel_sees_the_part_of_the_texture_that_it_covers(axis: int) -> None:
     camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
-    ramp = np.tile(4 * np.arange(64), (64, 1))
+    ramp = np.tile(np.clip(7 * np.arange(-6, 58), 0, 255), (64, 1))
     texture = texture_of(ramp.T if axis else ramp)
     shift = make_transform(np.eye(3), 2.0 / 128 * 0.5 * np.eye(3)[axis])
     part = screen(2.0, half=0.25, offset_m=(0.125, 0.125))  # from texel 8 to 40
     image = render_image(scene_of(part, t=texture), shift, camera)
     line = image[:, 30] if axis else image[30]
     # From 15 to 47 along the axis, the samples a quarter of a pixel inside.
-    assert line[15] == pytest.approx(0.5 * 7.0 + 0.5 * line[17] - 0.5 * 4 * 1.75, abs=0.51)
-    assert line[47] == pytest.approx(0.5 * 7.0 + 0.5 * line[45] + 0.5 * 4 * 1.75, abs=0.51)
+    assert line[15] == pytest.approx(0.5 * 7.0 + 0.5 * line[17] - 0.5 * 7 * 1.75, abs=0.51)
+    assert line[47] == pytest.approx(0.5 * 7.0 + 0.5 * line[45] + 0.5 * 7 * 1.75, abs=0.51)
 
 
 def test_what_a_mask_leaves_out_shows_what_is_behind() -> None:

@@ -279,6 +279,13 @@ def test_depth_noise_grows_with_the_square_of_the_depth() -> None:
         assert spoilt.std() == pytest.approx(0.002 * z**2, rel=0.03)
 
 
+def test_noise_never_puts_depth_behind_the_camera() -> None:
+    depth = np.full((50, 50), 500.0, dtype=np.float32)
+    spoilt = spoil_depth(depth, replace(PERFECT, depth_sigma=0.002), np.random.default_rng(0))
+    assert 0.05 < np.isnan(spoilt).mean() < 0.3
+    assert np.nanmin(spoilt) > 0
+
+
 def test_depth_comes_in_steps_of_the_inverse_depth() -> None:
     depth = np.linspace(0.5, 7.0, 5000, dtype=np.float32).reshape(50, 100)
     noise = replace(PERFECT, depth_step=0.01)

@@ -81,13 +81,14 @@ def test_rectified_topics_are_taken_before_raw_ones_and_these_before_compressed_
     assert taken == ("stereo", "/stereo/left/image_raw", "/stereo/right/image_raw")
 
 
-def test_registered_depth_is_taken_before_the_depth_camera_s_own() -> None:
-    topics = _topics(
-        "/camera/color/image_raw",
-        "/camera/depth/image_rect_raw",
-        "/camera/aligned_depth_to_color/image_raw",
-    )
-    assert _choose(topics)[2] == "/camera/aligned_depth_to_color/image_raw"
+@pytest.mark.parametrize("own", ["/camera/depth/image_rect_raw", "/camera/depth/image_raw"])
+@pytest.mark.parametrize(
+    "registered",
+    ["/camera/aligned_depth_to_color/image_raw", "/camera/depth_registered/image_raw"],
+)
+def test_registered_depth_is_taken_before_the_depth_camera_s_own(own: str, registered: str) -> None:
+    for names in permutations(["/camera/color/image_raw", own, registered]):
+        assert _choose(_topics(*names))[2] == registered
 
 
 def test_two_cameras_are_refused_with_what_to_type() -> None:

@@ -1,0 +1,191 @@
+"""The raw chain, driven by a front-end that knows the truth and fails on command."""
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.chain import RawChain, RawStep
+from gvo.config import WindowConfig
+from gvo.frontend.descriptor import DescriptorFrontend
+from gvo.geometry import se3
+from gvo.types import Failure, FloatArray, Observations, RelativePose, Status
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+STEP_NS = 100_000_000
+COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4])
+SETTINGS = WindowConfig(coasting_sigma_deg=2.0, coasting_sigma_m=0.4)
+
+
+def observe(stamp_ns: int) -> Observations:
+    return Observations(
+        stamp_ns=stamp_ns,
+        keypoints=np.zeros((0, 2)),
+        disparities=np.zeros(0),
+        points_cam=np.zeros((0, 3)),
+        sigmas=np.zeros((0, 3)),
+        descriptors_left=np.zeros((0, 32), dtype=np.uint8),
+    )
+
+
+class TrueFrontend:
+    """Registers frames at known poses, but those of `blank`; remembers what it was asked."""
+
+    def __init__(self, pose: Callable[[int], FloatArray], blank: set[int]) -> None:
+        self._pose = pose
+        self._blank = blank
+        self.asked: list[tuple[int, int, FloatArray | None]] = []
+
+    def register(
+        self, reference: Observations, current: Observations, prior: FloatArray | None = None
+    ) -> RelativePose | Failure:
+        a, b = reference.stamp_ns, current.stamp_ns
+        self.asked.append((a, b, prior))
+        if a in self._blank or b in self._blank:
+            return Failure(reason=f"nothing seen in {a} or {b}", n_matches=4, n_inliers=2)
+        return RelativePose(
+            T_reference_current=np.linalg.inv(self._pose(a)) @ self._pose(b),
+            covariance=COVARIANCE,
+            matches=np.zeros((9, 2), dtype=np.int64),
+            inliers=np.arange(9) < 7,
+        )
+
+
+def steady(stamp_ns: int) -> FloatArray:
+    """Return the pose of a camera that moves and turns at a constant rate."""
+    twist = np.array([0.05, 0.3, -0.1, 0.2, 0.1, 1.5])
+    return se3.exp(twist * (1e-9 * stamp_ns))
+
+
+def run(
+    stamps: list[int], blank: set[int], pose: Callable[[int], FloatArray] = steady
+) -> tuple[list[RawStep], TrueFrontend]:
+    frontend = TrueFrontend(pose, blank)
+    chain = RawChain(cast(DescriptorFrontend, frontend), SETTINGS)
+    return [chain.advance(observe(stamp)) for stamp in stamps], frontend
+
+
+def stamps_of(n: int, start: int = 0) -> list[int]:
+    return [start + STEP_NS * i for i in range(n)]
+
+
+def test_the_first_frame_is_the_world() -> None:
+    steps, _ = run([0], set())
+    np.testing.assert_array_equal(steps[0].estimate.T_world_cam, np.eye(4))
+    np.testing.assert_array_equal(steps[0].estimate.covariance, np.zeros((6, 6)))
+    assert steps[0].reference_ns is None
+    assert steps[0].is_registered
+    assert steps[0].estimate.status == Status.OK
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds)
+def test_the_chain_is_the_product_of_its_relative_poses(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = np.cumsum(rng.integers(1, 10**9, 20)).tolist()
+    poses = dict(zip(stamps, se3.exp(rng.normal(size=(20, 6))), strict=True))
+    steps, _ = run(stamps, set(), poses.__getitem__)
+    product = np.eye(4)
+    for step, stamp, previous in zip(steps, stamps, [None, *stamps], strict=False):
+        product = product @ step.T_reference_frame
+        expected = np.linalg.inv(poses[stamps[0]]) @ poses[stamp]
+        np.testing.assert_allclose(step.estimate.T_world_cam, expected, atol=1e-9)
+        np.testing.assert_allclose(product, expected, atol=1e-9)
+        assert step.reference_ns == previous
+        assert step.is_registered
+        assert step.estimate.stamp_ns == stamp
+    assert all((step.n_matches, step.n_inliers) == (9, 7) for step in steps[1:])
+
+
+def test_the_covariance_grows_as_sampled_chains_spread() -> None:
+    steps, _ = run(stamps_of(6), set())
+    rng = np.random.default_rng(0)
+    T = np.tile(np.eye(4), (20_000, 1, 1))
+    for step in steps[1:]:
+        noise = rng.multivariate_normal(np.zeros(6), COVARIANCE, len(T))
+        T = T @ step.T_reference_frame @ se3.exp(noise)
+    errors = se3.log(np.linalg.inv(steps[-1].estimate.T_world_cam) @ T)
+    covariance = steps[-1].estimate.covariance
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    np.testing.assert_allclose(np.cov(errors.T) / scale, covariance / scale, atol=0.05)
+
+
+def test_a_bad_frame_in_between_coasts_and_the_next_is_tied_to_the_one_before_it() -> None:
+    stamps = stamps_of(6)
+    steps, frontend = run(stamps, {stamps[3]})
+    assert [step.is_registered for step in steps] == [True, True, True, False, True, True]
+    assert [step.reference_ns for step in steps[3:]] == [stamps[2], stamps[2], stamps[4]]
+    assert steps[3].estimate.status == Status.COASTING
+    assert steps[3].reason.startswith("nothing seen")
+    assert (steps[3].n_matches, steps[3].n_inliers) == (4, 2)
+    assert not steps[4].reason
+    # At a constant rate coasting goes where the camera went.
+    for step, stamp in zip(steps, stamps, strict=True):
+        np.testing.assert_allclose(step.estimate.T_world_cam, steady(stamp), atol=1e-9)
+    assert [(a, b) for a, b, _ in frontend.asked[3:5]] == [
+        (stamps[3], stamps[4]),
+        (stamps[2], stamps[4]),
+    ]
+
+
+def test_coasting_inflates_the_covariance_by_its_sigmas() -> None:
+    stamps = stamps_of(5)
+    steps, _ = run(stamps, {stamps[2]})
+    sigmas = np.repeat([np.radians(2.0), 0.4], 3)
+    np.testing.assert_allclose(steps[2].covariance, np.diag(sigmas**2))
+    growth = np.sqrt(np.diag(steps[2].estimate.covariance))
+    assert np.all(growth >= sigmas)
+    # Tied to the last good frame again, the chain is as sure as if nothing had been.
+    assert np.diag(steps[3].estimate.covariance).max() < 0.01
+
+
+def test_a_long_gap_coasts_on_and_comes_back_to_the_last_good_frame() -> None:
+    stamps = stamps_of(20)
+    steps, _ = run(stamps, set(stamps[5:15]))
+    assert [step.is_registered for step in steps] == [True] * 5 + [False] * 10 + [True] * 5
+    assert steps[15].reference_ns == stamps[4]
+    assert [step.reference_ns for step in steps[5:15]] == stamps[4:14]
+    np.testing.assert_allclose(steps[19].estimate.T_world_cam, steady(stamps[19]), atol=1e-9)
+
+
+def test_coasting_goes_on_by_the_time_that_passed() -> None:
+    stamps = [0, STEP_NS, 4 * STEP_NS, 5 * STEP_NS]
+    steps, _ = run(stamps, {stamps[2]})
+    assert not steps[2].is_registered
+    np.testing.assert_allclose(steps[2].estimate.T_world_cam, steady(stamps[2]), atol=1e-9)
+
+
+def test_the_prior_is_constant_velocity_from_the_raw_chain() -> None:
+    stamps = [0, STEP_NS, 3 * STEP_NS, 4 * STEP_NS]
+    _, frontend = run(stamps, set())
+    first = frontend.asked[0][2]
+    assert first is not None
+    np.testing.assert_allclose(first, np.eye(4), atol=1e-12)  # nothing known yet
+    for a, b, prior in frontend.asked[1:]:
+        assert prior is not None
+        np.testing.assert_allclose(prior, np.linalg.inv(steady(a)) @ steady(b), atol=1e-9)
+
+
+@pytest.mark.parametrize("stamp", [STEP_NS, STEP_NS - 1, 0])
+def test_a_stamp_that_does_not_advance_is_misuse(stamp: int) -> None:
+    chain = RawChain(cast(DescriptorFrontend, TrueFrontend(steady, set())), SETTINGS)
+    for good in (0, STEP_NS):
+        chain.advance(observe(good))
+    with pytest.raises(ValueError, match=f"stamp {stamp} is not after {STEP_NS}"):
+        chain.advance(observe(stamp))
+    assert chain.advance(observe(2 * STEP_NS)).is_registered
+
+
+def test_frames_from_the_start_on_may_be_blank() -> None:
+    stamps = stamps_of(5)
+    steps, _ = run(stamps, set(stamps[:2]))
+    assert [step.is_registered for step in steps] == [True, False, False, True, True]
+
+
+def test_rotations_stay_rotations_over_a_long_chain() -> None:
+    steps, _ = run(stamps_of(2000), set())
+    R = steps[-1].estimate.T_world_cam[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)

@@ -1,0 +1,202 @@
+"""The command line: what it prints, its exit codes, one line for bad input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import gvo
+
+Command = Callable[..., Any]
+GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+
+
+def is_one_line(text: str) -> bool:
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def test_help_fits_a_screen(command: Command) -> None:
+    answer = command("--help")
+    assert answer.code == 0
+    assert len(answer.out.splitlines()) <= 24
+    for name in ("demo", "run", "compare", "convert", "config"):
+        assert name in answer.out
+
+
+def test_version_is_printed(command: Command) -> None:
+    assert command("--version").out == f"gvo {gvo.__version__}\n"
+
+
+def test_config_prints_every_key_and_can_be_read_back(command: Command, tmp_path: Path) -> None:
+    answer = command("config", "--set", "window.n_links=4")
+    assert yaml.safe_load(answer.out)["window"]["n_links"] == 4
+    (tmp_path / "config.yaml").write_text(answer.out)
+    assert command("config", "--config", tmp_path / "config.yaml").out == answer.out
+
+
+def test_run_writes_its_files_and_prints_the_errors(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    answer = command("run", room_bag, "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    assert "smoothed" in answer.out
+    assert "20 of 20 frames tracked" in answer.out
+    assert answer.err == ""
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {
+        *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
+        *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+        "frames.csv",
+        "summary.json",
+        "trajectories.png",
+    }
+
+
+def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("window: {n_recent: 4}\nfeatures: {n_features: 300}\n")
+    settings = ["--config", tmp_path / "c.yaml", "--set", "features.n_features=400"]
+    command("run", room_bag, "--out", tmp_path / "out", *settings)
+    configuration = json.loads((tmp_path / "out/summary.json").read_text())["configuration"]
+    assert configuration["window"]["n_recent"] == 4
+    assert configuration["features"]["n_features"] == 400
+    rows = (tmp_path / "out/frames.csv").read_text().splitlines()[1:]
+    assert all(int(row.split(",")[2]) <= 400 for row in rows)
+
+
+def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
+    command("run", room_bag, "--out", tmp_path)
+    answer = command("compare", room_bag, tmp_path / "raw.txt", tmp_path / "smoothed.txt", "--json")
+    estimates = json.loads(answer.out)["estimates"]
+    errors = json.loads((tmp_path / "summary.json").read_text())["errors"]
+    assert [entry["name"] for entry in estimates] == ["raw", "smoothed"]
+    assert estimates[0] == pytest.approx(errors[0])
+    assert set(estimates[0]) == {
+        "name",
+        "n",
+        "ate_m",
+        "rpe_m",
+        "rpe_deg",
+        "t_pct",
+        "r_deg_per_100m",
+    }
+
+
+def test_compare_draws(command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(20)))
+    answer = command("compare", path, path, "--plot", tmp_path / "plot.png", "--align", "none")
+    assert answer.code == 0
+    assert (tmp_path / "plot.png").stat().st_size > 0
+
+
+def test_estimates_of_one_name_are_told_apart(command: Command, tmp_path: Path) -> None:
+    paths = [tmp_path / folder / "raw.txt" for folder in "ab"]
+    for path in paths:
+        path.parent.mkdir()
+        path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(20)))
+    estimates = json.loads(command("compare", paths[0], *paths, "--json").out)["estimates"]
+    assert [entry["name"] for entry in estimates] == ["a/raw", "b/raw"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "missing.bag", "--out", "out"], ["missing.bag", "does not exist"]),
+        (["run", ".", "--out", "out"], ["a recording is"]),
+        (["run", "text.bag", "--out", "out"], ["text.bag"]),
+        (["run", "{bag}", "--out", "out", "--set", "window.n_link=3"], ["window.n_links"]),
+        (["run", "{bag}", "--out", "out", "--set", "window.n_links=0"], ["window.n_links"]),
+        (["run", "{bag}", "--out", "out", "--set", "window"], ["section.key=value"]),
+        (["run", "{bag}", "--out", "out", "--config", "missing.yaml"], ["missing.yaml"]),
+        (["run", "{bag}", "--out", "out", "--color", "/nothing"], ["/nothing"]),
+        (["run", "{bag}", "--out", "text.bag"], ["text.bag", "cannot be written"]),
+        (["run", "{bag}", "--out", "out", "--ground-truth", "missing.txt"], ["missing.txt"]),
+        (["compare", "missing.txt", "missing.txt"], ["missing.txt"]),
+        (["compare", "text.bag", "text.bag"], ["text.bag"]),
+        (["compare", "poses.txt", "poses.txt", "--segments", "0"], ["--segments 0"]),
+        (["compare", "poses.txt", "poses.txt", "--plot", "plot.gif"], ["plot.gif"]),
+        (["convert", "missing", "out.bag"], ["missing"]),
+        (["convert", "{bag}", "poses.txt"], ["poses.txt"]),
+    ],
+)
+def test_bad_input_gets_one_line_and_exit_code_2(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    room_bag: Path,
+    tmp_path: Path,
+    *,
+    arguments: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.bag").write_text("no bag at all\n")
+    Path("poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n2 0 0 3 0 0 0 1\n")
+    answer = command(*(argument.format(bag=room_bag) for argument in arguments))
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    for word in words:
+        assert word in answer.err
+
+
+def test_a_missing_argument_is_exit_code_2(command: Command) -> None:
+    assert command("run").code == 2
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    "name",
+    [
+        "assertion_in_reader.bag",
+        "damaged.bag",
+        "empty-file.bag",
+        "empty_message_definition.bag",
+        "no-messages.bag",
+        "not_a_bag.mcap",
+        "old_type_names.db3",
+        "silent_zero_messages_mcap",
+        "silent_zero_messages_sqlite3",
+        "truncated.bag",
+        "truncated.mcap",
+        "unindexed.bag",
+        "version1.bag",
+    ],
+)
+def test_a_broken_bag_gets_one_line_and_exit_code_2(
+    command: Command, gvo_data: Path, tmp_path: Path, name: str
+) -> None:
+    answer = command("run", gvo_data / "bags/bad" / name, "--out", tmp_path)
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    assert name in answer.err
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
+)
+def test_a_signal_ends_the_run_with_its_code_and_complete_files(
+    drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    process = subprocess.Popen(
+        [*GVO, "run", str(drive_bag), "--out", str(tmp_path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "COLUMNS": "80"},
+    )
+    raw = tmp_path / "raw.txt"
+    deadline = time.monotonic() + 60
+    while not (raw.exists() and raw.read_text().count("\n") >= 3):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (code, b"")
+    n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
+    assert len(n_poses) == 1
