@@ -72,6 +72,11 @@ class RawChain:
         self._anchor: _Link | None = None
         self._velocity = np.zeros(6)
 
+    @property
+    def anchor_ns(self) -> int | None:
+        """Stamp of the last registered frame, which the next one may be tied to."""
+        return None if self._anchor is None else self._anchor.observations.stamp_ns
+
     def advance(self, current: Observations) -> RawStep:
         """Register the next frame and return its step.
 

@@ -79,6 +79,7 @@ class Odometry:
         self._chain = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window)
         self._keyframes = Keyframes(self._frontend.camera, self._config.window)
+        self._anchor_ns: int | None = None
         self._coasting_since_ns: int | None = None
 
     def track(self, frame: Frame) -> FrameResult:
@@ -106,6 +107,7 @@ class Odometry:
         with watch.stage("window"):
             causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges, status=status)
             self._update_keyframes(observations, overlaps, is_tied=is_tied)
+            self._hold_anchor()
         return FrameResult(
             raw=replace(step.estimate, status=status, frame_id=frame.stamp_ns),
             causal=causal,
@@ -177,6 +179,14 @@ class Odometry:
         for stamp_ns in self._keyframes.choose_released(overlaps):
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)
+
+    def _hold_anchor(self) -> None:
+        """Keep the frame that the chain comes back to, however long it coasts."""
+        previous, self._anchor_ns = self._anchor_ns, self._chain.anchor_ns
+        if previous is not None and previous not in self._keyframes.stamps_ns:
+            self._window.release(previous)
+        if self._anchor_ns is not None:
+            self._window.keep(self._anchor_ns)
 
 
 class Stopwatch:

@@ -35,7 +35,7 @@ def wall(n: int = 2000, depth: float = 4.0) -> FloatArray:
     return np.asarray(depth * rays)
 
 
-def keyframes(*stamps: int, **changes: Any) -> Keyframes:  # noqa: ANN401
+def keyframes(*stamps: int, **changes: Any) -> Keyframes:
     values = {
         "n_recent": 3,
         "n_keyframes": 3,

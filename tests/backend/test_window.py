@@ -237,7 +237,7 @@ def test_the_window_holds_the_recent_and_the_kept_alone() -> None:
     assert (4 in window, 3 in window) == (True, False)
 
 
-def add_second(window: SlidingWindow, **changes: Any) -> None:  # noqa: ANN401
+def add_second(window: SlidingWindow, **changes: Any) -> None:
     """Add a second pose that is right but for the changes."""
     edge = {"reference_id": "a", "T_reference_frame": np.eye(4), "covariance": np.eye(6)}
     edge |= {name: changes.pop(name) for name in list(changes) if name in edge}

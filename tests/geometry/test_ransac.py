@@ -143,7 +143,7 @@ def test_samples_are_triples_of_distinct_indices(seed: int, n: int) -> None:
 
 def test_samples_are_uniform_over_all_ordered_triples() -> None:
     samples = draw_samples(5, 60_000, np.random.default_rng(3))
-    counts = {triple: 0 for triple in permutations(range(5), 3)}
+    counts = dict.fromkeys(permutations(range(5), 3), 0)
     for triple in map(tuple, samples.tolist()):
         counts[triple] += 1
     assert chisquare(list(counts.values())).pvalue > 1e-4
@@ -173,9 +173,9 @@ def test_points_on_a_line_are_a_failure() -> None:
     line = steps * [0.1, 0.05, 1.0]
     matches = Correspondences(
         source_points=line,
-        target_points=line + [0.0, 0.0, 0.5],
+        target_points=[*line, 0.0, 0.0, 0.5],
         source_uvd=uvd(line),
-        target_uvd=uvd(line + [0.0, 0.0, 0.5]),
+        target_uvd=uvd([*line, 0.0, 0.0, 0.5]),
         source_sigmas=np.ones((30, 3)),
         target_sigmas=np.ones((30, 3)),
     )

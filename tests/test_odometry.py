@@ -1,0 +1,320 @@
+"""Odometry on frames rendered of a textured box, with known poses."""
+
+from collections.abc import Iterable
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from gvo.config import Config
+from gvo.geometry import se3
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.odometry import FrameResult, Odometry
+from gvo.types import (
+    DepthArray,
+    Estimate,
+    FloatArray,
+    Frame,
+    ImageArray,
+    RgbdFrame,
+    Status,
+    StereoFrame,
+)
+
+CAMERA = StereoCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200, baseline=0.12)
+STEP_NS = 50_000_000
+N_FRAMES = 16
+# Planes n . p = c of a room, and the two axes that their texture is laid along.
+PLANES = [
+    (np.array([0.0, 0.0, 1.0]), 4.0, [0, 1]),
+    (np.array([0.0, 1.0, 0.0]), 1.2, [0, 2]),
+    (np.array([0.0, -1.0, 0.0]), 1.5, [0, 2]),
+    (np.array([1.0, 0.0, 0.0]), 2.5, [1, 2]),
+    (np.array([-1.0, 0.0, 0.0]), 2.5, [1, 2]),
+]
+TEXELS_PER_M = 55.0
+
+
+@cache
+def texture(seed: int) -> ImageArray:
+    rng = np.random.default_rng(seed)
+    image = np.full((512, 512), 120, dtype=np.uint8)
+    for u, v, radius, grey in zip(
+        *rng.integers(0, 512, (2, 2500)),
+        rng.integers(2, 9, 2500),
+        rng.integers(10, 246, 2500),
+        strict=True,
+    ):
+        cv2.circle(image, (int(u), int(v)), int(radius), int(grey), -1)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), dtype=np.uint8)
+
+
+def render(T_world_cam: FloatArray) -> tuple[ImageArray, DepthArray]:
+    """Cast one ray per pixel against all planes."""
+    v, u = np.indices((CAMERA.height, CAMERA.width)).astype(float)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], -1)
+    directions = rays @ T_world_cam[:3, :3].T
+    origin = T_world_cam[:3, 3]
+    image = np.zeros(u.shape, dtype=np.uint8)
+    depth = np.full(u.shape, np.inf)
+    for seed, (normal, distance, axes) in enumerate(PLANES):
+        with np.errstate(divide="ignore"):
+            hit = (distance - origin @ normal) / (directions @ normal)
+        is_nearest = (hit > 0) & (hit < depth)
+        at = (origin + np.where(is_nearest, hit, 0.0)[..., None] * directions)[..., axes]
+        at = TEXELS_PER_M * at.astype(np.float32) + 256
+        colours = cv2.remap(
+            texture(seed), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+        )
+        image[is_nearest] = np.asarray(colours)[is_nearest]
+        depth[is_nearest] = hit[is_nearest]
+    return image, depth.astype(np.float32)
+
+
+def true_pose(index: int) -> FloatArray:
+    """Return T_world_cam of a camera on an arc: it sways, turns and comes forward."""
+    phase = 0.12 * index
+    return se3.exp(
+        np.array(
+            [0.04 * np.sin(phase), 0.1 * np.sin(phase), 0.0, 0.4 * np.sin(phase), 0, 0.05 * phase]
+        )
+    )
+
+
+@cache
+def stereo_frame(index: int) -> StereoFrame:
+    to_right = np.eye(4)
+    to_right[0, 3] = CAMERA.baseline
+    return StereoFrame(
+        stamp_ns=index * STEP_NS,
+        left=render(true_pose(index))[0],
+        right=render(true_pose(index) @ to_right)[0],
+    )
+
+
+@cache
+def rgbd_frame(index: int) -> RgbdFrame:
+    image, depth = render(true_pose(index))
+    return RgbdFrame(stamp_ns=index * STEP_NS, image=image, depth=depth)
+
+
+def blank(index: int) -> StereoFrame:
+    grey = np.full((CAMERA.height, CAMERA.width), 100, dtype=np.uint8)
+    return StereoFrame(stamp_ns=index * STEP_NS, left=grey, right=grey)
+
+
+def configure(threads: int = 1, **window: object) -> Config:
+    return Config.model_validate(
+        {
+            "features": {"n_features": 300, "cell_size_px": 40, "kind": "orb", "n_octaves": 1},
+            "stereo": {"min_depth_m": 0.5, "max_depth_m": 30.0},
+            "depth": {"min_depth_m": 0.5, "max_depth_m": 10.0},
+            "temporal": {"radius_px": 15.0, "wide_radius_px": 40.0},
+            "ransac": {"n_hypotheses": 100, "min_inliers": 12, "min_disparity_px": 2.0},
+            "window": {"n_recent": 4, "n_keyframes": 4, "n_links": 3} | window,
+            "runtime": {"threads": threads},
+        }
+    )
+
+
+def run(
+    frames: Iterable[Frame], config: Config, camera: StereoCamera | PinholeCamera = CAMERA
+) -> tuple[list[FrameResult], list[Estimate]]:
+    """Return the results by frame and the smoothed estimates in the order of their stamps."""
+    odometry = Odometry(camera, config)
+    results = [odometry.track(frame) for frame in frames]
+    smoothed = [estimate for result in results for estimate in result.finished]
+    smoothed += odometry.finish()
+    return results, sorted(smoothed, key=lambda estimate: estimate.stamp_ns)
+
+
+@cache
+def stereo_run() -> tuple[list[FrameResult], list[Estimate]]:
+    return run(map(stereo_frame, range(N_FRAMES)), configure())
+
+
+def position_errors(estimates: Iterable[Estimate]) -> FloatArray:
+    return np.array(
+        [
+            np.linalg.norm((e.T_world_cam - true_pose(e.stamp_ns // STEP_NS))[:3, 3])
+            for e in estimates
+        ]
+    )
+
+
+def test_the_truth_starts_at_the_identity() -> None:
+    np.testing.assert_array_equal(true_pose(0), np.eye(4))
+
+
+def test_a_stereo_camera_is_followed_to_centimetres() -> None:
+    results, smoothed = stereo_run()
+    assert all(result.status == Status.OK for result in results)
+    # A step of 5 cm at 4 m is 2.5 px; the corners are whole pixels.
+    for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
+        assert position_errors(estimates).max() < 0.06
+    assert np.linalg.norm(true_pose(N_FRAMES - 1)[:3, 3]) > 0.3
+
+
+def test_a_depth_camera_is_followed_to_centimetres() -> None:
+    camera = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
+    results, smoothed = run(map(rgbd_frame, range(8)), configure(), camera)
+    assert all(result.status == Status.OK for result in results)
+    for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
+        assert position_errors(estimates).max() < 0.06
+
+
+def test_the_first_frame_is_the_world() -> None:
+    first = stereo_run()[0][0]
+    np.testing.assert_array_equal(first.raw.T_world_cam, np.eye(4))
+    np.testing.assert_allclose(first.causal.T_world_cam, np.eye(4), atol=1e-12)
+    assert first.status == Status.OK
+    assert first.n_links == 0
+
+
+def test_what_a_frame_gave_is_counted() -> None:
+    results, _ = stereo_run()
+    for index, result in enumerate(results):
+        assert result.stamp_ns == result.raw.stamp_ns == result.causal.stamp_ns == index * STEP_NS
+        assert result.raw.status == result.causal.status == result.status
+        assert result.raw.frame_id == result.causal.frame_id == result.stamp_ns
+        assert result.n_keypoints >= result.n_points > 50
+        assert set(result.stage_ms) == {"extract", "register", "links", "window"}
+        assert not result.reason
+    assert all(12 <= r.n_inliers <= r.n_matches <= r.n_points for r in results[1:])
+    assert all(1 <= r.n_links <= 3 for r in results[1:])
+    assert max(r.n_links for r in results) > 1
+
+
+def test_covariances_are_positive_and_the_smoothed_ones_no_larger() -> None:
+    results, smoothed = stereo_run()
+    for estimate in [*(r.raw for r in results[1:]), *(r.causal for r in results), *smoothed]:
+        assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+    causal = np.array([np.trace(r.causal.covariance) for r in results])
+    assert np.all([np.trace(e.covariance) for e in smoothed] <= causal * (1 + 1e-6))
+
+
+def same_estimates(first: Iterable[Estimate], second: Iterable[Estimate]) -> bool:
+    return all(
+        a.stamp_ns == b.stamp_ns
+        and a.status == b.status
+        and a.T_world_cam.tobytes() == b.T_world_cam.tobytes()
+        and a.covariance.tobytes() == b.covariance.tobytes()
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_second_run_is_equal_bit_for_bit_whatever_the_threads(threads: int) -> None:
+    results, smoothed = stereo_run()
+    again, smoothed_again = run(map(stereo_frame, range(N_FRAMES)), configure(threads))
+    assert same_estimates((r.raw for r in results), (r.raw for r in again))
+    assert same_estimates((r.causal for r in results), (r.causal for r in again))
+    assert same_estimates(smoothed, smoothed_again)
+
+
+@pytest.mark.parametrize(
+    "window",
+    [
+        {"n_recent": 2, "n_keyframes": 0, "n_links": 1},
+        {"n_recent": 12, "n_keyframes": 8, "n_links": 6, "keyframe_overlap": 0.97},
+        {"kernel": "none", "link_sigma_factor": 0.1},
+    ],
+)
+def test_the_raw_chain_does_not_depend_on_the_window(window: dict[str, object]) -> None:
+    results, _ = stereo_run()
+    others, _ = run(map(stereo_frame, range(N_FRAMES)), configure(**window))
+    assert same_estimates((r.raw for r in results), (r.raw for r in others))
+    assert not same_estimates((r.causal for r in results), (r.causal for r in others))
+
+
+@pytest.mark.parametrize("n_recent", [2, 5, 100])
+def test_every_frame_is_finished_exactly_once(n_recent: int) -> None:
+    odometry = Odometry(CAMERA, configure(n_recent=n_recent, n_keyframes=2))
+    finished: list[int] = []
+    for index in range(10):
+        result = odometry.track(stereo_frame(index))
+        finished += [estimate.stamp_ns for estimate in result.finished]
+        assert len(finished) >= index + 1 - n_recent - 3
+    finished += [estimate.stamp_ns for estimate in odometry.finish()]
+    assert sorted(finished) == [index * STEP_NS for index in range(10)]
+    assert not odometry.finish()
+
+
+@pytest.mark.parametrize("back_ns", [0, 1, 2 * STEP_NS])
+def test_stamps_that_go_back_are_misuse(back_ns: int) -> None:
+    odometry = Odometry(CAMERA, configure())
+    for index in range(3):
+        odometry.track(stereo_frame(index))
+    image = stereo_frame(3)
+    stamp_ns = 2 * STEP_NS - back_ns
+    with pytest.raises(ValueError, match=f"stamp {stamp_ns} is not after {2 * STEP_NS}"):
+        odometry.track(StereoFrame(stamp_ns=stamp_ns, left=image.left, right=image.right))
+    assert odometry.track(image).status == Status.OK
+
+
+def with_blanks(blanks: Iterable[int], n: int) -> list[Frame]:
+    chosen = set(blanks)
+    return [blank(i) if i in chosen else stereo_frame(i) for i in range(n)]
+
+
+def test_a_blank_image_is_coasted_over_without_a_jump() -> None:
+    results, smoothed = run(with_blanks([6], 10), configure())
+    statuses = [result.status for result in results]
+    assert statuses == [Status.OK] * 6 + [Status.COASTING, Status.RESUMED, Status.OK, Status.OK]
+    assert [bool(result.reason) for result in results] == [i == 6 for i in range(10)]
+    assert [estimate.status for estimate in smoothed] == statuses
+    for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
+        errors = position_errors(estimates)
+        assert errors[6] < 0.08  # the motion of a step is 5 cm
+        assert np.delete(errors, 6).max() < 0.05
+    spread = [np.trace(result.causal.covariance) for result in results]
+    assert spread[6] > 100 * spread[5]
+    assert spread[7] < 0.1 * spread[6]
+
+
+@pytest.mark.parametrize("n_keyframes", [0, 4])
+def test_a_gap_longer_than_the_window_is_bridged(n_keyframes: int) -> None:
+    config = configure(n_recent=2, n_keyframes=n_keyframes, keyframe_overlap=0.5, n_links=1)
+    results, smoothed = run(with_blanks(range(4, 9), 12), config)
+    statuses = [result.status for result in results]
+    assert statuses == (
+        [Status.OK] * 4 + [Status.COASTING] * 5 + [Status.RESUMED] + [Status.OK] * 2
+    )
+    assert len(smoothed) == 12
+    for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
+        assert position_errors(estimates)[9:].max() < 0.06
+
+
+def test_coasting_for_long_is_called_lost_until_it_resumes() -> None:
+    config = configure(lost_after_s=0.12)
+    results, _ = run(with_blanks(range(3, 8), 10), config)
+    assert [result.status for result in results[3:]] == (
+        [Status.COASTING] * 3 + [Status.LOST] * 2 + [Status.RESUMED, Status.OK]
+    )
+
+
+def test_nothing_but_blank_images_gives_finite_poses() -> None:
+    results, smoothed = run(with_blanks(range(8), 8), configure())
+    assert [result.status for result in results[1:]] == [Status.COASTING] * 7
+    assert len(smoothed) == 8
+    for estimate in [*(r.raw for r in results), *(r.causal for r in results), *smoothed]:
+        np.testing.assert_allclose(estimate.T_world_cam, np.eye(4), atol=1e-6)
+        assert np.isfinite(estimate.covariance).all()
+
+
+def test_blank_images_at_the_start_delay_the_odometry_alone() -> None:
+    results, _ = run(with_blanks(range(3), 8), configure())
+    assert [result.status for result in results[4:]] == [Status.RESUMED] + [Status.OK] * 3
+    T_3 = np.linalg.inv(true_pose(3)) @ true_pose(7)
+    moved = np.linalg.inv(results[3].raw.T_world_cam) @ results[7].raw.T_world_cam
+    np.testing.assert_allclose(moved, T_3, atol=0.05)
+
+
+def test_stamps_may_start_at_zero_or_before() -> None:
+    frames = [
+        StereoFrame(stamp_ns=-STEP_NS + index * STEP_NS, left=frame.left, right=frame.right)
+        for index, frame in enumerate(map(stereo_frame, range(3)))
+    ]
+    results, _ = run(frames, configure())
+    assert [result.status for result in results] == [Status.OK] * 3
