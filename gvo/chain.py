@@ -70,7 +70,7 @@ class RawChain:
         self._config = config
         self._predecessor: _Link | None = None
         self._anchor: _Link | None = None
-        self._velocity = np.zeros(6)
+        self._velocity: FloatArray | None = None
 
     @property
     def anchor_ns(self) -> int | None:
@@ -94,16 +94,30 @@ class RawChain:
                 f"stamp {current.stamp_ns} is not after {predecessor.observations.stamp_ns}, "
                 "that of the frame before"
             )
-        T_predecessor_current = se3.exp(self._velocity * elapsed_s)
+        T_predecessor_current = self._predict(elapsed_s)
         T_world_predicted = predecessor.T_world_frame @ T_predecessor_current
         failure = Failure(reason="")
         for link in [predecessor] if anchor is predecessor else [predecessor, anchor]:
-            prior = se3.invert(link.T_world_frame) @ T_world_predicted
-            result = self._frontend.register(link.observations, current, prior)
+            result = self._register(link, current, T_world_predicted)
             if isinstance(result, RelativePose):
                 return self._append(link, current, result)
             failure = failure if failure.reason else result
         return self._coast(predecessor, current, T_predecessor_current, failure)
+
+    def _predict(self, elapsed_s: float) -> FloatArray:
+        """Return T_predecessor_current at constant velocity, where there is one."""
+        return np.eye(4) if self._velocity is None else se3.exp(self._velocity * elapsed_s)
+
+    def _register(
+        self, link: _Link, current: Observations, T_world_predicted: FloatArray
+    ) -> RelativePose | Failure:
+        """Search around the predicted pixels, then around the previous ones."""
+        if self._velocity is not None:
+            prior = se3.invert(link.T_world_frame) @ T_world_predicted
+            result = self._frontend.register(link.observations, current, prior)
+            if isinstance(result, RelativePose):
+                return result
+        return self._frontend.register(link.observations, current, None)
 
     def _begin(self, current: Observations) -> RawStep:
         step = RawStep(

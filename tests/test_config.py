@@ -224,4 +224,4 @@ def test_the_description_is_plain_yaml() -> None:
 def test_a_configuration_cannot_be_changed() -> None:
     config = Config()
     with pytest.raises(ValidationError, match="frozen"):
-        config.window.n_recent = 4
+        config.window.n_recent = 4  # type: ignore[misc]

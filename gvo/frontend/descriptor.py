@@ -118,18 +118,19 @@ class DescriptorFrontend:
         reference, current : Observations
         prior : ndarray of float64, shape (4, 4), optional
             Predicted T_reference_current; matches are searched around the pixels it predicts.
-            Without it, or where it leads to nothing, a wider window is searched.
+            Where it leads to nothing, a wider window is searched; without it, the wider window
+            around the previous pixels.
 
         Returns
         -------
         RelativePose or Failure
         """
-        temporal = self._config.temporal
-        result: RelativePose | Failure = Failure(reason="not tried")
-        if prior is not None:
-            result = self._register_within(reference, current, prior, temporal.radius_px)
-        if not result:
-            result = self._register_within(reference, current, prior, temporal.wide_radius_px)
+        narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
+        if prior is None:
+            return self._register_within(reference, current, None, wide)
+        result = self._register_within(reference, current, prior, narrow)
+        if isinstance(result, Failure):
+            result = self._register_within(reference, current, prior, wide)
         return result
 
     def _register_within(

@@ -1,5 +1,7 @@
 """Descriptor distances and mutual best pairs against plain loops."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,6 +117,6 @@ def test_real_distances_are_euclidean_within_zero_and_one(seed: int) -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_no_pairs_have_no_distances(dtype: type) -> None:
-    descriptors = np.zeros((3, 32), dtype=dtype)
+    descriptors: Any = np.zeros((3, 32), dtype=dtype)
     none = np.zeros((0, 2), dtype=np.int64)
     assert descriptor_distances(descriptors, descriptors[:0], none).shape == (0,)

@@ -158,7 +158,7 @@ def test_matches_without_a_common_motion_are_a_failure_that_counts_them() -> Non
         for i in range(2)
     ]
     matches = np.stack([np.arange(80)] * 2, axis=1)
-    result = register_matches(*frames, matches, CAMERA, configure())
+    result = register_matches(frames[0], frames[1], matches, CAMERA, configure())
     assert isinstance(result, Failure)
     assert result.n_matches == 80
     assert result.n_inliers < 12

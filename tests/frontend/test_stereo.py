@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
@@ -32,7 +33,9 @@ SETTINGS = StereoConfig(
 
 
 def features(
-    keypoints: FloatArray, descriptors: FloatArray | None = None, octaves: IntArray | None = None
+    keypoints: FloatArray,
+    descriptors: NDArray[np.uint8] | None = None,
+    octaves: IntArray | None = None,
 ) -> Features:
     n = len(keypoints)
     return Features(

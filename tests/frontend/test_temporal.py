@@ -168,7 +168,7 @@ def test_a_prediction_is_the_projection_into_the_current_camera(seed: int) -> No
     points = rng.uniform([-3, -3, 0.5], [3, 3, 9], (30, 3))
     T_reference_current = np.eye(4)
     T_reference_current[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
-    T_reference_current[:3, 3] = [*rng.normal(size=3), 0, 0, 2]
+    T_reference_current[:3, 3] = rng.normal(size=3) + np.array([0.0, 0.0, 2.0])
     reference = observe(np.zeros((30, 2)), random_codes(rng, 30), points=points)
     pixels, indices = predict_pixels(reference, T_reference_current, CAMERA)
     T_current_reference = np.linalg.inv(T_reference_current)

@@ -171,8 +171,8 @@ def test_points_seen_by_raw_cameras_land_on_one_row_at_the_disparity_of_their_de
     zero = np.zeros(3)
     seen_left, _ = cv2.projectPoints(points_left, zero, zero, LEFT.K, LEFT.D)
     seen_right, _ = cv2.projectPoints(points_left, rotation, T_right_left[:3, 3], RIGHT.K, RIGHT.D)
-    pixels_left = rectified_pixels(left, np.asarray(seen_left)[:, 0])
-    pixels_right = rectified_pixels(right, np.asarray(seen_right)[:, 0])
+    pixels_left = rectified_pixels(left, np.asarray(seen_left, dtype=np.float64)[:, 0])
+    pixels_right = rectified_pixels(right, np.asarray(seen_right, dtype=np.float64)[:, 0])
     np.testing.assert_allclose(pixels_left[:, 1], pixels_right[:, 1], atol=0.02)
     points_cam = points_left @ left.R.T
     expected = camera.project_stereo(points_cam)

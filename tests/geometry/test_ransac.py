@@ -1,5 +1,6 @@
 """Consensus over minimal samples, on points projected from known poses."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -171,11 +172,12 @@ def test_matches_without_a_common_motion_are_a_failure_with_counts() -> None:
 def test_points_on_a_line_are_a_failure() -> None:
     steps = np.linspace(2.0, 9.0, 30)[:, np.newaxis]
     line = steps * [0.1, 0.05, 1.0]
+    farther = line + np.array([0.0, 0.0, 0.5])
     matches = Correspondences(
         source_points=line,
-        target_points=[*line, 0.0, 0.0, 0.5],
+        target_points=farther,
         source_uvd=uvd(line),
-        target_uvd=uvd([*line, 0.0, 0.0, 0.5]),
+        target_uvd=uvd(farther),
         source_sigmas=np.ones((30, 3)),
         target_sigmas=np.ones((30, 3)),
     )
@@ -193,14 +195,7 @@ def test_far_points_are_counted_but_not_fitted() -> None:
     # Far points all too near by a tenth: fitted, they would pull the motion along.
     spoilt = matches.target_points.copy()
     spoilt[is_far] *= 0.9
-    spoilt_matches = Correspondences(
-        source_points=matches.source_points,
-        target_points=spoilt,
-        source_uvd=matches.source_uvd,
-        target_uvd=matches.target_uvd,
-        source_sigmas=matches.source_sigmas,
-        target_sigmas=matches.target_sigmas,
-    )
+    spoilt_matches = replace(matches, target_points=spoilt)
     config = SETTINGS.model_copy(update={"min_disparity_px": 30.0, "inlier_threshold_px": 5.0})
     result = run(spoilt_matches, config)
     assert isinstance(result, Consensus)
@@ -213,14 +208,7 @@ def test_weights_enter_the_last_fit() -> None:
     T, matches, _ = scene(rng, 60, 0)
     shifted = matches.target_points.copy()
     shifted[30:] += 0.05
-    noisy = Correspondences(
-        source_points=matches.source_points,
-        target_points=shifted,
-        source_uvd=matches.source_uvd,
-        target_uvd=matches.target_uvd,
-        source_sigmas=matches.source_sigmas,
-        target_sigmas=matches.target_sigmas,
-    )
+    noisy = replace(matches, target_points=shifted)
     config = SETTINGS.model_copy(update={"inlier_metric": "distance", "inlier_threshold_m": 1.0})
     weights = np.repeat([1.0, 1e-12], 30)
     result = ransac_rigid(noisy, CAMERA, config, weights=weights, rng=np.random.default_rng(0))

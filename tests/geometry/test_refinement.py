@@ -1,5 +1,7 @@
 """Refinement of a pose: derivatives, optimum, covariance, refusal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -77,9 +79,16 @@ def error_of(result: Refinement, T: FloatArray) -> FloatArray:
 @given(seed=seeds)
 def test_jacobians_are_the_numerical_derivatives(seed: int) -> None:
     point = np.random.default_rng(seed).uniform([-2, -2, 1], [2, 2, 9])
-    J_project = approx_fprime(point, lambda p: project(p[None])[0], 1e-7)
+
+    def project_one(p: FloatArray) -> FloatArray:
+        return np.asarray(project(p[None])[0])
+
+    def unproject_one(measured: FloatArray) -> FloatArray:
+        return np.asarray(unproject(measured[None])[0])
+
+    J_project = approx_fprime(point, project_one, 1e-7)
     np.testing.assert_allclose(projection_jacobian(point[None], CAMERA)[0], J_project, atol=2e-3)
-    J_unproject = approx_fprime(project(point[None])[0], lambda m: unproject(m[None])[0], 1e-6)
+    J_unproject = approx_fprime(project_one(point), unproject_one, 1e-6)
     np.testing.assert_allclose(
         unprojection_jacobian(point[None], CAMERA)[0], J_unproject, rtol=1e-3, atol=1e-5
     )
@@ -112,13 +121,11 @@ def test_the_result_is_the_optimum_that_scipy_finds(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T, exact = measure(rng, 40, noise=0.0)
     target_uvd = exact.target_uvd + SIGMAS * rng.normal(size=(40, 3))
-    matches = Correspondences(
-        source_points=exact.source_points,
+    matches = replace(
+        exact,
         target_points=unproject(target_uvd),
-        source_uvd=exact.source_uvd,
         target_uvd=target_uvd,
         source_sigmas=np.full((40, 3), 1e-9),
-        target_sigmas=exact.target_sigmas,
     )
     # Kernel and gate out of reach leave plain least squares.
     wide = RegistrationConfig(n_iterations=50, huber=1e6, gate=1e6)
@@ -148,7 +155,7 @@ def nees(config: RegistrationConfig, noise: float, n_runs: int = 250) -> float:
         result = refine_pose(T, matches, all_of(matches), CAMERA, config)
         assert isinstance(result, Refinement)
         error = error_of(result, T)
-        total += error @ np.linalg.solve(result.covariance, error)
+        total += float(error @ np.linalg.solve(result.covariance, error))
     return total / (6 * n_runs)
 
 
@@ -178,14 +185,7 @@ def test_outliers_among_the_inliers_are_left_out(seed: int) -> None:
     shifts = rng.choice([-1.0, 1.0], size=(15, 3)) * rng.uniform(10, 30, size=(15, 3))
     spoilt_uvd = matches.target_uvd.copy()
     spoilt_uvd[is_outlier] += shifts
-    spoilt = Correspondences(
-        source_points=matches.source_points,
-        target_points=matches.target_points,
-        source_uvd=matches.source_uvd,
-        target_uvd=spoilt_uvd,
-        source_sigmas=matches.source_sigmas,
-        target_sigmas=matches.target_sigmas,
-    )
+    spoilt = replace(matches, target_uvd=spoilt_uvd)
     result = refine(se3.exp(0.005 * rng.normal(size=6)) @ T, spoilt, all_of(spoilt))
     clean = refine(T, matches, ~is_outlier)
     assert not result.inliers[is_outlier].any()
@@ -222,14 +222,7 @@ def spoil(matches: Correspondences, kind: str) -> Correspondences:
         uvd[3] = np.nan
     elif kind == "at the camera":
         points[:] = 0.0
-    return Correspondences(
-        source_points=points,
-        target_points=matches.target_points,
-        source_uvd=matches.source_uvd,
-        target_uvd=uvd,
-        source_sigmas=matches.source_sigmas,
-        target_sigmas=matches.target_sigmas,
-    )
+    return replace(matches, source_points=points, target_uvd=uvd)
 
 
 @pytest.mark.parametrize(
