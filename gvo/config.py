@@ -120,7 +120,7 @@ class TemporalConfig(Section):
 class RansacConfig(Section):
     """Minimal samples of three points."""
 
-    n_hypotheses: int = _parameter(256, "samples drawn", ge=1, le=100000)
+    n_hypotheses: int = _parameter(128, "samples drawn", ge=1, le=100000)
     inlier_metric: Literal["reprojection", "distance"] = _parameter(
         "reprojection", "residual in the image (u, v, disparity), or between the points"
     )

@@ -82,24 +82,39 @@ def refine_pose(
     Refinement or Failure
         A failure where the residuals leave a direction of motion open.
     """
-    T: FloatArray | Failure = _gauss_newton(
-        T_target_source,
-        matches.select(inliers),
-        camera,
-        huber=config.huber,
-        n_iterations=min(_N_FIRST_ITERATIONS, config.n_iterations),
-    )
-    if isinstance(T, Failure):
-        return T
-    chosen = _within_gate(T, matches, camera, config.gate)
+    problem = _Problem.of(T_target_source, matches, camera, huber=config.huber)
+    n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
+    solution = _gauss_newton(T_target_source, problem.select(inliers), n_iterations=n_first)
+    if isinstance(solution, Failure):
+        return solution
+    chosen = _within_gate(solution.T, problem, config.gate)
     if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
         chosen = inliers
-    inlying = matches.select(chosen)
-    T = _gauss_newton(T, inlying, camera, huber=config.huber, n_iterations=config.n_iterations)
-    if isinstance(T, Failure):
-        return T
-    covariance, scale = _covariance(T, inlying, camera, config)
-    return Refinement(T_target_source=T, covariance=covariance, inliers=chosen, scale=scale)
+    solution = _gauss_newton(solution.T, problem.select(chosen), n_iterations=config.n_iterations)
+    if isinstance(solution, Failure):
+        return solution
+    return _refinement(solution, chosen)
+
+
+def fit_covariance(
+    T_target_source: FloatArray,
+    matches: Correspondences,
+    inliers: BoolArray,
+    camera: StereoCamera,
+    config: RegistrationConfig,
+) -> Refinement | Failure:
+    """Give an unrefined pose the covariance that its residuals in the image imply.
+
+    Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
+    """
+    problem = _Problem.of(T_target_source, matches, camera, huber=config.huber).select(inliers)
+    normal = problem.linearize(T_target_source)
+    if isinstance(normal, Failure):
+        return normal
+    step = _solve(normal)
+    if isinstance(step, Failure):
+        return step
+    return _refinement(_Solution(T=T_target_source, normal=normal), inliers)
 
 
 def projection_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
@@ -130,34 +145,77 @@ def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
     return np.concatenate([-J_point @ se3.skew(points_cam), J_point], axis=2)
 
 
-def _gauss_newton(
-    T: FloatArray,
-    matches: Correspondences,
-    camera: StereoCamera,
-    *,
-    huber: float,
-    n_iterations: int,
-) -> FloatArray | Failure:
-    information = _information(T, matches, camera)
-    for _ in range(n_iterations):
-        points = se3.transform_points(T, matches.source_points)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Normal:
+    """The normal equations H step = g at one pose, and the weighted sum of squares there."""
+
+    H: FloatArray
+    g: FloatArray
+    sum_of_squares: float
+    n_matches: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Solution:
+    T: FloatArray
+    normal: _Normal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Problem:
+    """Points, their measurements and the inverse covariances of the residuals (n, 3, 3)."""
+
+    source_points: FloatArray
+    target_uvd: FloatArray
+    information: FloatArray
+    camera: StereoCamera
+    huber: float
+
+    @classmethod
+    def of(
+        cls, T: FloatArray, matches: Correspondences, camera: StereoCamera, *, huber: float
+    ) -> _Problem:
+        # The noise is carried through the start value and not again: it changes by far less
+        # than it is known.
+        return cls(
+            source_points=matches.source_points,
+            target_uvd=matches.target_uvd,
+            information=_information(T, matches, camera),
+            camera=camera,
+            huber=huber,
+        )
+
+    def select(self, chosen: BoolArray) -> _Problem:
+        return _Problem(
+            source_points=self.source_points[chosen],
+            target_uvd=self.target_uvd[chosen],
+            information=self.information[chosen],
+            camera=self.camera,
+            huber=self.huber,
+        )
+
+    def residuals(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (n, 3) and their squared whitened norms (n,)."""
+        r = self.target_uvd - self.camera.project_stereo(points)
+        return r, np.asarray(np.einsum("ni,nij,nj->n", r, self.information, r))
+
+    def linearize(self, T: FloatArray) -> _Normal | Failure:
+        points = se3.transform_points(T, self.source_points)
         if np.any(points[:, 2] < _MIN_DEPTH_M):
             return Failure(reason="the motion puts points behind the camera")
-        H, g, _ = _normal_equations(points, matches, information, camera, huber=huber)
-        step = _solve(H, g)
-        if isinstance(step, Failure):
-            return step
-        # Not the exponential map but a retraction: the same to first order, and cheap.
-        T = se3.make_transform(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]) @ T
-        if np.abs(step).max() < _CONVERGED:
-            break
-    if not np.isfinite(T).all():
-        return Failure(reason="the refinement diverged", n_matches=len(matches))
-    return se3.normalize(T)
+        r, squared = self.residuals(points)
+        weights = self.huber / np.maximum(np.sqrt(squared), self.huber)
+        J = pose_jacobian(points, self.camera)
+        weighted = ((self.information * weights[:, np.newaxis, np.newaxis]) @ J).reshape(-1, 6)
+        return _Normal(
+            H=weighted.T @ J.reshape(-1, 6),
+            g=weighted.T @ r.ravel(),
+            sum_of_squares=float(np.sum(weights * squared)),
+            n_matches=len(points),
+        )
 
 
 def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
-    """Return the inverse covariances of the residuals, both frames' noise, shape (n, 3, 3)."""
     points = se3.transform_points(T, matches.source_points)
     points[:, 2] = np.maximum(points[:, 2], _MIN_DEPTH_M)
     J = (
@@ -170,82 +228,50 @@ def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) 
     return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
-def _residuals(
-    points: FloatArray, matches: Correspondences, information: FloatArray, camera: StereoCamera
-) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (n, 3) and their squared whitened norms (n,)."""
-    r = matches.target_uvd - camera.project_stereo(points)
-    return r, np.asarray(np.einsum("ni,nij,nj->n", r, information, r))
+def _gauss_newton(T: FloatArray, problem: _Problem, *, n_iterations: int) -> _Solution | Failure:
+    normal: _Normal | Failure = Failure(reason="no iteration")
+    for _ in range(n_iterations):
+        normal = problem.linearize(T)
+        if isinstance(normal, Failure):
+            return normal
+        step = _solve(normal)
+        if isinstance(step, Failure):
+            return step
+        # Not the exponential map but a retraction: the same to first order, and cheap.
+        T = se3.make_transform(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]) @ T
+        if np.abs(step).max() < _CONVERGED:
+            break
+    if isinstance(normal, Failure) or not np.isfinite(T).all():
+        return Failure(reason="the refinement diverged", n_matches=len(problem.source_points))
+    return _Solution(T=se3.normalize(T), normal=normal)
 
 
-def _normal_equations(
-    points: FloatArray,
-    matches: Correspondences,
-    information: FloatArray,
-    camera: StereoCamera,
-    *,
-    huber: float,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return H (6, 6), g (6,) and the weighted sum of squares at transformed points."""
-    r, squared = _residuals(points, matches, information, camera)
-    weights = huber / np.maximum(np.sqrt(squared), huber)
-    J = pose_jacobian(points, camera)
-    weighted = (information * weights[:, np.newaxis, np.newaxis]) @ J
-    flat = weighted.reshape(-1, 6)
-    return flat.T @ J.reshape(-1, 6), flat.T @ r.ravel(), float(np.sum(weights * squared))
-
-
-def _solve(H: FloatArray, g: FloatArray) -> FloatArray | Failure:
-    scale = np.sqrt(np.diag(H))
+def _solve(normal: _Normal) -> FloatArray | Failure:
+    scale = np.sqrt(np.diag(normal.H))
     if not np.all(np.isfinite(scale)) or np.any(scale <= 0):
         return Failure(reason="the matches leave a direction of motion open")
-    eigenvalues, V = np.linalg.eigh(H / np.outer(scale, scale))
+    eigenvalues, V = np.linalg.eigh(normal.H / np.outer(scale, scale))
     if eigenvalues[0] < 1e-10 * eigenvalues[-1]:
         return Failure(reason="the matches leave a direction of motion open")
-    return np.asarray(V @ ((V.T @ (g / scale)) / eigenvalues) / scale)
+    return np.asarray(V @ ((V.T @ (normal.g / scale)) / eigenvalues) / scale)
 
 
-def _within_gate(
-    T: FloatArray, matches: Correspondences, camera: StereoCamera, gate: float
-) -> BoolArray:
-    points = se3.transform_points(T, matches.source_points)
+def _within_gate(T: FloatArray, problem: _Problem, gate: float) -> BoolArray:
+    points = se3.transform_points(T, problem.source_points)
     is_in_front = points[:, 2] > _MIN_DEPTH_M
     points[~is_in_front, 2] = 1.0
-    _, squared = _residuals(points, matches, _information(T, matches, camera), camera)
+    _, squared = problem.residuals(points)
     return np.asarray(is_in_front & (squared < gate**2))
 
 
-def _covariance(
-    T: FloatArray, matches: Correspondences, camera: StereoCamera, config: RegistrationConfig
-) -> tuple[FloatArray, float]:
-    points = se3.transform_points(T, matches.source_points)
-    information = _information(T, matches, camera)
-    H, _, sum_of_squares = _normal_equations(
-        points, matches, information, camera, huber=config.huber
-    )
-    scale_squared = max(sum_of_squares / max(3 * len(matches) - 6, 1), 1e-12)
-    covariance = np.linalg.inv(H) * scale_squared
-    return 0.5 * (covariance + covariance.T), float(np.sqrt(scale_squared))
-
-
-def fit_covariance(
-    T_target_source: FloatArray,
-    matches: Correspondences,
-    inliers: BoolArray,
-    camera: StereoCamera,
-    config: RegistrationConfig,
-) -> Refinement | Failure:
-    """Give an unrefined pose the covariance that its residuals in the image imply."""
-    inlying = matches.select(inliers)
-    points = se3.transform_points(T_target_source, inlying.source_points)
-    if np.any(points[:, 2] < _MIN_DEPTH_M):
-        return Failure(reason="the motion puts points behind the camera")
-    information = _information(T_target_source, inlying, camera)
-    H, g, _ = _normal_equations(points, inlying, information, camera, huber=config.huber)
-    open_direction = _solve(H, g)
-    if isinstance(open_direction, Failure):
-        return open_direction
-    covariance, scale = _covariance(T_target_source, inlying, camera, config)
+def _refinement(solution: _Solution, inliers: BoolArray) -> Refinement:
+    normal = solution.normal
+    n_free = max(3 * normal.n_matches - 6, 1)
+    scale_squared = max(normal.sum_of_squares / n_free, 1e-12)
+    covariance = np.linalg.inv(normal.H) * scale_squared
     return Refinement(
-        T_target_source=T_target_source, covariance=covariance, inliers=inliers, scale=scale
+        T_target_source=solution.T,
+        covariance=0.5 * (covariance + covariance.T),
+        inliers=inliers,
+        scale=float(np.sqrt(scale_squared)),
     )

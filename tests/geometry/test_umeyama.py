@@ -105,6 +105,27 @@ def test_points_on_a_line_are_refused(seed: int, n: int) -> None:
     assert result.n_matches == n
 
 
+@settings(deadline=None)
+@given(seed=seeds, n=st.integers(min_value=3, max_value=10))
+def test_one_point_seen_many_times_is_refused(seed: int, n: int) -> None:
+    # Whatever the rounding of the mean leaves of it.
+    rng = np.random.default_rng(seed)
+    source = np.repeat(100 * rng.normal(size=(1, 3)), n, axis=0)
+    target = np.repeat(100 * rng.normal(size=(1, 3)), n, axis=0)
+    for noisy in (target, target + rng.normal(size=(n, 3))):
+        assert isinstance(fit_rigid(source, noisy), Failure)
+        assert isinstance(fit_rigid(noisy, source), Failure)
+
+
+@settings(deadline=None)
+@given(seed=seeds, size=st.sampled_from([1e-3, 1.0, 100.0]))
+def test_small_far_sets_of_points_are_not_refused(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    source = np.array([0.0, 0.0, 100.0]) + size * rng.normal(size=(6, 3))
+    T = random_transform(rng)
+    assert np.linalg.norm(fit(source, move(T, source))[:3, :3] - T[:3, :3]) < 1e-6
+
+
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fewer_than_three_points_are_refused(n: int) -> None:
     points = np.random.default_rng(0).normal(size=(n, 3))
