@@ -219,7 +219,8 @@ def test_a_second_run_is_equal_bit_for_bit_whatever_the_threads(threads: int) ->
     [
         {"n_recent": 2, "n_keyframes": 0, "n_links": 1},
         {"n_recent": 12, "n_keyframes": 8, "n_links": 6, "keyframe_overlap": 0.97},
-        {"kernel": "none", "link_sigma_factor": 0.1},
+        {"kernel": "none"},
+        {"link_sigma_factor": 0.1},
     ],
 )
 def test_the_raw_chain_does_not_depend_on_the_window(window: dict[str, Any]) -> None:

@@ -17,6 +17,9 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
 # Border that the descriptors' patch needs (31 px with its rotation), at the first octave.
 _BORDER_PX = 19
+# Candidates over budget. ORB cuts its candidates by strength over the whole image, and a tight
+# limit takes them from the road before the grid can: near points, which carry the translation.
+_N_CANDIDATES = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,9 +94,8 @@ class FeatureExtractor:
 
 
 def _make_orb(config: FeaturesConfig, threshold: int) -> cv2.Feature2D:
-    # Four times the budget, so that the grid has something to choose from.
     orb: cv2.Feature2D = cv2.ORB_create(  # type: ignore[attr-defined]
-        nfeatures=4 * config.n_features,
+        nfeatures=_N_CANDIDATES * config.n_features,
         scaleFactor=config.scale_factor,
         nlevels=config.n_octaves,
         edgeThreshold=_BORDER_PX,
@@ -103,7 +105,7 @@ def _make_orb(config: FeaturesConfig, threshold: int) -> cv2.Feature2D:
 
 
 def _make_detectors(config: FeaturesConfig, orb: cv2.Feature2D) -> list[cv2.Feature2D]:
-    n_candidates = 4 * config.n_features
+    n_candidates = _N_CANDIDATES * config.n_features
     if config.kind == "sift":
         return [cv2.SIFT_create(nfeatures=n_candidates)]  # type: ignore[attr-defined]
     if config.kind == "gftt":

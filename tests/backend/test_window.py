@@ -134,7 +134,7 @@ def test_a_window_that_holds_everything_gives_the_batch_optimum(seed: int, kerne
             chained = chained @ edges[frame][0].T_reference_frame
         expected = optimum.atPose3(frame).matrix()
         largest_correction = max(largest_correction, np.abs(chained - expected).max())
-        np.testing.assert_allclose(smoothed[frame].T_world_cam, expected, atol=1e-6)
+        np.testing.assert_allclose(smoothed[frame].T_world_cam, expected, atol=1e-7)
         assert_equal_covariances(smoothed[frame].covariance, marginals.marginalCovariance(frame))
     assert largest_correction > 3e-5  # there was something to smooth
     np.testing.assert_array_equal(causal[-1].T_world_cam, smoothed[29].T_world_cam)

@@ -150,6 +150,14 @@ def test_points_beyond_the_limits_of_depth_are_left_out(
     assert in_half.mean() > 0.9  # the others are chance matches of the other wall
 
 
+def test_the_limits_hold_for_the_refined_depth() -> None:
+    # The far wall stands at the very limit: noise puts half of its points beyond.
+    config = configure(stereo={"min_depth_m": 0.6, "max_depth_m": 2.4})
+    observations = DescriptorFrontend(CAMERA, config).extract(stereo_frame())
+    assert np.mean(observations.keypoints[:, 1] < 100) > 0.1
+    assert observations.points_cam[:, 2].max() <= 2.4
+
+
 def test_depth_points_lie_where_the_depth_image_says() -> None:
     config = configure()
     frontend = DescriptorFrontend(COLOUR, config)

@@ -85,6 +85,13 @@ def test_candidates_are_all_pairs_that_obey_rows_and_depth(
     assert len(found) == len(expected)
 
 
+def test_rows_between_two_pixels_are_not_rounded_apart() -> None:
+    left = features(np.array([[40.0, v + 0.5] for v in range(0, 12, 4)]))
+    right = features(np.array([[30.0, v + 1.5] for v in range(0, 12, 4)]))
+    config = SETTINGS.model_copy(update={"row_tolerance_px": 1.0})
+    assert candidate_pairs(left, right, CAMERA, config).tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
 def test_matches_are_reciprocal_and_close() -> None:
     rng = np.random.default_rng(0)
     codes = rng.integers(0, 256, (4, 32), dtype=np.uint8)

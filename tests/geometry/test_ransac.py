@@ -116,20 +116,47 @@ def test_inliers_are_those_within_the_threshold_of_the_metric(seed: int, metric:
                 assert found[i, j] == (ratio < 1.0)
 
 
-@pytest.mark.parametrize("depth_sign", [1.0, -1.0])
-def test_points_behind_the_camera_are_no_inliers(depth_sign: float) -> None:
-    # Behind the camera the formulas of the projection fit as well as in front of it.
-    points = depth_sign * random_points(np.random.default_rng(0), 30)
-    matches = Correspondences(
+def same_points(points: FloatArray, measured: FloatArray) -> Correspondences:
+    """Return correspondences of points with themselves, measured at `measured`."""
+    return Correspondences(
         source_points=points,
         target_points=points,
-        source_uvd=uvd(points),
-        target_uvd=uvd(points),
-        source_sigmas=np.ones((30, 3)),
-        target_sigmas=np.ones((30, 3)),
+        source_uvd=measured,
+        target_uvd=measured,
+        source_sigmas=np.ones((len(points), 3)),
+        target_sigmas=np.ones((len(points), 3)),
     )
-    found = find_inliers(np.eye(4)[np.newaxis], matches, CAMERA, SETTINGS)
-    assert found.all() if depth_sign > 0 else not found.any()
+
+
+def test_points_behind_the_camera_are_no_inliers() -> None:
+    points = random_points(np.random.default_rng(0), 30)
+    mirrored = points * [1.0, 1.0, -1.0]
+    nearer = np.column_stack([points[:, :2], np.ones(30)])
+    # Behind the camera the formulas of the projection fit as well as in front of it.
+    for there, measured, expected in (
+        (points, uvd(points), 1.0),
+        (-points, uvd(-points), 0.0),
+        (mirrored, uvd(points), 0.0),
+        (mirrored, uvd(nearer), 0.0),
+    ):
+        found = find_inliers(np.eye(4)[None], same_points(there, measured), CAMERA, SETTINGS)
+        assert found.mean() == expected
+
+
+def test_samples_are_drawn_of_near_points() -> None:
+    # One in eight is near, and only those were measured well: three samples suffice.
+    rng = np.random.default_rng(7)
+    T, matches, _ = scene(rng, 160, 0)
+    is_near = np.arange(160) < 20
+    spoilt = matches.target_points.copy()
+    spoilt[~is_near] = random_points(rng, 140)
+    measured = matches.source_uvd.copy()
+    measured[:, 2] = np.where(is_near, 40.0, 5.0)
+    far = replace(matches, target_points=spoilt, source_uvd=measured)
+    config = SETTINGS.model_copy(update={"min_disparity_px": 10.0, "n_hypotheses": 3})
+    result = run(far, config)
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
 
 
 @settings(deadline=None)
