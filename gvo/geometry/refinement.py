@@ -217,7 +217,7 @@ class _Problem:
 
 def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
     points = se3.transform_points(T, matches.source_points)
-    points[:, 2] = np.maximum(points[:, 2], _MIN_DEPTH_M)
+    points[points[:, 2] < _MIN_DEPTH_M] = (0.0, 0.0, 1.0)  # of no account, but finite
     J = (
         projection_jacobian(points, camera)
         @ T[:3, :3]

@@ -124,7 +124,7 @@ def test_smoothing_a_chain_of_consecutive_edges_returns_the_chain(
 def test_a_window_that_holds_everything_gives_the_batch_optimum(seed: int, kernel: Kernel) -> None:
     # Edges so good that the kernel keeps out and one linearization is as good as many.
     _, edges = redundant_edges(seed, 30, sigma=2e-5)
-    config = WindowConfig(n_recent=100, kernel=kernel, kernel_threshold=20.0)
+    config = WindowConfig(n_recent=100, kernel=kernel, kernel_threshold=1e3)
     causal, smoothed = run(edges, config)
     optimum, marginals = batch(edges)
     chained = np.eye(4)

@@ -74,7 +74,7 @@ def test_the_motion_of_the_current_frame_is_found_among_outliers(seed: int) -> N
     error = se3.log(np.linalg.inv(T) @ result.T_reference_current)
     assert np.linalg.norm(error[:3]) < 0.01
     assert np.linalg.norm(error[3:]) < 0.05
-    assert result.inliers[40:].mean() > 0.9
+    assert result.inliers[40:].mean() > 0.8
     assert result.inliers[:40].mean() < 0.2
     np.testing.assert_array_equal(result.matches, matches)
     np.testing.assert_array_equal(result.covariance, result.covariance.T)

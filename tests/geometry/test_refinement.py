@@ -264,6 +264,31 @@ def test_a_bad_start_gives_a_failure_or_a_finite_pose(seed: int, size: float) ->
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
 
 
+def test_matches_that_a_far_motion_leaves_behind_do_no_harm() -> None:
+    # Near points and very far ones, and motions up to hundreds of metres: some points come to
+    # lie behind the camera or in its plane, where the projection has no derivative.
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        uvd = rng.uniform([0, 0, 0.3], [640, 480, 0.6], size=(200, 3))
+        uvd[:100, 2] *= 100
+        points = unproject(uvd)
+        matches = Correspondences(
+            source_points=points,
+            target_points=points,
+            source_uvd=uvd,
+            target_uvd=uvd,
+            source_sigmas=np.tile(SIGMAS, (200, 1)),
+            target_sigmas=np.tile(SIGMAS, (200, 1)),
+        )
+        T = se3.exp(rng.normal(size=6) * 10.0 ** rng.uniform(-3, 2.5))
+        result = refine_pose(T, matches, rng.random(200) < 0.5, CAMERA, SETTINGS)
+        if isinstance(result, Refinement):
+            assert np.isfinite(result.T_target_source).all()
+            assert np.linalg.eigvalsh(result.covariance)[0] > 0
+            moved = points @ result.T_target_source[:3, :3].T + result.T_target_source[:3, 3]
+            assert moved[result.inliers, 2].min() > 0
+
+
 def test_an_unrefined_pose_keeps_its_place_and_gets_the_covariance_of_its_residuals() -> None:
     T, matches = measure(np.random.default_rng(8), 100)
     inliers = np.arange(100) % 2 == 0
