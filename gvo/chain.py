@@ -11,6 +11,9 @@ from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.geometry import se3
 from gvo.types import Estimate, Failure, FloatArray, Observations, RelativePose, Status
 
+# After a longer gap the last velocity says nothing about where the camera is.
+_MAX_EXTRAPOLATION_S = 1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawStep:
@@ -106,7 +109,9 @@ class RawChain:
 
     def _predict(self, elapsed_s: float) -> FloatArray:
         """Return T_predecessor_current at constant velocity, where there is one."""
-        return np.eye(4) if self._velocity is None else se3.exp(self._velocity * elapsed_s)
+        if self._velocity is None:
+            return np.eye(4)
+        return se3.exp(self._velocity * min(elapsed_s, _MAX_EXTRAPOLATION_S))
 
     def _register(
         self, link: _Link, current: Observations, T_world_predicted: FloatArray
@@ -161,10 +166,12 @@ class RawChain:
         T_predecessor_current: FloatArray,
         failure: Failure,
     ) -> RawStep:
-        sigmas = np.repeat(
-            [np.radians(self._config.coasting_sigma_deg), self._config.coasting_sigma_m], 3
-        )
-        covariance = np.diag(sigmas**2)
+        elapsed_s = 1e-9 * (current.stamp_ns - predecessor.observations.stamp_ns)
+        rates = [
+            np.radians(self._config.coasting_sigma_deg_per_s),
+            self._config.coasting_sigma_m_per_s,
+        ]
+        covariance = np.diag(np.repeat(rates, 3) * elapsed_s) ** 2
         estimate = Estimate(
             stamp_ns=current.stamp_ns,
             T_world_cam=se3.normalize(predecessor.T_world_frame @ T_predecessor_current),

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from gvo.config import Config
     from gvo.runs import Progress, RunResult
 
-_EXIT_INTERRUPTED = 130
-_EXIT_TERMINATED = 143
+_EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 app = typer.Typer(
     name="gvo",
@@ -75,8 +74,8 @@ def demo(
     from gvo.demo import BAG_NAME, run_demo
 
     typer.echo(f"rendering a drive into {out / BAG_NAME}", err=True)
-    with _signals(), _progress("demo") as on_progress:
-        result = run_demo(out, on_progress=on_progress)
+    with _interruptible() as check, _progress("demo") as show:
+        result = run_demo(out, on_rendered=check, on_progress=_both(show, check))
     _report(result, out)
 
 
@@ -107,9 +106,9 @@ def run(
     for decision in source.info.decisions:
         typer.echo(decision)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
-    with _signals(), _progress(source.info.name) as on_progress:
+    with _interruptible() as check, _progress(source.info.name) as show:
         result = run_recording(
-            source, out, config=parameters, ground_truth=truth, on_progress=on_progress
+            source, out, config=parameters, ground_truth=truth, on_progress=_both(show, check)
         )
     _report(result, out)
 
@@ -176,8 +175,8 @@ def convert(
 
     options = RecordingOptions(calibration=calibration)
     source = open_recording(folder, config=_load(config, set_), options=options)
-    with _signals():
-        written = write_bag(source, bag, rectify=rectify)
+    with _interruptible() as check:
+        written = write_bag(source, bag, rectify=rectify, progress=check)
     typer.echo(f"wrote {bag}: {written.n_images} images, {written.n_poses} true poses")
     _warn(written.skipped)
     raise typer.Exit(3 if written.skipped else 0)
@@ -236,10 +235,10 @@ def _warn(warnings: Sequence[str]) -> None:
 
 
 @contextmanager
-def _progress(title: str) -> Iterator[Callable[[Progress], None] | None]:
-    """Give a callback that draws a bar on a terminal; None in a pipe."""
+def _progress(title: str) -> Iterator[Callable[[Progress], None]]:
+    """Give a callback that draws a bar on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
-        yield None
+        yield lambda progress: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -254,35 +253,56 @@ def _progress(title: str) -> Iterator[Callable[[Progress], None] | None]:
         TextColumn("left"),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None, rate=0.0, tracked=1.0)
+        task = bar.add_task(title, total=None, start=False, rate=0.0, tracked=1.0)
 
         def update(progress: Progress) -> None:
-            elapsed = bar.tasks[0].elapsed or 1e-9
+            bar.start_task(task)
             bar.update(
                 task,
                 completed=progress.n_done,
                 total=progress.n_total,
-                rate=progress.n_done / elapsed,
+                rate=progress.n_done / (bar.tasks[0].elapsed or 1e-9),
                 tracked=progress.n_tracked / max(progress.n_done, 1),
             )
 
         yield update
 
 
+def _both(
+    show: Callable[[Progress], None], check: Callable[[object], None]
+) -> Callable[[Progress], None]:
+    def on_progress(progress: Progress) -> None:
+        show(progress)
+        check(progress)
+
+    return on_progress
+
+
 @contextmanager
-def _signals() -> Iterator[None]:
-    """End with 130 on an interrupt and 143 on SIGTERM, after the files are closed."""
+def _interruptible() -> Iterator[Callable[[object], None]]:
+    """Give a function that ends the work where a signal has come; call it between frames.
 
-    def terminate(number: int, frame: object) -> NoReturn:
-        raise SystemExit(_EXIT_TERMINATED)
+    So a frame is either in all files or in none. A second signal ends at once.
+    """
+    received: list[int] = []
 
-    before = signal.signal(signal.SIGTERM, terminate)
+    def receive(number: int, frame: object) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+
+    def check(_: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, receive) for number in _EXIT_CODES}
     try:
-        yield
+        yield check
     except KeyboardInterrupt:
-        raise SystemExit(_EXIT_INTERRUPTED) from None
+        raise SystemExit(_EXIT_CODES[received[0]] if received else 130) from None
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def main() -> None:

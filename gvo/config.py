@@ -76,14 +76,14 @@ class FeaturesConfig(Section):
         "orb", "orb and sift bring their own descriptors; fast and gftt corners get ORB's"
     )
     n_features: int = _parameter(1200, "keypoints kept per image", ge=50, le=20000)
-    n_octaves: int = _parameter(1, "pyramid levels (orb, fast, gftt)", ge=1, le=12)
-    scale_factor: float = _parameter(1.3, "size ratio of two pyramid levels", gt=1, le=4)
+    n_octaves: int = _parameter(1, "pyramid levels (orb)", ge=1, le=8)
+    scale_factor: float = _parameter(1.3, "size ratio of two pyramid levels (orb)", gt=1, le=2)
     fast_threshold: int = _parameter(20, "contrast of a corner (orb, fast)", "grey", ge=1, le=200)
     low_fast_threshold: int = _parameter(
         7, "tried where the first leaves the budget unfilled", "grey", ge=1, le=200
     )
     upright: bool = _parameter(
-        True, "describe without rotation: surer while the camera rolls less than some 20 degrees"
+        True, "describe without rotation (orb, fast, gftt): surer while the camera rolls little"
     )
     cell_size_px: int = _parameter(40, "size of the grid cells that share the budget", "px", ge=8)
 
@@ -171,11 +171,11 @@ class WindowConfig(Section):
     kernel_threshold: float = _parameter(
         3.55, "of the kernel, on the norm of the whitened 6-vector", gt=0
     )
-    coasting_sigma_deg: float = _parameter(
-        3.0, "rotation sigma of a frame without registration", "deg", gt=0
+    coasting_sigma_deg_per_s: float = _parameter(
+        30.0, "rotation sigma of a step without registration, by its duration", "deg/s", gt=0
     )
-    coasting_sigma_m: float = _parameter(
-        0.3, "translation sigma of a frame without registration", "m", gt=0
+    coasting_sigma_m_per_s: float = _parameter(
+        3.0, "translation sigma of a step without registration, by its duration", "m/s", gt=0
     )
     lost_after_s: float = _parameter(2.0, "coasting longer is called lost", "s", gt=0)
 
@@ -183,7 +183,9 @@ class WindowConfig(Section):
 class RuntimeConfig(Section):
     """How the work is done."""
 
-    threads: int = _parameter(2, "threads for images; 1: none beside the main one", ge=1, le=64)
+    threads: int = _parameter(
+        2, "images worked on side by side; a frame has two, more change nothing", ge=1, le=64
+    )
 
 
 class Config(Section):

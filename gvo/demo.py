@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 from gvo.config import Config
+from gvo.errors import RecordingError
 from gvo.outputs.bag_writer import convert
 from gvo.runs import Progress, RunResult, run_recording
 from gvo.sources.opening import open_recording
@@ -16,38 +16,58 @@ BAG_NAME = "drive.mcap"
 N_FRAMES = 100
 
 
-def write_demo_bag(path: Path, *, n_frames: int = N_FRAMES, seed: int = 0) -> None:
+def write_demo_bag(
+    path: Path,
+    *,
+    n_frames: int = N_FRAMES,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> None:
     """Render a drive with a stereo camera and write it as a bag with its exact truth.
 
     Parameters
     ----------
     path : Path
-        `.bag`, `.mcap`, or a folder for a ROS 2 bag; replaced where it exists.
+        `.bag` or `.mcap` file; replaced where it exists.
     n_frames : int
         Stereo pairs at 10 Hz.
     seed : int
-        Of textures, world, motion and noise.
+        Of textures, world and noise.
+    progress : callable, optional
+        Called with the number of images written so far.
+
+    Raises
+    ------
+    RecordingError
+        When the file cannot be written.
     """
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    convert(
-        SyntheticRecording(world="driving", sensor="stereo", n_frames=n_frames, seed=seed), path
-    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+    drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=n_frames, seed=seed)
+    convert(drive, path, progress=progress)
 
 
-def run_demo(out: Path, *, on_progress: Callable[[Progress], None] | None = None) -> RunResult:
+def run_demo(
+    out: Path,
+    *,
+    on_rendered: Callable[[int], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> RunResult:
     """Write the demo's bag into a folder, run on it, compare with the exact truth.
 
     Parameters
     ----------
     out : Path
         Folder for the bag and the run's files.
+    on_rendered : callable, optional
+        Called with the number of images written to the bag so far.
     on_progress : callable, optional
         Called after each frame of the run.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    write_demo_bag(out / BAG_NAME)
+    write_demo_bag(out / BAG_NAME, progress=on_rendered)
     return run_recording(
         open_recording(out / BAG_NAME), out, config=Config(), on_progress=on_progress
     )

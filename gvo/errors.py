@@ -20,5 +20,9 @@ class ConfigurationError(GvoError):
     """A configuration file or setting is unknown, malformed or out of range."""
 
 
+class SmoothingError(GvoError):
+    """The window could not take a pose; it stands as it was before."""
+
+
 class TrajectoryError(GvoError):
     """A trajectory file is missing, malformed or cannot be associated."""

@@ -36,11 +36,12 @@ class FrameResult:
     finished : tuple of Estimate
         Smoothed poses of frames that left the window with this one.
     status : Status
+        What ties the frame to earlier ones in the window; the raw chain's own is `raw.status`.
     reason : str
-        Why no registration succeeded; empty where one did.
+        Why the chain could not register the frame; empty where it could.
     n_keypoints, n_points, n_matches, n_inliers, n_links : int
-        Keypoints, those measured in 3-D, matches with the predecessor and those that the
-        pose rests on, edges that went into the window.
+        Keypoints, those measured in 3-D, matches of the chain's registration and those that it
+        rests on, edges that went into the window.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -109,11 +110,11 @@ class Odometry:
             self._update_keyframes(observations, overlaps, is_tied=is_tied)
             self._hold_anchor()
         return FrameResult(
-            raw=replace(step.estimate, status=status, frame_id=frame.stamp_ns),
+            raw=replace(step.estimate, frame_id=frame.stamp_ns),
             causal=causal,
             finished=tuple(self._window.pop_finished()),
             status=status,
-            reason="" if is_tied else step.reason,
+            reason=step.reason,
             n_keypoints=observations.n_keypoints,
             n_points=len(observations),
             n_matches=step.n_matches,
@@ -173,7 +174,7 @@ class Odometry:
         """Keep and release keyframes; none while the pose is only a guess."""
         if not is_tied:
             return
-        if self._keyframes.is_needed(overlaps):
+        if self._config.window.n_keyframes > 0 and self._keyframes.is_needed(overlaps):
             self._keyframes.add(observations)
             self._window.keep(observations.stamp_ns)
         for stamp_ns in self._keyframes.choose_released(overlaps):

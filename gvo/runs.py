@@ -15,22 +15,22 @@ import numpy as np
 
 from gvo import __version__
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.errors import GvoError, RecordingError, SmoothingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
 from gvo.odometry import FrameResult, Odometry
 from gvo.outputs.plots import plot_trajectories
-from gvo.outputs.run_folder import TRAJECTORIES, RunFolder
+from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.tables import evaluations_json
 from gvo.sources.frames import frames
 from gvo.sources.opening import BAG_SUFFIXES, open_recording
-from gvo.sources.recording import Source
+from gvo.sources.recording import Sensor, Source
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
 from gvo.types import FaultyFrame, Frame, Status
 
 EXIT_COMPLETE = 0
-EXIT_NOTHING = 2
 EXIT_PARTLY = 3
+_BIN_WIDTH = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +72,23 @@ class RunResult:
     warnings: tuple[str, ...]
 
 
+class _Durations:
+    """Durations of a stage, counted in bins of one percent: the memory does not grow."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[int] = Counter()
+
+    def add(self, elapsed_ms: float) -> None:
+        self._counts[round(np.log(max(elapsed_ms, 1e-3)) / _BIN_WIDTH)] += 1
+
+    def median(self) -> float:
+        """Return the median in milliseconds, right to half a percent."""
+        bins = sorted(self._counts)
+        cumulated = np.cumsum([self._counts[bin_] for bin_ in bins])
+        middle = bins[int(np.searchsorted(cumulated, 0.5 * cumulated[-1]))]
+        return round(float(np.exp(middle * _BIN_WIDTH)), 3)
+
+
 @dataclass(slots=True, kw_only=True)
 class _Tally:
     """Counts and times over the frames of a run."""
@@ -81,7 +98,7 @@ class _Tally:
     n_unpaired: int = 0
     first_unpaired: str = ""
     broken_off: str = ""
-    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    stages: dict[str, _Durations] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
@@ -106,17 +123,20 @@ class _Tally:
 
     def add_result(self, result: FrameResult) -> None:
         self.statuses[result.status] += 1
-        for stage, elapsed in result.stage_ms.items():
-            self.stage_ms.setdefault(stage, []).append(elapsed)
+        for stage, elapsed_ms in result.stage_ms.items():
+            self.add_duration(stage, elapsed_ms)
 
-    def add_faulty(self, frame: FaultyFrame) -> None:
+    def add_duration(self, stage: str, elapsed_ms: float) -> None:
+        self.stages.setdefault(stage, _Durations()).add(elapsed_ms)
+
+    def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
         reason = f"frame at {frame.stamp_ns} ns: {frame.reason}"
-        if frame.is_unpaired:
-            self.n_unpaired += 1
-            self.first_unpaired = self.first_unpaired or reason
-        else:
+        if is_loss:
             self.statuses[Status.SKIPPED] += 1
             self.first_fault = self.first_fault or reason
+        else:
+            self.n_unpaired += 1
+            self.first_unpaired = self.first_unpaired or reason
 
 
 def run_recording(
@@ -156,14 +176,15 @@ def run_recording(
     with RunFolder(Path(out)) as folder:
         try:
             for item in _read_frames(source, config, tally):
-                _take(item, odometry, folder, tally)
+                _take(item, odometry, folder, tally, sensor=source.info.sensor)
                 if on_progress is not None:
                     on_progress(tally.progress(source.info.n_images))
+        except SmoothingError as error:
+            tally.broken_off = str(error)
         finally:
             # Also where the run is interrupted: what the window holds was computed.
             folder.add_smoothed(odometry.finish())
-    truth = ground_truth if ground_truth is not None else source.ground_truth()
-    return _conclude(source, folder, tally, config=config, truth=truth)
+    return _conclude(source, folder, tally, config=config, ground_truth=ground_truth)
 
 
 def read_ground_truth(path: str | Path) -> Trajectory:
@@ -202,14 +223,24 @@ def _read_frames(source: Source, config: Config, tally: _Tally) -> Iterator[Fram
         except RecordingError as error:
             tally.broken_off = str(error)
             return
-        tally.stage_ms.setdefault("read", []).append(1e3 * (time.perf_counter() - start))
+        tally.add_duration("read", 1e3 * (time.perf_counter() - start))
         yield item
 
 
-def _take(item: Frame | FaultyFrame, odometry: Odometry, folder: RunFolder, tally: _Tally) -> None:
+def _take(
+    item: Frame | FaultyFrame,
+    odometry: Odometry,
+    folder: RunFolder,
+    tally: _Tally,
+    *,
+    sensor: Sensor,
+) -> None:
     if isinstance(item, FaultyFrame):
-        tally.add_faulty(item)
-        if not item.is_unpaired:
+        # Colour and depth of a free-running sensor need not pair; the images of a stereo
+        # camera are taken together, and one without the other is a loss.
+        is_loss = not item.is_unpaired or sensor == "stereo"
+        tally.add_faulty(item, is_loss=is_loss)
+        if is_loss:
             folder.add_faulty(item)
         return
     result = odometry.track(item)
@@ -223,7 +254,7 @@ def _conclude(
     tally: _Tally,
     *,
     config: Config,
-    truth: Trajectory | None,
+    ground_truth: Trajectory | None,
 ) -> RunResult:
     if tally.n_with_pose == 0:
         reason = (
@@ -231,13 +262,18 @@ def _conclude(
         )
         raise RecordingError(f"{source.info.name}: no usable frame: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    evaluations, warnings = _evaluate(truth, estimates)
-    warnings = _warnings(tally) + warnings
+    warnings = _warnings(tally)
+    truth: Trajectory | None = None
+    evaluations: tuple[Evaluation, ...] = ()
+    try:
+        truth = ground_truth if ground_truth is not None else source.ground_truth()
+        evaluations = _evaluate(truth, estimates)
+    except GvoError as error:
+        warnings.append(f"not compared with the ground truth: {error}")
     is_partly = bool(tally.n_faulty or tally.broken_off)
     summary = _summary(source, tally, config=config, evaluations=evaluations, warnings=warnings)
     folder.write_summary(summary)
-    is_known = bool(evaluations)
-    plot_trajectories(folder.path / "trajectories.png", truth if is_known else None, estimates)
+    plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
         summary=summary,
         evaluations=evaluations,
@@ -246,24 +282,16 @@ def _conclude(
     )
 
 
-def _evaluate(
-    truth: Trajectory | None, estimates: dict[str, Trajectory]
-) -> tuple[tuple[Evaluation, ...], list[str]]:
+def _evaluate(truth: Trajectory | None, estimates: dict[str, Trajectory]) -> tuple[Evaluation, ...]:
     if truth is None:
-        return (), []
-    try:
-        evaluations = [evaluate(truth, T, name=name) for name, T in estimates.items()]
-    except GvoError as error:
-        return (), [f"not compared with the ground truth: {error}"]
-    return tuple(evaluations), []
+        return ()
+    return tuple(evaluate(truth, estimate, name=name) for name, estimate in estimates.items())
 
 
 def _warnings(tally: _Tally) -> list[str]:
     warnings = []
     if tally.broken_off:
-        warnings.append(
-            f"the recording broke off after {tally.n_frames} frames: {tally.broken_off}"
-        )
+        warnings.append(f"the run broke off after {tally.n_frames} frames: {tally.broken_off}")
     if tally.n_faulty:
         warnings.append(
             f"{tally.n_faulty} of {tally.n_frames} frames are faulty and were skipped; "
@@ -271,8 +299,7 @@ def _warnings(tally: _Tally) -> list[str]:
         )
     if tally.n_unpaired:
         warnings.append(
-            f"{tally.n_unpaired} images have no partner and make no frame "
-            "(sync.max_difference_ms, sync.stereo_tolerance_ms)"
+            f"{tally.n_unpaired} images have no partner and make no frame (sync.max_difference_ms)"
         )
     n_untied = tally.n_with_pose - tally.n_tracked
     if n_untied:
@@ -292,7 +319,7 @@ def _summary(
     warnings: list[str],
 ) -> dict[str, Any]:
     info = source.info
-    medians = {stage: round(float(np.median(ms)), 3) for stage, ms in tally.stage_ms.items()}
+    medians = {stage: durations.median() for stage, durations in tally.stages.items()}
     return {
         "gvo_version": __version__,
         "recording": info.name,

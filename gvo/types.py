@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,27 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 ImageArray: TypeAlias = NDArray[np.uint8]
 DepthArray: TypeAlias = NDArray[np.float32]
 FrameId: TypeAlias = Hashable
+
+
+def _freeze(value: object, *names: str) -> None:
+    """Replace arrays of a frozen value by copies that nobody can write to."""
+    for name in names:
+        array = np.array(getattr(value, name))
+        array.setflags(write=False)
+        object.__setattr__(value, name, array)
+
+
+def _check_images(kind: str, first: NDArray[Any], second: NDArray[Any], dtype: type) -> None:
+    if first.ndim != 2 or first.shape != second.shape:
+        raise ValueError(
+            f"the images of {kind} must be (height, width) and of one size, "
+            f"got {first.shape} and {second.shape}"
+        )
+    if first.dtype != np.uint8 or second.dtype != dtype:
+        raise ValueError(
+            f"the images of {kind} must be uint8 and {np.dtype(dtype)}, "
+            f"got {first.dtype} and {second.dtype}"
+        )
 
 
 class Status(StrEnum):
@@ -71,12 +92,8 @@ class StereoFrame:
     right: ImageArray
 
     def __post_init__(self) -> None:
-        """Check the shapes once."""
-        if self.left.ndim != 2 or self.left.shape != self.right.shape:
-            raise ValueError(
-                f"left and right must be grey images of one size, "
-                f"got {self.left.shape} and {self.right.shape}"
-            )
+        """Check shapes and types once."""
+        _check_images("a stereo frame", self.left, self.right, np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,12 +115,8 @@ class RgbdFrame:
     depth: DepthArray
 
     def __post_init__(self) -> None:
-        """Check the shapes once."""
-        if self.image.ndim != 2 or self.image.shape != self.depth.shape:
-            raise ValueError(
-                f"image must be grey and depth of its size, "
-                f"got {self.image.shape} and {self.depth.shape}"
-            )
+        """Check shapes and types once."""
+        _check_images("an RGB-D frame", self.image, self.depth, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,6 +229,10 @@ class Edge:
     T_reference_frame: FloatArray
     covariance: FloatArray
 
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        _freeze(self, "T_reference_frame", "covariance")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate:
@@ -240,3 +257,7 @@ class Estimate:
     covariance: FloatArray
     status: Status = Status.OK
     frame_id: FrameId = field(default=None)
+
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        _freeze(self, "T_world_cam", "covariance")

@@ -61,6 +61,8 @@ def measure(path: Path, settings: list[str]) -> None:
         for stage, elapsed in result.stage_ms.items():
             stages.setdefault(stage, []).append(elapsed)
     smoothed += odometry.finish()
+    if not results:
+        raise gvo.GvoError(f"{path}: no usable frame")
     print(f"\n{source.info.name}: {len(results)} frames")
     estimates = {
         "raw": [result.raw for result in results],

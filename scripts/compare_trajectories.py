@@ -20,7 +20,9 @@ def main() -> None:
 
     truth = gvo.read_ground_truth(arguments.reference)
     trajectories = {str(path): gvo.read_trajectory(path) for path in arguments.estimates}
-    evaluations = [gvo.evaluate(truth, T, name=name) for name, T in trajectories.items()]
+    evaluations = [
+        gvo.evaluate(truth, estimate, name=name) for name, estimate in trajectories.items()
+    ]
     print(gvo.format_evaluations(evaluations), end="")
     if arguments.plot:
         gvo.plot_trajectories(arguments.plot, truth, trajectories)

@@ -16,8 +16,8 @@ def main() -> None:
     parser.add_argument("bag", type=Path, help=".bag, .mcap, or a ROS 2 folder to make")
     parser.add_argument("--world", choices=["driving", "handheld"], default="driving")
     parser.add_argument("--sensor", choices=["stereo", "rgbd"], default="stereo")
-    parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, choices=range(1, 100_000), default=100, metavar="N")
+    parser.add_argument("--seed", type=int, choices=range(2**31), default=0, metavar="N")
     arguments = parser.parse_args()
 
     recording = gvo.SyntheticRecording(

@@ -24,7 +24,8 @@ def main() -> int:
     result = gvo.run_recording(source, arguments.out, config=config)
     if result.evaluations:
         print(gvo.format_evaluations(result.evaluations), end="")
-    print(*result.warnings, sep="\n", end="", file=sys.stderr)
+    for warning in result.warnings:
+        print(f"run_bag: warning: {warning}", file=sys.stderr)
     return result.exit_code
 
 

@@ -5,7 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gvo.types import Failure, FaultyFrame, Observations, RelativePose, RgbdFrame, StereoFrame
+from gvo.types import (
+    Edge,
+    Estimate,
+    Failure,
+    FaultyFrame,
+    Observations,
+    RelativePose,
+    RgbdFrame,
+    StereoFrame,
+)
 
 
 def grey(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -45,6 +54,29 @@ def test_an_rgbd_frame_needs_depth_of_the_size_of_its_grey_image(
 ) -> None:
     with pytest.raises(ValueError, match="size"):
         RgbdFrame(stamp_ns=0, image=grey(*image), depth=np.zeros(depth, dtype=np.float32))
+
+
+def test_images_of_another_type_are_refused() -> None:
+    floats = np.zeros((4, 5), dtype=np.float32)
+    with pytest.raises(ValueError, match="uint8"):
+        StereoFrame(stamp_ns=0, left=floats, right=floats)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="uint8"):
+        RgbdFrame(stamp_ns=0, image=floats, depth=floats)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="float32"):
+        RgbdFrame(stamp_ns=0, image=grey(4, 5), depth=grey(4, 5))  # type: ignore[arg-type]
+
+
+def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
+    T, covariance = np.eye(4), np.eye(6)
+    edge = Edge(reference_id="a", T_reference_frame=T, covariance=covariance)
+    estimate = Estimate(stamp_ns=0, T_world_cam=T, covariance=covariance)
+    T[0, 3], covariance[0, 0] = 7.0, 7.0
+    for array in (edge.T_reference_frame, estimate.T_world_cam):
+        assert array[0, 3] == 0.0
+    for array in (edge.covariance, estimate.covariance):
+        assert array[0, 0] == 1.0
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 2.0
 
 
 def test_frames_of_stamp_zero_are_frames() -> None:

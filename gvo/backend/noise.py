@@ -47,7 +47,8 @@ def check_covariance(covariance: FloatArray, name: str) -> None:
     if np.any(variances <= 0):
         raise ValueError(f"{name} must be positive definite")
     # Of correlations: rounding leaves elements that should be zero at any ratio to each other.
-    correlations = covariance / np.sqrt(np.outer(variances, variances))
+    sigmas = np.sqrt(variances)
+    correlations = covariance / np.outer(sigmas, sigmas)
     if np.abs(correlations - correlations.T).max() > 1e-6:
         raise ValueError(f"{name} must be symmetric")
     if np.linalg.eigvalsh(correlations)[0] <= 1e-12:

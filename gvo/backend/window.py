@@ -9,7 +9,8 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import gtsam
@@ -17,6 +18,8 @@ import numpy as np
 
 from gvo.backend.noise import check_covariance, check_transform, edge_noise
 from gvo.config import WindowConfig
+from gvo.errors import SmoothingError
+from gvo.geometry import se3
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Status
 
 # Of the first pose, which defines the world: radians and metres.
@@ -115,22 +118,25 @@ class SlidingWindow:
         ValueError
             A known name, a stamp that does not advance, an edge to a pose that is not in the
             window, a matrix that is no rotation or no covariance.
+        SmoothingError
+            When GTSAM fails all the same; the window stands as it was before.
         """
         self._check(frame_id, stamp_ns, edges, T_world_frame)
         key = self._n_keys
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if edges:
             self._add_edges(graph, key, edges)
-            start = self._predict(edges[0])
+            start = self._start_value(edges)
         else:
             start = np.eye(4) if T_world_frame is None else T_world_frame
             origin = gtsam.noiseModel.Isotropic.Sigma(6, _ORIGIN_SIGMA)
             graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(start), origin))
         values.insert(key, gtsam.Pose3(start))
-        self._n_keys += 1
-        self._members[frame_id] = _Member(key=key, stamp_ns=stamp_ns, status=status)
-        self._update(graph, values, new_key=key)
-        return self._estimate(frame_id)
+        with self._restored_on_error(frame_id):
+            self._n_keys += 1
+            self._members[frame_id] = _Member(key=key, stamp_ns=stamp_ns, status=status)
+            self._update(graph, values, new_key=key)
+            return self._estimate(frame_id)
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose of the window as a keyframe until it is released."""
@@ -204,8 +210,33 @@ class SlidingWindow:
         if T_world_frame is not None:
             check_transform(T_world_frame, f"T_world_frame of {frame_id!r}")
 
-    def _predict(self, edge: Edge) -> FloatArray:
-        return np.asarray(self.pose(edge.reference_id) @ edge.T_reference_frame)
+    def _start_value(self, edges: Sequence[Edge]) -> FloatArray:
+        """Return the prediction that the other edges agree with best, their medoid.
+
+        A robust kernel cannot leave the wrong side of an outlier, so a single bad edge must
+        not decide where the optimization starts.
+        """
+        predictions = [self.pose(edge.reference_id) @ edge.T_reference_frame for edge in edges]
+        information = [np.linalg.inv(edge.covariance) for edge in edges]
+        disagreements = []
+        for T in predictions:
+            residuals = se3.log(np.stack([se3.invert(other) @ T for other in predictions]))
+            distances = np.sqrt(np.einsum("ni,nij,nj->n", residuals, information, residuals))
+            disagreements.append(np.sum(distances))
+        return np.asarray(predictions[int(np.argmin(disagreements))])
+
+    @contextmanager
+    def _restored_on_error(self, frame_id: FrameId) -> Iterator[None]:
+        """Put the window back as it was when an update fails or is interrupted."""
+        before = gtsam.ISAM2(self._isam), self._members.copy(), list(self._finished)
+        try:
+            yield
+        except BaseException as error:
+            self._isam, self._members, self._finished = before
+            if isinstance(error, RuntimeError | IndexError):
+                reason = str(error).strip().splitlines()[0]
+                raise SmoothingError(f"the window refused {frame_id!r}: {reason}") from error
+            raise
 
     def _add_edges(
         self, graph: gtsam.NonlinearFactorGraph, key: int, edges: Sequence[Edge]

@@ -70,7 +70,7 @@ class FeatureExtractor:
         if self._config.kind in ("fast", "gftt"):
             found = _inside(found, image.shape)
         found = _spread(found, image.shape, self._config)
-        if self._config.upright:
+        if self._config.upright and self._config.kind != "sift":
             for point in found:
                 point.angle = 0.0
         describer = self._detectors[0] if self._config.kind == "sift" else self._orb

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from gvo.types import FloatArray, IntArray
 
-# Real descriptors of SIFT have this length, so that two can be no farther apart than twice it.
-_SIFT_NORM = 512.0
+# Descriptors of SIFT have length 512 and no negative entry, so that two are at most this far apart.
+_MAX_SIFT_DISTANCE = np.sqrt(2.0) * 512.0
 
 
 def descriptor_distances(
@@ -35,7 +35,7 @@ def descriptor_distances(
         words_a, words_b = a.view(np.uint64), b.view(np.uint64)
         bits = np.bitwise_count(words_a ^ words_b).sum(axis=1, dtype=np.int64)
         return np.asarray(bits / (8.0 * first.shape[1]))
-    return np.asarray(np.linalg.norm(a - b, axis=1) / (2.0 * _SIFT_NORM), dtype=np.float64)
+    return np.asarray(np.linalg.norm(a - b, axis=1) / _MAX_SIFT_DISTANCE, dtype=np.float64)
 
 
 def mutual_best(pairs: IntArray, distances: FloatArray, n_first: int, n_second: int) -> IntArray:

@@ -57,8 +57,17 @@ def register_matches(
         camera,
         config.registration,
     )
+    n_inliers = int(np.count_nonzero(consensus.inliers))
     if isinstance(refined, Failure):
-        return Failure(reason=refined.reason, n_matches=len(matches))
+        return Failure(reason=refined.reason, n_matches=len(matches), n_inliers=n_inliers)
+    n_inliers = int(np.count_nonzero(refined.inliers))
+    if n_inliers < config.ransac.min_inliers:
+        return Failure(
+            reason=f"{n_inliers} of {len(matches)} matches fit the refined motion, "
+            f"{config.ransac.min_inliers} are needed (ransac.min_inliers)",
+            n_matches=len(matches),
+            n_inliers=n_inliers,
+        )
     return RelativePose(
         T_reference_current=se3.invert(refined.T_target_source),
         covariance=refined.covariance,

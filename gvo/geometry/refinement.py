@@ -24,6 +24,8 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3
+# Nearer points, or points behind the camera, have no noise to speak of: they are no inliers.
+_MIN_NOISE_DEPTH_M = 0.1
 # A step of the pose, radians and metres, that no longer matters.
 _CONVERGED = 1e-5
 # The first round only has to be good enough to choose the inliers again.
@@ -217,7 +219,7 @@ class _Problem:
 
 def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
     points = se3.transform_points(T, matches.source_points)
-    points[points[:, 2] < _MIN_DEPTH_M] = (0.0, 0.0, 1.0)  # of no account, but finite
+    points[points[:, 2] < _MIN_NOISE_DEPTH_M] = (0.0, 0.0, 1.0)  # of no account, but finite
     J = (
         projection_jacobian(points, camera)
         @ T[:3, :3]
@@ -243,7 +245,11 @@ def _gauss_newton(T: FloatArray, problem: _Problem, *, n_iterations: int) -> _So
             break
     if isinstance(normal, Failure) or not np.isfinite(T).all():
         return Failure(reason="the refinement diverged", n_matches=len(problem.source_points))
-    return _Solution(T=se3.normalize(T), normal=normal)
+    T = se3.normalize(T)
+    normal = problem.linearize(T)
+    if isinstance(normal, Failure):
+        return normal
+    return _Solution(T=T, normal=normal)
 
 
 def _solve(normal: _Normal) -> FloatArray | Failure:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
@@ -15,6 +16,7 @@ from gvo.odometry import FrameResult
 from gvo.trajectory_files import COVARIANCE_HEADER, format_covariance_line, format_tum_line
 from gvo.types import Estimate, FaultyFrame, Status
 
+PICTURE = "trajectories.png"
 TRAJECTORIES = ("raw", "causal", "smoothed")
 FRAMES_HEADER = (
     "stamp_ns",
@@ -37,7 +39,8 @@ class RunFolder:
     Parameters
     ----------
     path : Path
-        Folder to write into; made where it is missing. Files of an earlier run are replaced.
+        Folder to write into; made where it is missing. Files of an earlier run are replaced, its
+        summary and picture removed.
 
     Raises
     ------
@@ -48,20 +51,30 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._files: dict[str, TextIO] = {}
-        try:
+        with self._refused_on_error():
             path.mkdir(parents=True, exist_ok=True)
+            for name in ("summary.json", PICTURE):
+                (path / name).unlink(missing_ok=True)
             for name in TRAJECTORIES:
-                self._open(f"{name}.txt")
-                self._open(f"{name}_covariance.csv").write(f"{COVARIANCE_HEADER}\n")
-            self._open("frames.csv").write(_csv_line(FRAMES_HEADER))
-        except OSError as error:
-            self._close_files()
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+                self._open(f"{name}.txt", "")
+                self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
+            self._open("frames.csv", _csv_line(FRAMES_HEADER))
 
-    def _open(self, name: str) -> TextIO:
+    @contextmanager
+    def _refused_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def _open(self, name: str, header: str) -> None:
         file = (self.path / name).open("w", encoding="utf-8", newline="\n", buffering=1)
         self._files[name] = file
-        return file
+        file.write(header)
+
+    def _write(self, name: str, line: str) -> None:
+        with self._refused_on_error():
+            self._files[name].write(line)
 
     def add_frame(self, result: FrameResult) -> None:
         """Write what one frame gave."""
@@ -78,12 +91,12 @@ class RunFolder:
             result.n_links,
             result.reason,
         )
-        self._files["frames.csv"].write(_csv_line(row))
+        self._write("frames.csv", _csv_line(row))
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a row for a frame without a pose."""
         row = (frame.stamp_ns, Status.SKIPPED, 0, 0, 0, 0, 0, frame.reason)
-        self._files["frames.csv"].write(_csv_line(row))
+        self._write("frames.csv", _csv_line(row))
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses that are final."""
@@ -92,24 +105,23 @@ class RunFolder:
 
     def _add_pose(self, name: str, estimate: Estimate) -> None:
         pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)
-        self._files[f"{name}.txt"].write(f"{pose}\n")
+        self._write(f"{name}.txt", f"{pose}\n")
         covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
-        self._files[f"{name}_covariance.csv"].write(f"{covariance}\n")
+        self._write(f"{name}_covariance.csv", f"{covariance}\n")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write `summary.json`."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        (self.path / "summary.json").write_text(text, encoding="utf-8")
+        with self._refused_on_error():
+            (self.path / "summary.json").write_text(text, encoding="utf-8")
 
     def close(self) -> None:
         """Close all files and sort the smoothed poses by stamp."""
-        self._close_files()
-        _sort_lines(self.path / "smoothed.txt", n_header=0)
-        _sort_lines(self.path / "smoothed_covariance.csv", n_header=1)
-
-    def _close_files(self) -> None:
-        for file in self._files.values():
-            file.close()
+        with self._refused_on_error():
+            for file in self._files.values():
+                file.close()
+            _sort_lines(self.path / "smoothed.txt", n_header=0)
+            _sort_lines(self.path / "smoothed_covariance.csv", n_header=1)
 
     def __enter__(self) -> RunFolder:
         """Return the folder, open for writing."""

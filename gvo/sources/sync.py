@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from dataclasses import dataclass
 from typing import TypeAlias
 
 from gvo.sources.recording import StampedImage
 from gvo.types import FaultyFrame
 
 MAX_PENDING = 100
-"""Images of one stream that are kept while the other one lags behind."""
+"""Images of one stream that are kept while the other one lags behind, or while they compete."""
 
 Pair: TypeAlias = tuple[StampedImage, StampedImage]
 
@@ -25,9 +25,10 @@ def pair_images(
 ) -> Iterator[Pair | FaultyFrame]:
     """Pair the images of stream 0 with those of stream 1.
 
-    In the order of stream 0, each image takes the nearest partner within the limit among those
-    after the partner taken before. Where that would leave the next image without any, and
-    there is an earlier one within the limit, it takes the earlier one.
+    Of all ways to pair within the limit, each image at most once, that with the least sum of
+    differences is taken, where an image of stream 0 without partner counts as much as the limit.
+    So none is left without while its partner's stamp is nearer to it than to the image that got
+    it, and a missing image does not shift those after it.
 
     Parameters
     ----------
@@ -44,6 +45,12 @@ def pair_images(
         One for each image of stream 0, in its order: faulty where the stamp repeats or goes
         back, or where there is no partner. Images of stream 1 whose stamp repeats or goes back
         are left out.
+
+    Notes
+    -----
+    The sum is minimized by dynamic programming over the images of stream 0. A pair is given out
+    when all plans that may still turn out best agree on it, which is mostly an image later; when
+    `MAX_PENDING` images wait for that, the best plan so far decides about the first.
     """
     pairing = _Pairing(limit_ns, partner)
     for image in images:
@@ -51,6 +58,18 @@ def pair_images(
         yield from pairing.decided()
     pairing.is_ended = True
     yield from pairing.decided()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Plan:
+    """One way to pair the images that are planned but not given out.
+
+    `last_ns` is the stamp of the last partner taken, `cost_ns` the sum of differences so far.
+    """
+
+    last_ns: int
+    cost_ns: int
+    partners: tuple[StampedImage | None, ...]
 
 
 class _Pairing:
@@ -62,8 +81,12 @@ class _Pairing:
         self._partners: deque[StampedImage] = deque()
         self._last_stamps: list[int | None] = [None, None]
         self._stamp_passed: int | None = None
+        # planned images, each with what it becomes where the plan has no partner for it
+        self._planned: deque[tuple[StampedImage | None, FaultyFrame]] = deque()
+        self._plans = [_Plan(last_ns=-(2**64), cost_ns=0, partners=())]
 
     def push(self, image: StampedImage) -> None:
+        """Take the next image of either stream."""
         last_ns = self._last_stamps[image.stream]
         is_late = last_ns is not None and image.stamp_ns <= last_ns
         if not is_late:
@@ -77,73 +100,65 @@ class _Pairing:
 
     def decided(self) -> Iterator[Pair | FaultyFrame]:
         """Yield what no later image can change."""
-        while self._waiting:
-            front = self._waiting[0]
-            if isinstance(front, FaultyFrame):
-                yield front
+        while self._waiting and self._is_plannable(self._waiting[0]):
+            image = self._waiting.popleft()
+            if isinstance(image, FaultyFrame):
+                self._planned.append((None, image))
+                self._plans = [_extended(plan, None) for plan in self._plans]
             else:
-                is_forced = max(len(self._waiting), len(self._partners)) > MAX_PENDING
-                if not (is_forced or self._knows_nearest(front.stamp_ns)):
-                    return
-                self._pass_partners_before(front.stamp_ns - self._limit_ns)
-                index = self._choose(front.stamp_ns, is_forced=is_forced)
-                if index is None:
-                    return
-                yield self._take(front, index)
-            self._waiting.popleft()
+                self._plan(image)
+            yield from self._agreed()
+        if self.is_ended:
+            self._plans = [self._best_plan()]
+            yield from self._agreed()
 
-    def _choose(self, stamp_ns: int, *, is_forced: bool) -> int | None:
-        """Return the index of the partner to take, -1 for none, None while undecided."""
-        differences = [abs(partner.stamp_ns - stamp_ns) for partner in self._near(stamp_ns)]
-        if not differences:
-            return -1
-        nearest = differences.index(min(differences))
-        if nearest == 0:
-            return nearest
-        needs_it = self._next_needs(nearest)
-        if needs_it is None and not is_forced:
-            return None
-        return nearest - 1 if needs_it else nearest
-
-    def _near(self, stamp_ns: int) -> Iterator[StampedImage]:
-        for partner in self._partners:
-            if partner.stamp_ns > stamp_ns + self._limit_ns:
-                return
-            yield partner
-
-    def _next_needs(self, index: int) -> bool | None:
-        """Tell whether the next image has no partner but this one; None while unknown."""
-        later = islice(self._waiting, 1, None)
-        following = next((item for item in later if isinstance(item, StampedImage)), None)
-        if following is None:
-            return False if self.is_ended else None
-        if abs(self._partners[index].stamp_ns - following.stamp_ns) > self._limit_ns:
-            return False
-        latest_ns = following.stamp_ns + self._limit_ns
-        if index + 1 < len(self._partners):
-            return self._partners[index + 1].stamp_ns > latest_ns
-        return True if self._knows_partners_until(latest_ns) else None
-
-    def _knows_nearest(self, stamp_ns: int) -> bool:
-        if self._partners and self._partners[-1].stamp_ns >= stamp_ns:
-            return True
-        return self._knows_partners_until(stamp_ns + self._limit_ns)
-
-    def _knows_partners_until(self, stamp_ns: int) -> bool:
+    def _is_plannable(self, image: StampedImage | FaultyFrame) -> bool:
+        """Tell whether all images that may become its partner are known."""
         last_ns = self._last_stamps[1]
-        return self.is_ended or (last_ns is not None and last_ns >= stamp_ns)
+        return (
+            self.is_ended
+            or isinstance(image, FaultyFrame)
+            or (last_ns is not None and last_ns >= image.stamp_ns + self._limit_ns)
+            or max(len(self._waiting), len(self._partners)) > MAX_PENDING
+        )
 
-    def _take(self, image: StampedImage, index: int) -> Pair | FaultyFrame:
-        if index < 0:
-            return self._partnerless_frame(image)
-        partner = self._partners[index]
-        for _ in range(index + 1):
+    def _plan(self, image: StampedImage) -> None:
+        """Continue all plans by all choices for one image, and keep those that may be best."""
+        earliest_ns = image.stamp_ns - self._limit_ns
+        while self._partners and self._partners[0].stamp_ns < earliest_ns:
             self._pass_partner()
-        return image, partner
+        self._planned.append((image, self._partnerless_frame(image)))
+        near = [p for p in self._partners if p.stamp_ns <= image.stamp_ns + self._limit_ns]
+        plans = []
+        for plan in self._plans:
+            # one more than the limit: a pair with just that difference is better than none
+            plans.append(_extended(plan, None, cost_ns=self._limit_ns + 1))
+            plans += [
+                _extended(plan, partner, cost_ns=abs(partner.stamp_ns - image.stamp_ns))
+                for partner in near
+                if partner.stamp_ns > plan.last_ns
+            ]
+        self._plans = _not_dominated(plans, earliest_ns)
 
-    def _pass_partners_before(self, stamp_ns: int) -> None:
-        while self._partners and self._partners[0].stamp_ns < stamp_ns:
-            self._pass_partner()
+    def _agreed(self) -> Iterator[Pair | FaultyFrame]:
+        """Yield the answers that all plans share; the best plan's where too many wait."""
+        while self._planned:
+            if len(self._planned) > MAX_PENDING:
+                first = self._best_plan().partners[0]
+            else:
+                first = self._plans[0].partners[0]
+                if any(plan.partners[0] is not first for plan in self._plans):
+                    return
+            self._plans = [
+                _Plan(last_ns=plan.last_ns, cost_ns=plan.cost_ns, partners=plan.partners[1:])
+                for plan in self._plans
+                if plan.partners[0] is first
+            ]
+            image, alone = self._planned.popleft()
+            yield alone if image is None or first is None else (image, first)
+
+    def _best_plan(self) -> _Plan:
+        return min(self._plans, key=lambda plan: plan.cost_ns)
 
     def _pass_partner(self) -> None:
         self._stamp_passed = self._partners.popleft().stamp_ns
@@ -159,6 +174,27 @@ class _Pairing:
             reason=f"no {self._partner} image within {self._limit_ns / 1e6:g} ms: {nearest}",
             is_unpaired=True,
         )
+
+
+def _extended(plan: _Plan, partner: StampedImage | None, *, cost_ns: int = 0) -> _Plan:
+    return _Plan(
+        last_ns=plan.last_ns if partner is None else partner.stamp_ns,
+        cost_ns=plan.cost_ns + cost_ns,
+        partners=(*plan.partners, partner),
+    )
+
+
+def _not_dominated(plans: list[_Plan], earliest_ns: int) -> list[_Plan]:
+    """Leave out each plan that another one cannot do worse than, whatever comes.
+
+    Of two plans, that whose last partner is earlier has all choices of the other; partners
+    before `earliest_ns` are no choice any more.
+    """
+    kept: list[_Plan] = []
+    for plan in sorted(plans, key=lambda plan: (max(plan.last_ns, earliest_ns), plan.cost_ns)):
+        if not kept or plan.cost_ns < kept[-1].cost_ns:
+            kept.append(plan)
+    return kept
 
 
 def _late_frame(image: StampedImage, last_ns: int | None) -> FaultyFrame:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
+from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Status
 
@@ -345,20 +346,53 @@ def test_a_good_edge_outvotes_a_bad_one_by_their_covariances() -> None:
     np.testing.assert_allclose(np.diag(estimate.covariance), 0.8e-4, rtol=1e-3)
 
 
-def test_a_kernel_keeps_one_bad_edge_from_moving_the_pose() -> None:
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_kernel_keeps_one_bad_edge_from_moving_the_pose_wherever_it_stands(place: int) -> None:
     found = {}
     for kernel in ("huber", "none"):
         window = SlidingWindow(WindowConfig.model_validate({"kernel": kernel}))
         window.add_pose("a", 0, [])
-        good, bad = np.eye(4), np.eye(4)
-        bad[0, 3] = 0.5  # fifty sigmas
+        transforms = [np.eye(4) for _ in range(3)]
+        transforms[place][0, 3] = 0.5  # fifty sigmas
         edges = [
             Edge(reference_id="a", T_reference_frame=T, covariance=1e-4 * np.eye(6))
-            for T in (good, bad, good)
+            for T in transforms
         ]
         found[kernel] = window.add_pose("b", 1, edges).T_world_cam[0, 3]
     assert found["none"] == pytest.approx(0.5 / 3, rel=0.01)
     assert found["huber"] < 0.1 * 0.5
+
+
+class Failing(gtsam.ISAM2):
+    """An optimiser that gives up on everything."""
+
+    def update(self, *_: Any, **__: Any) -> Any:
+        raise RuntimeError("Indeterminant linear system\nand more lines")
+
+
+def test_an_update_that_fails_is_told_in_one_line_and_undone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    window = SlidingWindow(WindowConfig(n_recent=2))
+    edges = [
+        Edge(reference_id=frame, T_reference_frame=np.eye(4), covariance=1e-4 * np.eye(6))
+        for frame in range(4)
+    ]
+    for frame in range(3):
+        window.add_pose(frame, frame, edges[frame - 1 : frame])
+    before = window.poses()
+    with monkeypatch.context() as patch:
+        patch.setattr(window, "_isam", Failing(window._isam))
+        with pytest.raises(SmoothingError) as caught:
+            window.add_pose(3, 3, edges[2:3])
+        assert "3" in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert list(window.poses()) == list(before)
+        for name, pose in window.poses().items():
+            np.testing.assert_array_equal(pose, before[name])
+        assert window.add_pose(3, 3, edges[2:3]).frame_id == 3
+        finished = [estimate.frame_id for estimate in window.pop_finished()]
+        assert finished + [estimate.frame_id for estimate in window.finish()] == [0, 1, 2, 3]
 
 
 def test_edges_many_sizes_apart_do_not_break_the_window() -> None:

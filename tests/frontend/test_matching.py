@@ -108,11 +108,13 @@ def test_real_distances_are_euclidean_within_zero_and_one(seed: int) -> None:
     first, second = (512 * raw / np.linalg.norm(raw, axis=2, keepdims=True)).astype(np.float32)
     pairs = random_pairs(rng, 4, 4)
     distances = descriptor_distances(first, second, pairs)
-    expected = [np.sqrt(sum((first[i] - second[j]) ** 2)) / 1024 for i, j in pairs]
+    expected = [np.sqrt(sum((first[i] - second[j]) ** 2)) / 724.07734 for i, j in pairs]
     np.testing.assert_allclose(distances, expected, rtol=1e-4)
     assert np.all((distances >= 0) & (distances <= 1))
-    opposite = descriptor_distances(first, -first, np.array([[0, 0]]))
-    assert opposite[0] == pytest.approx(1.0, rel=1e-6)
+    # No entry is negative: two descriptors are farthest apart where they share none.
+    apart = np.zeros((2, 128), dtype=np.float32)
+    apart[0, 3] = apart[1, 7] = 512.0
+    assert descriptor_distances(apart, apart, np.array([[0, 1]]))[0] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])

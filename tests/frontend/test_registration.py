@@ -151,6 +151,20 @@ def test_too_few_matches_are_a_failure(n: int) -> None:
     assert result.n_matches == n
 
 
+def test_a_pose_rests_on_as_many_matches_as_are_needed_after_refinement_too() -> None:
+    # Noise of four times the stated sigmas: RANSAC's threshold takes what the gate leaves out.
+    outcomes = []
+    for seed in range(30):
+        _, reference, current, matches = two_frames(seed, n=80, n_outliers=0, noise=4.0)
+        config = configure(min_inliers=55, inlier_threshold_px=20.0)
+        result = register_matches(reference, current, matches, CAMERA, config)
+        assert result.n_matches == 80
+        outcomes.append(bool(result))
+        assert (result.n_inliers >= 55) == bool(result)
+    assert any(outcomes)
+    assert not all(outcomes)
+
+
 def test_matches_without_a_common_motion_are_a_failure_that_counts_them() -> None:
     rng = np.random.default_rng(0)
     frames = [
