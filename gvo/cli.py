@@ -73,7 +73,7 @@ def demo(
     """Render a drive, write it as a bag, run on it, compare with the exact truth."""
     from gvo.demo import BAG_NAME, run_demo
 
-    typer.echo(f"rendering a drive into {out / BAG_NAME}", err=True)
+    typer.echo(f"rendering a drive into {out / BAG_NAME}")
     with _interruptible() as check, _progress("demo") as show:
         result = run_demo(out, on_rendered=check, on_progress=_both(show, check))
     _report(result, out)

@@ -125,6 +125,7 @@ def test_estimates_of_one_name_are_told_apart(command: Command, tmp_path: Path) 
         (["compare", "poses.txt", "poses.txt", "--plot", "plot.gif"], ["plot.gif"]),
         (["convert", "missing", "out.bag"], ["missing"]),
         (["convert", "{bag}", "poses.txt"], ["poses.txt"]),
+        (["demo", "--out", "poses.txt"], ["poses.txt", "cannot be written"]),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(

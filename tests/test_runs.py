@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import gvo
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
@@ -192,3 +192,56 @@ def test_the_errors_do_not_depend_on_the_frame_of_the_truth(
     second = gvo.run_recording(room, tmp_path / "b", ground_truth=moved).evaluations
     for a, b in zip(first, second, strict=True):
         assert a.ate_m == pytest.approx(b.ate_m, abs=1e-9)
+
+
+class TruthlessSource(FaultySource):
+    """A source whose ground truth cannot be read."""
+
+    def ground_truth(self) -> Trajectory | None:
+        raise TrajectoryError("groundtruth.txt: line 3: expected 8 numbers, got 2")
+
+
+class OneEyedSource(FaultySource):
+    """A stereo source that lost some images of its right camera."""
+
+    def images(self) -> Iterator[StampedImage]:
+        for index, image in enumerate(self._source.images()):
+            if image.stream == 0 or index // 2 not in self._faulty:
+                yield image
+
+
+def test_a_malformed_truth_of_the_recording_is_a_warning(
+    room: SyntheticRecording, tmp_path: Path
+) -> None:
+    result = gvo.run_recording(TruthlessSource(room, faulty=set()), tmp_path)
+    assert result.exit_code == 0
+    assert "line 3" in result.warnings[0]
+    assert (tmp_path / "summary.json").exists()
+    assert (tmp_path / "trajectories.png").exists()
+
+
+def test_a_left_image_without_a_right_one_is_a_loss(tmp_path: Path) -> None:
+    drive = SyntheticRecording("driving", "stereo", n_frames=8, scale=0.4)
+    result = gvo.run_recording(OneEyedSource(drive, faulty={2, 5}), tmp_path)
+    assert result.exit_code == 3
+    assert result.summary["status_counts"]["skipped"] == 2
+    assert result.summary["coverage"] == 0.75
+
+
+def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:
+    result = gvo.run_recording(OneEyedSource(room, faulty={2, 5}), tmp_path)
+    assert result.exit_code == 0
+    assert result.summary["frames"] == 10
+    assert result.summary["unpaired_images"] == 2
+    assert "2 images have no partner" in result.warnings[0]
+
+
+def test_a_run_that_fails_leaves_no_summary_of_an_earlier_one(
+    room: SyntheticRecording, tmp_path: Path
+) -> None:
+    (tmp_path / "summary.json").write_text("{}")
+    (tmp_path / "trajectories.png").write_text("")
+    with pytest.raises(RecordingError):
+        gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path)
+    assert not (tmp_path / "summary.json").exists()
+    assert not (tmp_path / "trajectories.png").exists()

@@ -14,10 +14,10 @@ from gvo.geometry.camera import Calibration
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.calibration import (
     make_calibration,
-    read_mono_file,
-    read_stereo_file,
+    make_rgbd_calibration,
     stereo_baseline,
 )
+from gvo.sources.calibration_files import read_mono_file, read_stereo_file
 from gvo.sources.messages import camera_fields
 from gvo.sources.topics import CameraTopics, Topic, camera_info_names, find_camera_info
 
@@ -69,10 +69,9 @@ def calibrations_of_messages(reader: BagReader, topics: CameraTopics, where: str
     for name in names:
         if name not in messages:
             raise CalibrationError(f"{where}: {name} yields no message; give --calibration FILE")
+    make = make_rgbd_calibration if topics.sensor == "rgbd" else make_calibration
     calibrations = tuple(
-        make_calibration(
-            camera_fields(messages[name], f"{where}: {name}"), is_rectified=image.is_rectified
-        )
+        make(camera_fields(messages[name], f"{where}: {name}"), is_rectified=image.is_rectified)
         for image, name in zip(images, names, strict=True)
     )
     state = "rectified" if topics.first.is_rectified else "raw, rectified by D, R and P"
@@ -91,7 +90,7 @@ def calibrations_of_file(path: Path, topics: CameraTopics) -> BagCalibration:
     Parameters
     ----------
     path : Path
-        See `gvo.sources.calibration.read_calibration_file`.
+        See `gvo.sources.calibration_files.read_calibration_file`.
     topics : CameraTopics
         The image topics; their names say whether the images are rectified.
 
@@ -107,7 +106,7 @@ def calibrations_of_file(path: Path, topics: CameraTopics) -> BagCalibration:
         baseline = f"baseline: {stereo_baseline((left, right), str(path)):.4f} m from P of {path}"
         return BagCalibration(calibrations=(left, right), decisions=(decision, baseline))
     fields, depth_scale = read_mono_file(path)
-    camera = make_calibration(fields, is_rectified=is_rectified)
+    camera = make_rgbd_calibration(fields, is_rectified=is_rectified)
     return BagCalibration(calibrations=(camera,), decisions=(decision,), depth_scale=depth_scale)
 
 

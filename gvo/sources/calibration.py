@@ -1,29 +1,23 @@
-"""Calibrations from the fields of `CameraInfo`, and from YAML files that hold them."""
+"""Calibrations from the fields of `CameraInfo`, checked."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
 
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import Calibration, stereo_camera
 from gvo.types import FloatArray
 
+MAX_SIDE_PX = 32767
+"""Largest width or height of an image, pixels: what OpenCV rectifies."""
+
+MAX_AREA_PX = 100_000_000
+"""Most pixels of an image: more is a damaged number, and would not fit into memory."""
+
 _ROTATION_TOLERANCE = 1e-3
-_FILE_KEYS = {
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-    "K": ("camera_matrix", "K", "k"),
-    "D": ("distortion_coefficients", "D", "d"),
-    "R": ("rectification_matrix", "R", "r"),
-    "P": ("projection_matrix", "P", "p"),
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,22 +44,6 @@ class CameraFields:
     D: ArrayLike
     R: ArrayLike
     P: ArrayLike
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationFile:
-    """What a calibration file holds.
-
-    Parameters
-    ----------
-    cameras : tuple of CameraFields
-        One camera, or left and right.
-    depth_scale : float, optional
-        Counts per metre of integer depth.
-    """
-
-    cameras: tuple[CameraFields, ...]
-    depth_scale: float | None = None
 
 
 def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
@@ -96,7 +74,7 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
         P = np.hstack([K, np.zeros((3, 1))])
     if not np.any(R):
         R = np.eye(3)
-    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):
+    if not is_rotation(R):
         raise CalibrationError(f"{where}: R is no rotation")
     calibration = Calibration(
         width=fields.width,
@@ -111,84 +89,80 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     return calibration
 
 
-def check_camera(calibration: Calibration, where: str) -> None:
-    """Refuse a calibration whose rectified camera is none, naming where it comes from.
+def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
+    """Check the fields of an RGB-D camera's `CameraInfo` and return the calibration.
+
+    Depth is measured along the axis of the raw camera: where rectification turns the camera,
+    the depth of a pixel would have to change with it.
+
+    Parameters
+    ----------
+    fields : CameraFields
+        Raw numbers of the colour camera.
+    is_rectified : bool
+        The images are rectified already: only P counts.
+
+    Returns
+    -------
+    Calibration
 
     Raises
     ------
     CalibrationError
-        When a focal length or the image size is not positive.
+        As `make_calibration`, and when R of raw images is not the identity.
     """
+    calibration = make_calibration(fields, is_rectified=is_rectified)
+    if not is_rectified and not np.allclose(calibration.R, np.eye(3), atol=_ROTATION_TOLERANCE):
+        raise CalibrationError(
+            f"{fields.where}: R turns the camera, and depth cannot be turned with it: expected the "
+            "identity for an RGB-D camera; give rectified images or a calibration without R"
+        )
+    return calibration
+
+
+def is_rotation(matrix: FloatArray) -> bool:
+    """Tell whether a matrix of a file, shape (3, 3), is a rotation up to the file's rounding."""
+    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(3), atol=_ROTATION_TOLERANCE)
+    return bool(is_orthogonal and np.linalg.det(matrix) > 0)
+
+
+def check_camera(calibration: Calibration, where: str) -> None:
+    """Refuse a calibration whose rectified camera is none, naming where it comes from.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of one camera.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    CalibrationError
+        When a focal length or the image size is not positive, or the image is larger than
+        `MAX_SIDE_PX` or `MAX_AREA_PX`.
+    """
+    width, height = calibration.width, calibration.height
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_AREA_PX:
+        raise CalibrationError(
+            f"{where}: the image size must be at most {MAX_SIDE_PX} px a side and "
+            f"{MAX_AREA_PX // 10**6} megapixels, got {width}x{height}; mend the calibration"
+        )
     try:
         calibration.pinhole()
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from error
 
 
-def read_calibration_file(path: Path) -> CalibrationFile:
-    """Read a calibration in the form of ROS's camera_calibration or of `CameraInfo`.
+def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -> float:
+    """Return the baseline of a rectified pair in metres.
 
     Parameters
     ----------
-    path : Path
-        YAML: `image_width`, `image_height`, `camera_matrix`, `distortion_coefficients`,
-        `distortion_model`, optionally `rectification_matrix`, `projection_matrix` and
-        `depth_scale` (counts per metre); or `width`, `height`, `k`, `d`, `r`, `p`. A stereo
-        pair holds two of them under `left` and `right`.
-
-    Raises
-    ------
-    CalibrationError
-        When it cannot be read or lacks a key.
-    """
-    content = read_yaml(path)
-    if "left" in content and "right" in content:
-        cameras = tuple(
-            _camera_fields(content[side], f"{path}: {side}") for side in ("left", "right")
-        )
-        return CalibrationFile(cameras=cameras)
-    scale = content.get("depth_scale")
-    if scale is not None and not (isinstance(scale, int | float) and 0 < scale < np.inf):
-        raise CalibrationError(f"{path}: depth_scale must be a positive number, got {scale!r}")
-    return CalibrationFile(
-        cameras=(_camera_fields(content, str(path)),),
-        depth_scale=None if scale is None else float(scale),
-    )
-
-
-def read_mono_file(path: Path) -> tuple[CameraFields, float | None]:
-    """Read one camera, and the depth scale if there is one, from a calibration file.
-
-    Raises
-    ------
-    CalibrationError
-        When it cannot be read or holds a stereo pair.
-    """
-    file = read_calibration_file(path)
-    if len(file.cameras) != 1:
-        raise CalibrationError(f"{path}: expected one camera, got left and right")
-    return file.cameras[0], file.depth_scale
-
-
-def read_stereo_file(path: Path, *, is_rectified: bool) -> tuple[Calibration, Calibration]:
-    """Read left and right from a calibration file.
-
-    Raises
-    ------
-    CalibrationError
-        When it cannot be read or does not hold both.
-    """
-    cameras = read_calibration_file(path).cameras
-    if len(cameras) != 2:
-        raise CalibrationError(
-            f"{path}: expected the keys left and right, each with a camera of the stereo pair"
-        )
-    left, right = (make_calibration(camera, is_rectified=is_rectified) for camera in cameras)
-    return left, right
-
-
-def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -> float:
-    """Return the baseline of a rectified pair in metres.
+    calibrations : tuple of two Calibration
+        Left and right.
+    where : str
+        File or topics, for the message.
 
     Raises
     ------
@@ -199,52 +173,6 @@ def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -
         return stereo_camera(*calibrations).baseline
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from error
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file of keys.
-
-    Raises
-    ------
-    CalibrationError
-        When it is missing, malformed or holds no keys.
-    """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: the calibration cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"{path}: the calibration is no YAML") from error
-    if not isinstance(content, dict):
-        raise CalibrationError(f"{path}: the calibration holds no keys")
-    return content
-
-
-def _camera_fields(content: object, where: str) -> CameraFields:
-    if not isinstance(content, Mapping):
-        raise CalibrationError(f"{where}: expected the keys of a camera")
-    values = {name: _first(content, keys) for name, keys in _FILE_KEYS.items()}
-    for name in ("width", "height", "K"):
-        if values[name] is None:
-            raise CalibrationError(f"{where}: lacks {' or '.join(_FILE_KEYS[name])}")
-    for name in ("width", "height"):
-        if not isinstance(values[name], int) or values[name] <= 0:
-            raise CalibrationError(f"{where}: {name} must be a positive integer")
-    return CameraFields(
-        where=where,
-        width=values["width"],
-        height=values["height"],
-        model=str(content.get("distortion_model", "plumb_bob")),
-        K=values["K"],
-        D=[] if values["D"] is None else values["D"],
-        R=np.zeros(9) if values["R"] is None else values["R"],
-        P=np.zeros(12) if values["P"] is None else values["P"],
-    )
-
-
-def _first(content: Mapping[str, Any], keys: tuple[str, ...]) -> Any:  # noqa: ANN401 - YAML
-    value = next((content[key] for key in keys if key in content), None)
-    return value.get("data") if isinstance(value, Mapping) else value
 
 
 def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:

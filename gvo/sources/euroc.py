@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,13 @@ from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectify_stereo
 from gvo.sources.calibration import (
     CameraFields,
+    is_rotation,
     make_calibration,
-    read_stereo_file,
-    read_yaml,
     stereo_baseline,
 )
-from gvo.sources.folders import StampedPath, merge_streams
-from gvo.sources.recording import RecordingInfo, StampedImage
+from gvo.sources.calibration_files import read_stereo_file, read_yaml
+from gvo.sources.folders import FolderSource, StampedPath
+from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import parse_nanoseconds, read_rows
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
@@ -29,7 +28,7 @@ from gvo.types import FloatArray
 _TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
-class EurocSource:
+class EurocSource(FolderSource):
     """A folder with `cam0` and `cam1`, or the folder of its `mav0`.
 
     Parameters
@@ -49,7 +48,7 @@ class EurocSource:
         self._root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         name = folder.resolve().parent.name if folder.name == "mav0" else folder.resolve().name
         cameras = [self._root / "cam0", self._root / "cam1"]
-        self._left, self._right = (_list_images(camera) for camera in cameras)
+        left, right = (_list_images(camera) for camera in cameras)
         sensors = [_read_sensor(camera / "sensor.yaml") for camera in cameras]
         self._T_body_left = sensors[0].T_body_cam
         if calibration is not None:
@@ -60,26 +59,18 @@ class EurocSource:
             calibrations = rectify_stereo(sensors[0].raw, sensors[1].raw, T_left_right)
             rectification = "rectification: from T_BS and distortion of cam0 and cam1"
         decisions = [
-            f"stereo: cam0 + cam1 ({len(self._left)} + {len(self._right)} images)",
+            f"stereo: cam0 + cam1 ({len(left)} + {len(right)} images)",
             rectification,
             f"baseline: {stereo_baseline(calibrations, str(self._root)):.4f} m",
         ]
-        self._info = RecordingInfo(
+        info = RecordingInfo(
             name=name,
             sensor="stereo",
             calibrations=calibrations,
-            n_images=len(self._left),
+            n_images=len(left),
             decisions=decisions,
         )
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._info
-
-    def images(self) -> Iterator[StampedImage]:
-        """Yield the images of both cameras by stamp."""
-        return merge_streams(self._left, self._right)
+        super().__init__(info, left, right)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the rectified left camera.
@@ -132,8 +123,7 @@ def _read_sensor(path: Path) -> _Sensor:
         P=np.zeros(12),
     )
     T_body_cam = _numbers(content, "T_BS", (4, 4), path)
-    R = T_body_cam[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+    if not is_rotation(T_body_cam[:3, :3]):
         raise CalibrationError(f"{path}: T_BS is no rigid transform")
     return _Sensor(
         raw=make_calibration(fields, is_rectified=False), T_body_cam=se3.normalize(T_body_cam)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,10 @@ import numpy as np
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.sources.calibration import check_camera, read_stereo_file, stereo_baseline
-from gvo.sources.folders import StampedPath, first_image_size, merge_streams
-from gvo.sources.recording import RecordingInfo, StampedImage
+from gvo.sources.calibration import check_camera, stereo_baseline
+from gvo.sources.calibration_files import read_stereo_file
+from gvo.sources.folders import FolderSource, StampedPath, first_image_size
+from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import parse_seconds, read_rows
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
@@ -22,7 +22,7 @@ _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-class KittiSource:
+class KittiSource(FolderSource):
     """A sequence folder: `calib.txt`, `times.txt`, `image_0` and `image_1`.
 
     Where the grey cameras are missing, the colour cameras `image_2` and `image_3` are read. An
@@ -50,31 +50,27 @@ class KittiSource:
             for number, fields in rows
         ]
         names = _find_pair(folder)
-        self._left, self._right = (self._list_images(name) for name in names)
-        calibrations = self._calibrations(names, calibration)
+        left, right = (self._list_images(name) for name in names)
+        if calibration is not None:
+            calibrations = read_stereo_file(calibration, is_rectified=True)
+        else:
+            size = first_image_size([path for _, path in left], folder / names[0])
+            calibrations = _read_calibrations(folder / "calib.txt", names, size)
         self._t_cam0_cam = _camera_offset(calibrations[0])
         file = calibration or folder / "calib.txt"
         decisions = [
-            f"stereo: {names[0]} + {names[1]} ({len(self._left)} + {len(self._right)} images)",
+            f"stereo: {names[0]} + {names[1]} ({len(left)} + {len(right)} images)",
             f"calibration: {file.name}, rectified",
             f"baseline: {stereo_baseline(calibrations, str(file)):.4f} m",
         ]
-        self._info = RecordingInfo(
+        info = RecordingInfo(
             name=folder.resolve().name,
             sensor="stereo",
             calibrations=calibrations,
-            n_images=len(self._left),
+            n_images=len(left),
             decisions=decisions,
         )
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._info
-
-    def images(self) -> Iterator[StampedImage]:
-        """Yield the images of both cameras by stamp."""
-        return merge_streams(self._left, self._right)
+        super().__init__(info, left, right)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the left camera; the world is the first grey left camera.
@@ -123,25 +119,20 @@ class KittiSource:
             )
         return self._stamps_ns[int(path.stem)]
 
-    def _calibrations(
-        self, names: tuple[str, str], file: Path | None
-    ) -> tuple[Calibration, Calibration]:
-        if file is not None:
-            return read_stereo_file(file, is_rectified=True)
-        path = self._folder / "calib.txt"
-        projections = _read_projections(path)
-        size = first_image_size([image for _, image in self._left], self._folder / names[0])
-        left, right = (
-            _rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names
-        )
-        return left, right
-
 
 def _find_pair(folder: Path) -> tuple[str, str]:
     for pair in _PAIRS:
         if all((folder / name).is_dir() for name in pair):
             return pair
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
+
+
+def _read_calibrations(
+    path: Path, names: tuple[str, str], size: tuple[int, int]
+) -> tuple[Calibration, Calibration]:
+    projections = _read_projections(path)
+    left, right = (_rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names)
+    return left, right
 
 
 def _read_projections(path: Path) -> dict[str, FloatArray]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.sources.calibration import CameraFields, make_calibration, read_mono_file
-from gvo.sources.folders import StampedPath, merge_streams
+from gvo.sources.calibration import CameraFields, make_calibration, make_rgbd_calibration
+from gvo.sources.calibration_files import read_mono_file
+from gvo.sources.folders import FolderSource, StampedPath
 from gvo.sources.pixels import read_depth
-from gvo.sources.recording import RecordingInfo, StampedImage
+from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import parse_seconds, read_rows
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
@@ -37,13 +39,14 @@ _CAMERAS = {
     ),
     "3": ((535.433105, 539.212524, 320.106653, 247.632132), (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
+_CAMERA_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?![a-z0-9])")
 
 
-class TumSource:
+class TumSource(FolderSource):
     """A folder with `rgb.txt` and `depth.txt`.
 
-    The calibration is, first found: the file given, `calibration.yaml` in the folder, the
-    published one of the camera that the folder's name tells (freiburg1 or fr1, and so on).
+    The calibration is, first found: the file given, the published one of the camera that the
+    folder's name tells (freiburg1 or fr1, and so on), `calibration.yaml` in the folder.
 
     Parameters
     ----------
@@ -64,37 +67,28 @@ class TumSource:
         self, folder: Path, *, calibration: Path | None = None, depth_scale: float | None = None
     ) -> None:
         self._folder = folder
-        self._color = _list_images(folder / "rgb.txt")
-        self._depth = _list_images(folder / "depth.txt")
+        color, depth = (_list_images(folder / name) for name in ("rgb.txt", "depth.txt"))
         camera, from_file, origin = _find_calibration(folder, calibration)
-        self._scale = depth_scale or from_file or DEFAULT_SCALE
+        scale = depth_scale or from_file or DEFAULT_SCALE
         decisions = [
-            f"rgbd: rgb + depth ({len(self._color)} + {len(self._depth)} images)",
+            f"rgbd: rgb + depth ({len(color)} + {len(depth)} images)",
             f"calibration: {origin}",
         ]
         if depth_scale is not None:
             origin_of_scale = "depth.scale"
         else:
             origin_of_scale = "the calibration file" if from_file else "the default of TUM folders"
-        decisions.append(f"depth: {self._scale:g} counts per metre, by {origin_of_scale}")
+        decisions.append(f"depth: {scale:g} counts per metre, by {origin_of_scale}")
         if depth_scale is None and from_file is None:
-            decisions += _doubt_scale([path for _, path in self._depth], self._scale)
-        self._info = RecordingInfo(
+            decisions += _doubt_scale([path for _, path in depth], scale)
+        info = RecordingInfo(
             name=folder.resolve().name,
             sensor="rgbd",
             calibrations=(camera,),
-            n_images=len(self._color),
+            n_images=len(color),
             decisions=decisions,
         )
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._info
-
-    def images(self) -> Iterator[StampedImage]:
-        """Yield colour and depth images by stamp."""
-        return merge_streams(self._color, self._depth, partial(read_depth, scale=self._scale))
+        super().__init__(info, color, depth, partial(read_depth, scale=scale))
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the colour camera.
@@ -117,19 +111,21 @@ def _list_images(table: Path) -> list[StampedPath]:
 
 def _find_calibration(folder: Path, explicit: Path | None) -> tuple[Calibration, float | None, str]:
     """Return the camera, the depth scale of its file, and where it comes from."""
-    path = explicit or folder / "calibration.yaml"
-    if explicit is not None or path.is_file():
-        fields, scale = read_mono_file(path)
-        return make_calibration(fields, is_rectified=False), scale, path.name
-    name = folder.resolve().name.lower()
-    for number, (intrinsics, distortion) in _CAMERAS.items():
-        if f"freiburg{number}" in name or f"fr{number}" in name:
-            camera = _published_camera(intrinsics, distortion)
-            return camera, None, f"freiburg{number}, by the name of the folder"
-    raise CalibrationError(
-        f"{folder}: no calibration is known: the name holds none of freiburg1, freiburg2, "
-        "freiburg3; add calibration.yaml or give --calibration FILE"
-    )
+    beside = folder / "calibration.yaml"
+    named = _CAMERA_NAME.search(folder.resolve().name.lower())
+    if explicit is None and named is not None:
+        origin = f"published for freiburg{named[1]}, by the name of the folder"
+        if beside.is_file():
+            origin += f"; {beside.name} there is not used, give it by --calibration to use it"
+        return _published_camera(*_CAMERAS[named[1]]), None, origin
+    path = explicit or beside
+    if explicit is None and not beside.is_file():
+        raise CalibrationError(
+            f"{folder}: no calibration is known: the name holds none of freiburg1, freiburg2, "
+            "freiburg3; add calibration.yaml or give --calibration FILE"
+        )
+    fields, scale = read_mono_file(path)
+    return make_rgbd_calibration(fields, is_rectified=False), scale, path.name
 
 
 def _published_camera(

@@ -6,15 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
-from gvo.sources.calibration import (
-    CameraFields,
-    make_calibration,
-    read_calibration_file,
-    read_mono_file,
-    read_stereo_file,
-)
+from gvo.sources.calibration import CameraFields, make_calibration, make_rgbd_calibration
+from gvo.sources.calibration_files import read_calibration_file, read_mono_file, read_stereo_file
 
 _K = [50.0, 0, 23.5, 0, 51.0, 15.5, 0, 0, 1]
 _P = [40.0, 0, 20.5, -20.0, 0, 41.0, 10.5, 0, 0, 0, 1, 0]
@@ -67,12 +63,27 @@ def test_missing_distortion_coefficients_are_zero(D: list[float]) -> None:
         ({"D": [0.1, 0.2]}, "D must hold 4 or 5 numbers, got 2"),
         ({"model": "equidistant"}, "distortion model 'equidistant'"),
         ({"model": "rational_polynomial", "D": [0.1] * 8}, "'rational_polynomial'"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "R is no rotation"),
         ({"width": 0}, "image size must be positive"),
+        ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
+        ({"height": 32768}, "at most 32767 px a side .* got 48x32768"),
+        ({"width": 30000, "height": 30000}, "100 megapixels, got 30000x30000"),
     ],
 )
 def test_a_camera_that_cannot_be_used_is_refused(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(CalibrationError, match=f"/info.*{text}"):
         make_calibration(_fields(**changes), is_rectified=False)
+
+
+def test_depth_is_not_rectified_by_a_camera_that_turns() -> None:
+    R = np.asarray(Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix())
+    with pytest.raises(CalibrationError, match=r"/info.*R turns the camera.*identity"):
+        make_rgbd_calibration(_fields(R=R), is_rectified=False)
+    # rectified images and their depth are turned already
+    assert make_rgbd_calibration(_fields(R=R), is_rectified=True).is_rectified
+    for unturned in (np.eye(3), np.zeros(9)):
+        calibration = make_rgbd_calibration(_fields(R=unturned), is_rectified=False)
+        np.testing.assert_array_equal(calibration.R, np.eye(3))
 
 
 def test_the_distortion_model_of_rectified_images_does_not_matter() -> None:
@@ -144,7 +155,9 @@ def test_a_missing_key_is_named(tmp_path: Path, tiny: Any, key: str) -> None:
         read_mono_file(path)
 
 
-@pytest.mark.parametrize("text", ["a: [", "", "- 1", "\x00"])
+@pytest.mark.parametrize(
+    "text", ["a: [", "", "- 1", "\x00", "a: 2024-99-99", "a: 0b2", "a: " + "[" * 5000]
+)
 def test_a_file_that_holds_no_keys_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "c.yaml"
     path.write_text(text)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from gvo.sources.recording import StampedImage
 from gvo.sources.sync import MAX_PENDING, pair_images
@@ -15,6 +16,7 @@ from gvo.types import FaultyFrame
 _LIMIT = 20
 _any_stamps = st.lists(st.integers(0, 400), max_size=30)
 _stamps = st.one_of(_any_stamps.map(sorted), _any_stamps)
+_sorted_stamps = st.lists(st.integers(0, 300), unique=True, max_size=30).map(sorted)
 
 
 def _image(stream: int, stamp_ns: int) -> StampedImage:
@@ -47,30 +49,16 @@ def _pair(
     return found
 
 
-def _increasing(stamps: list[int]) -> list[int]:
-    kept: list[int] = []
-    for stamp in stamps:
-        if not kept or stamp > kept[-1]:
-            kept.append(stamp)
-    return kept
+def _pairs(first: list[int], second: list[int]) -> list[tuple[int, int]]:
+    return [answer for answer in _pair(first, second) if isinstance(answer, tuple)]
 
 
-def _expected(first: list[int], second: list[int]) -> list[tuple[int, int]]:
-    """Apply the rule to complete, increasing lists of stamps."""
-    pairs, free = [], list(second)
-    for n, stamp in enumerate(first):
-        near = [other for other in free if abs(other - stamp) <= _LIMIT]
-        if not near:
-            continue
-        taken = min(near, key=lambda other: (abs(other - stamp), other))
-        earlier = [other for other in near if other < taken]
-        if earlier and n + 1 < len(first):
-            for_next = [o for o in free if o >= taken and abs(o - first[n + 1]) <= _LIMIT]
-            if for_next == [taken]:
-                taken = earlier[-1]
-        pairs.append((stamp, taken))
-        free = [other for other in free if other > taken]
-    return pairs
+def _least_cost(first: list[int], second: list[int]) -> int:
+    """Return the least sum of differences, the limit and one for each image left alone."""
+    differences = np.abs(np.subtract.outer(np.array(first), np.array(second))).astype(float)
+    differences[differences > _LIMIT] = 1e9
+    costs = np.hstack([differences, np.full((len(first), len(first)), _LIMIT + 1.0)])
+    return int(costs[linear_sum_assignment(costs)].sum())
 
 
 @given(first=_stamps, second=_stamps, order=st.lists(st.booleans(), max_size=60))
@@ -80,12 +68,34 @@ def test_the_interleaving_of_the_streams_does_not_matter(
     assert _pair(first, second, order) == _pair(first, second)
 
 
-@given(first=_stamps, second=_stamps, order=st.lists(st.booleans(), max_size=60))
-def test_pairs_are_those_of_the_rule(
-    first: list[int], second: list[int], order: list[bool]
+@given(first=_sorted_stamps, second=_sorted_stamps)
+def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
+    first: list[int], second: list[int]
 ) -> None:
-    pairs = [item for item in _pair(first, second, order) if isinstance(item, tuple)]
-    assert pairs == _expected(_increasing(first), _increasing(second))
+    pairs = _pairs(first, second)
+    assert all(abs(image - partner) <= _LIMIT for image, partner in pairs)
+    for stream in zip(*pairs, strict=True):
+        assert list(stream) == sorted(set(stream))
+
+
+@given(first=_sorted_stamps, second=_sorted_stamps)
+def test_no_image_is_left_alone_that_is_nearer_than_the_one_that_got_the_partner(
+    first: list[int], second: list[int]
+) -> None:
+    pairs = _pairs(first, second)
+    alone = set(first) - {image for image, _ in pairs}
+    free = set(second) - {partner for _, partner in pairs}
+    for image in alone:
+        assert all(abs(image - partner) > _LIMIT for partner in free)
+        assert all(abs(image - used) >= abs(other - used) for other, used in pairs)
+
+
+@given(first=_sorted_stamps, second=_sorted_stamps)
+def test_no_other_assignment_is_better_on_the_whole(first: list[int], second: list[int]) -> None:
+    pairs = _pairs(first, second)
+    cost = sum(abs(image - partner) for image, partner in pairs)
+    cost += (_LIMIT + 1) * (len(first) - len(pairs))
+    assert cost == (_least_cost(first, second) if first else 0)
 
 
 @given(first=_stamps, second=_stamps)
@@ -114,13 +124,44 @@ def test_a_partner_is_left_to_the_next_image_that_has_no_other() -> None:
     assert _pair([100, 130], [85, 112, 131]) == [(100, 112), (130, 131)]
 
 
+def test_images_of_twice_the_rate_of_depth_pair_where_their_stamps_are_equal() -> None:
+    color = [0, 17, 33, 50, 67, 83, 100]
+    assert _pairs(color, [17, 50, 83]) == [(17, 17), (50, 50), (83, 83)]
+
+
+def test_a_missing_depth_image_does_not_shift_those_after_it() -> None:
+    color = list(range(0, 1000, 17))
+    assert _pairs(color, color[1:]) == [(stamp, stamp) for stamp in color[1:]]
+    assert _pairs(color, color[:-1]) == [(stamp, stamp) for stamp in color[:-1]]
+
+
+def test_images_that_compete_for_long_are_decided_before_too_many_wait() -> None:
+    """Each image is nearer to the depth before it, by little, but the first one has none."""
+    color = list(range(0, 900 * 2001, 2001))
+    n_pushed = n_answered = 0
+
+    def images() -> Iterator[StampedImage]:
+        nonlocal n_pushed
+        for stamp in color:
+            n_pushed += 1
+            yield _image(0, stamp)
+            yield _image(1, stamp + 1001)
+
+    for answer in pair_images(images(), limit_ns=2000, partner="depth"):
+        n_answered += 1
+        assert n_pushed - n_answered <= MAX_PENDING + 1
+        assert isinstance(answer, tuple)
+        assert answer[1].stamp_ns - answer[0].stamp_ns == 1001
+    assert n_answered == len(color)
+
+
 def test_an_image_without_a_partner_says_how_far_the_nearest_is() -> None:
     ms = 1_000_000
     (answer,) = _pair([100 * ms], [50 * ms, 133 * ms], limit_ns=20 * ms)
     assert answer == f"{100 * ms}: no depth image within 20 ms: the nearest is 33 ms away"
-    taken = _pair([0, 5 * ms], [4 * ms], limit_ns=20 * ms)[1]
+    taken = _pair([0, 5 * ms], [1 * ms], limit_ns=20 * ms)[1]
     assert isinstance(taken, str)
-    assert taken.endswith("1 ms away and belongs to another image")
+    assert taken.endswith("4 ms away and belongs to another image")
 
 
 @pytest.mark.parametrize(("late", "word"), [(200, "repeats"), (150, "goes back from 200 to 150")])

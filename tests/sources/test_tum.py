@@ -52,15 +52,29 @@ def test_the_name_of_the_folder_tells_the_camera(
     assert (calibration.width, calibration.height) == (640, 480)
 
 
-def test_the_nearest_calibration_wins(tmp_path: Path, tiny: Any) -> None:
+def test_the_file_given_wins_then_the_name_then_the_file_beside(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_tum(tmp_path / "freiburg1", _COLOR, _DEPTH)
-    assert TumSource(folder).info.camera.fx == tiny.camera.fx
+    info = TumSource(folder).info
+    assert info.camera.fx == 517.306408
+    (line,) = [line for line in info.decisions if line.startswith("calibration:")]
+    assert "freiburg1, by the name of the folder" in line
+    assert "calibration.yaml there is not used" in line
+    (folder / "calibration.yaml").unlink()
+    assert not any("not used" in line for line in TumSource(folder).info.decisions)
+    other = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
+    assert TumSource(other).info.camera.fx == tiny.camera.fx
     K = [99.0, 0, 23.5, 0, 99.0, 15.5, 0, 0, 1]
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(tiny.ros_camera(camera_matrix={"data": K})))
     info = TumSource(folder, calibration=path).info
     assert info.camera.fx == 99.0
     assert "calibration: mine.yaml" in info.decisions
+
+
+@pytest.mark.parametrize("name", ["afr1ca", "fr10", "fr1day", "freiburg4_desk", "fr"])
+def test_a_name_that_only_looks_alike_tells_no_camera(tmp_path: Path, tiny: Any, name: str) -> None:
+    folder = tiny.write_tum(tmp_path / name, _COLOR, _DEPTH)
+    assert TumSource(folder).info.camera.fx == tiny.camera.fx
 
 
 def test_without_any_calibration_the_message_says_what_to_give(tmp_path: Path, tiny: Any) -> None:
