@@ -97,6 +97,7 @@ class _Tally:
     first_fault: str = ""
     n_unpaired: int = 0
     first_unpaired: str = ""
+    first_untied: str = ""
     broken_off: str = ""
     stages: dict[str, _Durations] = field(default_factory=dict)
 
@@ -116,6 +117,12 @@ class _Tally:
     def n_faulty(self) -> int:
         return self.statuses[Status.SKIPPED]
 
+    @property
+    def is_partly(self) -> bool:
+        """Tell whether frames are missing, or poses not tied to the others."""
+        is_loose = self.n_with_pose > 1 and self.n_tracked < 2
+        return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
+
     def progress(self, n_images: int) -> Progress:
         return Progress(
             n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
@@ -123,6 +130,7 @@ class _Tally:
 
     def add_result(self, result: FrameResult) -> None:
         self.statuses[result.status] += 1
+        self.first_untied = self.first_untied or result.reason
         for stage, elapsed_ms in result.stage_ms.items():
             self.add_duration(stage, elapsed_ms)
 
@@ -266,11 +274,13 @@ def _conclude(
     truth: Trajectory | None = None
     evaluations: tuple[Evaluation, ...] = ()
     try:
-        truth = ground_truth if ground_truth is not None else source.ground_truth()
+        truth = (
+            source.ground_truth() if ground_truth is None else _with_stamps(ground_truth, folder)
+        )
         evaluations = _evaluate(truth, estimates)
     except GvoError as error:
         warnings.append(f"not compared with the ground truth: {error}")
-    is_partly = bool(tally.n_faulty or tally.broken_off)
+    is_partly = tally.is_partly or (ground_truth is not None and not evaluations)
     summary = _summary(source, tally, config=config, evaluations=evaluations, warnings=warnings)
     folder.write_summary(summary)
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
@@ -280,6 +290,14 @@ def _conclude(
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
+
+
+def _with_stamps(truth: Trajectory, folder: RunFolder) -> Trajectory:
+    """Give poses without stamps, one for each frame, the stamps of the frames."""
+    stamps_ns = folder.frame_stamps_ns()
+    if truth.stamps_from != "rows" or len(truth) != len(stamps_ns):
+        return truth
+    return Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.T_world_cam)
 
 
 def _evaluate(truth: Trajectory | None, estimates: dict[str, Trajectory]) -> tuple[Evaluation, ...]:
@@ -302,7 +320,13 @@ def _warnings(tally: _Tally) -> list[str]:
             f"{tally.n_unpaired} images have no partner and make no frame (sync.max_difference_ms)"
         )
     n_untied = tally.n_with_pose - tally.n_tracked
-    if n_untied:
+    if n_untied and tally.n_tracked < 2:
+        warnings.append(
+            "no frame could be registered against another (are left and right exchanged, is the "
+            "calibration or depth.scale wrong, are the images dark?); the first: "
+            f"{tally.first_untied}"
+        )
+    elif n_untied:
         warnings.append(
             f"{n_untied} of {tally.n_with_pose} poses continue the last velocity, without a "
             "registration (frames.csv: coasting, lost)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Literal, get_args
 
 import numpy as np
@@ -76,7 +77,18 @@ class Trajectory:
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(steps)])
 
     def select(self, indices: ArrayLike | slice) -> Trajectory:
-        """Return the poses at increasing indices, of a mask or of a slice."""
+        """Return some of the poses.
+
+        Parameters
+        ----------
+        indices : array_like of int or bool, or slice
+            Increasing indices, a mask of shape (n,), or a slice.
+
+        Returns
+        -------
+        Trajectory
+            With their covariances, where there are some.
+        """
         chosen = indices if isinstance(indices, slice) else np.asarray(indices)
         if not isinstance(chosen, slice) and chosen.size == 0:
             chosen = np.empty(0, dtype=np.int64)  # an empty list would be an array of floats
@@ -191,8 +203,50 @@ def _between(T_before: FloatArray, T_after: FloatArray, shares: FloatArray) -> F
 def format_stamp(stamp_ns: int) -> str:
     """Return a stamp in seconds with nine decimals, without loss.
 
+    Parameters
+    ----------
+    stamp_ns : int
+        Nanoseconds.
+
+    Examples
+    --------
     >>> format_stamp(1403636579763555584)
     '1403636579.763555584'
     """
     seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
+
+
+def parse_stamp(text: str, *, unit_ns: int) -> int:
+    """Return the nanoseconds of a decimal number, without passing through a float.
+
+    Parameters
+    ----------
+    text : str
+        A number, in any notation.
+    unit_ns : int
+        Nanoseconds of a unit: 1_000_000_000 for seconds, 1 for nanoseconds.
+
+    Returns
+    -------
+    int
+        Rounded to the nanosecond.
+
+    Raises
+    ------
+    ValueError
+        Where the text is no number, or no int64 can hold it.
+
+    Examples
+    --------
+    >>> parse_stamp("1305031102.175304", unit_ns=1_000_000_000)
+    1305031102175304000
+    """
+    try:
+        stamp = Decimal(text) * unit_ns
+    except ArithmeticError:
+        raise ValueError(f"the stamp {text!r} is no number") from None
+    if not stamp.is_finite() or abs(stamp) >= 2**63 - 1:
+        unit = "seconds" if unit_ns > 1 else "nanoseconds"
+        raise ValueError(f"the stamp {text} is out of range; expected {unit}")
+    return round(stamp)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
@@ -34,6 +36,7 @@ def associate(
     Parameters
     ----------
     reference, estimate : Trajectory
+        With at least one pose each.
     max_difference_ns : int
         Largest difference of associated stamps, nanoseconds.
     name : str
@@ -122,7 +125,18 @@ class Similarity:
     scale: float = 1.0
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
-        """Return a trajectory of world b in world a; scaled covariances where it has some."""
+        """Move a trajectory from world b to world a.
+
+        Parameters
+        ----------
+        trajectory : Trajectory
+            In world b.
+
+        Returns
+        -------
+        Trajectory
+            In world a, with scaled covariances where it has some.
+        """
         scaled = trajectory.T_world_cam.copy()
         scaled[:, :3, 3] *= self.scale
         covariances = trajectory.covariances
@@ -173,19 +187,32 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
         return Similarity(T_a_b=reference.T_world_cam[0] @ se3.invert(estimate.T_world_cam[0]))
     if mode not in ("se3", "sim3"):
         raise ValueError(f"mode must be one of {get_args(AlignMode)}, got {mode!r}")
-    return _umeyama(reference.positions, estimate.positions, is_scaled=mode == "sim3")
+    return _fit(reference.positions, estimate.positions, is_scaled=mode == "sim3")
 
 
-def _umeyama(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Similarity:
+def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Similarity:
     mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)  # eq. 34, 35
     centred_a, centred_b = points_a - mean_a, points_b - mean_b
-    U, d, Vt = np.linalg.svd(centred_a.T @ centred_b / len(points_a))  # eq. 38
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # eq. 39, 43
-    R = (U * signs) @ Vt  # eq. 40
+    R = _best_rotation(centred_a, centred_b)
     scale = 1.0
     if is_scaled:
-        variance_b = np.mean(np.sum(centred_b**2, axis=1))  # eq. 37
-        scale = float(d @ signs / variance_b) if variance_b > 0 else 0.0  # eq. 42
-        if scale <= 0:
+        square_b = np.sum(centred_b**2)
+        scale = float(np.sum(centred_a * (centred_b @ R.T)) / square_b) if square_b > 0 else 0.0
+        if scale <= 0:  # eq. 42
             raise TrajectoryError("no scale can be estimated: the trajectories do not move alike")
     return Similarity(T_a_b=se3.make_transform(R, mean_a - scale * R @ mean_b), scale=scale)  # 41
+
+
+def _best_rotation(vectors_a: FloatArray, vectors_b: FloatArray) -> FloatArray:
+    """Return R_a_b of least squares (eq. 40), one of the best where the vectors lie on a line.
+
+    `geometry.umeyama` refuses such points, and nearly such points: there a rotation is measured,
+    and one about the line would be noise. Here any of the best will do, as only the aligned
+    positions count; a camera may have driven straight on, or have two poses.
+    """
+    if len(vectors_a) == 1:
+        return np.eye(3)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Optimal rotation is not uniquely", UserWarning)
+        rotation, _ = Rotation.align_vectors(vectors_a, vectors_b)
+    return np.asarray(rotation.as_matrix())

@@ -1,20 +1,25 @@
-"""Trajectory files: read TUM, KITTI and EuRoC, write TUM, KITTI and covariances."""
+"""Trajectory files: read TUM, KITTI and EuRoC, write TUM and KITTI; covariances, both ways."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory import StampsFrom, Trajectory, format_stamp
+from gvo.trajectory_rows import (
+    Row,
+    check_increasing,
+    read_numbers,
+    read_rows,
+    read_stamps,
+    refuse,
+)
 from gvo.types import FloatArray, IntArray
 
 _FORMATS = (
@@ -31,19 +36,6 @@ COVARIANCE_HEADER = "stamp_ns," + ",".join(
     f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)
 )
 """First line of a covariance file: the upper triangle, row by row."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Row:
-    """The fields of one line of a file."""
-
-    path: Path
-    number: int
-    fields: list[str]
-
-    def error(self, text: str) -> TrajectoryError:
-        """Return an error that names the line."""
-        return TrajectoryError(f"{self.path}:{self.number}: {text}")
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
@@ -70,7 +62,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         Naming file and line, where the file is missing, empty or malformed.
     """
     path = Path(path)
-    header, rows = _read_rows(path)
+    header, rows = read_rows(path, of="poses")
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
     n_columns = len(rows[0].fields)
@@ -84,7 +76,12 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
-    """Read what `write_covariances` wrote.
+    """Read the covariances of a run folder, or what `write_covariances` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV with `COVARIANCE_HEADER` as its first line.
 
     Returns
     -------
@@ -98,14 +95,14 @@ def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
         Where the file is missing or malformed.
     """
     path = Path(path)
-    _, rows = _read_rows(path)
+    _, rows = read_rows(path, of="covariances")
     if not rows or rows[0].fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
-    values = _numbers(rows[1:], slice(1, None), n_columns=22)
+    values = read_numbers(rows[1:], slice(1, None), n_columns=22)
     covariances = np.zeros((len(values), 6, 6))
     covariances[:, _UPPER[0], _UPPER[1]] = values
     covariances[:, _UPPER[1], _UPPER[0]] = values
-    return _stamps(rows[1:], unit_ns=1), covariances
+    return read_stamps(rows[1:], unit_ns=1), covariances
 
 
 def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
@@ -145,19 +142,52 @@ def format_covariance_line(stamp_ns: int, covariance: FloatArray) -> str:
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
-    """Write stamps and poses as a TUM file; raise `TrajectoryError` where that fails."""
+    """Write stamps and poses as a TUM file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced where it exists.
+    trajectory : Trajectory
+        Its covariances are not written.
+
+    Raises
+    ------
+    TrajectoryError
+        Where the file cannot be written.
+    """
     poses = zip(trajectory.stamps_ns, trajectory.T_world_cam, strict=True)
     _write_lines(path, (format_tum_line(int(stamp_ns), T) for stamp_ns, T in poses))
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
-    """Write poses, without their stamps, as a KITTI file; raise `TrajectoryError` likewise."""
+    """Write poses, without their stamps, as a KITTI file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced where it exists.
+    trajectory : Trajectory
+        Its stamps and covariances are not written.
+
+    Raises
+    ------
+    TrajectoryError
+        Where the file cannot be written.
+    """
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12)
     _write_lines(path, (" ".join(f"{value:.12e}" for value in row) for row in rows))
 
 
 def write_covariances(path: str | Path, trajectory: Trajectory) -> None:
-    """Write the covariances of a trajectory as CSV, a header and a line per pose.
+    """Write the covariances of a trajectory as CSV, a header and a line per pose, without loss.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced where it exists.
+    trajectory : Trajectory
+        With covariances.
 
     Raises
     ------
@@ -181,54 +211,33 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
         raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _read_rows(path: Path) -> tuple[str, list[_Row]]:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise TrajectoryError(
-            f"{path}: cannot be read: {error.strerror}; give a file of poses"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: is no text; expected rows of {_FORMATS}") from error
-    header: list[str] = []
-    rows: list[_Row] = []
-    for number, line in enumerate(lines, start=1):
-        text, mark, comment = line.partition("#")
-        fields = text.replace(",", " ").split()
-        if mark and not rows:
-            header.append(comment)
-        if fields:
-            rows.append(_Row(path=path, number=number, fields=fields))
-    return " ".join(header), rows
-
-
-def _read_tum(rows: list[_Row]) -> Trajectory:
-    values = _numbers(rows, slice(1, 8), n_columns=8)
-    stamps_ns = _stamps(rows, unit_ns=1_000_000_000)
+def _read_tum(rows: list[Row]) -> Trajectory:
+    values = read_numbers(rows, slice(1, 8), n_columns=8)
+    stamps_ns = read_stamps(rows, unit_ns=1_000_000_000)
     # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
     is_last = np.diff(stamps_ns, append=stamps_ns[-1] + 1) != 0
     rows = [row for row, is_kept in zip(rows, is_last, strict=True) if is_kept]
     values = values[is_last]
     R = _rotations_of_quaternions(rows, values[:, 3:])
     return Trajectory(
-        stamps_ns=_increasing(rows, stamps_ns[is_last]),
+        stamps_ns=check_increasing(rows, stamps_ns[is_last]),
         T_world_cam=se3.make_transform(R, values[:, :3]),
     )
 
 
-def _read_euroc(rows: list[_Row]) -> Trajectory:
-    values = _numbers(rows, slice(1, 8), n_columns=len(rows[0].fields))
-    stamps_ns = _increasing(rows, _stamps(rows, unit_ns=1))
+def _read_euroc(rows: list[Row]) -> Trajectory:
+    values = read_numbers(rows, slice(1, 8), n_columns=len(rows[0].fields))
+    stamps_ns = check_increasing(rows, read_stamps(rows, unit_ns=1))
     R = _rotations_of_quaternions(rows, values[:, [4, 5, 6, 3]])
     return Trajectory(stamps_ns=stamps_ns, T_world_cam=se3.make_transform(R, values[:, :3]))
 
 
-def _read_kitti(path: Path, rows: list[_Row]) -> Trajectory:
-    P = _numbers(rows, slice(0, 12), n_columns=12).reshape(-1, 3, 4)
+def _read_kitti(path: Path, rows: list[Row]) -> Trajectory:
+    P = read_numbers(rows, slice(0, 12), n_columns=12).reshape(-1, 3, 4)
     M = P[:, :, :3]
     residuals = np.abs(M @ np.swapaxes(M, 1, 2) - np.eye(3)).max(axis=(1, 2))
     is_wrong = (residuals > _ROUNDING) | (np.linalg.det(M) <= 0)
-    _refuse(rows, is_wrong, "the first three columns of the pose are no rotation")
+    refuse(rows, is_wrong, "the first three columns of the pose are no rotation")
     stamps_ns, stamps_from = _kitti_stamps(path, len(rows))
     return Trajectory(
         stamps_ns=stamps_ns,
@@ -242,61 +251,13 @@ def _kitti_stamps(path: Path, n_rows: int) -> tuple[IntArray, StampsFrom]:
     official = path.parent.parent / "sequences" / path.stem / "times.txt"
     for times in (beside, official):
         if times.is_file():
-            _, rows = _read_rows(times)
+            _, rows = read_rows(times, of="stamps")
             if len(rows) == n_rows:
-                return _increasing(rows, _stamps(rows, unit_ns=1_000_000_000)), "times"
+                return check_increasing(rows, read_stamps(rows, unit_ns=1_000_000_000)), "times"
     return np.arange(n_rows, dtype=np.int64) * 1_000_000_000, "rows"
 
 
-def _numbers(rows: list[_Row], columns: slice, *, n_columns: int) -> FloatArray:
-    values = []
-    for row in rows:
-        if len(row.fields) != n_columns:
-            raise row.error(
-                f"expected {n_columns} columns, got {len(row.fields)}; remove or complete the row"
-            )
-        try:
-            values.append([float(field) for field in row.fields[columns]])
-        except ValueError as error:
-            raise row.error(f"{error}; expected {n_columns} numbers") from None
-    array = np.array(values).reshape(len(rows), len(range(n_columns)[columns]))
-    _refuse(rows, ~np.isfinite(array).all(axis=1), "a number is not finite; remove the row")
-    return array
-
-
-def _stamps(rows: list[_Row], *, unit_ns: int) -> IntArray:
-    """Return the first column in nanoseconds, in decimal arithmetic: without loss."""
-    return np.array([_stamp(row, unit_ns) for row in rows], dtype=np.int64)
-
-
-def _stamp(row: _Row, unit_ns: int) -> int:
-    try:
-        stamp = Decimal(row.fields[0]) * unit_ns
-    except ArithmeticError:
-        raise row.error(f"the stamp {row.fields[0]!r} is no number") from None
-    if not stamp.is_finite() or abs(stamp) >= 2**63 - 1:
-        unit = "seconds" if unit_ns > 1 else "nanoseconds"
-        raise row.error(f"the stamp {row.fields[0]} is out of range; expected {unit}")
-    return round(stamp)
-
-
-def _increasing(rows: list[_Row], stamps_ns: IntArray) -> IntArray:
-    falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
-    if len(falls) > 0:
-        before, row = rows[falls[0]], rows[falls[0] + 1]
-        raise row.error(
-            f"the stamp {row.fields[0]} is not after {before.fields[0]} of line {before.number}; "
-            "sort the rows and remove repeated ones"
-        )
-    return stamps_ns
-
-
-def _rotations_of_quaternions(rows: list[_Row], quaternions_xyzw: FloatArray) -> FloatArray:
+def _rotations_of_quaternions(rows: list[Row], quaternions_xyzw: FloatArray) -> FloatArray:
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
-    _refuse(rows, np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
+    refuse(rows, np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
     return np.asarray(Rotation.from_quat(quaternions_xyzw).as_matrix())
-
-
-def _refuse(rows: list[_Row], is_wrong: NDArray[np.bool_], text: str) -> None:
-    if np.any(is_wrong):
-        raise rows[int(np.argmax(is_wrong))].error(text)

@@ -15,7 +15,7 @@ from gvo.geometry import se3
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_covariances
+from gvo.trajectory_files import read_covariances, write_kitti
 
 TRAJECTORIES = ("raw", "causal", "smoothed")
 
@@ -245,3 +245,30 @@ def test_a_run_that_fails_leaves_no_summary_of_an_earlier_one(
         gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path)
     assert not (tmp_path / "summary.json").exists()
     assert not (tmp_path / "trajectories.png").exists()
+
+
+def test_poses_without_stamps_belong_to_the_frames_in_their_order(
+    room: SyntheticRecording, tmp_path: Path
+) -> None:
+    truth = room.ground_truth()
+    write_kitti(tmp_path / "poses.txt", truth)
+    expected = gvo.run_recording(room, tmp_path / "a").evaluations
+    poses = gvo.read_trajectory(tmp_path / "poses.txt")
+    found = gvo.run_recording(room, tmp_path / "b", ground_truth=poses).evaluations
+    assert found[0].ate_m == pytest.approx(expected[0].ate_m, abs=1e-9)
+    short = gvo.run_recording(room, tmp_path / "c", ground_truth=poses.select(slice(0, 9)))
+    assert short.exit_code == 3
+    assert "not compared" in short.warnings[0]
+
+
+def test_a_run_in_which_nothing_could_be_registered_says_so(tmp_path: Path) -> None:
+    class Black(FaultySource):
+        def images(self) -> Iterator[StampedImage]:
+            for image in self._source.images():
+                yield replace(image, load=lambda: np.zeros((192, 256), np.uint8))
+
+    drive = SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.4)
+    result = gvo.run_recording(Black(drive, faulty=set()), tmp_path)
+    assert result.exit_code == 3
+    assert "no frame could be registered" in result.warnings[0]
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 4

@@ -170,6 +170,19 @@ def test_poses_on_a_line_are_aligned_as_well(n: int) -> None:
     np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-9)
 
 
+@pytest.mark.parametrize("mode", ["se3", "sim3"])
+def test_a_nearly_straight_path_is_aligned_exactly(mode: AlignMode) -> None:
+    """A drive of 100 m that leaves its line by millimetres still tells which side is up."""
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(50, 3)) * [100.0, 1e-3, 2e-3]
+    path = Trajectory(stamps_ns=np.arange(50), T_world_cam=poses)
+    moved = random_similarity(4)
+    reference = Similarity(T_a_b=moved.T_a_b).apply(path)
+    aligned = alignment(reference, path, mode).apply(path)
+    np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-6)
+
+
 def test_a_scale_needs_motion() -> None:
     with pytest.raises(TrajectoryError, match="no scale"):
         alignment(random_trajectory(0, 3), still([0, 1, 2]), "sim3")

@@ -80,12 +80,31 @@ class BagWriter:
         self._writer.__exit__(error_type, error, traceback)
 
     def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
-        """Return a message of a type."""
+        """Return a message.
+
+        Parameters
+        ----------
+        type_ : str
+            `package/msg/Name`.
+        **fields
+            All its fields, by name.
+        """
         make_message: Callable[..., Any] = self._store.types[type_]
         return make_message(**fields)
 
     def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
-        """Return the message of a header; `RecordingError` where its stamp does not fit."""
+        """Return the message of a header.
+
+        Parameters
+        ----------
+        header : Header
+            Stamp in nanoseconds, and frame.
+
+        Raises
+        ------
+        RecordingError
+            When the stamp does not fit into the message.
+        """
         sec, nanosec = divmod(header.stamp_ns, 10**9)
         max_seconds = _MAX_SECONDS_ROS1 if self.is_ros1 else _MAX_SECONDS_ROS2
         if not 0 <= sec <= max_seconds:
@@ -98,7 +117,17 @@ class BagWriter:
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
 
     def write(self, topic: str, type_: str, message: object, stamp_ns: int) -> None:
-        """Write a message; its log time is the stamp, but never goes back."""
+        """Write a message; its log time is the stamp, but never goes back.
+
+        Parameters
+        ----------
+        topic, type_ : str
+            Name, and type as `package/msg/Name`.
+        message : object
+            Made by `make`.
+        stamp_ns : int
+            Not negative, nanoseconds.
+        """
         # Readers sort by log time: a frame whose stamp goes back must stay where it was.
         self._log_time_ns = max(self._log_time_ns, stamp_ns)
         if topic not in self._connections:
@@ -143,7 +172,19 @@ def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header
 
 
 def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
-    """Write a calibration as `CameraInfo`, all numbers without loss."""
+    """Write a calibration as `CameraInfo`, all numbers without loss.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    calibration : Calibration
+        Of one camera.
+    header : Header
+        Stamp and frame.
+    """
     matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
     message = bag.make(
@@ -161,7 +202,17 @@ def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, head
 
 
 def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
-    """Write a pose of the ground truth, shape (4, 4), to `/tf`."""
+    """Write a pose of the ground truth to `/tf`.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    stamp_ns : int
+        Nanoseconds.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Of the rectified camera, metres.
+    """
     parent, child = TRUTH_FRAMES
     t = [float(value) for value in T_world_cam[:3, 3]]
     q = [float(value) for value in Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()]

@@ -11,10 +11,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
+import numpy as np
+
 from gvo.errors import RecordingError
 from gvo.odometry import FrameResult
 from gvo.trajectory_files import COVARIANCE_HEADER, format_covariance_line, format_tum_line
-from gvo.types import Estimate, FaultyFrame, Status
+from gvo.types import Estimate, FaultyFrame, IntArray, Status
 
 PICTURE = "trajectories.png"
 TRAJECTORIES = ("raw", "causal", "smoothed")
@@ -108,6 +110,11 @@ class RunFolder:
         self._write(f"{name}.txt", f"{pose}\n")
         covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
         self._write(f"{name}_covariance.csv", f"{covariance}\n")
+
+    def frame_stamps_ns(self) -> IntArray:
+        """Return the stamps of all frames of the table, shape (n,), also of faulty ones."""
+        with (self.path / "frames.csv").open(encoding="utf-8", newline="") as file:
+            return np.array([int(row["stamp_ns"]) for row in csv.DictReader(file)], dtype=np.int64)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write `summary.json`."""

@@ -102,7 +102,18 @@ class TextureAtlas:
         return np.asarray(wrapped * self._scales.take(levels) + self._starts.take(levels))
 
     def sample(self, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the grey values at positions in the atlas, bilinear."""
+        """Return the grey values at positions in the atlas, bilinear.
+
+        Parameters
+        ----------
+        map_x, map_y : ndarray of float32, shape (n,) or (h, w)
+            Column and row in the atlas, texels.
+
+        Returns
+        -------
+        ndarray of float32, of the same shape
+            0 to 255.
+        """
         shape = map_x.shape
         if map_x.ndim == 1:  # cv2.remap writes images of fewer than 2^15 rows
             pad = -len(map_x) % 256
@@ -116,7 +127,21 @@ class TextureAtlas:
     def is_opaque(
         self, texture: int, level: int, s: NDArray[np.float32], t: NDArray[np.float32]
     ) -> BoolArray:
-        """Tell where a texture is opaque, at texture coordinates of a level of its mask."""
+        """Tell where a texture is opaque.
+
+        Parameters
+        ----------
+        texture : int
+            Index of a texture that has a mask.
+        level : int
+            Of the mask's pyramid: 0 is the finest.
+        s, t : ndarray of float32, shape (n,) or (h, w)
+            Texture coordinates, texels of the finest level.
+
+        Returns
+        -------
+        ndarray of bool, of the same shape
+        """
         masks = self._masks[texture]
         mask = masks[min(level, len(masks) - 1)]
         n = len(mask)

@@ -7,15 +7,14 @@ types: one foreign type that it cannot parse would block the camera's topics.
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import apsw
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
@@ -28,19 +27,29 @@ from rosbags.typesys.store import Typestore
 from gvo.errors import RecordingError
 from gvo.sources.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, Topic
 
-if sys.version_info >= (3, 14):
-    from compression.zstd import ZstdError
-else:
-    from backports.zstd import ZstdError
-
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _READ_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE, CAMERA_INFO_TYPE, TF_TYPE)
 
 _STORAGE_SUFFIXES = (".mcap", ".db3")
 _Reader: TypeAlias = Reader1 | Reader2
 
+
+def _storage_faults() -> Iterator[type[Exception]]:
+    """Yield the errors of the libraries that rosbags reads SQLite and Zstandard with.
+
+    It lets them through. The libraries are its own affair, another release may bring others.
+    """
+    for module, name in (
+        ("apsw", "Error"),
+        ("compression.zstd", "ZstdError"),
+        ("backports.zstd", "ZstdError"),
+    ):
+        with suppress(ImportError):
+            yield getattr(import_module(module), name)
+
+
 # The readers check the structure of a file by assertions and by what happens to fail.
-_FAULTS = (
+_FAULTS: tuple[type[Exception], ...] = (
     ReaderError1,
     ReaderError2,
     SerdeError,
@@ -55,8 +64,7 @@ _FAULTS = (
     RuntimeError,
     MemoryError,  # a damaged size
     struct.error,
-    apsw.Error,
-    ZstdError,
+    *_storage_faults(),
 )
 
 

@@ -20,7 +20,7 @@ from gvo.sources.calibration import (
 from gvo.sources.calibration_files import read_stereo_file, read_yaml
 from gvo.sources.folders import FolderSource, StampedPath
 from gvo.sources.recording import RecordingInfo
-from gvo.sources.tables import parse_nanoseconds, read_rows
+from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
 from gvo.types import FloatArray
@@ -100,7 +100,10 @@ class _Sensor:
 def _list_images(camera: Path) -> list[StampedPath]:
     table = camera / "data.csv"
     return [
-        (parse_nanoseconds(fields[0], f"{table}, line {number}"), camera / "data" / fields[1])
+        (
+            read_stamp(fields[0], f"{table}, line {number}", unit_ns=1),
+            camera / "data" / fields[1],
+        )
         for number, fields in read_rows(table, n_fields=2, separator=",")
     ]
 

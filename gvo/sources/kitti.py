@@ -13,7 +13,7 @@ from gvo.sources.calibration import check_camera, stereo_baseline
 from gvo.sources.calibration_files import read_stereo_file
 from gvo.sources.folders import FolderSource, StampedPath, first_image_size
 from gvo.sources.recording import RecordingInfo
-from gvo.sources.tables import parse_seconds, read_rows
+from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
 from gvo.types import FloatArray
@@ -46,7 +46,7 @@ class KittiSource(FolderSource):
         self._folder = folder
         rows = read_rows(folder / "times.txt", n_fields=1)
         self._stamps_ns = [
-            parse_seconds(fields[0], f"{folder / 'times.txt'}, line {number}")
+            read_stamp(fields[0], f"{folder / 'times.txt'}, line {number}", unit_ns=10**9)
             for number, fields in rows
         ]
         names = _find_pair(folder)

@@ -90,7 +90,13 @@ _DEPTH_ENCODINGS = {
 
 
 def stamp_of(header: HeaderMessage) -> int:
-    """Return the stamp of a header in nanoseconds."""
+    """Return the stamp of a header in nanoseconds.
+
+    Parameters
+    ----------
+    header : std_msgs/Header
+        Of ROS 1 or ROS 2.
+    """
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
@@ -151,7 +157,19 @@ def decode_depth(message: ImageMessage, scale: float, where: str) -> DepthArray:
 
 
 def decode_compressed(message: CompressedImageMessage, where: str) -> ImageArray:
-    """Return the pixels, as `decode_grey_or_color` does, of a `CompressedImage` message.
+    """Return the pixels of a `CompressedImage` message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CompressedImage
+        Of any format that OpenCV reads.
+    where : str
+        The topic, for messages.
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w) or (h, w, 3)
+        Grey, or colour in BGR order.
 
     Raises
     ------
@@ -195,7 +213,20 @@ def decode_compressed_depth(
 
 
 def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - ROS 1 or 2
-    """Return the fields of a `CameraInfo` message: D, K, R, P of ROS 1 or d, k, r, p of ROS 2."""
+    """Return the fields of a `CameraInfo` message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CameraInfo
+        With D, K, R, P of ROS 1, or d, k, r, p of ROS 2.
+    where : str
+        Bag and topic, for messages.
+
+    Returns
+    -------
+    CameraFields
+        As they stand there, not checked.
+    """
     return CameraFields(
         where=where,
         width=int(message.width),

@@ -151,7 +151,18 @@ def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthAr
 
 
 def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
-    """Return a copy (h, w) of metres as float32 where all that is not positive is NaN."""
+    """Return depth where all that is unknown is NaN.
+
+    Parameters
+    ----------
+    metres : ndarray of float, shape (h, w)
+        Zero, negative or not finite: unknown.
+
+    Returns
+    -------
+    ndarray of float32, shape (h, w)
+        A copy, metres, NaN = unknown.
+    """
     depth = np.array(metres, dtype=np.float32)
     depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
     return depth

@@ -124,5 +124,16 @@ def _shade(view: View, visible: IndexArray, u: SampleArray, v: SampleArray) -> S
 
 
 def to_uint8(grey: SampleArray) -> ImageArray:
-    """Round and clip grey values to 0..255."""
+    """Round and clip grey values.
+
+    Parameters
+    ----------
+    grey : ndarray of float32, shape (h, w)
+        Any values.
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w)
+        0 to 255.
+    """
     return np.asarray(cv2.convertScaleAbs(np.maximum(grey, 0.0)), dtype=np.uint8)

@@ -117,6 +117,19 @@ def make_scene(
 ) -> Scene:
     """Put rectangles and the textures they name together.
 
+    Parameters
+    ----------
+    rectangles : sequence of Rectangle
+        In the map frame.
+    textures : mapping of str to Texture
+        Of one size, by the names that the rectangles use.
+    light : Light
+        Of the whole scene.
+
+    Returns
+    -------
+    Scene
+
     Raises
     ------
     ValueError

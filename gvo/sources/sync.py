@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from gvo.errors import GvoError
 from gvo.sources.recording import StampedImage
 from gvo.types import FaultyFrame
 
@@ -46,6 +47,11 @@ def pair_images(
         back, or where there is no partner. Images of stream 1 whose stamp repeats or goes back
         are left out.
 
+    Raises
+    ------
+    GvoError
+        What reading the images raises, after the pairs of those read before.
+
     Notes
     -----
     The sum is minimized by dynamic programming over the images of stream 0. A pair is given out
@@ -53,11 +59,14 @@ def pair_images(
     `MAX_PENDING` images wait for that, the best plan so far decides about the first.
     """
     pairing = _Pairing(limit_ns, partner)
-    for image in images:
-        pairing.push(image)
-        yield from pairing.decided()
-    pairing.is_ended = True
-    yield from pairing.decided()
+    try:
+        for image in images:
+            pairing.push(image)
+            yield from pairing.decided()
+    except GvoError:
+        yield from pairing.rest()  # what was read before it counts
+        raise
+    yield from pairing.rest()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,7 +83,7 @@ class _Plan:
 
 class _Pairing:
     def __init__(self, limit_ns: int, partner: str) -> None:
-        self.is_ended = False
+        self._is_ended = False
         self._limit_ns = limit_ns
         self._partner = partner
         self._waiting: deque[StampedImage | FaultyFrame] = deque()
@@ -108,15 +117,19 @@ class _Pairing:
             else:
                 self._plan(image)
             yield from self._agreed()
-        if self.is_ended:
-            self._plans = [self._best_plan()]
-            yield from self._agreed()
+
+    def rest(self) -> Iterator[Pair | FaultyFrame]:
+        """Yield what is left when no image will come any more."""
+        self._is_ended = True
+        yield from self.decided()
+        self._plans = [self._best_plan()]
+        yield from self._agreed()
 
     def _is_plannable(self, image: StampedImage | FaultyFrame) -> bool:
         """Tell whether all images that may become its partner are known."""
         last_ns = self._last_stamps[1]
         return (
-            self.is_ended
+            self._is_ended
             or isinstance(image, FaultyFrame)
             or (last_ns is not None and last_ns >= image.stamp_ns + self._limit_ns)
             or max(len(self._waiting), len(self._partners)) > MAX_PENDING

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from gvo.errors import RecordingError
+from gvo.trajectory import parse_stamp
 
 _Row = tuple[int, list[str]]
 
@@ -48,35 +48,27 @@ def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> lis
     return rows
 
 
-def parse_seconds(text: str, where: str) -> int:
-    """Return nanoseconds of decimal seconds, without passing through a float.
+def read_stamp(text: str, where: str, *, unit_ns: int) -> int:
+    """Return the nanoseconds that a field of a table says, without loss.
+
+    Parameters
+    ----------
+    text : str
+        A decimal number.
+    where : str
+        File and line, for the message.
+    unit_ns : int
+        Nanoseconds of its unit: 1_000_000_000 for seconds, 1 for nanoseconds.
 
     Raises
     ------
     RecordingError
-        When the text is no finite number.
-
-    Examples
-    --------
-    >>> parse_seconds("1305031102.175304", "rgb.txt")
-    1305031102175304000
+        When the text is no number, or out of range.
     """
-    return _nanoseconds(text, 10**9, where)
-
-
-def parse_nanoseconds(text: str, where: str) -> int:
-    """Return the nanoseconds that a text says; `RecordingError` when it is no finite number."""
-    return _nanoseconds(text, 1, where)
-
-
-def _nanoseconds(text: str, factor: int, where: str) -> int:
     try:
-        value = Decimal(text)
-    except InvalidOperation as error:
-        raise RecordingError(f"{where}: {text!r} is no stamp") from error
-    if not value.is_finite() or abs(value) * factor >= 2**63:
-        raise RecordingError(f"{where}: {text!r} is no stamp")
-    return int((value * factor).to_integral_value())
+        return parse_stamp(text, unit_ns=unit_ns)
+    except ValueError as error:
+        raise RecordingError(f"{where}: {error}") from None
 
 
 def _read_lines(path: Path) -> list[str]:

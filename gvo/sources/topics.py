@@ -141,9 +141,21 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
 
 
 def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
-    """Return the name of the `CameraInfo` topic of an image topic, or None.
+    """Return the name of the `CameraInfo` topic of an image topic.
 
     It is `camera_info` beside the image topic, below it, or beside or below its namespace.
+
+    Parameters
+    ----------
+    image : Topic
+        Of images.
+    topics : iterable of Topic
+        All that the bag holds.
+
+    Returns
+    -------
+    str or None
+        None where the bag holds none, or only one without messages.
     """
     names = {
         topic.name.strip("/"): topic.name
@@ -157,7 +169,18 @@ def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
 
 
 def camera_info_names(image: Topic) -> list[str]:
-    """Return where `CameraInfo` is looked for, best first, without the leading slash."""
+    """Return where `CameraInfo` is looked for.
+
+    Parameters
+    ----------
+    image : Topic
+        Of images.
+
+    Returns
+    -------
+    list of str
+        Names without the leading slash, best first.
+    """
     parent = image.base.rpartition("/")[0]
     grandparent = parent.rpartition("/")[0]
     places = [parent, image.base, grandparent, f"{grandparent}/info"]

@@ -16,7 +16,7 @@ from gvo.sources.calibration_files import read_mono_file
 from gvo.sources.folders import FolderSource, StampedPath
 from gvo.sources.pixels import read_depth
 from gvo.sources.recording import RecordingInfo
-from gvo.sources.tables import parse_seconds, read_rows
+from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
 
@@ -104,7 +104,10 @@ class TumSource(FolderSource):
 
 def _list_images(table: Path) -> list[StampedPath]:
     return [
-        (parse_seconds(fields[0], f"{table}, line {number}"), table.parent / fields[1])
+        (
+            read_stamp(fields[0], f"{table}, line {number}", unit_ns=10**9),
+            table.parent / fields[1],
+        )
         for number, fields in read_rows(table, n_fields=2)
     ]
 

@@ -61,7 +61,22 @@ class View:
 
 
 def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
-    """Keep the rectangles in view and express them as linear forms of the pixel."""
+    """Keep the rectangles in view and express them as linear forms of the pixel.
+
+    Parameters
+    ----------
+    scene : Scene
+        In the map frame, metres.
+    T_map_cam : ndarray of float64, shape (4, 4)
+        Maps camera coordinates to the map, metres.
+    camera : PinholeCamera
+        Of the image.
+
+    Returns
+    -------
+    View
+        What the camera may see.
+    """
     T_cam_map = invert(T_map_cam)
     origins = transform_points(T_cam_map, scene.origins)
     R = T_cam_map[:3, :3]
@@ -108,7 +123,18 @@ def _is_in_frustum(corners: FloatArray, camera: PinholeCamera) -> BoolArray:
 
 
 def refine(view: View) -> View:
-    """Return the view of an image of twice the width and height."""
+    """Return the view of an image of twice the width and height.
+
+    Parameters
+    ----------
+    view : View
+        From the same pose.
+
+    Returns
+    -------
+    View
+        Its linear forms take pixels of the larger image.
+    """
     M = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
     camera = PinholeCamera(
         fx=2 * view.camera.fx,
@@ -129,7 +155,18 @@ def refine(view: View) -> View:
 
 
 def find_visible(view: View) -> IndexArray:
-    """Return the nearest rectangle at each pixel, as an index into the view; -1: nothing."""
+    """Return the nearest rectangle at each pixel.
+
+    Parameters
+    ----------
+    view : View
+        Of h x w pixels.
+
+    Returns
+    -------
+    ndarray of int16, shape (h, w)
+        Index into the view; -1: nothing.
+    """
     nearest = np.zeros((view.camera.height, view.camera.width), dtype=np.float32)
     visible = np.full(nearest.shape, NOTHING, dtype=np.int16)
     first, last, upper_bounds = _bounds(view)

@@ -210,6 +210,7 @@ def test_a_stereo_calibration_file_holds_both_cameras(tmp_path: Path, tiny: Any)
         ({"P": np.zeros(12)}, "baseline must be positive"),
         ({"R": np.full(9, 7.0)}, "R is no rotation"),
         ({"K": np.full(9, np.nan)}, "not finite"),
+        ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
     ],
 )
 def test_an_unusable_camera_info_is_refused(
@@ -219,6 +220,20 @@ def test_an_unusable_camera_info_is_refused(
     with pytest.raises(CalibrationError, match=text) as caught:
         BagSource(bag)
     assert str(caught.value).startswith(str(bag))
+
+
+def test_depth_of_a_camera_that_rectification_turns_is_refused(tmp_path: Path, tiny: Any) -> None:
+    R = np.array([0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8])
+    messages = _rgbd(tiny, tiny.depth(0), "32FC1")
+    messages[0] = _info("/c/rgb/camera_info", _P_LEFT, R=R)
+    with pytest.raises(CalibrationError, match=r"/c/rgb/camera_info: R turns the camera"):
+        BagSource(_write(tmp_path / "a.bag", messages))
+    content = tiny.ros_camera(rectification_matrix={"data": R.tolist()})
+    file = tmp_path / "turned.yaml"
+    file.write_text(yaml.safe_dump(content))
+    bag = _write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
+    with pytest.raises(CalibrationError, match=r"turned\.yaml: R turns the camera"):
+        BagSource(bag, calibration=file)
 
 
 def test_topics_can_be_chosen(tmp_path: Path, tiny: Any) -> None:

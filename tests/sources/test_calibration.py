@@ -156,7 +156,7 @@ def test_a_missing_key_is_named(tmp_path: Path, tiny: Any, key: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["a: [", "", "- 1", "\x00", "a: 2024-99-99", "a: 0b2", "a: " + "[" * 5000]
+    "text", ["a: [", "", "- 1", "\x00", "a: 2024-99-99", "a: 0b2", "a: " + "[" * 1000]
 )
 def test_a_file_that_holds_no_keys_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "c.yaml"

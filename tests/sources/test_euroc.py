@@ -118,6 +118,14 @@ def test_a_malformed_sensor_is_refused(
         EurocSource(folder)
 
 
+def test_a_date_that_is_none_is_refused_in_the_sensor_too(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    with (folder / "mav0/cam1/sensor.yaml").open("a") as file:
+        file.write("calibrated: 2024-99-99\n")
+    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml: the calibration is no YAML"):
+        EurocSource(folder)
+
+
 def test_a_missing_table_is_refused_and_a_missing_image_is_not(tmp_path: Path, tiny: Any) -> None:
     folder = _write(tmp_path / "m", tiny)
     (folder / "mav0/cam1/data" / f"{_STAMPS[1]}.png").unlink()

@@ -101,7 +101,7 @@ def _with(name: str, text: str) -> Any:
     [
         (_without("times.txt"), RecordingError, r"times\.txt: the file is missing"),
         (_without("calib.txt"), RecordingError, r"calib\.txt: the file is missing"),
-        (_with("times.txt", "0\nx\n0.2\n"), RecordingError, r"times\.txt, line 2: 'x'"),
+        (_with("times.txt", "0\nx\n0.2\n"), RecordingError, r"times\.txt, line 2: the stamp 'x'"),
         (_with("times.txt", "0\n0.1\n"), RecordingError, r"000002\.png: .* number below 2"),
         (_with("image_0/left.png", ""), RecordingError, r"left\.png: expected an image number"),
         (_with("calib.txt", "P0: 1 2 3\n"), CalibrationError, "line 1: expected 12"),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from gvo.errors import RecordingError
 from gvo.sources.recording import StampedImage
 from gvo.sources.sync import MAX_PENDING, pair_images
 from gvo.types import FaultyFrame
@@ -153,6 +154,19 @@ def test_images_that_compete_for_long_are_decided_before_too_many_wait() -> None
         assert isinstance(answer, tuple)
         assert answer[1].stamp_ns - answer[0].stamp_ns == 1001
     assert n_answered == len(color)
+
+
+def test_the_pairs_before_a_fault_of_the_recording_come_first() -> None:
+    def images() -> Iterator[StampedImage]:
+        for stamp in (0, 30, 60):
+            yield _image(0, stamp)
+            yield _image(1, stamp + 15)
+        raise RecordingError("cut off")
+
+    pairs = pair_images(images(), limit_ns=20, partner="depth")
+    assert [next(pairs)[0].stamp_ns for _ in range(3)] == [0, 30, 60]  # type: ignore[index]
+    with pytest.raises(RecordingError, match="cut off"):
+        next(pairs)
 
 
 def test_an_image_without_a_partner_says_how_far_the_nearest_is() -> None:
