@@ -56,7 +56,7 @@ def associate(
         empty = "the reference" if len(reference) == 0 else name
         raise TrajectoryError(f"{empty} holds no poses, nothing can be associated")
     if _is_associated_by_row(reference, estimate, name):
-        rows = np.arange(min(len(reference), len(estimate)))
+        rows = np.arange(len(reference))
         return rows, rows.copy()
     if len(estimate) > len(reference):
         longer, shorter = _nearest(estimate.stamps_ns, reference.stamps_ns, max_difference_ns)
@@ -76,11 +76,13 @@ def _is_associated_by_row(reference: Trajectory, estimate: Trajectory, name: str
     origins = (reference.stamps_from, estimate.stamps_from)
     if "rows" not in origins:
         return False
-    if origins == ("rows", "rows") or (
-        # as many stamps beside the one as there are rows in the other: frames of one sequence
-        "file" not in origins and len(reference) == len(estimate)
-    ):
-        return True
+    if "file" not in origins and len(reference) == len(estimate):
+        return True  # one row per frame in both, whether or not stamps lie beside one of them
+    if origins == ("rows", "rows"):
+        raise TrajectoryError(
+            f"{name} holds {len(estimate)} poses without stamps, the reference {len(reference)}: "
+            "row by row they cannot belong together; give files of the same frames, or with stamps"
+        )
     bare, stamped = (name, "the reference") if origins[1] == "rows" else ("the reference", name)
     raise TrajectoryError(
         f"{bare} holds rows of poses without stamps and cannot be associated with {stamped}, "

@@ -75,7 +75,9 @@ class BagSource:
         self._scale = depth_scale or found.depth_scale or DEFAULT_SCALE
         decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
         if self._topics.sensor == "rgbd":
-            decisions.append(f"depth: {self._scale:g} counts per metre of integer depth")
+            decisions.append(
+                f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
+            )
         self._info = RecordingInfo(
             name=path.resolve().stem if path.is_file() else path.resolve().name,
             sensor=self._topics.sensor,

@@ -211,7 +211,10 @@ def _limit_ns(sensor: Sensor, config: Config) -> int:
 
 
 def _partner(sensor: Sensor) -> str:
-    return "right" if sensor == "stereo" else "depth"
+    """Name the partner, and the parameter that says how far away its stamp may be."""
+    if sensor == "stereo":
+        return "right image within sync.stereo_tolerance_ms"
+    return "depth image within sync.max_difference_ms"
 
 
 def _size_text(shape: tuple[int, ...]) -> str:

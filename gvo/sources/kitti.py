@@ -63,6 +63,9 @@ class KittiSource(FolderSource):
             f"calibration: {file.name}, rectified",
             f"baseline: {stereo_baseline(calibrations, str(file)):.4f} m",
         ]
+        n_missing = len(self._stamps_ns) - len(left)
+        if n_missing:
+            decisions.append(f"missing: {n_missing} rows of times.txt have no image {names[0]}")
         info = RecordingInfo(
             name=folder.resolve().name,
             sensor="stereo",

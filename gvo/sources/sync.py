@@ -38,7 +38,7 @@ def pair_images(
     limit_ns : int
         Largest difference of the stamps of a pair, nanoseconds.
     partner : str
-        What stream 1 is called in messages.
+        What stream 1 is called in messages, with the parameter that sets the limit.
 
     Yields
     ------
@@ -184,7 +184,7 @@ class _Pairing:
             nearest += " and belongs to another image"
         return FaultyFrame(
             stamp_ns=image.stamp_ns,
-            reason=f"no {self._partner} image within {self._limit_ns / 1e6:g} ms: {nearest}",
+            reason=f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}",
             is_unpaired=True,
         )
 

@@ -22,6 +22,8 @@ from gvo.trajectory_files import read_trajectory
 
 DEFAULT_SCALE = 5000.0
 """Counts per metre of the benchmark's depth images."""
+MILLIMETRES = 1000.0
+"""Counts per metre of depth images in millimetres."""
 
 _PLAUSIBLE_MEDIAN_M = (0.5, 10.0)
 
@@ -55,7 +57,8 @@ class TumSource(FolderSource):
     calibration : Path, optional
         YAML of the colour camera.
     depth_scale : float, optional
-        Counts per metre; otherwise that of the calibration file, or 5000.
+        Counts per metre; otherwise that of the calibration file; otherwise 5000 as TUM has it,
+        or 1000 where the first depth image only makes sense in millimetres.
 
     Raises
     ------
@@ -69,18 +72,17 @@ class TumSource(FolderSource):
         self._folder = folder
         color, depth = (_list_images(folder / name) for name in ("rgb.txt", "depth.txt"))
         camera, from_file, origin = _find_calibration(folder, calibration)
-        scale = depth_scale or from_file or DEFAULT_SCALE
+        if depth_scale is not None:
+            scale, reason = depth_scale, "by depth.scale"
+        elif from_file is not None:
+            scale, reason = from_file, "by the calibration"
+        else:
+            scale, reason = _assume_scale([path for _, path in depth])
         decisions = [
             f"rgbd: rgb + depth ({len(color)} + {len(depth)} images)",
             f"calibration: {origin}",
+            f"depth: {scale:g} counts per metre, {reason}",
         ]
-        if depth_scale is not None:
-            origin_of_scale = "depth.scale"
-        else:
-            origin_of_scale = "the calibration file" if from_file else "the default of TUM folders"
-        decisions.append(f"depth: {scale:g} counts per metre, by {origin_of_scale}")
-        if depth_scale is None and from_file is None:
-            decisions += _doubt_scale([path for _, path in depth], scale)
         info = RecordingInfo(
             name=folder.resolve().name,
             sensor="rgbd",
@@ -120,7 +122,7 @@ def _find_calibration(folder: Path, explicit: Path | None) -> tuple[Calibration,
         origin = f"published for freiburg{named[1]}, by the name of the folder"
         if beside.is_file():
             origin += f"; {beside.name} there is not used, give it by --calibration to use it"
-        return _published_camera(*_CAMERAS[named[1]]), None, origin
+        return _published_camera(*_CAMERAS[named[1]]), DEFAULT_SCALE, origin
     path = explicit or beside
     if explicit is None and not beside.is_file():
         raise CalibrationError(
@@ -148,21 +150,40 @@ def _published_camera(
     return make_calibration(fields, is_rectified=False)
 
 
-def _doubt_scale(paths: Sequence[Path], scale: float) -> list[str]:
-    """Return a line of advice where the first depth image makes no sense at this scale."""
+def _assume_scale(paths: Sequence[Path]) -> tuple[float, str]:
+    """Choose between the two scales in use by the first depth image that can be read.
+
+    The scale of TUM's tools unless the scene would then be nearer than such a camera can see,
+    and millimetres put it where it can.
+    """
     for path in paths:
-        try:
-            depth = read_depth(path, scale)
-        except RecordingError:
-            continue  # it becomes a faulty frame later
-        if not np.any(np.isfinite(depth)):
+        median = _median_depth(path)
+        if median is None:
             continue
-        median = float(np.nanmedian(depth))
-        if _PLAUSIBLE_MEDIAN_M[0] <= median <= _PLAUSIBLE_MEDIAN_M[1]:
-            return []
-        other = 1000 if median < _PLAUSIBLE_MEDIAN_M[0] else 5000
-        return [
-            f"depth: a median of {median:.2f} m in {path.name} is implausible; if its counts are "
-            f"per 1/{other} m, use --set depth.scale={other}"
-        ]
-    return []
+        if _is_plausible(median):
+            break
+        if _is_plausible(median * DEFAULT_SCALE / MILLIMETRES):
+            reason = (
+                f"because the median of {path.name} would be {median:.2f} m at TUM's "
+                f"{DEFAULT_SCALE:g} (--set depth.scale={DEFAULT_SCALE:g} if that is right)"
+            )
+            return MILLIMETRES, reason
+        reason = (
+            f"the default of TUM folders, at which the median of {path.name} is an implausible "
+            f"{median:.2f} m (--set depth.scale=... changes it)"
+        )
+        return DEFAULT_SCALE, reason
+    return DEFAULT_SCALE, "the default of TUM folders"
+
+
+def _median_depth(path: Path) -> float | None:
+    """Return the median of the known depth at the default scale; None where there is none."""
+    try:
+        depth = read_depth(path, DEFAULT_SCALE)
+    except RecordingError:
+        return None  # it becomes a faulty frame later
+    return float(np.nanmedian(depth)) if np.any(np.isfinite(depth)) else None
+
+
+def _is_plausible(median_m: float) -> bool:
+    return _PLAUSIBLE_MEDIAN_M[0] <= median_m <= _PLAUSIBLE_MEDIAN_M[1]

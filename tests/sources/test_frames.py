@@ -64,7 +64,7 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
     assert faults == [
         (20, "left image: a.png: damaged"),
         (30, "right image: expected 48x32 pixels by the calibration, got 48x31"),
-        (40, "no right image within 0 ms: the nearest is 1e-05 ms away"),
+        (40, "no right image within sync.stereo_tolerance_ms=0: the nearest is 1e-05 ms away"),
         (50, "left image: b; right image: c"),
         (45, "the stamp goes back from 50 to 45 ns"),
         (60, "the stamp 60 ns repeats"),

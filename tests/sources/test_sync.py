@@ -172,7 +172,7 @@ def test_the_pairs_before_a_fault_of_the_recording_come_first() -> None:
 def test_an_image_without_a_partner_says_how_far_the_nearest_is() -> None:
     ms = 1_000_000
     (answer,) = _pair([100 * ms], [50 * ms, 133 * ms], limit_ns=20 * ms)
-    assert answer == f"{100 * ms}: no depth image within 20 ms: the nearest is 33 ms away"
+    assert answer == f"{100 * ms}: no depth=20: the nearest is 33 ms away"
     taken = _pair([0, 5 * ms], [1 * ms], limit_ns=20 * ms)[1]
     assert isinstance(taken, str)
     assert taken.endswith("4 ms away and belongs to another image")

@@ -96,17 +96,41 @@ def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: A
     assert largest(depth_scale=10000.0) == pytest.approx(0.5 * at_5000)
 
 
-def test_an_implausible_scale_is_doubted_and_not_changed(tmp_path: Path, tiny: Any) -> None:
+def _depth_decision(source: TumSource) -> str:
+    (line,) = [line for line in source.info.decisions if line.startswith("depth: ")]
+    return line
+
+
+def test_depth_that_only_makes_sense_in_millimetres_is_read_so(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
-    assert not any("implausible" in line for line in TumSource(folder).info.decisions)
+    assert _depth_decision(TumSource(folder)).startswith(
+        "depth: 5000 counts per metre, the default"
+    )
+    expected = next(TumSource(folder).images()).load()
     for stamp in _DEPTH:
         tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
-    info = TumSource(folder).info
-    (doubt,) = [line for line in info.decisions if "implausible" in line]
-    assert "--set depth.scale=1000" in doubt
-    assert np.nanmedian(next(TumSource(folder).images()).load()) < 0.5
-    chosen = TumSource(folder, depth_scale=1000.0).info
-    assert not any("implausible" in line for line in chosen.decisions)
+    assert _depth_decision(TumSource(folder)).startswith("depth: 1000 counts per metre, because")
+    found = next(TumSource(folder).images()).load()
+    is_known = np.isfinite(expected)
+    np.testing.assert_allclose(found[is_known], expected[is_known], atol=2e-3)
+    insisted = TumSource(folder, depth_scale=5000.0)
+    assert _depth_decision(insisted) == "depth: 5000 counts per metre, by depth.scale"
+
+
+def test_a_published_camera_keeps_its_scale_however_near_the_scene(
+    tmp_path: Path, tiny: Any
+) -> None:
+    folder = tiny.write_tum(tmp_path / "fr2_near", _COLOR, _DEPTH)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
+    assert _depth_decision(TumSource(folder)).startswith("depth: 5000 counts per metre")
+
+
+def test_depth_that_makes_no_sense_at_all_is_doubted(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 1000 + 1)
+    assert "implausible" in _depth_decision(TumSource(folder))
 
 
 def test_depth_and_colour_are_undistorted_with_the_same_camera(tmp_path: Path, tiny: Any) -> None:
@@ -156,7 +180,7 @@ def test_nearly_all_recorded_images_find_their_depth(gvo_data: Path) -> None:
 
 @pytest.mark.recorded
 def test_the_recorded_depth_in_millimetres_is_noticed(gvo_data: Path) -> None:
-    decisions = TumSource(gvo_data / "sevenscenes_start").info.decisions
-    assert any("--set depth.scale=1000" in decision for decision in decisions)
-    decisions = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start").info.decisions
-    assert not any("implausible" in decision for decision in decisions)
+    room = TumSource(gvo_data / "sevenscenes_start")
+    assert _depth_decision(room).startswith("depth: 1000 counts per metre, because")
+    desk = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    assert _depth_decision(desk).startswith("depth: 5000 counts per metre")
