@@ -26,8 +26,8 @@ from gvo.types import BoolArray, Failure, FloatArray
 _MIN_DEPTH_M = 1e-3
 # Nearer points, or points behind the camera, have no noise to speak of: they are no inliers.
 _MIN_NOISE_DEPTH_M = 0.1
-# A step of the pose, radians and metres, that no longer matters.
-_CONVERGED = 1e-5
+# A step of a hundredth of a sigma no longer matters; this is its square.
+_CONVERGED = 1e-4
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
 
@@ -86,16 +86,16 @@ def refine_pose(
     """
     problem = _Problem.of(T_target_source, matches, camera, huber=config.huber)
     n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
-    solution = _gauss_newton(T_target_source, problem.select(inliers), n_iterations=n_first)
-    if isinstance(solution, Failure):
-        return solution
-    chosen = _within_gate(solution.T, problem, config.gate)
+    T = _gauss_newton(T_target_source, problem.select(inliers), n_iterations=n_first)
+    if isinstance(T, Failure):
+        return T
+    chosen = _within_gate(T, problem, config.gate)
     if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
         chosen = inliers
-    solution = _gauss_newton(solution.T, problem.select(chosen), n_iterations=config.n_iterations)
-    if isinstance(solution, Failure):
-        return solution
-    return _refinement(solution, chosen)
+    T = _gauss_newton(T, problem.select(chosen), n_iterations=config.n_iterations)
+    if isinstance(T, Failure):
+        return T
+    return _with_covariance(T, problem.select(chosen), chosen)
 
 
 def fit_covariance(
@@ -109,14 +109,8 @@ def fit_covariance(
 
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
-    problem = _Problem.of(T_target_source, matches, camera, huber=config.huber).select(inliers)
-    normal = problem.linearize(T_target_source)
-    if isinstance(normal, Failure):
-        return normal
-    step = _solve(normal)
-    if isinstance(step, Failure):
-        return step
-    return _refinement(_Solution(T=T_target_source, normal=normal), inliers)
+    problem = _Problem.of(T_target_source, matches, camera, huber=config.huber)
+    return _with_covariance(T_target_source, problem.select(inliers), inliers)
 
 
 def projection_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
@@ -155,12 +149,6 @@ class _Normal:
     g: FloatArray
     sum_of_squares: float
     n_matches: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Solution:
-    T: FloatArray
-    normal: _Normal
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -230,8 +218,7 @@ def _information(T: FloatArray, matches: Correspondences, camera: StereoCamera) 
     return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
 
-def _gauss_newton(T: FloatArray, problem: _Problem, *, n_iterations: int) -> _Solution | Failure:
-    normal: _Normal | Failure = Failure(reason="no iteration")
+def _gauss_newton(T: FloatArray, problem: _Problem, *, n_iterations: int) -> FloatArray | Failure:
     for _ in range(n_iterations):
         normal = problem.linearize(T)
         if isinstance(normal, Failure):
@@ -241,15 +228,11 @@ def _gauss_newton(T: FloatArray, problem: _Problem, *, n_iterations: int) -> _So
             return step
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]) @ T
-        if np.abs(step).max() < _CONVERGED:
+        if step @ normal.g < _CONVERGED:
             break
-    if isinstance(normal, Failure) or not np.isfinite(T).all():
+    if not np.isfinite(T).all():
         return Failure(reason="the refinement diverged", n_matches=len(problem.source_points))
-    T = se3.normalize(T)
-    normal = problem.linearize(T)
-    if isinstance(normal, Failure):
-        return normal
-    return _Solution(T=T, normal=normal)
+    return se3.normalize(T)
 
 
 def _solve(normal: _Normal) -> FloatArray | Failure:
@@ -270,13 +253,18 @@ def _within_gate(T: FloatArray, problem: _Problem, gate: float) -> BoolArray:
     return np.asarray(is_in_front & (squared < gate**2))
 
 
-def _refinement(solution: _Solution, inliers: BoolArray) -> Refinement:
-    normal = solution.normal
+def _with_covariance(T: FloatArray, problem: _Problem, inliers: BoolArray) -> Refinement | Failure:
+    normal = problem.linearize(T)
+    if isinstance(normal, Failure):
+        return normal
+    open_direction = _solve(normal)
+    if isinstance(open_direction, Failure):
+        return open_direction
     n_free = max(3 * normal.n_matches - 6, 1)
     scale_squared = max(normal.sum_of_squares / n_free, 1e-12)
     covariance = np.linalg.inv(normal.H) * scale_squared
     return Refinement(
-        T_target_source=solution.T,
+        T_target_source=T,
         covariance=0.5 * (covariance + covariance.T),
         inliers=inliers,
         scale=float(np.sqrt(scale_squared)),
