@@ -216,13 +216,15 @@ class SlidingWindow:
         A robust kernel cannot leave the wrong side of an outlier, so a single bad edge must
         not decide where the optimization starts.
         """
-        predictions = [self.pose(edge.reference_id) @ edge.T_reference_frame for edge in edges]
-        information = [np.linalg.inv(edge.covariance) for edge in edges]
-        disagreements = []
-        for T in predictions:
-            residuals = se3.log(np.stack([se3.invert(other) @ T for other in predictions]))
-            distances = np.sqrt(np.einsum("ni,nij,nj->n", residuals, information, residuals))
-            disagreements.append(np.sum(distances))
+        predictions = np.stack(
+            [self.pose(edge.reference_id) @ edge.T_reference_frame for edge in edges]
+        )
+        if len(edges) == 1:
+            return np.asarray(predictions[0])
+        information = np.linalg.inv(np.stack([edge.covariance for edge in edges]))
+        residuals = se3.log(se3.invert(predictions) @ predictions[:, np.newaxis])
+        squares = np.einsum("mni,nij,mnj->mn", residuals, information, residuals)
+        disagreements = np.sum(np.sqrt(np.maximum(squares, 0.0)), axis=1)
         return np.asarray(predictions[int(np.argmin(disagreements))])
 
     @contextmanager

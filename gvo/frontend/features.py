@@ -158,15 +158,18 @@ def _spread(
     pixels = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64)
     responses = np.array([point.response for point in found])
     columns = -(-shape[1] // config.cell_size_px)
-    cells = (pixels // config.cell_size_px).astype(np.int64) @ [1, columns]
-    order = np.lexsort((np.arange(len(found)), -responses, cells))
-    ranks = rank_in_group(np.asarray(cells[order], dtype=np.int64))
+    # Cells and ranks are small integers, which NumPy sorts stably in linear time.
+    cells = ((pixels // config.cell_size_px) @ [1, columns]).astype(np.uint16)
+    by_response = np.argsort(-responses, kind="stable")
+    by_cell = np.argsort(cells[by_response], kind="stable")
+    ranks = np.empty(len(found), dtype=np.uint16)
+    ranks[by_cell] = np.minimum(rank_in_group(cells[by_response][by_cell]), 65535)
     # The first of every cell before the second of any: the weakest rank is cut by response.
-    chosen = order[np.lexsort((-responses[order], ranks))[: config.n_features]]
+    chosen = by_response[np.argsort(ranks, kind="stable")[: config.n_features]]
     return [found[int(index)] for index in np.sort(chosen)]
 
 
-def rank_in_group(sorted_groups: IntArray) -> IntArray:
+def rank_in_group(sorted_groups: NDArray[Any]) -> IntArray:
     """Return the rank of the members of each run of equal values, from zero, shape (n,)."""
     n = len(sorted_groups)
     is_first = np.ones(n, dtype=np.bool_)
