@@ -80,3 +80,8 @@ def test_the_public_names_can_be_imported() -> None:
         assert getattr(gvo, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = gvo.nothing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_placeholder_is_left(page: Path) -> None:
+    assert re.findall(r"\b(?:TODO|TBD|XXX|RAW|SMO|BENCH)[A-Z0-9]+\b", page.read_text()) == []

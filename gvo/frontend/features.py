@@ -100,6 +100,7 @@ def _make_orb(config: FeaturesConfig, threshold: int) -> cv2.Feature2D:
         nlevels=config.n_octaves,
         edgeThreshold=_BORDER_PX,
         fastThreshold=threshold,
+        scoreType=cv2.ORB_FAST_SCORE,
     )
     return orb
 

@@ -26,8 +26,8 @@ from gvo.types import BoolArray, Failure, FloatArray
 _MIN_DEPTH_M = 1e-3
 # Nearer points, or points behind the camera, have no noise to speak of: they are no inliers.
 _MIN_NOISE_DEPTH_M = 0.1
-# A step of a hundredth of a sigma no longer matters; this is its square.
-_CONVERGED = 1e-4
+# A step of three hundredths of a sigma no longer matters; this is its square.
+_CONVERGED = 1e-3
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
 
