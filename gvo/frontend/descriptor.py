@@ -154,12 +154,4 @@ def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCam
     """Return a stereo camera; an RGB-D camera gets the virtual baseline."""
     if isinstance(camera, StereoCamera):
         return camera
-    return StereoCamera(
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        width=camera.width,
-        height=camera.height,
-        baseline=config.depth.virtual_baseline_m,
-    )
+    return StereoCamera.from_pinhole(camera, config.depth.virtual_baseline_m)

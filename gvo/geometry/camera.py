@@ -110,6 +110,19 @@ class StereoCamera(PinholeCamera):
                 "(are left and right exchanged?)"
             )
 
+    @classmethod
+    def from_pinhole(cls, pinhole: PinholeCamera, baseline: float) -> StereoCamera:
+        """Return the stereo camera of this left camera and a baseline in metres."""
+        return cls(
+            fx=pinhole.fx,
+            fy=pinhole.fy,
+            cx=pinhole.cx,
+            cy=pinhole.cy,
+            width=pinhole.width,
+            height=pinhole.height,
+            baseline=baseline,
+        )
+
     def depth_to_disparity(self, depths: FloatArray | float) -> FloatArray:
         """Return the disparity in pixels of depths in metres, any shape."""
         return np.asarray(self.fx * self.baseline / np.asarray(depths))
@@ -227,15 +240,7 @@ def stereo_camera(left: Calibration, right: Calibration) -> StereoCamera:
             "columns; give a calibration of the rectified pair"
         )
     pinhole = left.pinhole()
-    return StereoCamera(
-        fx=pinhole.fx,
-        fy=pinhole.fy,
-        cx=pinhole.cx,
-        cy=pinhole.cy,
-        width=pinhole.width,
-        height=pinhole.height,
-        baseline=float(left.P[0, 3] - right.P[0, 3]) / pinhole.fx,
-    )
+    return StereoCamera.from_pinhole(pinhole, float(left.P[0, 3] - right.P[0, 3]) / pinhole.fx)
 
 
 RectificationMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
