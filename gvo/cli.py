@@ -171,6 +171,7 @@ def convert(
 ) -> None:
     """Write a data-set folder as a bag, pixels untouched, with the ground truth as tf."""
     from gvo.outputs.bag_writer import convert as write_bag
+    from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
     from gvo.sources.opening import RecordingOptions, open_recording
 
     options = RecordingOptions(calibration=calibration)
@@ -179,7 +180,7 @@ def convert(
         written = write_bag(source, bag, rectify=rectify, progress=check)
     typer.echo(f"wrote {bag}: {written.n_images} images, {written.n_poses} true poses")
     _warn(written.skipped)
-    raise typer.Exit(3 if written.skipped else 0)
+    raise typer.Exit(EXIT_PARTLY if written.skipped else EXIT_COMPLETE)
 
 
 @app.command("config")

@@ -16,23 +16,13 @@ BAG_NAME = "drive.mcap"
 N_FRAMES = 100
 
 
-def write_demo_bag(
-    path: Path,
-    *,
-    n_frames: int = N_FRAMES,
-    seed: int = 0,
-    progress: Callable[[int], None] | None = None,
-) -> None:
+def write_demo_bag(path: Path, *, progress: Callable[[int], None] | None = None) -> None:
     """Render a drive with a stereo camera and write it as a bag with its exact truth.
 
     Parameters
     ----------
     path : Path
         `.bag` or `.mcap` file; replaced where it exists.
-    n_frames : int
-        Stereo pairs at 10 Hz.
-    seed : int
-        Of textures, world and noise.
     progress : callable, optional
         Called with the number of images written so far.
 
@@ -46,7 +36,7 @@ def write_demo_bag(
         path.unlink(missing_ok=True)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
-    drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=n_frames, seed=seed)
+    drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
     convert(drive, path, progress=progress)
 
 

@@ -77,7 +77,7 @@ def ransac_rigid(
         return Failure(reason=f"{n} points lie on a line", n_matches=n)
     inliers = find_inliers(T, correspondences, camera, config)
     best = inliers[np.argmax(np.count_nonzero(inliers, axis=1))]
-    return _refit(best, correspondences, camera, config, weights=weights)
+    return _refit(best, correspondences, camera, config, near=near, weights=weights)
 
 
 def _near(correspondences: Correspondences, config: RansacConfig) -> IntArray:
@@ -150,6 +150,7 @@ def _refit(
     camera: StereoCamera,
     config: RansacConfig,
     *,
+    near: IntArray,
     weights: FloatArray | None,
 ) -> Consensus | Failure:
     n, n_inliers = len(correspondences), int(np.count_nonzero(inliers))
@@ -160,9 +161,9 @@ def _refit(
             n_matches=n,
             n_inliers=n_inliers,
         )
-    fitted = np.flatnonzero(inliers)
-    near = np.intersect1d(fitted, _near(correspondences, config))
-    fitted = near if len(near) >= config.min_inliers else fitted
+    fitted = near[inliers[near]]
+    if len(fitted) < config.min_inliers:
+        fitted = np.flatnonzero(inliers)
     T = fit_rigid(
         correspondences.source_points[fitted],
         correspondences.target_points[fitted],
