@@ -7,10 +7,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from gvo.backend.comparison import MeasurementLog
     from gvo.backend.window import SlidingWindow
-    from gvo.config import Config, load_configuration
+    from gvo.config import Config, WindowConfig, load_configuration
     from gvo.errors import GvoError
     from gvo.evaluation import Evaluation, evaluate
+    from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
     from gvo.odometry import FrameResult, Odometry
     from gvo.outputs.bag_writer import convert
@@ -22,15 +24,30 @@ if TYPE_CHECKING:
     from gvo.sources.synthetic import SyntheticRecording
     from gvo.trajectory import Trajectory
     from gvo.trajectory_files import read_trajectory
-    from gvo.types import Edge, Estimate, FaultyFrame, RgbdFrame, Status, StereoFrame
+    from gvo.types import (
+        Edge,
+        Estimate,
+        Failure,
+        FaultyFrame,
+        GraphEdge,
+        PosePrior,
+        PositionPrior,
+        Rejected,
+        RelativePose,
+        RgbdFrame,
+        Status,
+        StereoFrame,
+    )
 
 __version__ = "0.1.0"
 
 _MODULES = {
+    "gvo.backend.comparison": ("MeasurementLog",),
     "gvo.backend.window": ("SlidingWindow",),
-    "gvo.config": ("Config", "load_configuration"),
+    "gvo.config": ("Config", "WindowConfig", "load_configuration"),
     "gvo.errors": ("GvoError",),
     "gvo.evaluation": ("Evaluation", "evaluate"),
+    "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry": ("FrameResult", "Odometry"),
     "gvo.outputs.bag_writer": ("convert",),
@@ -42,7 +59,20 @@ _MODULES = {
     "gvo.sources.synthetic": ("SyntheticRecording",),
     "gvo.trajectory": ("Trajectory",),
     "gvo.trajectory_files": ("read_trajectory",),
-    "gvo.types": ("Edge", "Estimate", "FaultyFrame", "RgbdFrame", "Status", "StereoFrame"),
+    "gvo.types": (
+        "Edge",
+        "Estimate",
+        "Failure",
+        "FaultyFrame",
+        "GraphEdge",
+        "PosePrior",
+        "PositionPrior",
+        "Rejected",
+        "RelativePose",
+        "RgbdFrame",
+        "Status",
+        "StereoFrame",
+    ),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -51,12 +81,20 @@ __all__ = [
     "Edge",
     "Estimate",
     "Evaluation",
+    "Failure",
     "FaultyFrame",
     "FrameResult",
+    "Frontend",
+    "GraphEdge",
     "GvoError",
+    "MeasurementLog",
     "Odometry",
     "PinholeCamera",
+    "PosePrior",
+    "PositionPrior",
     "RecordingOptions",
+    "Rejected",
+    "RelativePose",
     "RgbdFrame",
     "RunResult",
     "SlidingWindow",
@@ -65,6 +103,7 @@ __all__ = [
     "StereoFrame",
     "SyntheticRecording",
     "Trajectory",
+    "WindowConfig",
     "__version__",
     "convert",
     "evaluate",

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
 
+from gvo.coasting import predict_step
 from gvo.config import WindowConfig
-from gvo.frontend.descriptor import DescriptorFrontend
+from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
 from gvo.geometry import se3
-from gvo.types import Estimate, Failure, FloatArray, Observations, RelativePose, Status
-
-# After a longer gap the last velocity says nothing about where the camera is.
-_MAX_EXTRAPOLATION_S = 1.0
+from gvo.types import Estimate, Failure, FloatArray, RelativePose, Status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,6 +32,8 @@ class RawStep:
     reason : str
         Why there is no registration; empty where there is one.
     n_matches, n_inliers : int
+    flow_px : float or None
+        Median displacement of the inliers in the image, where it is known.
     """
 
     estimate: Estimate
@@ -43,18 +44,19 @@ class RawStep:
     reason: str = ""
     n_matches: int = 0
     n_inliers: int = 0
+    flow_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Link:
+class _Link(Generic[ObservationsT]):
     """A frame that the next one may be registered against."""
 
-    observations: Observations
+    observations: ObservationsT
     T_world_frame: FloatArray
     covariance: FloatArray
 
 
-class RawChain:
+class RawChain(Generic[ObservationsT]):
     """Chains relative poses of consecutive frames; the smoother never touches it.
 
     A frame that cannot be registered against its predecessor is tried against the last
@@ -63,16 +65,16 @@ class RawChain:
 
     Parameters
     ----------
-    frontend : DescriptorFrontend
+    frontend : Frontend
     config : WindowConfig
         Sigmas of a step without registration.
     """
 
-    def __init__(self, frontend: DescriptorFrontend, config: WindowConfig) -> None:
+    def __init__(self, frontend: Frontend[ObservationsT], config: WindowConfig) -> None:
         self._frontend = frontend
         self._config = config
-        self._predecessor: _Link | None = None
-        self._anchor: _Link | None = None
+        self._predecessor: _Link[ObservationsT] | None = None
+        self._anchor: _Link[ObservationsT] | None = None
         self._velocity: FloatArray | None = None
 
     @property
@@ -80,7 +82,7 @@ class RawChain:
         """Stamp of the last registered frame, which the next one may be tied to."""
         return None if self._anchor is None else self._anchor.observations.stamp_ns
 
-    def advance(self, current: Observations) -> RawStep:
+    def advance(self, current: ObservationsT) -> RawStep:
         """Register the next frame and return its step.
 
         Raises
@@ -97,34 +99,28 @@ class RawChain:
                 f"stamp {current.stamp_ns} is not after {predecessor.observations.stamp_ns}, "
                 "that of the frame before"
             )
-        T_predecessor_current = self._predict(elapsed_s)
-        T_world_predicted = predecessor.T_world_frame @ T_predecessor_current
+        predicted = predict_step(self._velocity, elapsed_s, self._config)
+        T_world_predicted = predecessor.T_world_frame @ predicted[0]
         failure = Failure(reason="")
         for link in [predecessor] if anchor is predecessor else [predecessor, anchor]:
             result = self._register(link, current, T_world_predicted)
             if isinstance(result, RelativePose):
                 return self._append(link, current, result)
             failure = failure if failure.reason else result
-        return self._coast(predecessor, current, T_predecessor_current, failure)
-
-    def _predict(self, elapsed_s: float) -> FloatArray:
-        """Return T_predecessor_current at constant velocity, where there is one."""
-        if self._velocity is None:
-            return np.eye(4)
-        return se3.exp(self._velocity * min(elapsed_s, _MAX_EXTRAPOLATION_S))
+        return self._coast(predecessor, current, predicted, failure)
 
     def _register(
-        self, link: _Link, current: Observations, T_world_predicted: FloatArray
+        self, link: _Link[ObservationsT], current: ObservationsT, T_world_predicted: FloatArray
     ) -> RelativePose | Failure:
         """Search around the predicted pixels, then around the previous ones."""
         if self._velocity is not None:
             prior = se3.invert(link.T_world_frame) @ T_world_predicted
-            result = self._frontend.register(link.observations, current, prior)
+            result = register_checked(self._frontend, link.observations, current, prior)
             if isinstance(result, RelativePose):
                 return result
-        return self._frontend.register(link.observations, current, None)
+        return register_checked(self._frontend, link.observations, current, None)
 
-    def _begin(self, current: Observations) -> RawStep:
+    def _begin(self, current: ObservationsT) -> RawStep:
         step = RawStep(
             estimate=Estimate(
                 stamp_ns=current.stamp_ns, T_world_cam=np.eye(4), covariance=np.zeros((6, 6))
@@ -137,7 +133,9 @@ class RawChain:
         self._predecessor = self._anchor = _link_of(current, step.estimate)
         return step
 
-    def _append(self, link: _Link, current: Observations, result: RelativePose) -> RawStep:
+    def _append(
+        self, link: _Link[ObservationsT], current: ObservationsT, result: RelativePose
+    ) -> RawStep:
         T_world_current = se3.normalize(link.T_world_frame @ result.T_reference_current)
         estimate = Estimate(
             stamp_ns=current.stamp_ns,
@@ -157,21 +155,17 @@ class RawChain:
             is_registered=True,
             n_matches=result.n_matches,
             n_inliers=result.n_inliers,
+            flow_px=result.flow_px,
         )
 
     def _coast(
         self,
-        predecessor: _Link,
-        current: Observations,
-        T_predecessor_current: FloatArray,
+        predecessor: _Link[ObservationsT],
+        current: ObservationsT,
+        predicted: tuple[FloatArray, FloatArray],
         failure: Failure,
     ) -> RawStep:
-        elapsed_s = 1e-9 * (current.stamp_ns - predecessor.observations.stamp_ns)
-        rates = [
-            np.radians(self._config.coasting_sigma_deg_per_s),
-            self._config.coasting_sigma_m_per_s,
-        ]
-        covariance = np.diag(np.repeat(rates, 3) * elapsed_s) ** 2
+        T_predecessor_current, covariance = predicted
         estimate = Estimate(
             stamp_ns=current.stamp_ns,
             T_world_cam=se3.normalize(predecessor.T_world_frame @ T_predecessor_current),
@@ -193,7 +187,7 @@ class RawChain:
         )
 
 
-def _link_of(observations: Observations, estimate: Estimate) -> _Link:
+def _link_of(observations: ObservationsT, estimate: Estimate) -> _Link[ObservationsT]:
     return _Link(
         observations=observations,
         T_world_frame=estimate.T_world_cam,

@@ -19,6 +19,7 @@ from gvo.errors import ConfigurationError, GvoError
 if TYPE_CHECKING:
     from gvo.config import Config
     from gvo.runs import Progress, RunResult
+    from gvo.trajectory import Trajectory
 
 _EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
@@ -37,10 +38,19 @@ _Settings = Annotated[
 _ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
 ]
+_Compare = Annotated[
+    bool,
+    typer.Option("--compare", help="Also smooth by full iSAM2 and batch; print the difference."),
+]
 _CalibrationFile = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Camera, ROS camera_info YAML; replaces the recording's."),
 ]
+
+
+class _KeyframePolicy(StrEnum):
+    DISTANCE = "distance"
+    MANUAL = "manual"
 
 
 class _Align(StrEnum):
@@ -93,6 +103,7 @@ def run(
     right: Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")] = None,
     color: Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")] = None,
     depth: Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")] = None,
+    compare_smoothing: _Compare = False,
 ) -> None:
     """Estimate the trajectory of a recording; write it with covariances, summary and picture."""
     from gvo.runs import read_ground_truth, run_recording
@@ -108,9 +119,101 @@ def run(
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
     with _interruptible() as check, _progress(source.info.name) as show:
         result = run_recording(
-            source, out, config=parameters, ground_truth=truth, on_progress=_both(show, check)
+            source,
+            out,
+            config=parameters,
+            ground_truth=truth,
+            compare_smoothing=compare_smoothing,
+            on_progress=_both(show, check),
         )
     _report(result, out)
+
+
+@app.command()
+def smooth(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
+    ] = None,
+    sigma: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sigma", metavar="DEG,M", help="Of a step, for all inputs or one after another."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
+    ] = None,
+    keyframes: Annotated[
+        _KeyframePolicy, typer.Option(help="What keeps poses in the window.")
+    ] = _KeyframePolicy.DISTANCE,
+    config: _ConfigFile = None,
+    set_: _Settings = None,
+    compare_smoothing: _Compare = False,
+) -> None:
+    """Smooth the edges or poses of any front-end: g2o, trajectories, odometry topics, stdin."""
+    from gvo.runs import read_ground_truth
+    from gvo.smoothing import configuration_for, smooth_edges
+    from gvo.sources.edge_inputs import open_edges, parse_sigma
+
+    parameters = _load(config, set_)
+    truth = None if ground_truth is None else read_ground_truth(ground_truth)
+    if "-" in inputs:
+        _refuse_with_lines(inputs, topic=topic, sigma=sigma, compare=compare_smoothing)
+        _smooth_lines(out, config=parameters, keyframes=keyframes, ground_truth=truth)
+    sigmas = [parse_sigma(text) for text in sigma or []]
+    source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
+    for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
+        typer.echo(decision)
+    with _interruptible() as check, _progress(source.name, "poses") as show:
+        result = smooth_edges(
+            source,
+            out,
+            config=parameters,
+            keyframes=keyframes.value,
+            ground_truth=truth,
+            compare_smoothing=compare_smoothing,
+            on_progress=_both(show, check),
+        )
+    _report_smoothed(result, out)
+
+
+def _refuse_with_lines(inputs: list[str], **options: object) -> None:
+    if len(inputs) > 1:
+        raise ConfigurationError("-: standard input does not go with another input")
+    for name, given in options.items():
+        if given:
+            raise ConfigurationError(f"-: standard input does not go with --{name}")
+
+
+def _smooth_lines(
+    out: Path, *, config: Config, keyframes: _KeyframePolicy, ground_truth: Trajectory | None
+) -> NoReturn:
+    """Answer standard input line by line; nothing else goes to standard output."""
+    from gvo.smoothing_lines import smooth_lines
+    from gvo.sources.edge_answers import read_lines
+
+    def answer(line: str) -> None:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+
+    with _interruptible() as check:
+        result = smooth_lines(
+            read_lines(sys.stdin.fileno(), lambda: check(None)),
+            answer,
+            out,
+            config=config,
+            keyframes=keyframes.value,
+            ground_truth=ground_truth,
+        )
+    _report_smoothed(result, out, is_stdout_taken=True)
 
 
 @app.command()
@@ -224,10 +327,35 @@ def _report(result: RunResult, out: Path) -> NoReturn:
 
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False)
+    _print_smoothings(result)
     frames, tracked = result.summary["frames"], result.summary["tracked"]
     typer.echo(f"{tracked} of {frames} frames tracked; {out / 'trajectories.png'}")
     _warn(result.warnings)
     raise typer.Exit(result.exit_code)
+
+
+def _report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
+    from gvo.outputs.tables import format_evaluations
+
+    if result.evaluations:
+        typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
+    summary = result.summary
+    if summary["polish"] is not None:
+        errors = summary["polish"]
+        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} polished"
+        typer.echo(text, err=is_stdout_taken)
+    _print_smoothings(result)
+    counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
+    typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
+    _warn(result.warnings)
+    raise typer.Exit(result.exit_code)
+
+
+def _print_smoothings(result: RunResult) -> None:
+    if "smoothing" in result.summary:
+        from gvo.outputs.smoothings import format_smoothings
+
+        typer.echo(format_smoothings(result.summary["smoothing"]), nl=False)
 
 
 def _warn(warnings: Sequence[str]) -> None:
@@ -236,7 +364,7 @@ def _warn(warnings: Sequence[str]) -> None:
 
 
 @contextmanager
-def _progress(title: str) -> Iterator[Callable[[Progress], None]]:
+def _progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], None]]:
     """Give a callback that draws a bar on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
         yield lambda progress: None
@@ -249,7 +377,7 @@ def _progress(title: str) -> Iterator[Callable[[Progress], None]]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.1f} frames/s, {task.fields[tracked]:.0%} tracked,"),
+        TextColumn("{task.fields[rate]:.1f} " + unit + "/s, {task.fields[tracked]:.0%} tracked,"),
         TimeRemainingColumn(),
         TextColumn("left"),
     )

@@ -31,6 +31,9 @@ def _parameter(
     )
 
 
+Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
+
+
 class Section(BaseModel):
     """A group of parameters: frozen, no unknown keys, no infinities."""
 
@@ -67,6 +70,46 @@ class DepthConfig(Section):
         0.075, "baseline of the stereo camera that the depth camera is seen as", "m", gt=0
     )
     sigma_px: float = _parameter(1.0, "noise of the virtual disparity", "px", gt=0)
+
+
+class FrontendConfig(Section):
+    """How two frames are registered."""
+
+    kind: Literal["descriptor", "klt"] = _parameter(
+        "descriptor", "corners matched by descriptors, or tracked by Lucas-Kanade"
+    )
+
+
+class KltConfig(Section):
+    """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
+
+    n_corners: int = _parameter(500, "corners kept per image", ge=50, le=20000)
+    min_eigenvalue: float = _parameter(
+        1e-4,
+        "weakest corner: smaller eigenvalue of the gradients' covariance, grey in [0, 1]",
+        gt=0,
+    )
+    min_distance_px: int = _parameter(
+        10, "size of the cells that give one corner each", "px", ge=2, le=200
+    )
+    cell_size_px: int = _parameter(40, "size of the grid cells that share the budget", "px", ge=8)
+    window_radius_px: int = _parameter(
+        5, "half size of the window that is tracked", "px", ge=2, le=50
+    )
+    n_levels: int = _parameter(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
+    n_wide_levels: int = _parameter(
+        4, "the same where there is no prediction, or it led to nothing", ge=0, le=8
+    )
+    max_return_px: float = _parameter(
+        0.5, "how far from its corner a track may end when it is followed back", "px", gt=0
+    )
+    pixel_sigma_px: float = _parameter(0.15, "noise of a tracked pixel", "px", gt=0)
+    disparity_sigma_px: float = _parameter(
+        0.15, "noise of the disparity of a corner or a track, for stereo", "px", gt=0
+    )
+    sigma_factor: float = _parameter(
+        2.2, "factor on the sigmas of a registration: neighbouring tracks share their errors", gt=0
+    )
 
 
 class FeaturesConfig(Section):
@@ -150,12 +193,17 @@ class RegistrationConfig(Section):
         4.0, "matches nearer to the refined pose than this become its inliers", "sigma", gt=0
     )
     pixel_sigma_px: float = _parameter(0.7, "noise of a keypoint's pixel", "px", gt=0)
+    sigma_factor: float = _parameter(
+        1.28, "factor on the sigmas of a registration: matches share errors residuals hide", gt=0
+    )
 
 
 class WindowConfig(Section):
     """Sliding-window smoothing."""
 
-    n_recent: int = _parameter(5, "recent frames in the window", ge=2, le=100)
+    size: int | None = _parameter(
+        5, "recent frames in the window; null: all frames (full smoothing)", ge=2, le=1000
+    )
     n_keyframes: int = _parameter(12, "keyframes kept beside them", ge=0, le=100)
     n_links: int = _parameter(3, "registrations per frame: predecessor and keyframes", ge=1, le=20)
     min_overlap: float = _parameter(
@@ -165,11 +213,21 @@ class WindowConfig(Section):
         0.9, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
     )
     link_sigma_factor: float = _parameter(
-        1.5, "factor on the sigmas of links to keyframes: a frame's links share its noise", gt=0
+        2.0, "factor on the sigmas of links to keyframes: a frame's links share its noise", gt=0
     )
-    kernel: Literal["huber", "none"] = _parameter("huber", "robust kernel of the edges")
-    kernel_threshold: float = _parameter(
-        3.55, "of the kernel, on the norm of the whitened 6-vector", gt=0
+    keyframe_distance_m: float = _parameter(
+        1.0, "a frame this far from all keyframes becomes one, where no overlap is known", "m", gt=0
+    )
+    keyframe_angle_deg: float = _parameter(15.0, "the same for a turn", "deg", gt=0, le=180)
+    kernel: Kernel = _parameter("huber", "robust kernel of the edges")
+    kernel_threshold: float | None = _parameter(
+        None,
+        "of the kernel, on the norm of the whitened 6-vector (dcs: its square); "
+        "null: huber 3.55, cauchy 9.4, geman_mcclure 13.6, dcs 15.6",
+        gt=0,
+    )
+    gate: float | None = _parameter(
+        10.0, "an edge that disagrees more with most others of its pose is refused", "sigma", gt=0
     )
     coasting_sigma_deg_per_s: float = _parameter(
         30.0, "rotation sigma of a step without registration, by its duration", "deg/s", gt=0
@@ -178,6 +236,18 @@ class WindowConfig(Section):
         3.0, "translation sigma of a step without registration, by its duration", "m/s", gt=0
     )
     lost_after_s: float = _parameter(2.0, "coasting longer is called lost", "s", gt=0)
+    zero_motion: bool = _parameter(
+        False, "at standstill, tie a frame to its predecessor by an edge without motion"
+    )
+    zero_motion_flow_px: float = _parameter(
+        1.0, "standstill: the median pixel moves by less", "px", gt=0
+    )
+    zero_motion_gate: float = _parameter(
+        5.0, "standstill: the motion is this insignificant against its covariance", "sigma", gt=0
+    )
+    zero_motion_sigma_factor: float = _parameter(
+        1.0, "sigmas of that edge, as a multiple of those of the registration", gt=0
+    )
 
 
 class RuntimeConfig(Section):
@@ -193,6 +263,8 @@ class Config(Section):
 
     sync: SyncConfig = SyncConfig()
     depth: DepthConfig = DepthConfig()
+    frontend: FrontendConfig = FrontendConfig()
+    klt: KltConfig = KltConfig()
     features: FeaturesConfig = FeaturesConfig()
     stereo: StereoConfig = StereoConfig()
     temporal: TemporalConfig = TemporalConfig()

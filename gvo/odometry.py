@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+import numpy as np
+
+from gvo.backend.comparison import MeasurementLog
 from gvo.backend.window import SlidingWindow
 from gvo.chain import RawChain, RawStep
-from gvo.config import Config
-from gvo.frontend.descriptor import DescriptorFrontend
+from gvo.coasting import StatusClock
+from gvo.config import Config, WindowConfig
+from gvo.frontend.descriptor import as_stereo
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.protocol import Frontend, Stamped, register_checked
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.keyframe_policy import choose_links, choose_released, is_needed
 from gvo.keyframes import Keyframes
 from gvo.types import (
     Edge,
     Estimate,
     Failure,
     FloatArray,
-    Frame,
-    Observations,
     Status,
 )
 
@@ -41,7 +47,8 @@ class FrameResult:
         Why the chain could not register the frame; empty where it could.
     n_keypoints, n_points, n_matches, n_inliers, n_links : int
         Keypoints, those measured in 3-D, matches of the chain's registration and those that it
-        rests on, edges that went into the window.
+        rests on (0 where a front-end of one's own does not count them), edges that went into
+        the window.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -65,30 +72,55 @@ class FrameResult:
 
 
 class Odometry:
-    """Estimates the motion of a camera from its frames.
+    """Estimates the motion of a camera, or of any sensor with a front-end, from its frames.
 
     Parameters
     ----------
-    camera : StereoCamera or PinholeCamera
-        Of the rectified stereo pair, or of the colour image of an RGB-D sensor.
+    camera : StereoCamera or PinholeCamera, optional
+        Of the rectified stereo pair, or of the colour image of an RGB-D sensor. Needed without
+        a front-end of one's own.
     config : Config, optional
+    frontend : Frontend, optional
+        Any object with `extract` and `register`, in place of what `frontend.kind` names.
+    log : MeasurementLog, optional
+        Is given all that goes into the window, to compare ways of smoothing it.
+
+    Raises
+    ------
+    ValueError
+        When neither a camera nor a front-end is given.
     """
 
-    def __init__(self, camera: StereoCamera | PinholeCamera, config: Config | None = None) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera | PinholeCamera | None = None,
+        config: Config | None = None,
+        *,
+        frontend: Frontend[Any] | None = None,
+        log: MeasurementLog | None = None,
+    ) -> None:
         self._config = config or Config()
-        self._frontend = DescriptorFrontend(camera, self._config)
-        self._chain = RawChain(self._frontend, self._config.window)
-        self._window = SlidingWindow(self._config.window)
-        self._keyframes = Keyframes(self._frontend.camera, self._config.window)
+        self._frontend = _choose_frontend(camera, self._config, frontend)
+        view = getattr(self._frontend, "camera", None) or camera
+        self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
+        self._window = SlidingWindow(self._config.window, log=log)
+        self._keyframes: Keyframes[Any] = Keyframes(
+            None if view is None else as_stereo(view, self._config), self._config.window
+        )
         self._anchor_ns: int | None = None
-        self._coasting_since_ns: int | None = None
+        self._clock = StatusClock(self._config.window.lost_after_s)
 
-    def track(self, frame: Frame) -> FrameResult:
+    @property
+    def window(self) -> SlidingWindow:
+        """The sliding window: its poses by stamp, covariances, edges and counts."""
+        return self._window
+
+    def track(self, frame: Stamped) -> FrameResult:
         """Take the next frame and return its poses.
 
         Parameters
         ----------
-        frame : StereoFrame or RgbdFrame
+        frame : StereoFrame or RgbdFrame, or what the front-end takes
             Its stamp must be later than that of the frame before.
 
         Raises
@@ -102,21 +134,22 @@ class Odometry:
         with watch.stage("register"):
             step = self._chain.advance(observations)
         with watch.stage("links"):
-            edges, overlaps = self._edges(observations, step)
+            edges, scores = self._edges(observations, step)
         is_tied = step.is_registered or len(edges) > 1
-        status = self._next_status(frame.stamp_ns, is_tied=is_tied)
+        status = self._clock.next(frame.stamp_ns, is_tied=is_tied)
         with watch.stage("window"):
             causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges, status=status)
-            self._update_keyframes(observations, overlaps, is_tied=is_tied)
+            self._update_keyframes(observations, scores, is_tied=is_tied)
             self._hold_anchor()
+        n_points = _count_points(observations)
         return FrameResult(
             raw=replace(step.estimate, frame_id=frame.stamp_ns),
             causal=causal,
             finished=tuple(self._window.pop_finished()),
             status=status,
             reason=step.reason,
-            n_keypoints=observations.n_keypoints,
-            n_points=len(observations),
+            n_keypoints=getattr(observations, "n_keypoints", n_points),
+            n_points=n_points,
             n_matches=step.n_matches,
             n_inliers=step.n_inliers,
             n_links=len(edges),
@@ -127,10 +160,8 @@ class Odometry:
         """Return the smoothed poses of the frames still in the window."""
         return tuple(self._window.finish())
 
-    def _edges(
-        self, observations: Observations, step: RawStep
-    ) -> tuple[list[Edge], dict[int, float]]:
-        """Return the edges of a frame, to its predecessor first, and the keyframes' overlaps."""
+    def _edges(self, observations: Any, step: RawStep) -> tuple[list[Edge], dict[int, float]]:  # noqa: ANN401
+        """Return the edges of a frame, to its predecessor first, and the keyframes' scores."""
         if step.reference_ns is None:
             return [], {}
         first = Edge(
@@ -138,20 +169,31 @@ class Odometry:
             T_reference_frame=step.T_reference_frame,
             covariance=step.covariance,
         )
+        if step.reference_ns not in self._window:  # it had to start anew
+            return [first], {}
         T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
         T_frame_keyframes = {
             stamp_ns: se3.invert(T_world_frame) @ self._window.pose(stamp_ns)
             for stamp_ns in self._keyframes.stamps_ns
+            if stamp_ns in self._window
         }
-        overlaps = self._keyframes.overlaps(T_frame_keyframes)
+        scores = self._keyframes.scores(T_frame_keyframes)
+        chosen = choose_links(scores, self._config.window, exclude=step.reference_ns)
         links = [
             self._link(stamp_ns, observations, se3.invert(T_frame_keyframes[stamp_ns]))
-            for stamp_ns in self._keyframes.choose_links(overlaps, exclude=step.reference_ns)
+            for stamp_ns in chosen
         ]
-        return [first, *(link for link in links if link is not None)], overlaps
+        links.append(zero_motion_edge(step, self._config.window))
+        return [first, *(link for link in links if link is not None)], scores
 
-    def _link(self, stamp_ns: int, observations: Observations, prior: FloatArray) -> Edge | None:
-        result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
+    def _link(
+        self,
+        stamp_ns: int,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        prior: FloatArray,
+    ) -> Edge | None:
+        keyframe = self._keyframes[stamp_ns]
+        result = register_checked(self._frontend, keyframe, observations, prior)
         if isinstance(result, Failure):
             return None
         return Edge(
@@ -160,34 +202,67 @@ class Odometry:
             covariance=self._config.window.link_sigma_factor**2 * result.covariance,
         )
 
-    def _next_status(self, stamp_ns: int, *, is_tied: bool) -> Status:
-        since, self._coasting_since_ns = self._coasting_since_ns, None
-        if is_tied:
-            return Status.OK if since is None else Status.RESUMED
-        self._coasting_since_ns = stamp_ns if since is None else since
-        coasting_s = 1e-9 * (stamp_ns - self._coasting_since_ns)
-        return Status.LOST if coasting_s > self._config.window.lost_after_s else Status.COASTING
-
     def _update_keyframes(
-        self, observations: Observations, overlaps: dict[int, float], *, is_tied: bool
+        self,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        scores: dict[int, float],
+        *,
+        is_tied: bool,
     ) -> None:
         """Keep and release keyframes; none while the pose is only a guess."""
         if not is_tied:
             return
-        if self._config.window.n_keyframes > 0 and self._keyframes.is_needed(overlaps):
+        config = self._config.window
+        if config.n_keyframes > 0 and is_needed(scores, config):
             self._keyframes.add(observations)
             self._window.keep(observations.stamp_ns)
-        for stamp_ns in self._keyframes.choose_released(overlaps):
+        for stamp_ns in choose_released(scores, config, n_kept=len(self._keyframes)):
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)
+        for stamp_ns in self._keyframes.stamps_ns:
+            if stamp_ns not in self._window:
+                self._keyframes.drop(stamp_ns)
 
     def _hold_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
         previous, self._anchor_ns = self._anchor_ns, self._chain.anchor_ns
-        if previous is not None and previous not in self._keyframes.stamps_ns:
+        if previous not in self._keyframes.stamps_ns and previous in self._window:
             self._window.release(previous)
-        if self._anchor_ns is not None:
+        if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
+
+
+def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
+    """Return the edge that holds a frame where its predecessor was, if it stands still.
+
+    Both must hold: the image hardly moves, and the motion is insignificant against its own
+    covariance, so that a slow motion that the registration can tell is not frozen.
+    """
+    if not config.zero_motion or not step.is_registered or step.flow_px is None:
+        return None
+    twist = se3.log(step.T_reference_frame)
+    significance = np.sqrt(twist @ np.linalg.solve(step.covariance, twist))
+    if step.flow_px > config.zero_motion_flow_px or significance > config.zero_motion_gate:
+        return None
+    return Edge(
+        reference_id=step.reference_ns,
+        T_reference_frame=np.eye(4),
+        covariance=config.zero_motion_sigma_factor**2 * step.covariance,
+    )
+
+
+def _choose_frontend(
+    camera: StereoCamera | PinholeCamera | None, config: Config, frontend: Frontend[Any] | None
+) -> Frontend[Any]:
+    if frontend is not None:
+        return frontend
+    if camera is None:
+        raise ValueError("Odometry needs a camera, or a front-end of your own (frontend=...)")
+    return make_frontend(camera, config)
+
+
+def _count_points(observations: object) -> int:
+    return len(observations) if isinstance(observations, Sized) else 0
 
 
 class Stopwatch:

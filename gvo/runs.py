@@ -7,19 +7,21 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gvo import __version__
+from gvo.backend.ledger import WindowCounts
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, SmoothingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
 from gvo.odometry import FrameResult, Odometry
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
+from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
 from gvo.sources.frames import frames
 from gvo.sources.opening import BAG_SUFFIXES, open_recording
@@ -99,6 +101,7 @@ class _Tally:
     first_unpaired: str = ""
     first_untied: str = ""
     broken_off: str = ""
+    window: WindowCounts = field(default_factory=WindowCounts)
     stages: dict[str, _Durations] = field(default_factory=dict)
 
     @property
@@ -153,6 +156,7 @@ def run_recording(
     *,
     config: Config | None = None,
     ground_truth: Trajectory | None = None,
+    compare_smoothing: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Run odometry over a recording and write a run folder.
@@ -166,6 +170,9 @@ def run_recording(
     config : Config, optional
     ground_truth : Trajectory, optional
         Poses of the recording's camera; the recording's own where omitted.
+    compare_smoothing : bool
+        Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
+        all of them in memory.
     on_progress : callable, optional
         Called after each frame.
 
@@ -180,8 +187,11 @@ def run_recording(
     """
     config = config or Config()
     tally = _Tally()
-    odometry = Odometry(source.info.camera, config)
-    with RunFolder(Path(out)) as folder:
+    comparison = SmoothingComparison() if compare_smoothing else None
+    odometry = Odometry(
+        source.info.camera, config, log=None if comparison is None else comparison.log
+    )
+    with RunFolder(Path(out), watch=None if comparison is None else comparison.add) as folder:
         try:
             for item in _read_frames(source, config, tally):
                 _take(item, odometry, folder, tally, sensor=source.info.sensor)
@@ -192,7 +202,10 @@ def run_recording(
         finally:
             # Also where the run is interrupted: what the window holds was computed.
             folder.add_smoothed(odometry.finish())
-    return _conclude(source, folder, tally, config=config, ground_truth=ground_truth)
+    tally.window = odometry.window.counts
+    return _conclude(
+        source, folder, tally, config=config, ground_truth=ground_truth, comparison=comparison
+    )
 
 
 def read_ground_truth(path: str | Path) -> Trajectory:
@@ -263,6 +276,7 @@ def _conclude(
     *,
     config: Config,
     ground_truth: Trajectory | None,
+    comparison: SmoothingComparison | None,
 ) -> RunResult:
     if tally.n_with_pose == 0:
         reason = (
@@ -282,6 +296,8 @@ def _conclude(
         warnings.append(f"not compared with the ground truth: {error}")
     is_partly = tally.is_partly or (ground_truth is not None and not evaluations)
     summary = _summary(source, tally, config=config, evaluations=evaluations, warnings=warnings)
+    if comparison is not None:
+        summary["smoothing"] = comparison.conclude(folder.path, truth if evaluations else None)
     folder.write_summary(summary)
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
@@ -331,6 +347,11 @@ def _warnings(tally: _Tally) -> list[str]:
             f"{n_untied} of {tally.n_with_pose} poses continue the last velocity, without a "
             "registration (frames.csv: coasting, lost)"
         )
+    if tally.window.n_restored:
+        warnings.append(
+            f"{tally.window.n_restored} updates of the window failed and were undone; the poses "
+            "behind them continue the last velocity"
+        )
     return warnings
 
 
@@ -354,6 +375,7 @@ def _summary(
         "coverage": tally.n_with_pose / tally.n_frames,
         "status_counts": {status.value: tally.statuses[status] for status in Status},
         "unpaired_images": tally.n_unpaired,
+        "window": asdict(tally.window),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gvo.config import Kernel
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -24,6 +26,24 @@ def _freeze(value: object, *names: str) -> None:
         array = np.array(getattr(value, name))
         array.setflags(write=False)
         object.__setattr__(value, name, array)
+
+
+def _freeze_shaped(value: object, **shapes: tuple[int, ...]) -> None:
+    """Replace arrays by read-only copies in float64 of the given shapes."""
+    for name, shape in shapes.items():
+        try:
+            array = np.array(getattr(value, name), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} must be an array of numbers: {error}") from None
+        if array.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+        array.setflags(write=False)
+        object.__setattr__(value, name, array)
+
+
+def _check_kernel(kernel: str | None) -> None:
+    if kernel is not None and kernel not in get_args(Kernel):
+        raise ValueError(f"kernel must be one of {get_args(Kernel)}, got {kernel!r}")
 
 
 def _check_images(kind: str, first: NDArray[Any], second: NDArray[Any], dtype: type) -> None:
@@ -190,15 +210,19 @@ class RelativePose:
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the current camera frame.
     matches : ndarray of int64, shape (n, 2)
-        Indices into the observations of reference and current.
+        Indices into the observations of reference and current; -1 where the current frame
+        holds none of the point. Empty where the front-end does not tell.
     inliers : ndarray of bool, shape (n,)
         Which matches the pose rests on.
+    flow_px : float or None
+        Median displacement of the inliers between the images, where the front-end tells.
     """
 
     T_reference_current: FloatArray
     covariance: FloatArray
-    matches: IntArray
-    inliers: BoolArray
+    matches: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    flow_px: float | None = None
 
     @property
     def n_matches(self) -> int:
@@ -215,6 +239,9 @@ class RelativePose:
 class Edge:
     """A relative pose to a frame that is already in the window.
 
+    Only shapes are checked here; the window judges the values and refuses what is no rotation
+    or no covariance (`Rejected`).
+
     Parameters
     ----------
     reference_id : hashable
@@ -223,15 +250,141 @@ class Edge:
         Maps coordinates of the new frame to the reference frame, metres.
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the new frame.
+    kernel : {"none", "huber", "cauchy", "geman_mcclure", "dcs"}, optional
+        Robust kernel of this edge; the window's where omitted.
+
+    Raises
+    ------
+    ValueError
+        Where a shape does not fit or the kernel is none of these.
     """
 
     reference_id: FrameId
     T_reference_frame: FloatArray
     covariance: FloatArray
+    kernel: Kernel | None = None
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze(self, "T_reference_frame", "covariance")
+        if not isinstance(self.reference_id, Hashable):
+            raise ValueError(f"reference_id must be hashable, got {self.reference_id!r}")
+        _freeze_shaped(self, T_reference_frame=(4, 4), covariance=(6, 6))
+        _check_kernel(self.kernel)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePrior:
+    """A measured pose of one frame in the world: a known start, a motion-capture fix.
+
+    Parameters
+    ----------
+    T_world_frame : ndarray of float64, shape (4, 4)
+        Maps coordinates of the frame to the world, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
+    kernel : {"none", "huber", "cauchy", "geman_mcclure", "dcs"}
+        Robust kernel.
+    """
+
+    T_world_frame: FloatArray
+    covariance: FloatArray
+    kernel: Kernel = "none"
+
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        _freeze_shaped(self, T_world_frame=(4, 4), covariance=(6, 6))
+        _check_kernel(self.kernel)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PositionPrior:
+    """A measured position of one frame in the world, such as a GPS fix.
+
+    Parameters
+    ----------
+    position_world : ndarray of float64, shape (3,)
+        Origin of the frame in the world, metres.
+    covariance : ndarray of float64, shape (3, 3)
+        Along the axes of the world, metres squared.
+    kernel : {"none", "huber", "cauchy", "geman_mcclure", "dcs"}
+        Robust kernel.
+    """
+
+    position_world: FloatArray
+    covariance: FloatArray
+    kernel: Kernel = "none"
+
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        _freeze_shaped(self, position_world=(3,), covariance=(3, 3))
+        _check_kernel(self.kernel)
+
+
+Prior: TypeAlias = PosePrior | PositionPrior
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejected:
+    """An edge or a prior that the window refused; falsy, so that `if answer:` reads well.
+
+    Parameters
+    ----------
+    frame_id : hashable
+        The frame it was given for.
+    stamp_ns : int or None
+        Stamp of that frame, where it is known.
+    reason : str
+        One line: what is wrong, with its numbers.
+    reference_id : hashable
+        The other frame of an edge; None for a prior.
+    """
+
+    frame_id: FrameId
+    stamp_ns: int | None
+    reason: str
+    reference_id: FrameId = None
+
+    def __bool__(self) -> bool:
+        """Tell that nothing was added."""
+        return False
+
+    def __str__(self) -> str:
+        """Name the frames, then the reason."""
+        place = "" if self.stamp_ns is None else f" at {self.stamp_ns} ns"
+        source = "prior" if self.reference_id is None else f"edge {self.reference_id!r} ->"
+        return f"{source} {self.frame_id!r}{place}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphEdge:
+    """A measurement of the window's graph and how well the present poses fit it.
+
+    Parameters
+    ----------
+    reference_id : hashable
+        None for a prior: the world is its reference.
+    frame_id : hashable
+    T_reference_frame : ndarray of float64, shape (4, 4)
+        As measured, metres; of a position prior, the present orientation.
+    covariance : ndarray of float64, shape (n, n)
+        n is 6; 3 for a position prior.
+    residual : ndarray of float64, shape (n,)
+        Whitened: of unit covariance where the stated covariances are right.
+    weight : float
+        Of the robust kernel, 1 without.
+    """
+
+    reference_id: FrameId
+    frame_id: FrameId
+    T_reference_frame: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    weight: float
+
+    @property
+    def chi2(self) -> float:
+        """Squared norm of the whitened residual."""
+        return float(self.residual @ self.residual)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -250,6 +403,8 @@ class Estimate:
         What ties the pose to the frames before it.
     frame_id : hashable
         The caller's name of the frame.
+    rejected : tuple of Rejected
+        The edges and the prior that came with the pose and were refused.
     """
 
     stamp_ns: int
@@ -257,6 +412,7 @@ class Estimate:
     covariance: FloatArray
     status: Status = Status.OK
     frame_id: FrameId = field(default=None)
+    rejected: tuple[Rejected, ...] = ()
 
     def __post_init__(self) -> None:
         """Copy the arrays."""

@@ -1,7 +1,8 @@
 """The raw chain, driven by a front-end that knows the truth and fails on command."""
 
 from collections.abc import Callable
-from typing import cast
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from hypothesis import strategies as st
 
 from gvo.chain import RawChain, RawStep
 from gvo.config import WindowConfig
-from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.geometry import se3
 from gvo.types import Failure, FloatArray, Observations, RelativePose, Status
 
@@ -39,6 +39,9 @@ class TrueFrontend:
         self._blank = blank
         self.asked: list[tuple[int, int, FloatArray | None]] = []
 
+    def extract(self, frame: Observations) -> Observations:
+        return frame
+
     def register(
         self, reference: Observations, current: Observations, prior: FloatArray | None = None
     ) -> RelativePose | Failure:
@@ -60,6 +63,9 @@ class Unpredictable:
     def __init__(self, frontend: TrueFrontend) -> None:
         self._frontend = frontend
 
+    def extract(self, frame: Observations) -> Observations:
+        return frame
+
     def register(
         self, reference: Observations, current: Observations, prior: FloatArray | None = None
     ) -> RelativePose | Failure:
@@ -78,7 +84,7 @@ def run(
     stamps: list[int], blank: set[int], pose: Callable[[int], FloatArray] = steady
 ) -> tuple[list[RawStep], TrueFrontend]:
     frontend = TrueFrontend(pose, blank)
-    chain = RawChain(cast(DescriptorFrontend, frontend), SETTINGS)
+    chain = RawChain(frontend, SETTINGS)
     return [chain.advance(observe(stamp)) for stamp in stamps], frontend
 
 
@@ -192,13 +198,13 @@ def test_the_prior_is_constant_velocity_from_the_raw_chain() -> None:
 def test_a_prediction_that_leads_nowhere_is_dropped_before_the_frame_is_given_up() -> None:
     stamps = stamps_of(4)
     frontend = TrueFrontend(steady, set())
-    chain = RawChain(cast(DescriptorFrontend, Unpredictable(frontend)), SETTINGS)
+    chain = RawChain(Unpredictable(frontend), SETTINGS)
     assert all(chain.advance(observe(stamp)).is_registered for stamp in stamps)
 
 
 @pytest.mark.parametrize("stamp", [STEP_NS, STEP_NS - 1, 0])
 def test_a_stamp_that_does_not_advance_is_misuse(stamp: int) -> None:
-    chain = RawChain(cast(DescriptorFrontend, TrueFrontend(steady, set())), SETTINGS)
+    chain = RawChain(TrueFrontend(steady, set()), SETTINGS)
     for good in (0, STEP_NS):
         chain.advance(observe(good))
     with pytest.raises(ValueError, match=f"stamp {stamp} is not after {STEP_NS}"):
@@ -216,3 +222,48 @@ def test_rotations_stay_rotations_over_a_long_chain() -> None:
     steps, _ = run(stamps_of(2000), set())
     R = steps[-1].estimate.T_world_cam[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+class Spoilt(TrueFrontend):
+    """A front-end whose result at one stamp is changed."""
+
+    def __init__(self, stamp_ns: int, **changes: Any) -> None:
+        super().__init__(steady, set())
+        self._stamp_ns = stamp_ns
+        self._changes = changes
+
+    def register(
+        self, reference: Observations, current: Observations, prior: FloatArray | None = None
+    ) -> RelativePose | Failure:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure) or current.stamp_ns != self._stamp_ns:
+            return result
+        return replace(result, **self._changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"T_reference_current": np.full((4, 4), np.nan)},
+        {"T_reference_current": np.diag([1.0, 1.0, -1.0, 1.0])},
+        {"T_reference_current": np.eye(3)},
+        {"covariance": np.full((6, 6), np.inf)},
+        {"covariance": np.zeros((6, 6))},
+        {"covariance": np.ones((6, 6))},
+    ],
+)
+def test_a_relative_pose_that_is_none_is_a_failure_and_the_chain_goes_on(
+    changes: dict[str, Any],
+) -> None:
+    stamps = stamps_of(6)
+    chain = RawChain(Spoilt(stamps[3], **changes), SETTINGS)
+    steps = [chain.advance(observe(stamp)) for stamp in stamps]
+    assert [step.is_registered for step in steps] == [stamp != stamps[3] for stamp in stamps]
+    assert "front-end is at fault" in steps[3].reason
+    np.testing.assert_allclose(steps[5].estimate.T_world_cam, steady(stamps[5]), atol=1e-9)
+
+
+def test_the_flow_is_handed_on() -> None:
+    stamps = stamps_of(3)
+    chain = RawChain(Spoilt(stamps[2], flow_px=2.5), SETTINGS)
+    assert [chain.advance(observe(stamp)).flow_px for stamp in stamps] == [None, None, 2.5]

@@ -27,7 +27,7 @@ def test_help_fits_a_screen(command: Command) -> None:
     answer = command("--help")
     assert answer.code == 0
     assert len(answer.out.splitlines()) <= 24
-    for name in ("demo", "run", "compare", "convert", "config"):
+    for name in ("demo", "run", "smooth", "compare", "convert", "config"):
         assert name in answer.out
 
 
@@ -61,11 +61,11 @@ def test_run_writes_its_files_and_prints_the_errors(
 
 
 def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.yaml").write_text("window: {n_recent: 4}\nfeatures: {n_features: 300}\n")
+    (tmp_path / "c.yaml").write_text("window: {size: 4}\nfeatures: {n_features: 300}\n")
     settings = ["--config", tmp_path / "c.yaml", "--set", "features.n_features=400"]
     command("run", room_bag, "--out", tmp_path / "out", *settings)
     configuration = json.loads((tmp_path / "out/summary.json").read_text())["configuration"]
-    assert configuration["window"]["n_recent"] == 4
+    assert configuration["window"]["size"] == 4
     assert configuration["features"]["n_features"] == 400
     rows = (tmp_path / "out/frames.csv").read_text().splitlines()[1:]
     assert all(int(row.split(",")[2]) <= 400 for row in rows)
@@ -201,3 +201,140 @@ def test_a_signal_ends_the_run_with_its_code_and_complete_files(
     assert (process.returncode, errors) == (code, b"")
     n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
     assert len(n_poses) == 1
+
+
+def write_poses(path: Path, n: int = 20) -> Path:
+    path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(n)))
+    return path
+
+
+def test_smooth_writes_a_run_folder_and_compares(command: Command, tmp_path: Path) -> None:
+    poses = write_poses(tmp_path / "poses.txt")
+    options = ["--sigma", "0.1,0.02", "--ground-truth", poses, "--keyframes", "manual"]
+    answer = command("smooth", poses, poses, "--out", tmp_path / "out", *options)
+    assert answer.code == 0, answer.err
+    assert "20 poses, 38 edges" in answer.out
+    assert "smoothed" in answer.out
+    assert answer.err == ""
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {
+        *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
+        *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+        "frames.csv",
+        "summary.json",
+        "trajectories.png",
+    }
+
+
+def test_smooth_tells_what_it_decides_for_a_pose_graph(command: Command, tmp_path: Path) -> None:
+    edge = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
+    path = tmp_path / "graph.g2o"
+    path.write_text(edge)
+    answer = command("smooth", path, "--out", tmp_path / "out", "--set", "window.gate=9")
+    assert answer.code == 0, answer.err
+    assert "window.size: null" in answer.out
+    assert "window.gate" not in answer.out
+    assert (tmp_path / "out/smoothed.g2o").read_text().splitlines()[-1] == edge.strip()
+
+
+def test_smooth_prints_the_price_of_the_window(command: Command, tmp_path: Path) -> None:
+    poses = write_poses(tmp_path / "poses.txt")
+    others = tmp_path / "others.txt"
+    others.write_text("".join(f"{i} {i * i} {0.3 * (i % 3)} {i} 0 0 0 1\n" for i in range(20)))
+    answer = command("smooth", poses, others, "--out", tmp_path / "out", "--compare")
+    assert answer.code == 0, answer.err
+    rows = [line.split("  ")[0] for line in answer.out.splitlines()]
+    assert {"window", "full iSAM2", "batch LM"} <= set(rows)
+    smoothing = json.loads((tmp_path / "out/summary.json").read_text())["smoothing"]
+    assert [row["smoothing"] for row in smoothing] == ["window", "full iSAM2", "batch LM"]
+    assert smoothing[-1]["error"] > 0.1
+    assert smoothing[0]["above_least_pct"] >= -1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["missing.g2o"], ["missing.g2o", "does not exist"]),
+        (["text.g2o"], ["text.g2o:1"]),
+        (["text.bag"], ["text.bag"]),
+        (["poses.txt", "--topic", "/odom"], ["--topic /odom", "poses.txt"]),
+        (["poses.txt", "--sigma", "1"], ["--sigma 1", "0.1,0.02"]),
+        (["poses.txt", "--sigma", "1,2", "--sigma", "1,2"], ["2 times for 1 inputs"]),
+        (["graph.g2o", "--sigma", "1,2"], ["--sigma", "graph.g2o"]),
+        (["graph.g2o", "poses.txt"], ["graph.g2o", "one input"]),
+        (["-", "poses.txt"], ["standard input"]),
+        (["-", "--topic", "/odom"], ["standard input", "--topic"]),
+        (["poses.txt", "--set", "window.siz=3"], ["window.size"]),
+        (["poses.txt", "--ground-truth", "missing.txt"], ["missing.txt"]),
+        (["{room}"], ["holds no poses"]),
+    ],
+)
+def test_bad_input_to_smooth_gets_one_line_and_exit_code_2(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    room_bag: Path,
+    tmp_path: Path,
+    *,
+    arguments: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("text.g2o", "text.bag"):
+        Path(name).write_text("No graph\n")
+    Path("graph.g2o").write_text("EDGE3 0 1 1 0 0 0 0 0\n")
+    write_poses(Path("poses.txt"))
+    given = [argument.format(room=room_bag) for argument in arguments]
+    answer = command("smooth", *given, "--out", "out")
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    for word in words:
+        assert word in answer.err
+
+
+def pipe(out: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*GVO, "smooth", "-", "--out", str(out)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+    )
+
+
+def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:
+    process = pipe(tmp_path)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    answers = []
+    lines = ["a,0", "b,100000000,a,0,0,1,0,0,0,1", "nonsense", "c,200000000,b,0,0,1,0,0,0,1"]
+    for line in lines:
+        # an answer must come before the next line is sent
+        process.stdin.write(f"{line}\n")
+        answers.append(process.stdout.readline())
+    rest, errors = process.communicate(timeout=60)
+    assert [answer.split(",")[0] for answer in answers if answer[0] != "{"] == ["a", "b", "c"]
+    assert json.loads(answers[2])["error"].startswith("line 3:")
+    assert rest == ""
+    assert process.returncode == 3
+    assert "3 poses, 2 edges" in errors
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 3
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_waiting_pipe_with_complete_files(
+    tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    process = pipe(tmp_path)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    for line in ("a,0", "b,100000000,a,0,0,1,0,0,0,1"):
+        process.stdin.write(f"{line}\n")
+        process.stdout.readline()
+    process.send_signal(number)
+    # the input stays open: it is the signal that ends the waiting
+    assert process.wait(timeout=60) == code
+    _, errors = process.communicate(timeout=60)
+    assert errors == ""
+    for name in ("raw", "causal", "smoothed"):
+        assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 2

@@ -37,17 +37,17 @@ def test_a_file_that_sets_nothing_is_the_default(tmp_path: Path, text: str) -> N
 
 
 def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
-    path = write(tmp_path, "window:\n  n_recent: 7\ndepth:\n  scale: 2000\n")
+    path = write(tmp_path, "window:\n  size: 7\ndepth:\n  scale: 2000\n")
     config = load_configuration(path)
-    assert config.window.n_recent == 7
+    assert config.window.size == 7
     assert config.depth.scale == 2000.0
     assert config.window.n_keyframes == Config().window.n_keyframes
 
 
 def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:
-    path = write(tmp_path, "window:\n  n_recent: 7\n  n_links: 4\n")
-    config = load_configuration(path, ["window.n_recent=8", " window.n_recent = 9 "])
-    assert (config.window.n_recent, config.window.n_links) == (9, 4)
+    path = write(tmp_path, "window:\n  size: 7\n  n_links: 4\n")
+    config = load_configuration(path, ["window.size=8", " window.size = 9 "])
+    assert (config.window.size, config.window.n_links) == (9, 4)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_values_of_settings_are_yaml(setting: str, value: float | None) -> None:
 @pytest.mark.parametrize(
     ("setting", "nearest"),
     [
-        ("window.n_recnt=5", "window.n_recent"),
+        ("window.sizee=5", "window.size"),
         ("ransac.n_hypothesis=5", "ransac.n_hypotheses"),
         ("features.n_feature=500", "features.n_features"),
         ("stereo.sigma=1", "stereo.sigma_px"),
@@ -92,7 +92,7 @@ def test_an_unknown_section_names_the_nearest(tmp_path: Path, section: str, near
 @pytest.mark.parametrize(
     ("setting", "key"),
     [
-        ("window.n_recent=1", "window.n_recent"),
+        ("window.size=1", "window.size"),
         ("window.min_overlap=1.5", "window.min_overlap"),
         ("stereo.max_distance=0", "stereo.max_distance"),
         ("depth.scale=-5", "depth.scale"),
@@ -102,9 +102,8 @@ def test_an_unknown_section_names_the_nearest(tmp_path: Path, section: str, near
         ("ransac.seed=-1", "ransac.seed"),
         ("ransac.seed=1.5", "ransac.seed"),
         ("features.kind=akaze", "features.kind"),
-        ("window.n_recent=five", "window.n_recent"),
-        ("window.n_recent=[5]", "window.n_recent"),
-        ("window.n_recent=", "window.n_recent"),
+        ("window.size=five", "window.size"),
+        ("window.size=[5]", "window.size"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(setting: str, key: str) -> None:
@@ -113,7 +112,7 @@ def test_values_out_of_range_are_refused_by_name(setting: str, key: str) -> None
 
 
 def test_a_choice_names_its_alternatives() -> None:
-    message = refusal(settings=("window.kernel=cauchy",))
+    message = refusal(settings=("window.kernel=tukey",))
     assert "huber" in message
     assert "none" in message
 
@@ -185,7 +184,7 @@ def test_the_description_tells_unit_range_and_choices() -> None:
     }
     assert "[1/m, > 0]" in lines["scale"]
     assert "[px, >= 1, <= 20]" in lines["patch_radius_px"]
-    assert "huber | none" in lines["kernel"]
+    assert "none | huber | cauchy" in lines["kernel"]
 
 
 changed = st.fixed_dictionaries(
@@ -198,9 +197,9 @@ changed = st.fixed_dictionaries(
         "stereo": st.fixed_dictionaries({"sigma_px": st.floats(1e-300, 1e300)}),
         "window": st.fixed_dictionaries(
             {
-                "n_recent": st.integers(2, 100),
+                "size": st.none() | st.integers(2, 100),
                 "min_overlap": st.floats(0.0, 1.0),
-                "kernel": st.sampled_from(["huber", "none"]),
+                "kernel": st.sampled_from(["huber", "none", "dcs"]),
             }
         ),
     },
@@ -224,4 +223,4 @@ def test_the_description_is_plain_yaml() -> None:
 def test_a_configuration_cannot_be_changed() -> None:
     config = Config()
     with pytest.raises(ValidationError, match="frozen"):
-        config.window.n_recent = 4  # type: ignore[misc]
+        config.window.size = 4  # type: ignore[misc]

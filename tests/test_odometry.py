@@ -1,23 +1,29 @@
 """Odometry on frames rendered of a textured box, with known poses."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from gvo.config import Config
+from gvo.chain import RawStep
+from gvo.config import Config, WindowConfig
+from gvo.frontend.klt import KltFrontend
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry import FrameResult, Odometry, zero_motion_edge
 from gvo.types import (
     DepthArray,
     Estimate,
+    Failure,
     FloatArray,
     Frame,
     ImageArray,
+    RelativePose,
     RgbdFrame,
     Status,
     StereoFrame,
@@ -113,7 +119,7 @@ def configure(threads: int = 1, **window: object) -> Config:
             "depth": {"min_depth_m": 0.5, "max_depth_m": 10.0},
             "temporal": {"radius_px": 15.0, "wide_radius_px": 40.0},
             "ransac": {"n_hypotheses": 100, "min_inliers": 12, "min_disparity_px": 2.0},
-            "window": {"n_recent": 4, "n_keyframes": 4, "n_links": 3} | window,
+            "window": {"size": 4, "n_keyframes": 4, "n_links": 3} | window,
             "runtime": {"threads": threads},
         }
     )
@@ -217,9 +223,9 @@ def test_a_second_run_is_equal_bit_for_bit_whatever_the_threads(threads: int) ->
 @pytest.mark.parametrize(
     "window",
     [
-        {"n_recent": 2, "n_keyframes": 0, "n_links": 1},
-        {"n_recent": 12, "n_keyframes": 8, "n_links": 6, "keyframe_overlap": 0.97},
-        {"kernel": "none"},
+        {"size": 2, "n_keyframes": 0, "n_links": 1},
+        {"size": 12, "n_keyframes": 8, "n_links": 6, "keyframe_overlap": 0.97},
+        {"kernel": "cauchy"},
         {"link_sigma_factor": 0.1},
     ],
 )
@@ -230,14 +236,14 @@ def test_the_raw_chain_does_not_depend_on_the_window(window: dict[str, Any]) -> 
     assert not same_estimates((r.causal for r in results), (r.causal for r in others))
 
 
-@pytest.mark.parametrize("n_recent", [2, 5, 100])
-def test_every_frame_is_finished_exactly_once(n_recent: int) -> None:
-    odometry = Odometry(CAMERA, configure(n_recent=n_recent, n_keyframes=2))
+@pytest.mark.parametrize("size", [2, 5, 100])
+def test_every_frame_is_finished_exactly_once(size: int) -> None:
+    odometry = Odometry(CAMERA, configure(size=size, n_keyframes=2))
     finished: list[int] = []
     for index in range(10):
         result = odometry.track(stereo_frame(index))
         finished += [estimate.stamp_ns for estimate in result.finished]
-        assert len(finished) >= index + 1 - n_recent - 3
+        assert len(finished) >= index + 1 - size - 3
     finished += [estimate.stamp_ns for estimate in odometry.finish()]
     assert sorted(finished) == [index * STEP_NS for index in range(10)]
     assert not odometry.finish()
@@ -277,7 +283,7 @@ def test_a_blank_image_is_coasted_over_without_a_jump() -> None:
 
 @pytest.mark.parametrize("n_keyframes", [0, 4])
 def test_a_gap_longer_than_the_window_is_bridged(n_keyframes: int) -> None:
-    config = configure(n_recent=2, n_keyframes=n_keyframes, keyframe_overlap=0.5, n_links=1)
+    config = configure(size=2, n_keyframes=n_keyframes, keyframe_overlap=0.5, n_links=1)
     results, smoothed = run(with_blanks(range(4, 9), 12), config)
     statuses = [result.status for result in results]
     assert statuses == (
@@ -320,3 +326,189 @@ def test_stamps_may_start_at_zero_or_before() -> None:
     ]
     results, _ = run(frames, configure())
     assert [result.status for result in results] == [Status.OK] * 3
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A frame of another sensor, at a known pose; None where it saw nothing."""
+
+    stamp_ns: int
+    T_world_scan: FloatArray | None
+
+
+class ScanFrontend:
+    """Registers scans by their poses, a little wrong; returns no more than it has to."""
+
+    def __init__(self) -> None:
+        self.pairs: list[tuple[int, int]] = []
+
+    def extract(self, frame: Scan) -> Scan:
+        return frame
+
+    def register(
+        self, reference: Scan, current: Scan, prior: FloatArray | None
+    ) -> RelativePose | Failure:
+        self.pairs.append((reference.stamp_ns, current.stamp_ns))
+        if reference.T_world_scan is None or current.T_world_scan is None:
+            return Failure(reason="an empty scan")
+        rng = np.random.default_rng([reference.stamp_ns, current.stamp_ns])
+        T = se3.invert(reference.T_world_scan) @ current.T_world_scan
+        noise = se3.exp(1e-3 * rng.normal(size=6))
+        return RelativePose(T_reference_current=T @ noise, covariance=1e-6 * np.eye(6))
+
+
+def scan_pose(index: int) -> FloatArray:
+    return se3.exp(np.array([0.0, 0.02, 0.0, 0.3, 0.0, 0.0]) * index)
+
+
+def run_scans(n: int, empty: int = -1) -> tuple[list[FrameResult], ScanFrontend]:
+    frontend = ScanFrontend()
+    config = Config.model_validate({"window": {"size": 3, "keyframe_distance_m": 1.0}})
+    odometry = Odometry(config=config, frontend=frontend)
+    scans = [Scan(i * STEP_NS, None if i == empty else scan_pose(i)) for i in range(n)]
+    return [odometry.track(scan) for scan in scans], frontend
+
+
+def test_a_front_end_of_ones_own_needs_no_camera_and_counts_nothing() -> None:
+    results, _ = run_scans(20)
+    assert [result.status for result in results] == [Status.OK] * 20
+    for index, result in enumerate(results):
+        for estimate in (result.raw, result.causal):
+            np.testing.assert_allclose(estimate.T_world_cam, scan_pose(index), atol=0.03)
+        assert (result.n_keypoints, result.n_points) == (0, 0)
+        assert (result.n_matches, result.n_inliers) == (0, 0)
+
+
+def test_its_keyframes_are_chosen_by_distance() -> None:
+    results, frontend = run_scans(30)
+    links = [(a, b) for a, b in frontend.pairs if b - a > STEP_NS]
+    assert links
+    # A keyframe every fourth scan, the first to be 1 m away; 0.3 m each.
+    assert {a // STEP_NS for a, _ in links} <= set(range(0, 30, 4))
+    assert max(b - a for a, b in links) > 10 * STEP_NS
+    assert max(result.n_links for result in results) == 3
+
+
+def test_an_empty_scan_is_coasted_over() -> None:
+    results, _ = run_scans(12, empty=6)
+    assert [r.status for r in results[5:8]] == [Status.OK, Status.COASTING, Status.RESUMED]
+    assert results[6].reason == "an empty scan"
+    np.testing.assert_allclose(results[11].raw.T_world_cam, scan_pose(11), atol=0.03)
+
+
+def test_neither_camera_nor_front_end_is_misuse() -> None:
+    with pytest.raises(ValueError, match="needs a camera, or a front-end"):
+        Odometry()
+
+
+def configure_klt(**window: Any) -> Config:
+    values = configure(**window).model_dump()
+    return Config.model_validate(values | {"frontend": {"kind": "klt"}})
+
+
+@cache
+def klt_run() -> tuple[list[FrameResult], list[Estimate]]:
+    return run(map(stereo_frame, range(N_FRAMES)), configure_klt())
+
+
+def test_tracks_follow_the_camera_more_closely_than_whole_pixels() -> None:
+    results, smoothed = klt_run()
+    descriptors, _ = stereo_run()
+    assert all(result.status == Status.OK for result in results)
+    for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
+        assert position_errors(estimates).max() < 0.02
+    ours, theirs = (position_errors(r.raw for r in each) for each in (results, descriptors))
+    assert np.mean(ours) < 0.7 * np.mean(theirs)
+    # A track starts at a point of the frame before.
+    for before, result in pairwise(results):
+        assert 12 <= result.n_inliers <= result.n_matches <= before.n_points
+
+
+def test_a_front_end_handed_in_gives_what_its_name_gives() -> None:
+    config = configure_klt()
+    odometry = Odometry(config=config, frontend=KltFrontend(CAMERA, config))
+    again = [odometry.track(stereo_frame(index)) for index in range(6)]
+    named = klt_run()[0][:6]
+    assert same_estimates((r.raw for r in again), (r.raw for r in named))
+    assert same_estimates((r.causal for r in again), (r.causal for r in named))
+
+
+def depth_frame(stamp_ns: int, x_m: float, seed: int) -> RgbdFrame:
+    """Return the view of a camera moved to the right and ahead, with a sensor's noise."""
+    T = np.eye(4)
+    T[:3, 3] = [x_m, 0.0, 0.5 * x_m]
+    image, depth = render(T)
+    grey = image + np.random.default_rng(seed).normal(scale=1.5, size=image.shape)
+    return RgbdFrame(
+        stamp_ns=stamp_ns, image=np.clip(np.rint(grey), 0, 255).astype(np.uint8), depth=depth
+    )
+
+
+def walk(positions_m: Iterable[float], config: Config) -> tuple[list[FrameResult], list[Estimate]]:
+    camera = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
+    frames = [depth_frame(i * STEP_NS, x, i) for i, x in enumerate(positions_m)]
+    return run(frames, config, camera)
+
+
+def path_length(estimates: Iterable[Estimate]) -> float:
+    positions = np.array([estimate.T_world_cam[:3, 3] for estimate in estimates])
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+def test_edges_without_motion_still_a_camera_that_stands(kind: str) -> None:
+    configurations = [
+        Config.model_validate(
+            configure(zero_motion=switch).model_dump() | {"frontend": {"kind": kind}}
+        )
+        for switch in (False, True)
+    ]
+    (off, smoothed_off), (on, smoothed_on) = (walk([0.0] * 14, c) for c in configurations)
+    # In the window from the second frame on; the raw chain knows nothing of them.
+    assert sum(r.n_links for r in on) >= sum(r.n_links for r in off) + 10
+    assert same_estimates((r.raw for r in on), (r.raw for r in off))
+    assert path_length(smoothed_on) < 0.9 * path_length(smoothed_off)
+
+
+def test_a_creeping_camera_is_not_frozen() -> None:
+    steps = 0.005 * np.arange(33)
+    config = configure_klt(zero_motion=True)
+    results, smoothed = walk(steps, config)
+    true_length = float(steps[-1] * np.hypot(1.0, 0.5))
+    went = np.linalg.norm(smoothed[-1].T_world_cam[:3, 3])
+    assert went == pytest.approx(true_length, rel=0.02)
+    assert path_length(smoothed) > 0.98 * true_length  # noise lengthens a path
+    off, _ = walk(steps, configure_klt(zero_motion=False))
+    assert sum(r.n_links for r in results) == sum(r.n_links for r in off)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_still"),
+    [
+        ({}, True),
+        ({"flow_px": 1.5}, False),
+        ({"flow_px": None}, False),
+        ({"is_registered": False}, False),
+        ({"covariance": 1e-9 * np.eye(6)}, False),
+    ],
+)
+def test_standstill_is_no_flow_and_no_significant_motion(
+    changes: dict[str, Any], is_still: bool
+) -> None:
+    estimate = Estimate(stamp_ns=7, T_world_cam=np.eye(4), covariance=np.eye(6))
+    step = RawStep(
+        estimate=estimate,
+        reference_ns=3,
+        T_reference_frame=se3.exp(np.full(6, 1e-3)),
+        covariance=1e-6 * np.eye(6),
+        is_registered=True,
+        flow_px=0.2,
+    )
+    config = WindowConfig(zero_motion=True, zero_motion_sigma_factor=0.5)
+    edge = zero_motion_edge(replace(step, **changes), config)
+    assert (edge is not None) == is_still
+    if edge is not None:
+        assert edge.reference_id == 3
+        np.testing.assert_array_equal(edge.T_reference_frame, np.eye(4))
+        np.testing.assert_allclose(edge.covariance, 0.25e-6 * np.eye(6))
+    assert zero_motion_edge(step, WindowConfig(zero_motion=False)) is None

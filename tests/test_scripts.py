@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import gvo
+from gvo.geometry import se3
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 # The scripts import the same package as the tests do.
@@ -59,9 +62,72 @@ def test_a_data_set_folder_becomes_a_bag(gvo_data: Path, tmp_path: Path) -> None
     assert gvo.open_recording(tmp_path / "e.mcap").info.n_images == 50
 
 
+def test_edges_of_a_table_are_smoothed(tmp_path: Path) -> None:
+    row = "0,0,{},0,0,0,1,0.01,0.1"
+    rows = [f"b,100000000,a,{row.format(1)}", f"c,200000000,b,{row.format(1)}"]
+    rows.append(f"c,200000000,a,{row.format(2.1)}")
+    path = tmp_path / "edges.csv"
+    path.write_text("\n".join(rows) + "\n")
+    smoothed = run("smooth_edges", path)
+    assert smoothed.returncode == 0, smoothed.stderr
+    lines = [line for line in smoothed.stdout.splitlines() if line.startswith("smoothed")]
+    assert [line.split()[1] for line in lines] == ["a", "b", "c"]
+    # two thirds of the disagreement of 0.1 m go to the chain, which is twice as unsure
+    assert "2.0667" in lines[-1]
+
+
+def write_poses(path: Path, *, scale: float = 1.0) -> Path:
+    turn = [np.array([0.0, 0.02, 0.0, 0.0, 0.0, scale])] * 60
+    T = [np.eye(4)]
+    for twist in turn:
+        T.append(T[-1] @ se3.exp(twist))
+    path.write_text("".join(" ".join(map(str, pose[:3].ravel())) + "\n" for pose in T))
+    return path
+
+
+def test_a_pose_stream_is_smoothed_with_loops(tmp_path: Path) -> None:
+    drifting = write_poses(tmp_path / "drifting.txt", scale=1.02)
+    true = write_poses(tmp_path / "true.txt")
+    alone = run("smooth_pose_stream", drifting)
+    assert alone.returncode == 0, alone.stderr
+    assert "61 poses; the last one is 0.00 m from the odometry's" in alone.stdout
+    tied = run("smooth_pose_stream", drifting, "--loops", true)
+    assert tied.returncode == 0, tied.stderr
+    moved = float(tied.stdout.splitlines()[-1].split("last one is ")[1].split(" m")[0])
+    assert moved > 0.3
+
+
+def test_two_trajectories_are_fused_and_compared(tmp_path: Path) -> None:
+    true = write_poses(tmp_path / "true.txt")
+    paths = [write_poses(tmp_path / f"{s}.txt", scale=s) for s in (0.96, 1.02)]
+    fused = run("fuse_trajectories", true, *paths, "--out", tmp_path / "out")
+    assert fused.returncode == 0, fused.stderr
+    rows = {line.split()[0]: line.split() for line in fused.stdout.splitlines()[2:]}
+    assert set(rows) == {"0.96", "1.02", "smoothed"}
+    assert float(rows["smoothed"][3]) < float(rows["1.02"][3]) < float(rows["0.96"][3])
+
+
+def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(tmp_path: Path) -> None:
+    options = ["--world", "handheld", "--sensor", "rgbd", "--frames", 6]
+    assert run("make_demo_bag", tmp_path / "room.bag", *options).returncode == 0
+    answer = run("odometry_of_opencv", tmp_path / "room.bag")
+    if not hasattr(cv2, "Odometry"):
+        assert answer.returncode == 2
+        assert "has no cv2.Odometry" in answer.stderr
+        return
+    assert answer.returncode == 0, answer.stderr
+    errors = [float(line.split("ATE ")[1].split()[0]) for line in answer.stdout.splitlines()]
+    assert len(errors) == 3
+    assert max(errors) < 0.02
+
+
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
+        ("smooth_edges", ["missing.csv"]),
+        ("smooth_pose_stream", ["missing.txt"]),
+        ("fuse_trajectories", ["missing.txt", "missing.txt"]),
+        ("odometry_of_opencv", ["missing"]),
         ("run_bag", ["missing.bag", "out"]),
         ("compare_trajectories", ["missing.txt", "missing.txt"]),
         ("convert_dataset", ["missing", "out.bag"]),

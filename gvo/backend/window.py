@@ -1,51 +1,109 @@
-"""A sliding window of poses, smoothed by iSAM2 with marginalization.
-
-References
-----------
-M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree", IJRR 31(2),
-2012, doi:10.1177/0278364911430419.
-"""
+"""A sliding window of poses, smoothed by iSAM2 with marginalization."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
 
 import gtsam
 import numpy as np
 
-from gvo.backend.noise import check_covariance, check_transform, edge_noise
+from gvo.backend.checks import find_faults, pose_fault, prior_fault, sane_covariance
+from gvo.backend.comparison import MeasurementLog
+from gvo.backend.export import g2o_lines
+from gvo.backend.factors import Factors
+from gvo.backend.gating import Verdict, disagreement, judge
+from gvo.backend.graph import PoseGraph, definite, first_line
+from gvo.backend.ledger import Ledger, WindowCounts
+from gvo.backend.motion import Motion
+from gvo.backend.polish import Polish, polish
+from gvo.coasting import StatusClock
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, FrameId, Status
+from gvo.keyframe_policy import choose_released, is_needed, proximity
+from gvo.types import (
+    Edge,
+    Estimate,
+    FloatArray,
+    FrameId,
+    GraphEdge,
+    PosePrior,
+    PositionPrior,
+    Prior,
+    Rejected,
+    Status,
+)
 
-# Of the first pose, which defines the world: radians and metres.
-_ORIGIN_SIGMA = 1e-5
+Keeping = Literal["manual", "distance"]
+
+_LOGGER = logging.getLogger(__name__)
+
+# Of a first pose without a prior, which defines the world: radians and metres.
+_ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
+# Of a first pose of which the position alone is known: radians, and metres beside its prior.
+_UNKNOWN_SIGMAS = np.repeat([1.0, 1e4], 3)
 
 
 @dataclass(slots=True, kw_only=True)
 class _Member:
-    """A pose of the window."""
+    """A pose of the window, with what was measured of it."""
 
     key: int
     stamp_ns: int
-    status: Status
+    edges: list[Edge]
+    priors: list[Prior]
     is_kept: bool = False
+    status: Status = Status.OK
+    causal: Estimate | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class _Arrival:
+    """A pose on its way into the window, with what is usable of its measurements.
+
+    `anchor` and `coasting` hold it where the measurements do not; they are none themselves.
+    """
+
+    frame_id: FrameId
+    key: int
+    stamp_ns: int
+    T_world_start: gtsam.Pose3
+    edges: list[Edge] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    rejected: list[Rejected] = field(default_factory=list)
+    anchor: PosePrior | None = None
+    coasting: Edge | None = None
+
+    @property
+    def is_measured(self) -> bool:
+        """Tell whether a measurement ties the pose, or it is the origin."""
+        return bool(self.edges or self.priors or self.anchor is _ORIGIN)
 
 
 class SlidingWindow:
     """Recent poses and kept keyframes, tied by relative poses of any origin.
 
-    A pose leaves when it is neither recent nor kept; what was known of it stays as a
-    marginal on the poses it was tied to. It is then handed over by `pop_finished`.
+    A pose leaves when it is neither recent nor kept; what was known of it stays as a marginal on
+    the poses it was tied to. It is then handed over by `pop_finished`. With `window.size: null`
+    nothing leaves, and `finish` polishes the result by Levenberg-Marquardt.
+
+    Whatever the measurements hold, the window goes on: an edge or a prior that GTSAM could not
+    live with, or that the others contradict, is refused with a reason (`Rejected`), and a pose
+    without a usable edge continues the last velocity.
 
     Parameters
     ----------
     config : WindowConfig, optional
-        Number of recent poses, robust kernel.
+        Number of recent poses, robust kernel, gate.
+    keyframes : {"manual", "distance"}
+        Who keeps poses: the caller by `keep` and `release`, or the window, by distance and angle
+        (`window.keyframe_distance_m`, `window.keyframe_angle_deg`, `window.n_keyframes`).
+    log : MeasurementLog, optional
+        Is given all that goes in, to compare ways of smoothing it; grows with every pose.
 
     Examples
     --------
@@ -59,22 +117,27 @@ class SlidingWindow:
     [0.0, 0.0, 1.0]
     """
 
-    def __init__(self, config: WindowConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: WindowConfig | None = None,
+        *,
+        keyframes: Keeping = "manual",
+        log: MeasurementLog | None = None,
+    ) -> None:
+        if keyframes not in get_args(Keeping):
+            raise ValueError(f"keyframes must be one of {get_args(Keeping)}, got {keyframes!r}")
         self._config = config or WindowConfig()
-        self._members: OrderedDict[FrameId, _Member] = OrderedDict()
+        self._keeps_by_distance = keyframes == "distance"
+        self._factors = Factors(self._config)
+        self._graph = self._new_graph()
+        self._members: dict[FrameId, _Member] = {}
         self._finished: list[Estimate] = []
         self._n_keys = 0
-        parameters = gtsam.ISAM2Params()
-        # Cholesky calls the system indeterminate once the drift's variance is 4096^2 times
-        # that of an edge; QR does not.
-        parameters.setFactorization("QR")
-        parameters.setRelinearizeThreshold(0.01)
-        parameters.relinearizeSkip = 1
-        parameters.findUnusedFactorSlots = True
-        # Carry every change through to the oldest pose: by default small ones are left out, which
-        # costs what smoothing gains where edges are good to a tenth of a millimetre.
-        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        self._isam = gtsam.ISAM2(parameters)
+        self._ledger = Ledger()
+        self._clock = StatusClock(self._config.lost_after_s)
+        self._motion = Motion(self._config)
+        self._polish: Polish | None = None
+        self._log = log
 
     def __contains__(self, frame_id: object) -> bool:
         """Tell whether a frame is in the window."""
@@ -84,14 +147,29 @@ class SlidingWindow:
         """Return the number of poses in the window."""
         return len(self._members)
 
+    @property
+    def newest(self) -> FrameId:
+        """The newest frame of the window; None while it is empty."""
+        return next(reversed(self._members), None)
+
+    @property
+    def counts(self) -> WindowCounts:
+        """What was taken and refused so far."""
+        return self._ledger.counts
+
+    @property
+    def polish(self) -> Polish | None:
+        """What `finish` gained by Levenberg-Marquardt, where the window kept everything."""
+        return self._polish
+
     def add_pose(
         self,
         frame_id: FrameId,
         stamp_ns: int,
         edges: Sequence[Edge],
+        prior: Prior | None = None,
         *,
-        T_world_frame: FloatArray | None = None,
-        status: Status = Status.OK,
+        status: Status | None = None,
     ) -> Estimate:
         """Add a pose, smooth the window, and let poses leave that are neither recent nor kept.
 
@@ -102,41 +180,89 @@ class SlidingWindow:
         stamp_ns : int
             Nanoseconds, later than that of the pose before.
         edges : sequence of Edge
-            Relative poses to poses in the window; none for the very first one only.
-        T_world_frame : ndarray of float64, shape (4, 4), optional
-            The very first pose; the identity where omitted.
-        status : Status
-            Handed through to the estimates.
+            Relative poses to poses in the window; none for the very first one. They are gated
+            against each other. Where none is usable the pose continues the last velocity.
+        prior : PosePrior or PositionPrior, optional
+            What is known of the pose in the world. The very first pose is the identity where it
+            has none; of a position alone its rotation starts there, free to turn.
+        status : Status, optional
+            Handed through to the estimates; found by the window where omitted.
 
         Returns
         -------
         Estimate
-            The causal pose: the best at this moment, with its marginal covariance.
+            The causal pose: the best at this moment, with its marginal covariance, and what was
+            refused.
 
         Raises
         ------
         ValueError
-            A known name, a stamp that does not advance, an edge to a pose that is not in the
-            window, a matrix that is no rotation or no covariance.
-        SmoothingError
-            When GTSAM fails all the same; the window stands as it was before.
+            A name that is in the window already, a stamp that does not advance, edges of the
+            very first pose. The window stands as before.
         """
-        self._check(frame_id, stamp_ns, edges, T_world_frame)
-        key = self._n_keys
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if edges:
-            self._add_edges(graph, key, edges)
-            start = self._start_value(edges)
-        else:
-            start = np.eye(4) if T_world_frame is None else T_world_frame
-            origin = gtsam.noiseModel.Isotropic.Sigma(6, _ORIGIN_SIGMA)
-            graph.add(gtsam.PriorFactorPose3(key, gtsam.Pose3(start), origin))
-        values.insert(key, gtsam.Pose3(start))
-        with self._restored_on_error(frame_id):
-            self._n_keys += 1
-            self._members[frame_id] = _Member(key=key, stamp_ns=stamp_ns, status=status)
-            self._update(graph, values, new_key=key)
-            return self._estimate(frame_id)
+        edges = _as_edges(frame_id, edges)
+        self._check_arrival(frame_id, stamp_ns, edges, prior)
+        arrival = self._receive(frame_id, int(stamp_ns), edges, prior)
+        estimate = self._enter(arrival, status)
+        self._motion.append(estimate, is_measured=arrival.is_measured)
+        if self._keeps_by_distance and frame_id in self._members:
+            self._keep_by_distance(frame_id)
+        return estimate
+
+    def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate | Rejected:
+        """Tie two poses that are both in the window, as a loop does.
+
+        Parameters
+        ----------
+        frame_id : hashable
+            The frame that the edge measures in its `reference_id`.
+        edge : Edge
+
+        Returns
+        -------
+        Estimate or Rejected
+            The frame's pose with the edge; falsy where the edge was refused.
+        """
+        self._find(frame_id)
+        _as_edges(frame_id, [edge])
+        fault = self._membership_fault(frame_id, edge) or find_faults([edge])[0]
+        gated = "" if fault or self._config.gate is None else self._gate_loop(frame_id, edge)
+        if fault or gated:
+            return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
+        member = self._members[frame_id]
+        reference_key = self._members[edge.reference_id].key
+        answer = self._extend(
+            frame_id, self._factors.between(reference_key, member.key, edge), edge=edge
+        )
+        if isinstance(answer, Estimate):
+            member.edges.append(edge)
+            self._ledger.add(n_edges=1)
+        return answer
+
+    def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
+        """Tie a pose of the window to the world.
+
+        Parameters
+        ----------
+        frame_id : hashable
+        prior : PosePrior or PositionPrior
+
+        Returns
+        -------
+        Estimate or Rejected
+            The frame's pose with the prior; falsy where the prior was refused.
+        """
+        _check_prior(frame_id, prior)
+        is_there = self._find(frame_id) is not None
+        fault = prior_fault(prior) if is_there else _absence(frame_id)
+        if fault:
+            return self._reject(frame_id, fault)
+        member = self._members[frame_id]
+        answer = self._extend(frame_id, self._factors.prior(member.key, prior))
+        if isinstance(answer, Estimate):
+            member.priors.append(prior)
+            self._ledger.add(n_priors=1)
+        return answer
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose of the window as a keyframe until it is released."""
@@ -146,18 +272,89 @@ class SlidingWindow:
         """Let a kept pose leave, with the next update after it is no longer recent."""
         self._member(frame_id).is_kept = False
 
+    def kept(self) -> list[FrameId]:
+        """Return the kept frames, oldest first."""
+        return [frame_id for frame_id, member in self._members.items() if member.is_kept]
+
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        key = self._member(frame_id).key
-        return np.asarray(self._isam.calculateEstimatePose3(key).matrix())
+        return self._graph.pose(self._member(frame_id).key)
 
     def poses(self) -> dict[FrameId, FloatArray]:
         """Return T_world_frame of all poses of the window, oldest first."""
         return {frame_id: self.pose(frame_id) for frame_id in self._members}
 
+    def stamp_ns(self, frame_id: FrameId) -> int:
+        """Return the stamp of a pose of the window, nanoseconds."""
+        return self._member(frame_id).stamp_ns
+
     def covariance(self, frame_id: FrameId) -> FloatArray:
         """Return the marginal covariance, shape (6, 6), of a pose of the window."""
-        return np.asarray(self._isam.marginalCovariance(self._member(frame_id).key))
+        self._member(frame_id)
+        return self._final_estimate(frame_id).covariance
+
+    def relative_pose(self, reference_id: FrameId, frame_id: FrameId) -> Edge:
+        """Return the pose of one frame of the window in another, with its covariance.
+
+        Parameters
+        ----------
+        reference_id, frame_id : hashable
+            Two poses of the window.
+
+        Returns
+        -------
+        Edge
+            T_reference_frame; its covariance comes of the joint one of both poses, so that what
+            they do not know together does not count.
+        """
+        reference, member = self._member(reference_id), self._member(frame_id)
+        return Edge(
+            reference_id=reference_id,
+            T_reference_frame=se3.invert(self._graph.pose(reference.key))
+            @ self._graph.pose(member.key),
+            covariance=self._relative_covariance(reference.key, member.key),
+        )
+
+    def graph(self) -> list[GraphEdge]:
+        """Return the measurements between poses of the window, and how the poses fit them.
+
+        What poses that left knew is in the marginals and not listed.
+        """
+        poses = self.poses()
+        found = []
+        for frame_id, member in self._members.items():
+            found += [
+                self._factors.residual_of_edge(
+                    edge, frame_id, poses[edge.reference_id], poses[frame_id]
+                )
+                for edge in member.edges
+                if edge.reference_id in poses
+            ]
+            found += [
+                self._factors.residual_of_prior(prior, frame_id, poses[frame_id])
+                for prior in member.priors
+            ]
+        return found
+
+    def write_g2o(self, path: str | Path) -> None:
+        """Write poses and edges of the window as a g2o file.
+
+        Parameters
+        ----------
+        path : str or Path
+            Whole-number ids are kept, others numbered with their names as comments; priors are
+            left out. Rotations of the information matrix are in radians, as GTSAM reads them.
+
+        Raises
+        ------
+        SmoothingError
+            When the file cannot be written.
+        """
+        text = "".join(f"{line}\n" for line in g2o_lines(self.poses(), self.graph()))
+        try:
+            Path(path).write_text(text, encoding="utf-8", newline="\n")
+        except OSError as error:
+            raise SmoothingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def pop_finished(self) -> list[Estimate]:
         """Hand over the smoothed estimates of the poses that left since the last call."""
@@ -165,129 +362,412 @@ class SlidingWindow:
         return finished
 
     def finish(self) -> list[Estimate]:
-        """Hand over all estimates that were not popped yet, in the order of their stamps."""
-        self._finished += [self._estimate(frame_id) for frame_id in self._members]
-        self._members.clear()
+        """Hand over all estimates that were not popped yet, in the order of their stamps.
+
+        Where the window kept everything they are polished first. It is empty afterwards, ready
+        for another first pose.
+        """
+        if self._config.size is None and self._members:
+            self._finished += self._polished()
+        else:
+            self._finished += [self._final_estimate(frame_id) for frame_id in self._members]
+        self._members = {}
+        self._graph = self._new_graph()
+        self._motion = Motion(self._config)
+        self._clock = StatusClock(self._config.lost_after_s)
         return sorted(self.pop_finished(), key=lambda estimate: estimate.stamp_ns)
 
+    # What comes in
+
+    def _check_arrival(
+        self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
+    ) -> None:
+        try:
+            is_known = frame_id in self._members
+        except TypeError:
+            raise ValueError(f"frame_id must be hashable, got {type(frame_id).__name__}") from None
+        if frame_id is None or is_known:
+            raise ValueError(
+                f"{frame_id!r} is in the window already" if is_known else "no frame_id"
+            )
+        if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
+            raise ValueError(f"stamp_ns of {frame_id!r} must be an int, got {stamp_ns!r}")
+        last = self._motion.last
+        if last is not None and stamp_ns <= last.stamp_ns:
+            raise ValueError(
+                f"stamp {stamp_ns} of {frame_id!r} is not after {last.stamp_ns} of the pose before"
+            )
+        if prior is not None:
+            _check_prior(frame_id, prior)
+        if len(edges) > 0 and last is None:
+            raise ValueError(f"{frame_id!r} is the first pose and can have no edges, only a prior")
+
+    def _membership_fault(self, frame_id: FrameId, edge: Edge, *, is_new: bool = False) -> str:
+        if edge.reference_id == frame_id:
+            return "an edge of a pose to itself"
+        for end in [edge.reference_id] if is_new else [edge.reference_id, frame_id]:
+            if end not in self._members:
+                return _absence(end)
+        return ""
+
+    def _receive(
+        self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
+    ) -> _Arrival:
+        """Sort out what is usable, and find where to start."""
+        arrival = _Arrival(
+            frame_id=frame_id, key=self._n_keys, stamp_ns=stamp_ns, T_world_start=gtsam.Pose3()
+        )
+        self._n_keys += 1
+        if prior is not None:
+            self._receive_prior(arrival, prior)
+        valid = []
+        for edge, fault in zip(edges, find_faults(edges), strict=True):
+            reason = self._membership_fault(frame_id, edge, is_new=True) or fault
+            if reason:
+                self._refuse(arrival, edge, reason)
+            else:
+                valid.append(edge)
+        if valid:
+            self._receive_edges(arrival, valid)
+        else:
+            self._receive_without_edges(arrival)
+        return arrival
+
+    def _receive_prior(self, arrival: _Arrival, prior: Prior) -> None:
+        if fault := prior_fault(prior):
+            arrival.rejected.append(self._ledger.reject(arrival.frame_id, arrival.stamp_ns, fault))
+        else:
+            arrival.priors.append(prior)
+
+    def _receive_edges(self, arrival: _Arrival, edges: list[Edge]) -> None:
+        verdict = self._judge(edges, arrival.stamp_ns)
+        arrival.T_world_start = verdict.T_world_start
+        for edge, reason in zip(edges, verdict.reasons, strict=True):
+            if reason:
+                self._refuse(arrival, edge, reason, is_gated=True)
+            else:
+                arrival.edges.append(edge)
+
+    def _receive_without_edges(self, arrival: _Arrival) -> None:
+        """Start at the prior, else at the origin, else where the last velocity leads."""
+        prior = arrival.priors[0] if arrival.priors else None
+        if isinstance(prior, PosePrior):
+            arrival.T_world_start = gtsam.Pose3(prior.T_world_frame)
+        elif self._motion.last is not None:
+            self._coast(arrival)
+        elif isinstance(prior, PositionPrior):
+            arrival.T_world_start = gtsam.Pose3(gtsam.Rot3(), prior.position_world)
+            arrival.anchor = PosePrior(
+                T_world_frame=arrival.T_world_start.matrix(), covariance=np.diag(_UNKNOWN_SIGMAS**2)
+            )
+        else:
+            arrival.anchor = _ORIGIN
+
+    def _coast(self, arrival: _Arrival) -> None:
+        """Tie the pose to the last one by the velocity so far."""
+        arrival.coasting = self._coasting_edge(arrival.stamp_ns)
+        if arrival.coasting is not None:
+            T_last_frame = gtsam.Pose3(arrival.coasting.T_reference_frame)
+            last_key = self._members[arrival.coasting.reference_id].key
+            arrival.T_world_start = self._graph.pose3(last_key).compose(T_last_frame)
+        elif (prediction := self._motion.predict_pose(arrival.stamp_ns)) is not None:
+            arrival.T_world_start = gtsam.Pose3(prediction[0])
+            arrival.anchor = PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
+
+    def _refuse(
+        self, arrival: _Arrival, edge: Edge, reason: str, *, is_gated: bool = False
+    ) -> None:
+        arrival.rejected.append(
+            self._ledger.reject(
+                arrival.frame_id,
+                arrival.stamp_ns,
+                reason,
+                reference_id=edge.reference_id,
+                is_gated=is_gated,
+            )
+        )
+
+    def _reject(
+        self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False
+    ) -> Rejected:
+        member = self._members.get(frame_id)
+        return self._ledger.reject(
+            frame_id,
+            None if member is None else member.stamp_ns,
+            reason,
+            reference_id=None if edge is None else edge.reference_id,
+            is_gated=is_gated,
+        )
+
+    def _judge(self, edges: list[Edge], stamp_ns: int) -> Verdict:
+        return judge(
+            edges,
+            pose_of=lambda frame_id: self._graph.pose3(self._members[frame_id].key),
+            relative_covariance=lambda reference_id, frame_id: self._relative_covariance(
+                self._members[reference_id].key, self._members[frame_id].key
+            ),
+            motion=lambda: self._coasting_edge(stamp_ns),
+            gate=self._config.gate,
+        )
+
+    def _coasting_edge(self, stamp_ns: int) -> Edge | None:
+        """Return the edge from the last pose, where it is in the window, by the velocity so far."""
+        last = self._motion.last
+        if last is None or last.frame_id not in self._members:
+            return None
+        T_last_frame, covariance = self._motion.predict_step(stamp_ns)
+        return Edge(
+            reference_id=last.frame_id,
+            T_reference_frame=T_last_frame,
+            covariance=covariance,
+            kernel="none",
+        )
+
+    def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
+        """Return why an edge between known poses is refused; empty where it fits them."""
+        reference_key, key = self._members[edge.reference_id].key, self._members[frame_id].key
+        T = se3.invert(self._graph.pose(reference_key)) @ self._graph.pose(key)
+        covariance = self._relative_covariance(reference_key, key)
+        return disagreement(edge, T, covariance, gate=self._config.gate)
+
+    def _relative_covariance(self, reference_key: int, key: int) -> FloatArray:
+        """Return the covariance (6, 6) of T_reference_frame, zero of a pose to itself."""
+        if reference_key == key:
+            return np.zeros((6, 6))
+        joint = self._graph.joint_covariance(reference_key, key)
+        T = se3.invert(self._graph.pose(reference_key)) @ self._graph.pose(key)
+        # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
+        J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
+        return definite(J @ joint @ J.T)
+
+    # What goes into the graph
+
+    def _enter(self, arrival: _Arrival, status: Status | None) -> Estimate:
+        """Put the pose into the graph; where GTSAM gives up, with ever less beside it."""
+        pose = self._insert_safely(arrival)
+        found = self._clock.next(arrival.stamp_ns, is_tied=arrival.is_measured)
+        estimate = Estimate(
+            frame_id=arrival.frame_id,
+            stamp_ns=arrival.stamp_ns,
+            T_world_cam=pose[0],
+            covariance=pose[1],
+            status=status if status and arrival.is_measured else found,
+            rejected=tuple(arrival.rejected),
+        )
+        if arrival.frame_id in self._members:
+            member = self._members[arrival.frame_id]
+            member.status, member.causal = estimate.status, estimate
+        else:
+            self._finished.append(estimate)
+        self._ledger.add(
+            n_poses=1,
+            n_edges=len(arrival.edges),
+            n_priors=len(arrival.priors),
+            n_coasting=int(not arrival.is_measured),
+        )
+        return estimate
+
+    def _insert_safely(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
+        """Return the pose of the new frame and its covariance, whatever GTSAM does."""
+        harden = [self._harden] if self._graph.can_be_hardened else []
+        for simplify in (None, *harden, self._drop_measurements, self._rebuild_for):
+            try:
+                if simplify is not None:
+                    simplify(arrival)
+                return self._insert(arrival)
+            except SmoothingError as error:
+                self._ledger.add(n_restored=1)
+                place = f"{arrival.frame_id!r} at {arrival.stamp_ns} ns"
+                _LOGGER.warning("%s: %s; the window stands as before", place, error)
+        # Not even alone: the pose is handed over as it is reckoned, and never in the window.
+        prediction = self._motion.predict_pose(arrival.stamp_ns)
+        return prediction or (_ORIGIN.T_world_frame, _ORIGIN.covariance)
+
+    def _new_graph(self) -> PoseGraph:
+        return PoseGraph(is_whole=self._config.size is None)
+
+    def _harden(self, _: _Arrival) -> None:
+        """Go on with a graph that takes worse conditioned measurements."""
+        self._graph = self._graph.hardened()
+
+    def _drop_measurements(self, arrival: _Arrival) -> None:
+        for edge in arrival.edges:
+            self._refuse(arrival, edge, "GTSAM gave up on the update")
+        for _ in arrival.priors:
+            rejected = self._ledger.reject(
+                arrival.frame_id, arrival.stamp_ns, "GTSAM gave up on the update"
+            )
+            arrival.rejected.append(rejected)
+        arrival.edges, arrival.priors, arrival.anchor = [], [], None
+        self._receive_without_edges(arrival)
+
+    def _rebuild_for(self, arrival: _Arrival) -> None:
+        """Make the graph anew from its poses and what is known of each; nobody leaves."""
+        graph = PoseGraph(is_whole=self._config.size is None, is_hardened=True)
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for frame_id, member in self._members.items():
+            estimate = self._final_estimate(frame_id)
+            prior = PosePrior(
+                T_world_frame=se3.normalize(estimate.T_world_cam),
+                covariance=sane_covariance(estimate.covariance),
+            )
+            factors.add(self._factors.prior(member.key, prior))
+            values.insert(member.key, gtsam.Pose3(estimate.T_world_cam))
+        with graph.restored_on_error():
+            graph.update(factors, values)
+        self._graph = graph
+        self._ledger.add(n_rebuilt=1)
+        for member in self._members.values():
+            member.edges, member.priors = [], []
+
+    def _insert(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        coasting = [] if arrival.coasting is None else [arrival.coasting]
+        anchors = [] if arrival.anchor is None else [arrival.anchor]
+        for edge in [*arrival.edges, *coasting]:
+            reference_key = self._members[edge.reference_id].key
+            factors.add(self._factors.between(reference_key, arrival.key, edge))
+        for prior in [*arrival.priors, *anchors]:
+            factors.add(self._factors.prior(arrival.key, prior))
+        values.insert(arrival.key, arrival.T_world_start)
+        leaving = self._leaving()
+        keys = [self._members[frame_id].key for frame_id in leaving]
+        alive = [member.key for member in self._members.values()]
+        with self._graph.restored_on_error():
+            self._graph.update(factors, values, alive=alive, leaving=keys)
+            self._graph.settle(
+                arrival.key, arrival.T_world_start, alive=[*alive, arrival.key], leaving=keys
+            )
+            # In this order, before anything leaves: the covariances share most of their work.
+            finished = [self._estimate(frame_id) for frame_id in leaving]
+            pose = self._graph.pose(arrival.key), self._graph.covariance(arrival.key)
+            _check_result(*pose)
+            self._graph.marginalize(keys)
+        if self._log is not None:
+            self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)
+        self._finished += finished
+        self._forget(leaving)
+        self._members[arrival.frame_id] = _Member(
+            key=arrival.key,
+            stamp_ns=arrival.stamp_ns,
+            edges=arrival.edges,
+            priors=arrival.priors,
+        )
+        return pose
+
+    def _extend(
+        self, frame_id: FrameId, factor: gtsam.NonlinearFactor, *, edge: Edge | None = None
+    ) -> Estimate | Rejected:
+        """Add a factor between poses that are there."""
+        factors = gtsam.NonlinearFactorGraph()
+        factors.add(factor)
+        try:
+            with self._graph.restored_on_error():
+                before = self._graph.pose3(self._members[frame_id].key)
+                self._graph.update(factors, gtsam.Values())
+                self._graph.settle(self._members[frame_id].key, before)
+                estimate = self._estimate(frame_id)
+                _check_result(estimate.T_world_cam, estimate.covariance)
+        except SmoothingError as error:
+            self._ledger.add(n_restored=1)
+            _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
+            return self._reject(frame_id, f"GTSAM gave up on the update: {error}", edge=edge)
+        if self._log is not None:
+            self._log.add(factors, gtsam.Values(), keys={})
+        return estimate
+
+    def _leaving(self) -> list[FrameId]:
+        """Return who leaves with the next pose: neither recent then, nor kept."""
+        if self._config.size is None:
+            return []
+        n_old = max(len(self._members) + 1 - self._config.size, 0)
+        old = list(self._members.items())[:n_old]
+        return [frame_id for frame_id, member in old if not member.is_kept]
+
+    def _forget(self, leaving: Sequence[FrameId]) -> None:
+        for frame_id in leaving:
+            del self._members[frame_id]
+        gone = set(leaving)
+        for member in self._members.values():
+            if member.is_kept:  # the others leave soon themselves
+                member.edges = [edge for edge in member.edges if edge.reference_id not in gone]
+
+    def _keep_by_distance(self, frame_id: FrameId) -> None:
+        T_frame_world = se3.invert(self.pose(frame_id))
+        scores = {
+            kept_id: proximity(T_frame_world @ self.pose(kept_id), self._config)
+            for kept_id in self.kept()
+        }
+        if self._config.n_keyframes > 0 and is_needed(scores, self._config):
+            self.keep(frame_id)
+        n_kept = len(scores) + int(self._members[frame_id].is_kept)
+        for kept_id in choose_released(scores, self._config, n_kept=n_kept):
+            self.release(kept_id)
+
+    # What comes out
+
     def _member(self, frame_id: FrameId) -> _Member:
-        if frame_id not in self._members:
-            raise ValueError(f"{frame_id!r} is not in the window")
-        return self._members[frame_id]
+        member = self._find(frame_id)
+        if member is None:
+            raise ValueError(_absence(frame_id))
+        return member
+
+    def _find(self, frame_id: FrameId) -> _Member | None:
+        """Return a pose of the window, if it is there; misuse is told."""
+        try:
+            return self._members.get(frame_id)
+        except TypeError:
+            raise ValueError(f"a frame_id must be hashable, got {frame_id!r}") from None
 
     def _estimate(self, frame_id: FrameId) -> Estimate:
         member = self._members[frame_id]
         return Estimate(
             stamp_ns=member.stamp_ns,
-            T_world_cam=self.pose(frame_id),
-            covariance=self.covariance(frame_id),
+            T_world_cam=self._graph.pose(member.key),
+            covariance=self._graph.covariance(member.key),
             status=member.status,
             frame_id=frame_id,
         )
 
-    def _check(
-        self,
-        frame_id: FrameId,
-        stamp_ns: int,
-        edges: Sequence[Edge],
-        T_world_frame: FloatArray | None,
-    ) -> None:
-        if frame_id in self._members:
-            raise ValueError(f"{frame_id!r} is in the window already")
-        if self._members:
-            last = next(reversed(self._members.values()))
-            if stamp_ns <= last.stamp_ns:
-                raise ValueError(f"stamp {stamp_ns} of {frame_id!r} is not after {last.stamp_ns}")
-        if bool(edges) != bool(self._members):
-            raise ValueError(
-                f"{frame_id!r} needs an edge to a pose in the window; only the first has none"
-            )
-        for edge in edges:
-            self._member(edge.reference_id)
-            name = f"edge {edge.reference_id!r} -> {frame_id!r}"
-            check_transform(edge.T_reference_frame, f"T_reference_frame of {name}")
-            check_covariance(edge.covariance, f"covariance of {name}")
-        if T_world_frame is not None:
-            check_transform(T_world_frame, f"T_world_frame of {frame_id!r}")
-
-    def _start_value(self, edges: Sequence[Edge]) -> FloatArray:
-        """Return the prediction that the other edges agree with best, their medoid.
-
-        A robust kernel cannot leave the wrong side of an outlier, so a single bad edge must
-        not decide where the optimization starts.
-        """
-        predictions = np.stack(
-            [self.pose(edge.reference_id) @ edge.T_reference_frame for edge in edges]
-        )
-        if len(edges) == 1:
-            return np.asarray(predictions[0])
-        information = np.linalg.inv(np.stack([edge.covariance for edge in edges]))
-        residuals = se3.log(se3.invert(predictions) @ predictions[:, np.newaxis])
-        squares = np.einsum("mni,nij,mnj->mn", residuals, information, residuals)
-        disagreements = np.sum(np.sqrt(np.maximum(squares, 0.0)), axis=1)
-        return np.asarray(predictions[int(np.argmin(disagreements))])
-
-    @contextmanager
-    def _restored_on_error(self, frame_id: FrameId) -> Iterator[None]:
-        """Put the window back as it was when an update fails or is interrupted."""
-        before = gtsam.ISAM2(self._isam), self._members.copy(), list(self._finished)
+    def _final_estimate(self, frame_id: FrameId) -> Estimate:
+        """Return a pose also where GTSAM cannot give it, or its covariance, any more."""
         try:
-            yield
-        except BaseException as error:
-            self._isam, self._members, self._finished = before
-            if isinstance(error, RuntimeError | IndexError):
-                reason = str(error).strip().splitlines()[0]
-                raise SmoothingError(f"the window refused {frame_id!r}: {reason}") from error
-            raise
+            estimate = self._estimate(frame_id)
+            _check_result(estimate.T_world_cam, estimate.covariance)
+        except (RuntimeError, SmoothingError) as error:
+            member = self._members[frame_id]
+            place = f"{frame_id!r} at {member.stamp_ns} ns"
+            _LOGGER.warning("%s: %s; its causal pose stands", place, first_line(error))
+            if member.causal is None:
+                raise
+            return replace(member.causal, status=member.status, rejected=())
+        return estimate
 
-    def _add_edges(
-        self, graph: gtsam.NonlinearFactorGraph, key: int, edges: Sequence[Edge]
-    ) -> None:
-        for edge in edges:
-            graph.add(
-                gtsam.BetweenFactorPose3(
-                    self._members[edge.reference_id].key,
-                    key,
-                    gtsam.Pose3(edge.T_reference_frame),
-                    edge_noise(edge.covariance, self._config),
-                )
-            )
+    def _polished(self) -> list[Estimate]:
+        """Return all poses at the least error of the whole graph."""
+        try:
+            optimized, self._polish = polish(self._graph.factors(), self._graph.values())
+            self._graph = self._graph.moved(optimized)
+        except (RuntimeError, SmoothingError) as error:
+            _LOGGER.warning("the poses stand as iSAM2 left them: %s", first_line(error))
+        return [self._final_estimate(frame_id) for frame_id in self._members]
 
-    def _leaving(self) -> list[FrameId]:
-        n_old = max(len(self._members) - self._config.n_recent, 0)
-        old = list(self._members.items())[:n_old]
-        return [frame_id for frame_id, member in old if not member.is_kept]
 
-    def _update(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, *, new_key: int
-    ) -> None:
-        leaving = self._leaving()
-        if leaving:
-            self._update_with_order(graph, values, leaving, new_key=new_key)
-        else:
-            self._isam.update(graph, values)
-        self._finished += [self._estimate(frame_id) for frame_id in leaving]
-        for frame_id in leaving:
-            leaf = gtsam.KeyList()
-            leaf.push_back(self._members.pop(frame_id).key)
-            self._isam.marginalizeLeaves(leaf)
+def _as_edges(frame_id: FrameId, edges: Sequence[Edge]) -> tuple[Edge, ...]:
+    if isinstance(edges, Sequence) and all(isinstance(edge, Edge) for edge in edges):
+        return tuple(edges)
+    raise ValueError(f"edges of {frame_id!r} must be a sequence of Edge values")
 
-    def _update_with_order(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        leaving: Sequence[FrameId],
-        *,
-        new_key: int,
-    ) -> None:
-        """Update with the leaving poses eliminated first, each in a group of its own.
 
-        Only so do they become leaves of the Bayes tree, which can be marginalized.
-        """
-        groups = {frame_id: group for group, frame_id in enumerate(leaving)}
-        constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
-        for frame_id, member in self._members.items():
-            constrained.insert2(member.key, groups.get(frame_id, len(leaving)))
-            if member.key != new_key:
-                reeliminate.push_back(member.key)
-        self._isam.update(graph, values, [], constrained, None, reeliminate, False)
+def _check_prior(frame_id: FrameId, prior: Prior) -> None:
+    if not isinstance(prior, PosePrior | PositionPrior):
+        raise ValueError(f"the prior of {frame_id!r} must be a PosePrior or a PositionPrior")
+
+
+def _absence(frame_id: FrameId) -> str:
+    return f"{frame_id!r} is not in the window: it has left, or never was"
+
+
+def _check_result(T_world_frame: FloatArray, covariance: FloatArray) -> None:
+    if fault := pose_fault(T_world_frame, covariance):
+        raise SmoothingError(f"GTSAM: {fault}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -147,7 +148,11 @@ class DescriptorFrontend:
             radius_px=radius_px,
             max_distance=self._config.temporal.max_distance,
         )
-        return register_matches(reference, current, matches, self.camera, self._config)
+        result = register_matches(reference, current, matches, self.camera, self._config)
+        if isinstance(result, Failure):
+            return result
+        factor = self._config.registration.sigma_factor
+        return replace(result, covariance=factor**2 * result.covariance)
 
 
 def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCamera:

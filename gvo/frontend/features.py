@@ -156,18 +156,47 @@ def _spread(
     """Keep the strongest of each grid cell, round by round, up to the budget."""
     if len(found) == 0:
         return []
-    pixels = np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64)
-    responses = np.array([point.response for point in found])
-    columns = -(-shape[1] // config.cell_size_px)
+    chosen = choose_spread(
+        np.asarray(cv2.KeyPoint.convert(found), dtype=np.float64),
+        np.array([point.response for point in found]),
+        width=shape[1],
+        cell_size_px=config.cell_size_px,
+        n_chosen=config.n_features,
+    )
+    return [found[int(index)] for index in chosen]
+
+
+def choose_spread(
+    pixels: FloatArray, responses: NDArray[Any], *, width: int, cell_size_px: int, n_chosen: int
+) -> IntArray:
+    """Choose the strongest keypoints of each grid cell, round by round, up to the budget.
+
+    Parameters
+    ----------
+    pixels : ndarray of float64, shape (n, 2)
+    responses : ndarray, shape (n,)
+        Strengths.
+    width : int
+        Of the image, pixels.
+    cell_size_px : int
+        Size of the grid cells.
+    n_chosen : int
+        The budget.
+
+    Returns
+    -------
+    ndarray of int64, shape (m,)
+        Indices, sorted.
+    """
+    columns = -(-width // cell_size_px)
     # Cells and ranks are small integers, which NumPy sorts stably in linear time.
-    cells = ((pixels // config.cell_size_px) @ [1, columns]).astype(np.uint16)
+    cells = ((pixels // cell_size_px) @ [1, columns]).astype(np.uint16)
     by_response = np.argsort(-responses, kind="stable")
     by_cell = np.argsort(cells[by_response], kind="stable")
-    ranks = np.empty(len(found), dtype=np.uint16)
+    ranks = np.empty(len(pixels), dtype=np.uint16)
     ranks[by_cell] = np.minimum(rank_in_group(cells[by_response][by_cell]), 65535)
     # The first of every cell before the second of any: the weakest rank is cut by response.
-    chosen = by_response[np.argsort(ranks, kind="stable")[: config.n_features]]
-    return [found[int(index)] for index in np.sort(chosen)]
+    return np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
 
 
 def rank_in_group(sorted_groups: NDArray[Any]) -> IntArray:

@@ -36,10 +36,45 @@ def register_matches(
     -------
     RelativePose or Failure
     """
-    correspondences = Correspondences.of(reference, current, matches)
+    return register_correspondences(
+        Correspondences.of(reference, current, matches),
+        matches,
+        camera,
+        config,
+        stamps_ns=(reference.stamp_ns, current.stamp_ns),
+    )
+
+
+def register_correspondences(
+    correspondences: Correspondences,
+    matches: IntArray,
+    camera: StereoCamera,
+    config: Config,
+    *,
+    stamps_ns: tuple[int, int],
+) -> RelativePose | Failure:
+    """Estimate the motion between two frames from 3D-3D correspondences.
+
+    Parameters
+    ----------
+    correspondences : Correspondences
+        Source is the reference, target the current frame.
+    matches : ndarray of int64, shape (n, 2)
+        Handed through to the result.
+    camera : StereoCamera
+        Of both frames.
+    config : Config
+        Sections `ransac` and `registration`.
+    stamps_ns : tuple of two int
+        Stamps of reference and current.
+
+    Returns
+    -------
+    RelativePose or Failure
+    """
     # The generator depends on the two frames alone, so that a run that starts
     # anywhere draws the same samples for them.
-    seeds = [config.ransac.seed, reference.stamp_ns, current.stamp_ns]
+    seeds = [config.ransac.seed, *stamps_ns]
     consensus = ransac_rigid(
         correspondences,
         camera,
@@ -73,7 +108,13 @@ def register_matches(
         covariance=refined.covariance,
         matches=matches,
         inliers=refined.inliers,
+        flow_px=_flow(correspondences.select(refined.inliers)),
     )
+
+
+def _flow(correspondences: Correspondences) -> float:
+    displacements = correspondences.target_uvd[:, :2] - correspondences.source_uvd[:, :2]
+    return float(np.median(np.linalg.norm(displacements, axis=1)))
 
 
 def _weights(correspondences: Correspondences, config: Config) -> FloatArray | None:

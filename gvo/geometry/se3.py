@@ -132,6 +132,29 @@ def compose_covariance(
     return np.asarray(0.5 * (moved + moved.T) + covariance_b_c)  # symmetric in spite of rounding
 
 
+def covariance_from_ros(covariance_ros: FloatArray, R_parent_frame: FloatArray) -> FloatArray:
+    """Return the covariance of a pose from that of a ROS message.
+
+    Parameters
+    ----------
+    covariance_ros : ndarray of float64, shape (..., 6, 6)
+        Of (x, y, z, rx, ry, rz): the position in the parent frame, and the rotation about the
+        axes of the parent frame.
+    R_parent_frame : ndarray of float64, shape (..., 3, 3)
+        Rotation of the pose.
+
+    Returns
+    -------
+    ndarray of float64, shape (..., 6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
+    """
+    R_frame_parent = np.swapaxes(R_parent_frame, -1, -2)
+    J = np.zeros((*R_parent_frame.shape[:-2], 6, 6))
+    J[..., :3, 3:] = R_frame_parent
+    J[..., 3:, :3] = R_frame_parent
+    return np.asarray(J @ covariance_ros @ np.swapaxes(J, -1, -2))
+
+
 def rotation_angle(T: FloatArray) -> FloatArray:
     """Return the rotation angles in radians, shape (...), of transforms (..., 4, 4)."""
     R = T[..., :3, :3]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -43,6 +43,10 @@ class RunFolder:
     path : Path
         Folder to write into; made where it is missing. Files of an earlier run are replaced, its
         summary and picture removed.
+    columns : sequence of str
+        Of the table of frames; the first is `stamp_ns`.
+    watch : callable, optional
+        Is given the smoothed poses too.
 
     Raises
     ------
@@ -50,8 +54,15 @@ class RunFolder:
         When the folder cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        columns: Sequence[str] = FRAMES_HEADER,
+        watch: Callable[[Iterable[Estimate]], None] | None = None,
+    ) -> None:
         self.path = path
+        self._watch = watch
         self._files: dict[str, TextIO] = {}
         with self._refused_on_error():
             path.mkdir(parents=True, exist_ok=True)
@@ -60,7 +71,7 @@ class RunFolder:
             for name in TRAJECTORIES:
                 self._open(f"{name}.txt", "")
                 self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
-            self._open("frames.csv", _csv_line(FRAMES_HEADER))
+            self._open("frames.csv", _csv_line(columns))
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:
@@ -80,9 +91,6 @@ class RunFolder:
 
     def add_frame(self, result: FrameResult) -> None:
         """Write what one frame gave."""
-        self._add_pose("raw", result.raw)
-        self._add_pose("causal", result.causal)
-        self.add_smoothed(result.finished)
         row = (
             result.stamp_ns,
             result.status,
@@ -93,6 +101,13 @@ class RunFolder:
             result.n_links,
             result.reason,
         )
+        self.add_poses(result.raw, result.causal, row)
+        self.add_smoothed(result.finished)
+
+    def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
+        """Write both poses of a frame as it arrives, and its row of the table."""
+        self._add_pose("raw", raw)
+        self._add_pose("causal", causal)
         self._write("frames.csv", _csv_line(row))
 
     def add_faulty(self, frame: FaultyFrame) -> None:
@@ -102,8 +117,11 @@ class RunFolder:
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses that are final."""
+        estimates = tuple(estimates)
         for estimate in estimates:
             self._add_pose("smoothed", estimate)
+        if self._watch is not None:
+            self._watch(estimates)
 
     def _add_pose(self, name: str, estimate: Estimate) -> None:
         pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)

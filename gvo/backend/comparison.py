@@ -1,0 +1,135 @@
+"""The price of a window: the same measurements smoothed in a window, whole, and in a batch."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+
+from gvo.backend.graph import PoseGraph
+from gvo.backend.polish import polish
+from gvo.types import Estimate, FloatArray, FrameId
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Update:
+    """One update of a window's graph."""
+
+    factors: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    leaving: Sequence[int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Smoothing:
+    """One way of smoothing, and what it came to.
+
+    Parameters
+    ----------
+    name : str
+        `window`, `full iSAM2` or `batch LM`.
+    poses : dict of hashable to ndarray of float64, shape (4, 4)
+        T_world_frame by frame.
+    error : float
+        Half the sum of the squared whitened residuals of all measurements (of their kernels'
+        costs), as GTSAM counts it.
+    elapsed_s : float
+        Seconds for all updates, covariances apart.
+    """
+
+    name: str
+    poses: dict[FrameId, FloatArray]
+    error: float
+    elapsed_s: float
+
+
+@dataclass(slots=True)
+class MeasurementLog:
+    """All that went into a window's graph, so that it can be smoothed again in other ways.
+
+    Unlike the window it keeps everything. Give it to `SlidingWindow`.
+    """
+
+    _updates: list[_Update] = field(default_factory=list)
+    _keys: dict[FrameId, int] = field(default_factory=dict)
+
+    def add(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        *,
+        keys: dict[FrameId, int],
+        leaving: Sequence[int] = (),
+    ) -> None:
+        """Take what one update added: factors, start values, the new frames and their keys."""
+        self._updates.append(_Update(factors=factors, values=values, leaving=tuple(leaving)))
+        self._keys |= keys
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self._keys)
+
+    def compare(self, smoothed: Sequence[Estimate]) -> list[Smoothing]:
+        """Smooth everything again, as a whole and in a batch.
+
+        Parameters
+        ----------
+        smoothed : sequence of Estimate
+            What the window gave for all its poses.
+
+        Returns
+        -------
+        list of Smoothing
+            The window; iSAM2 without marginalization; Levenberg-Marquardt over all factors,
+            started where iSAM2 ended.
+        """
+        factors = gtsam.NonlinearFactorGraph()
+        for update in self._updates:
+            factors.push_back(update.factors)
+        _, windowed_s = self._replay(is_windowed=True)
+        graph, whole_s = self._replay(is_windowed=False)
+        whole = graph.values()
+        start = time.perf_counter()
+        optimum, _ = polish(factors, whole)
+        batch_s = time.perf_counter() - start
+        return [
+            self._smoothing("window", factors, self._values(smoothed, whole), windowed_s),
+            self._smoothing("full iSAM2", factors, whole, whole_s),
+            self._smoothing("batch LM", factors, optimum, batch_s),
+        ]
+
+    def _replay(self, *, is_windowed: bool) -> tuple[PoseGraph, float]:
+        graph, alive = PoseGraph(is_whole=not is_windowed), dict[int, None]()
+        start = time.perf_counter()
+        for update in self._updates:
+            leaving = update.leaving if is_windowed else ()
+            graph.update(update.factors, update.values, alive=alive, leaving=leaving)
+            graph.marginalize(leaving)
+            alive |= dict.fromkeys(update.values.keys())
+            for key in leaving:
+                del alive[key]
+        return graph, time.perf_counter() - start
+
+    def _values(self, smoothed: Sequence[Estimate], others: gtsam.Values) -> gtsam.Values:
+        """Return the window's poses; those that it never held, as others have them."""
+        values = gtsam.Values(others)
+        for estimate in smoothed:
+            if estimate.frame_id in self._keys:
+                values.update(self._keys[estimate.frame_id], gtsam.Pose3(estimate.T_world_cam))
+        return values
+
+    def _smoothing(
+        self,
+        name: str,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        elapsed_s: float,
+    ) -> Smoothing:
+        return Smoothing(
+            name=name,
+            poses={frame_id: values.atPose3(key).matrix() for frame_id, key in self._keys.items()},
+            error=float(factors.error(values)),
+            elapsed_s=elapsed_s,
+        )

@@ -1,0 +1,194 @@
+"""Which edges of a new pose agree: where to start, and which one to refuse.
+
+No robust kernel leaves the wrong side of a gross outlier, so a single bad edge must not decide
+where the optimization starts, and is better not let in at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import gtsam
+import numpy as np
+
+from gvo.geometry import se3
+from gvo.types import Edge, FloatArray, FrameId, IntArray
+
+# Sigmas of the difference of two edges, a 6-vector: all but a thousandth of good ones.
+_AGREEMENT = 5.0
+_TRACE = 1e-9 * np.eye(6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Verdict:
+    """What the edges of one pose say together.
+
+    Parameters
+    ----------
+    T_world_start : gtsam.Pose3
+        Mean of the predictions that agree with the one most agree with, their medoid.
+    reasons : list of str
+        For each edge why it is refused; empty where it is not.
+    """
+
+    T_world_start: gtsam.Pose3
+    reasons: list[str]
+
+
+def judge(
+    edges: Sequence[Edge],
+    *,
+    pose_of: Callable[[FrameId], gtsam.Pose3],
+    relative_covariance: Callable[[FrameId, FrameId], FloatArray],
+    motion: Callable[[], Edge | None],
+    gate: float | None,
+) -> Verdict:
+    """Find where the edges of a new pose agree, and which of them do not.
+
+    An edge is refused when it disagrees with the medoid by more than the gate, and more of the
+    edges (and of the motion so far) agree with the medoid than with it. What the references
+    themselves are uncertain of counts as agreement: a loop that closes after a long drift
+    disagrees with the drift, and is right.
+
+    Parameters
+    ----------
+    edges : sequence of Edge
+        At least one, valid.
+    pose_of : callable
+        Returns the present pose of a reference, T_world_reference.
+    relative_covariance : callable
+        Returns the covariance (6, 6) of the pose of the second reference in the first. Called
+        only when edges disagree.
+    motion : callable
+        Returns the edge that the motion so far predicts, or None. Called only when edges
+        disagree.
+    gate : float or None
+        In sigmas of the difference of two predictions; None refuses nothing.
+    """
+    predictions = [_predict(edge, pose_of) for edge in edges]
+    if len(edges) == 1:
+        return Verdict(T_world_start=predictions[0], reasons=[""])
+    covariances = np.array([edge.covariance for edge in edges])
+    twists = _twists(predictions)
+    distances = _distances(twists, covariances)
+    reasons = [""] * len(edges)
+    if gate is not None and distances.max() > gate:
+        voters = [*edges, *filter(None, [motion()])]
+        true_distances = _true_distances(voters, pose_of, relative_covariance)
+        reasons = _outvoted(edges, true_distances, gate=gate)
+    if any(reasons):
+        left = [index for index, reason in enumerate(reasons) if not reason]
+        predictions, covariances = [predictions[index] for index in left], covariances[left]
+        twists = _twists(predictions)
+        distances = _distances(twists, covariances)
+    start = predictions[0].retract(_mean(twists, covariances, distances))
+    return Verdict(T_world_start=start, reasons=reasons)
+
+
+def disagreement(
+    edge: Edge, T_reference_frame: FloatArray, covariance: FloatArray, *, gate: float | None
+) -> str:
+    """Return why an edge contradicts what is known of its two poses; empty where it does not.
+
+    Parameters
+    ----------
+    edge : Edge
+    T_reference_frame : ndarray of float64, shape (4, 4)
+        As known.
+    covariance : ndarray of float64, shape (6, 6)
+        Of T_reference_frame.
+    gate : float or None
+        In sigmas of the difference; None contradicts nothing.
+    """
+    difference = se3.log(se3.invert(T_reference_frame) @ edge.T_reference_frame)
+    sigmas = _mahalanobis(difference, covariance + edge.covariance)
+    if gate is None or sigmas <= gate:
+        return ""
+    return f"it disagrees by {sigmas:.3g} sigma with the window (window.gate: {gate:g})"
+
+
+def _predict(edge: Edge, pose_of: Callable[[FrameId], gtsam.Pose3]) -> gtsam.Pose3:
+    return pose_of(edge.reference_id).compose(gtsam.Pose3(edge.T_reference_frame))
+
+
+def _outvoted(edges: Sequence[Edge], distances: FloatArray, *, gate: float) -> list[str]:
+    """Return for each edge why the others outvote it; empty where they do not.
+
+    Where two edges disagree, the motion so far, behind them, has the casting vote.
+    """
+    n = len(edges)
+    # Capped: how far off an outlier is must not weigh more than that it is one.
+    medoid = int(np.minimum(distances, gate).sum(axis=1)[:n].argmin())
+    n_agreeing = np.count_nonzero(distances <= gate, axis=1)
+    is_out = (distances[medoid, :n] > gate) & (n_agreeing[:n] < n_agreeing[medoid])
+    return [
+        f"it disagrees by {distances[medoid, index]:.3g} sigma with the edge from "
+        f"{edges[medoid].reference_id!r} (window.gate: {gate:g})"
+        if is_out[index]
+        else ""
+        for index in range(n)
+    ]
+
+
+def _true_distances(
+    edges: Sequence[Edge],
+    pose_of: Callable[[FrameId], gtsam.Pose3],
+    relative_covariance: Callable[[FrameId, FrameId], FloatArray],
+) -> FloatArray:
+    """Return Mahalanobis distances, shape (n, n), that know how sure the references are."""
+    predictions = [_predict(edge, pose_of) for edge in edges]
+    distances = np.zeros((len(edges), len(edges)))
+    for i, j in zip(*_pairs(len(edges)), strict=True):
+        Ad = se3.adjoint(se3.invert(edges[j].T_reference_frame))
+        spread = Ad @ relative_covariance(edges[i].reference_id, edges[j].reference_id) @ Ad.T
+        difference = predictions[i].localCoordinates(predictions[j])
+        total = edges[i].covariance + edges[j].covariance + spread
+        distances[i, j] = _mahalanobis(difference, total)
+    return distances + distances.T
+
+
+def _mean(twists: FloatArray, covariances: FloatArray, distances: FloatArray) -> FloatArray:
+    """Return the weighted mean of the twists that agree with their medoid.
+
+    So a robust kernel weighs each edge near where it will be, not from where one of them was.
+    """
+    medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
+    is_near = distances[medoid] <= _AGREEMENT
+    information = np.linalg.inv(covariances[is_near])
+    weighted = np.einsum("nij,nj->i", information, twists[is_near])
+    return np.asarray(np.linalg.solve(information.sum(axis=0), weighted))
+
+
+@lru_cache(maxsize=32)
+def _pairs(n: int) -> tuple[IntArray, IntArray]:
+    rows, columns = np.triu_indices(n, k=1)
+    return rows, columns
+
+
+def _twists(predictions: Sequence[gtsam.Pose3]) -> FloatArray:
+    """Return the predictions as twists about the first, shape (n, 6)."""
+    return np.array([predictions[0].localCoordinates(prediction) for prediction in predictions])
+
+
+def _distances(twists: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return Mahalanobis distances, shape (n, n), between predictions of one pose.
+
+    Differences of twists about one of them are exact where they agree, large where they do not.
+    """
+    rows, columns = _pairs(len(twists))
+    differences = twists[rows] - twists[columns]
+    distances = np.zeros((len(twists), len(twists)))
+    distances[rows, columns] = _mahalanobis(differences, covariances[rows] + covariances[columns])
+    return distances + distances.T
+
+
+def _mahalanobis(differences: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return the lengths, shape (...), of differences (..., 6) in sigmas."""
+    # In units of the sigmas, and a trace wider than they: never singular.
+    sigmas = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    correlations = covariances / (sigmas[..., :, np.newaxis] * sigmas[..., np.newaxis, :])
+    scaled = differences / sigmas
+    solved = np.linalg.solve(correlations + _TRACE, scaled[..., np.newaxis])[..., 0]
+    return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, axis=-1), 0.0)))

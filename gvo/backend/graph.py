@@ -1,0 +1,219 @@
+"""The pose graph in iSAM2: what GTSAM needs, and nothing of frames or statuses.
+
+References
+----------
+M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree", IJRR 31(2),
+2012, doi:10.1177/0278364911430419.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+
+import gtsam
+import numpy as np
+
+from gvo.errors import SmoothingError
+from gvo.types import FloatArray
+
+# Radians and metres: a pose that an update moved farther than the first is updated again, until
+# it moves less than the second.
+_FAR = 0.02
+_STILL = 1e-4
+_MAX_STEPS = 10
+_MIN_EIGENVALUE = 1e-10
+_MAX_ROUNDING = 1e-6
+
+
+class PoseGraph:
+    """Poses by integer keys, smoothed incrementally; old ones can be marginalized.
+
+    Parameters
+    ----------
+    is_whole : bool
+        Nothing will be marginalized, and the graph may grow large.
+    is_hardened : bool
+        Of a whole graph: slower, and safe where sigmas are many orders apart.
+    """
+
+    def __init__(self, *, is_whole: bool = False, is_hardened: bool = False) -> None:
+        parameters = gtsam.ISAM2Params()
+        self._is_whole, self._is_hardened = is_whole, is_hardened
+        if is_whole:
+            # GTSAM's own trade of accuracy for time, which grows with the graph: the end is
+            # polished. Nothing is marginalized, so Cholesky holds, but for odd inputs.
+            parameters.setRelinearizeThreshold(0.1)
+            parameters.relinearizeSkip = 10
+            parameters.setFactorization("QR" if is_hardened else "CHOLESKY")
+        else:
+            # Cholesky calls the system indeterminate once the drift's variance is 4096^2 times
+            # that of an edge; QR does not.
+            parameters.setFactorization("QR")
+            parameters.setRelinearizeThreshold(0.001)
+            parameters.relinearizeSkip = 1
+            parameters.findUnusedFactorSlots = True
+            # Carry every change through to the oldest pose: by default small ones are left out,
+            # which costs what smoothing gains where edges are good to a tenth of a millimetre.
+            parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        self._isam = gtsam.ISAM2(parameters)
+
+    @property
+    def can_be_hardened(self) -> bool:
+        """Tell whether there is a way that takes worse conditioned factors."""
+        return self._is_whole and not self._is_hardened
+
+    def hardened(self) -> PoseGraph:
+        """Return a whole graph of the same factors that takes worse conditioned ones."""
+        graph = PoseGraph(is_whole=True, is_hardened=True)
+        with graph.restored_on_error():
+            graph.update(self.factors(), self.values())
+        return graph
+
+    def moved(self, values: gtsam.Values) -> PoseGraph:
+        """Return a graph of the same factors, linearized at other poses."""
+        graph = PoseGraph(is_whole=self._is_whole, is_hardened=self._is_hardened)
+        with graph.restored_on_error():
+            graph.update(self.factors(), values)
+        return graph
+
+    @contextmanager
+    def restored_on_error(self) -> Iterator[None]:
+        """Put the graph back as it was when an update fails or is interrupted.
+
+        Raises
+        ------
+        SmoothingError
+            In place of what GTSAM throws.
+        """
+        before = gtsam.ISAM2(self._isam)
+        try:
+            yield
+        except BaseException as error:
+            self._isam = before
+            if isinstance(error, RuntimeError | IndexError):
+                raise SmoothingError(f"GTSAM: {first_line(error)}") from error
+            raise
+
+    def update(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        *,
+        alive: Collection[int] = (),
+        leaving: Sequence[int] = (),
+    ) -> None:
+        """Add factors and poses; make leaving poses ready to be marginalized.
+
+        Parameters
+        ----------
+        factors : gtsam.NonlinearFactorGraph
+        values : gtsam.Values
+            Start values of new poses.
+        alive : collection of int
+            All keys that are in the graph; needed where some are leaving.
+        leaving : sequence of int
+            Keys to eliminate first, each in a group of its own: only so do they become leaves
+            of the Bayes tree, which can be marginalized.
+        """
+        if not leaving:
+            self._isam.update(factors, values)
+            return
+        groups = {key: group for group, key in enumerate(leaving)}
+        last = len(leaving)
+        constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key in alive:
+            constrained.insert2(key, groups.get(key, last))
+            reeliminate.push_back(key)
+        for key in values.keys():  # noqa: SIM118 - not a dict
+            constrained.insert2(key, last)
+        self._isam.update(factors, values, [], constrained, None, reeliminate, False)
+
+    def settle(
+        self,
+        key: int,
+        before: gtsam.Pose3,
+        *,
+        alive: Collection[int] = (),
+        leaving: Sequence[int] = (),
+    ) -> None:
+        """Go on until a pose stands still, where the update just done moved it far.
+
+        One step of Gauss-Newton is exact for what moves by a fraction of a radian only; after a
+        loop closes it takes a few. A whole graph is left to the polish at its end.
+
+        Parameters
+        ----------
+        key : int
+            Of the pose that the update was about.
+        before : gtsam.Pose3
+            Where it was, or started.
+        alive, leaving
+            As for the update.
+        """
+        limit = _FAR
+        for _ in range(0 if self._is_whole else _MAX_STEPS):
+            after = self.pose3(key)
+            if np.abs(before.localCoordinates(after)).max() < limit:
+                return
+            before, limit = after, _STILL
+            nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            self.update(*nothing, alive=alive, leaving=leaving)
+
+    def marginalize(self, keys: Sequence[int]) -> None:
+        """Take out poses that the last update made ready; what they knew stays."""
+        for key in keys:
+            leaf = gtsam.KeyList()
+            leaf.push_back(key)
+            self._isam.marginalizeLeaves(leaf)
+
+    def pose3(self, key: int) -> gtsam.Pose3:
+        """Return T_world_frame as GTSAM holds it."""
+        return self._isam.calculateEstimatePose3(key)
+
+    def pose(self, key: int) -> FloatArray:
+        """Return T_world_frame, shape (4, 4)."""
+        return np.asarray(self._isam.calculateEstimatePose3(key).matrix())
+
+    def covariance(self, key: int) -> FloatArray:
+        """Return the marginal covariance of a pose, shape (6, 6), symmetric positive definite."""
+        return definite(self._isam.marginalCovariance(key))
+
+    def joint_covariance(self, first: int, second: int) -> FloatArray:
+        """Return the joint covariance of two poses, shape (12, 12), in the order asked for."""
+        return np.asarray(self._isam.jointMarginalCovariance([first, second]).fullMatrix())
+
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """Return all factors, marginals among them."""
+        return self._isam.getFactorsUnsafe()
+
+    def values(self) -> gtsam.Values:
+        """Return all poses."""
+        return self._isam.calculateEstimate()
+
+
+def first_line(error: BaseException) -> str:
+    """Return what GTSAM says in a paragraph, in one line."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def definite(covariance: FloatArray) -> FloatArray:
+    """Return the covariance without the traces of rounding.
+
+    Where sigmas lie many orders apart, rounding may leave the smallest eigenvalue of the
+    correlations at or below zero.
+    """
+    symmetric = 0.5 * (covariance + covariance.T)
+    if not np.isfinite(symmetric).all():
+        raise SmoothingError("GTSAM: a covariance is not finite")
+    try:
+        np.linalg.cholesky(symmetric)
+    except np.linalg.LinAlgError:
+        sigmas = np.sqrt(np.maximum(np.diag(symmetric), np.finfo(float).tiny))
+        scale = np.outer(sigmas, sigmas)
+        eigenvalues, vectors = np.linalg.eigh(symmetric / scale)
+        if eigenvalues[0] < -_MAX_ROUNDING:
+            raise SmoothingError("GTSAM: a covariance is not positive definite") from None
+        clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
+        return np.asarray((vectors * clipped) @ vectors.T * scale)
+    return np.asarray(symmetric)

@@ -1,0 +1,74 @@
+"""Going on without a measurement: at the last velocity, less sure with every second."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.types import FloatArray, Status
+
+# After a longer gap the last velocity says nothing about where the camera is.
+_MAX_EXTRAPOLATION_S = 1.0
+_MIN_ELAPSED_S = 1e-3
+# Sigma of an angle that is not known at all, and of a place.
+_ANY_TURN = np.pi / np.sqrt(3.0)
+_ANYWHERE_M = 1e5
+
+
+def predict_step(
+    velocity: FloatArray | None, elapsed_s: float, config: WindowConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Continue the last velocity.
+
+    Parameters
+    ----------
+    velocity : ndarray of float64, shape (6,), or None
+        Twist per second (rad/s, m/s); None: standing still.
+    elapsed_s : float
+        Seconds since the last pose.
+    config : WindowConfig
+        Sigmas of a second without a measurement.
+
+    Returns
+    -------
+    T_last_frame : ndarray of float64, shape (4, 4)
+    covariance : ndarray of float64, shape (6, 6)
+        Its sigmas grow in proportion to the time.
+    """
+    T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, _MAX_EXTRAPOLATION_S))
+    elapsed_s = max(elapsed_s, _MIN_ELAPSED_S)
+    turn = min(np.radians(config.coasting_sigma_deg_per_s) * elapsed_s, _ANY_TURN)
+    shift = min(config.coasting_sigma_m_per_s * elapsed_s, _ANYWHERE_M)
+    return T, np.diag(np.repeat([turn, shift], 3)) ** 2
+
+
+class StatusClock:
+    """Tells a frame's status from how long there was no measurement.
+
+    Parameters
+    ----------
+    lost_after_s : float
+        Coasting longer is called lost.
+    """
+
+    def __init__(self, lost_after_s: float) -> None:
+        self._lost_after_s = lost_after_s
+        self._coasting_since_ns: int | None = None
+
+    def next(self, stamp_ns: int, *, is_tied: bool) -> Status:
+        """Return the status of the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Its stamp, nanoseconds.
+        is_tied : bool
+            Whether a measurement ties it to earlier frames or to the world.
+        """
+        since, self._coasting_since_ns = self._coasting_since_ns, None
+        if is_tied:
+            return Status.OK if since is None else Status.RESUMED
+        self._coasting_since_ns = stamp_ns if since is None else since
+        coasting_s = 1e-9 * (stamp_ns - self._coasting_since_ns)
+        return Status.LOST if coasting_s > self._lost_after_s else Status.COASTING

@@ -1,0 +1,213 @@
+"""Disparities of single pixels, found along the row of the right image.
+
+No keypoints of the right image are needed, so that any pixel can be measured: a coarse search
+over all disparities in small images, then a fine one around what it gave.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from gvo.config import StereoConfig
+from gvo.frontend.stereo import parabola_minimum
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+
+# The coarse search: images reduced by this, patches of this half size there.
+_REDUCTION = 4
+_COARSE_RADIUS_PX = 2
+_MIN_CORRELATION = 0.7
+# Grey values squared, over a patch: below this it is flat, and correlates with anything.
+_MIN_ENERGY = 50.0
+# Steps of the fine search after the parabola: the second moves by less than 0.01 pixels.
+_N_STEPS = 2
+# What the coarse search leaves open on either side, in pixels of the full image.
+COARSE_ERROR_PX = _REDUCTION + 1
+
+
+def search_disparities(
+    images: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
+) -> tuple[FloatArray, BoolArray]:
+    """Find the disparities of pixels to a few pixels, by normalized cross-correlation.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+        Rectified left and right.
+    pixels : ndarray of float64, shape (n, 2)
+        Whole pixels in the left image.
+    max_disparity : float
+        Pixels.
+
+    Returns
+    -------
+    disparities : ndarray of float64, shape (n,)
+        Right to `COARSE_ERROR_PX`.
+    is_found : ndarray of bool, shape (n,)
+    """
+    left, right = (_reduce(image) for image in images)
+    n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
+    columns, rows = (pixels // _REDUCTION).astype(np.int64).T
+    columns = np.minimum(columns, left.shape[1] - 1)
+    rows = np.minimum(rows, left.shape[0] - 1)
+    correlations = _correlate(left, right, (rows, columns), n_steps)
+    disparities = n_steps - np.arange(n_steps + 1)
+    correlations[disparities > columns[:, np.newaxis]] = -1.0  # left of the right image
+    best = np.argmax(correlations, axis=1)
+    is_found = correlations[np.arange(len(best)), best] > _MIN_CORRELATION
+    return float(_REDUCTION) * disparities[best], is_found
+
+
+def _reduce(image: ImageArray) -> NDArray[np.float32]:
+    height, width = image.shape
+    shape = (max(width // _REDUCTION, 1), max(height // _REDUCTION, 1))
+    reduced = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
+    return np.asarray(reduced, dtype=np.float32)
+
+
+def _correlate(
+    left: NDArray[np.float32],
+    right: NDArray[np.float32],
+    pixels: tuple[IntArray, IntArray],
+    n_steps: int,
+) -> NDArray[np.float32]:
+    """Return the correlations at disparities n_steps .. 0 of pixels, (n, n_steps + 1)."""
+    radius = _COARSE_RADIUS_PX
+    size = 2 * radius + 1
+    padded = np.pad(left, radius, mode="edge")
+    patches = sliding_window_view(padded, (size, size))[pixels]
+    patches = patches - patches.mean(axis=(1, 2), keepdims=True)
+    energy = np.maximum(np.sum(patches**2, axis=(1, 2)), _MIN_ENERGY)
+    padded = np.pad(right, ((radius, radius), (radius + n_steps, radius)), mode="edge")
+    strips = np.ascontiguousarray(sliding_window_view(padded, (size, size + n_steps))[pixels])
+    products = np.zeros((len(patches), n_steps + 1), dtype=np.float32)
+    term = np.empty_like(products)
+    for i, j in np.ndindex(size, size):
+        np.multiply(strips[:, i, j : j + n_steps + 1], patches[:, i, j, np.newaxis], out=term)
+        products += term
+    energies = sliding_window_view(_energies(padded), n_steps + 1, axis=1)[pixels]
+    return np.asarray(products / np.sqrt(energies * energy[:, np.newaxis]))
+
+
+def _energies(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the squared deviations from their mean of all patches that lie in the image."""
+    radius = _COARSE_RADIUS_PX
+    size = (2 * radius + 1, 2 * radius + 1)
+    centred = image - np.float32(image.mean())  # or the difference loses its digits
+    sums = cv2.boxFilter(centred, -1, size, normalize=False)
+    squares = cv2.boxFilter(centred**2, -1, size, normalize=False)
+    energies = squares - sums**2 / np.float32(size[0] * size[1])
+    return np.maximum(energies[radius:-radius, radius:-radius], np.float32(_MIN_ENERGY))
+
+
+def measure_disparities(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    predicted: FloatArray,
+    config: StereoConfig,
+    *,
+    reach_px: int,
+) -> tuple[FloatArray, BoolArray]:
+    """Measure the disparities of pixels near predicted ones, to a fraction of a pixel.
+
+    As `refine_disparities`, but between pixels: patches are interpolated, so that on a slanted
+    surface, such as the road, the disparity is that of the very pixel. After the parabola come
+    Gauss-Newton steps, which end where the patches are alike; the parabola alone leans to the
+    side where the texture is weaker.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+        Rectified left and right.
+    pixels : ndarray of float64, shape (n, 2)
+        In the left image.
+    predicted : ndarray of float64, shape (n,)
+        Pixels.
+    config : StereoConfig
+        Size of the patches.
+    reach_px : int
+        How far to search on either side.
+
+    Returns
+    -------
+    disparities : ndarray of float64, shape (n,)
+    is_valid : ndarray of bool, shape (n,)
+        False where a patch leaves the image or the best step is the last one searched.
+    """
+    radius = config.patch_radius_px
+    disparities = np.full(len(pixels), np.nan)
+    is_valid = _have_room(images[0].shape, pixels, predicted, radius)
+    chosen = np.flatnonzero(is_valid)
+    if len(chosen) == 0:
+        return disparities, is_valid
+    u, v = pixels[chosen].T
+    patches = _sample(images[0], u, v, radius + 1, radius)
+    strips = _sample(images[1], u - predicted[chosen], v, radius + reach_px, radius)
+    offsets, is_minimum = parabola_minimum(_squared_differences(patches[:, :, 1:-1], strips))
+    found = predicted[chosen] - (offsets - reach_px)
+    for _ in range(_N_STEPS):
+        strips = _sample(images[1], u - found, v, radius + 1, radius)
+        found = found + np.clip(_newton_step(patches, strips), -0.5, 0.5)
+    disparities[chosen] = found
+    is_valid[chosen] = is_minimum
+    return disparities, is_valid
+
+
+def _newton_step(
+    patches_left: NDArray[np.float32], patches_right: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the growth of disparity that makes patches alike (n, s, s + 2), along the row."""
+    n = len(patches_left)
+    both = patches_left + patches_right
+    gradients = 0.25 * (both[:, :, 2:] - both[:, :, :-2]).reshape(n, -1)
+    differences = (patches_right - patches_left)[:, :, 1:-1].reshape(n, -1)
+    differences = differences - differences.mean(axis=1, keepdims=True)
+    energies = np.einsum("ni,ni->n", gradients, gradients)
+    products = np.einsum("ni,ni->n", gradients, differences)
+    return np.asarray(products / np.maximum(energies, np.float32(_MIN_ENERGY)))
+
+
+def _have_room(
+    shape: tuple[int, ...], pixels: FloatArray, disparities: FloatArray, radius: int
+) -> BoolArray:
+    height, width = shape
+    u, v = pixels.T
+    last = np.array([width, height]) - 1 - radius
+    is_inside = (u >= radius) & (u <= last[0]) & (v >= radius) & (v <= last[1])
+    u_right = u - disparities
+    return np.asarray(is_inside & (u_right >= radius) & (u_right <= last[0]))
+
+
+def _sample(
+    image: ImageArray, u: FloatArray, v: FloatArray, radius_u: int, radius_v: int
+) -> NDArray[np.float32]:
+    """Return patches around pixels, interpolated, shape (n, 2 radius_v + 1, 2 radius_u + 1)."""
+    steps_u = np.arange(-radius_u, radius_u + 1, dtype=np.float32)
+    steps_v = np.arange(-radius_v, radius_v + 1, dtype=np.float32)
+    shape = (len(u), len(steps_v), len(steps_u))
+    columns = u.astype(np.float32)[:, np.newaxis, np.newaxis] + steps_u
+    rows = v.astype(np.float32)[:, np.newaxis, np.newaxis] + steps_v[:, np.newaxis]
+    patches = cv2.remap(
+        image,
+        np.broadcast_to(columns, shape).reshape(len(u), -1),
+        np.broadcast_to(rows, shape).reshape(len(u), -1),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(patches.reshape(shape), dtype=np.float32)
+
+
+def _squared_differences(
+    patches: NDArray[np.float32], strips: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the sums of squared differences less their mean, shape (n, places)."""
+    size = patches.shape[2]
+    n_places = strips.shape[2] - size + 1
+    sums = np.empty((len(patches), n_places), dtype=np.float32)
+    for place in range(n_places):
+        difference = (strips[:, :, place : place + size] - patches).reshape(len(patches), -1)
+        squares = np.einsum("ni,ni->n", difference, difference)
+        sums[:, place] = squares - difference.sum(axis=1) ** 2 / difference.shape[1]
+    return sums

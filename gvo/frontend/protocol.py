@@ -1,0 +1,129 @@
+"""What a front-end is: two methods, and values that the back-end understands."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from gvo.types import Failure, FloatArray, RelativePose
+
+# The largest deviation of R R^T from the identity that is still rounding.
+_MAX_SKEW = 1e-6
+# Of correlations: the largest asymmetry that is still rounding, and the smallest eigenvalue.
+_MAX_ASYMMETRY = 1e-6
+_MIN_EIGENVALUE = 1e-12
+
+
+class Stamped(Protocol):
+    """Anything with a stamp: a frame, or what a front-end keeps of one."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the frame, nanoseconds."""
+
+
+ObservationsT = TypeVar("ObservationsT", bound=Stamped)
+
+
+class Frontend(Protocol[ObservationsT]):
+    """Turns frames into observations, and two frames' observations into a relative pose.
+
+    Any object with these two methods will do; nothing is to be inherited. Observations are the
+    front-end's own affair but for their `stamp_ns`. Where they also hold `points_cam` (n, 3),
+    points in metres in the `cam` frame, and the front-end has a `camera` (StereoCamera),
+    keyframes are chosen by the share of these points in view; else by distance and angle.
+    Where they have a length or `n_keypoints`, these are reported with each frame.
+
+    `gvo.testing.check_frontend` tests the contract.
+    """
+
+    def extract(self, frame: Any, /) -> ObservationsT:  # noqa: ANN401 - its own kind of frame
+        """Return what is needed of a frame, which is left as it is.
+
+        Parameters
+        ----------
+        frame : StereoFrame or RgbdFrame, or whatever else has a stamp_ns
+            An image in which nothing is seen gives observations that cannot be registered, not
+            an exception.
+        """
+
+    def register(
+        self, reference: ObservationsT, current: ObservationsT, prior: FloatArray | None, /
+    ) -> RelativePose | Failure:
+        """Estimate the motion from the reference to the current frame.
+
+        Parameters
+        ----------
+        reference, current : observations
+            What `extract` gave for either frame, neighbours in time or not; left as they are.
+        prior : ndarray of float64, shape (4, 4), or None
+            Predicted T_reference_current, a guess that may be wrong.
+
+        Returns
+        -------
+        RelativePose or Failure
+            `T_reference_current` and its covariance are all that an own front-end has to fill
+            in. The same arguments give the same result, bit for bit.
+        """
+
+
+def register_checked(
+    frontend: Frontend[ObservationsT],
+    reference: ObservationsT,
+    current: ObservationsT,
+    prior: FloatArray | None,
+) -> RelativePose | Failure:
+    """Register two frames and turn a relative pose that is none into a failure.
+
+    Raises
+    ------
+    ValueError
+        When the front-end returns something else.
+    """
+    result = frontend.register(reference, current, prior)
+    if not isinstance(result, RelativePose | Failure):
+        raise ValueError(
+            f"register of {type(frontend).__name__} must return RelativePose or Failure, "
+            f"got {type(result).__name__}"
+        )
+    fault = find_fault(result) if isinstance(result, RelativePose) else ""
+    return Failure(reason=f"the front-end is at fault: {fault}") if fault else result
+
+
+def find_fault(result: RelativePose) -> str:
+    """Return what is wrong with a relative pose, in one line; empty where nothing is."""
+    return (
+        _find_fault_of_array("T_reference_current", result.T_reference_current, (4, 4))
+        or _find_fault_of_array("the covariance", result.covariance, (6, 6))
+        or _find_fault_of_transform(result.T_reference_current)
+        or _find_fault_of_covariance(result.covariance)
+    )
+
+
+def _find_fault_of_array(name: str, array: object, shape: tuple[int, int]) -> str:
+    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+        return f"{name} is no array of float64 of shape {shape}"
+    return "" if np.isfinite(array).all() else f"{name} is not finite"
+
+
+def _find_fault_of_transform(T: FloatArray) -> str:
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(R) < 0:
+        return "T_reference_current holds no rotation"
+    if np.any(T[3] != (0.0, 0.0, 0.0, 1.0)):
+        return "the last row of T_reference_current is not (0, 0, 0, 1)"
+    return ""
+
+
+def _find_fault_of_covariance(covariance: FloatArray) -> str:
+    variances = np.diag(covariance)
+    if np.any(variances <= 0):
+        return "the covariance is not positive definite"
+    # Of correlations: rounding leaves elements that should be zero at any ratio to each other.
+    correlations = covariance / np.sqrt(np.outer(variances, variances))
+    if np.abs(correlations - correlations.T).max() > _MAX_ASYMMETRY:
+        return "the covariance is not symmetric"
+    if np.linalg.eigvalsh(correlations)[0] <= _MIN_EIGENVALUE:
+        return "the covariance is not positive definite"
+    return ""

@@ -1,0 +1,217 @@
+"""Pose graphs in the text format of g2o: lines read and written, one at a time.
+
+Poses are `VERTEX_SE3:QUAT id x y z qx qy qz qw`, measurements `EDGE_SE3:QUAT a b x y z qx qy qz
+qw` with the upper triangle of the information matrix, and `FIX id ...` names poses that hold
+the world. `VERTEX3` and `EDGE3` are the older form with roll, pitch, yaw in place of the
+quaternion. An edge a b is T_a_b: it maps coordinates of b to a.
+
+The information matrix is taken as GTSAM takes it: that of `EDGE_SE3:QUAT` in the order (x, y, z,
+rx, ry, rz), with rotations in radians; that of `EDGE3` in the order (rx, ry, rz, x, y, z), and
+the identity where it is left out. g2o itself minimizes the vector part of the quaternion, which
+is half the rotation: by its reading the same numbers mean twice the sigmas of rotation.
+
+References
+----------
+R. Kuemmerle et al., "g2o: A general framework for graph optimization", ICRA 2011,
+doi:10.1109/ICRA.2011.5979949.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
+from gvo.types import FloatArray
+
+_UPPER = np.triu_indices(6)
+_UNIT_INFORMATION = [f"{float(i == j)}" for i, j in zip(*_UPPER, strict=True)]
+_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
+_NORM_TOLERANCE = 1e-2
+_QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
+_ANGLE_TAGS = ("VERTEX3", "EDGE3")
+
+MEASUREMENT_TAGS = ("EDGE_SE3:QUAT", "EDGE3")
+"""Tags of the measurements that are understood."""
+TAGS = (*_QUATERNION_TAGS, *_ANGLE_TAGS, "FIX")
+"""All tags that are understood."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Vertex:
+    """A pose: `T_world_frame` of shape (4, 4), metres."""
+
+    frame_id: int
+    T_world_frame: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurement:
+    """A relative pose between two poses, as it stands in the file.
+
+    Parameters
+    ----------
+    reference_id, frame_id : int
+        The first and the second id of the line.
+    T_reference_frame : ndarray of float64, shape (4, 4)
+        Maps coordinates of the frame to the reference, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; not a number where the
+        information matrix has no inverse.
+    """
+
+    reference_id: int
+    frame_id: int
+    T_reference_frame: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """Poses that hold the world."""
+
+    frame_ids: tuple[int, ...]
+
+
+Line: TypeAlias = Vertex | Measurement | Fix
+
+
+def parse_line(text: str) -> Line | None:
+    """Return what one line says.
+
+    Parameters
+    ----------
+    text : str
+        A line of a file.
+
+    Returns
+    -------
+    Vertex, Measurement, Fix or None
+        None for an empty line, a comment, and a tag that is not one of `TAGS`.
+
+    Raises
+    ------
+    ValueError
+        Where the tag is understood and the rest of the line is not what belongs to it.
+
+    Examples
+    --------
+    >>> parse_line("VERTEX_SE3:QUAT 7 1 2 3 0 0 0 1").T_world_frame[:3, 3].tolist()
+    [1.0, 2.0, 3.0]
+    """
+    fields = text.partition("#")[0].split()
+    if not fields or fields[0] not in TAGS:
+        return None
+    tag = fields[0]
+    if tag == "FIX":
+        return Fix(frame_ids=tuple(_id(field) for field in fields[1:]))
+    n_ids = 2 if tag in MEASUREMENT_TAGS else 1
+    n_pose = 7 if tag in _QUATERNION_TAGS else 6
+    n_expected = 1 + n_ids + n_pose + (21 if n_ids == 2 else 0)
+    if tag == "EDGE3" and len(fields) == 1 + n_ids + n_pose:
+        fields += _UNIT_INFORMATION
+    if len(fields) != n_expected:
+        raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}")
+    ids = [_id(field) for field in fields[1 : 1 + n_ids]]
+    numbers = np.array([float(field) for field in fields[1 + n_ids :]])
+    T = _transform(numbers[:n_pose])
+    if n_ids == 1:
+        return Vertex(frame_id=ids[0], T_world_frame=T)
+    return Measurement(
+        reference_id=ids[0],
+        frame_id=ids[1],
+        T_reference_frame=T,
+        covariance=_covariance(numbers[n_pose:], is_swapped=tag in _QUATERNION_TAGS),
+    )
+
+
+def _id(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"the id {text!r} is no whole number") from None
+
+
+def _transform(numbers: FloatArray) -> FloatArray:
+    """Return the pose of x, y, z and a quaternion (x, y, z, w), or roll, pitch, yaw."""
+    if len(numbers) == 6:
+        R = Rotation.from_euler("xyz", numbers[3:]).as_matrix()
+        return se3.make_transform(np.asarray(R), numbers[:3])
+    norm = float(np.linalg.norm(numbers[3:]))
+    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        raise ValueError(f"the quaternion is of length {norm:.4g}, expected 1")
+    return se3.make_transform(np.asarray(Rotation.from_quat(numbers[3:]).as_matrix()), numbers[:3])
+
+
+def _covariance(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
+    information = np.zeros((6, 6))
+    information[_UPPER] = upper
+    information.T[_UPPER] = upper
+    if is_swapped:
+        information = information[np.ix_(_SWAPPED, _SWAPPED)]
+    try:
+        covariance = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.nan)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def format_vertex(frame_id: int | str, T_world_frame: FloatArray) -> str:
+    """Return a line `VERTEX_SE3:QUAT`, without its line end and without loss.
+
+    Parameters
+    ----------
+    frame_id : int or str
+    T_world_frame : ndarray of float64, shape (4, 4)
+        Metres.
+    """
+    return f"VERTEX_SE3:QUAT {frame_id} {_pose_fields(T_world_frame)}"
+
+
+def format_edge(
+    reference_id: int | str, frame_id: int | str, T: FloatArray, covariance: FloatArray
+) -> str:
+    """Return a line `EDGE_SE3:QUAT`, without its line end.
+
+    Parameters
+    ----------
+    reference_id, frame_id : int or str
+    T : ndarray of float64, shape (4, 4)
+        T_reference_frame, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; positive definite.
+    """
+    information = np.linalg.inv(covariance)[np.ix_(_SWAPPED, _SWAPPED)]
+    information = 0.5 * (information + information.T)
+    upper = " ".join(repr(float(value)) for value in information[_UPPER])
+    return f"EDGE_SE3:QUAT {reference_id} {frame_id} {_pose_fields(T)} {upper}"
+
+
+def convert_line(text: str) -> str:
+    """Return a measurement's line in the newer form: `EDGE3` becomes `EDGE_SE3:QUAT`.
+
+    Parameters
+    ----------
+    text : str
+        A line that `parse_line` understands; what is no `EDGE3` is returned as it is.
+    """
+    text = text.strip()
+    line = parse_line(text)
+    if not isinstance(line, Measurement) or text.split()[0] != "EDGE3":
+        return text
+    numbers = text.partition("#")[0].split()[9:] or _UNIT_INFORMATION
+    order = np.zeros((6, 6), dtype=np.int64)
+    order[_UPPER] = np.arange(21)
+    order.T[_UPPER] = np.arange(21)
+    # The numbers themselves, in the other order: nothing is rounded.
+    upper = " ".join(numbers[i] for i in order[np.ix_(_SWAPPED, _SWAPPED)][_UPPER])
+    T = line.T_reference_frame
+    return f"EDGE_SE3:QUAT {line.reference_id} {line.frame_id} {_pose_fields(T)} {upper}"
+
+
+def _pose_fields(T: FloatArray) -> str:
+    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return " ".join(repr(float(value) + 0.0) for value in (*T[:3, 3], *quaternion))

@@ -1,0 +1,166 @@
+"""Topics of a bag that hold poses: odometry, stamped poses with and without covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.sources.bag_reader import BagReader
+from gvo.sources.edges import InputFaults
+from gvo.sources.messages import stamp_of
+from gvo.sources.pose_streams import PoseSample
+from gvo.sources.topics import Topic
+from gvo.trajectory import StampsFrom
+from gvo.types import FloatArray
+
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/PoseStamped",
+)
+"""Message types that hold a pose of a stamp; the last one without a covariance."""
+
+_NORM_TOLERANCE = 1e-2
+
+
+class TopicStream:
+    """The poses of one topic of a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+    topic : Topic
+        Of one of `POSE_TYPES`.
+    """
+
+    def __init__(self, reader: BagReader, topic: Topic) -> None:
+        self._reader = reader
+        self._topic = topic
+        self.name = topic.name
+        self.decisions = [f"{topic.name}: {topic.type}, {topic.n_messages} messages"]
+        self.n_poses = topic.n_messages
+        self.stamps_from: StampsFrom = "file"
+
+    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
+        """Yield the poses in the order of recording; skip and count what holds none.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read on.
+        """
+        n_messages = 0
+        for message in self._reader.messages([self._topic.name]):
+            if message.topic.type != self._topic.type:
+                continue
+            n_messages += 1
+            try:
+                yield _sample(message.decode(), self._topic)
+            except RecordingError as error:
+                faults.add("messages hold no pose and were skipped", str(error))
+        if n_messages == 0:
+            raise RecordingError(
+                f"{self._topic.name} announces {self._topic.n_messages} messages but yields "
+                "none; record or convert the bag anew"
+            )
+
+
+def find_topics(reader: BagReader, names: Sequence[str], where: str) -> list[Topic]:
+    """Find the topics of poses that were asked for, or the only one there is.
+
+    Parameters
+    ----------
+    reader : BagReader
+    names : sequence of str
+        With or without the leading slash; empty: the only topic of poses is taken.
+    where : str
+        The bag, for messages.
+
+    Returns
+    -------
+    list of Topic
+        In the order of the names.
+
+    Raises
+    ------
+    RecordingError
+        When a name is unknown, or none is given and there is not exactly one topic of poses.
+    """
+    found = [topic for topic in reader.topics if topic.type in POSE_TYPES and topic.n_messages]
+    if names:
+        return [_find(name, found, where) for name in names]
+    if len(found) == 1:
+        return found
+    if not found:
+        raise RecordingError(
+            f"{where}: holds no poses; expected a topic of {', '.join(POSE_TYPES)}"
+        )
+    raise RecordingError(
+        f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
+        f"several: {_list(found)}"
+    )
+
+
+def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
+    for topic in topics:
+        if topic.name.strip("/") == name.strip("/"):
+            return topic
+    held = _list(topics) if topics else "none"
+    raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
+
+
+def _list(topics: Sequence[Topic]) -> str:
+    return ", ".join(f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics)
+
+
+def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at run time
+    stamp_ns = stamp_of(message.header)
+    has_covariance = topic.type != POSE_TYPES[-1]
+    pose = message.pose.pose if has_covariance else message.pose
+    t = np.array([getattr(pose.position, axis) for axis in "xyz"], dtype=np.float64)
+    quaternion_xyzw = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
+    norm = np.linalg.norm(quaternion_xyzw)
+    if not np.isfinite(t).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        raise RecordingError(f"{topic.name} at {stamp_ns} ns: the pose is no transform")
+    R = np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix())
+    return PoseSample(
+        stamp_ns=stamp_ns,
+        T_world_frame=se3.make_transform(R, t),
+        covariance=_covariance(message.pose.covariance, R) if has_covariance else None,
+    )
+
+
+def _covariance(numbers: FloatArray, R: FloatArray) -> FloatArray | None:
+    """Return the covariance of 36 numbers; None where they say that it is not known."""
+    covariance_ros = np.asarray(numbers, dtype=np.float64).reshape(6, 6)
+    if not np.isfinite(covariance_ros).all() or covariance_ros[0, 0] < 0.0:
+        return None
+    covariance = se3.covariance_from_ros(covariance_ros, R)
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
+    """Return the streams of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag`, `.mcap` or `.db3` file, or a ROS 2 bag folder.
+    names : sequence of str
+        Topics; empty: the only one there is.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read or does not hold the topics.
+    """
+    reader = BagReader(path)
+    streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
+    streams[0].decisions[:0] = reader.notes
+    return streams

@@ -1,0 +1,270 @@
+"""The contract of a front-end, as a test that one's own suite can call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gvo.frontend.protocol import Frontend, Stamped, find_fault
+from gvo.geometry import se3
+from gvo.testing.fingerprint import fingerprint
+from gvo.types import Failure, FloatArray, RelativePose, RgbdFrame, StereoFrame
+
+# Of six honest errors, 3 in 10,000 are farther off; it leaves room for covariances a little small.
+_AGREEMENT_SIGMAS = 5.0
+# Differences below this are none, however sure the front-end is: radians and metres.
+_NEGLIGIBLE_RAD = 1e-4
+_NEGLIGIBLE_M = 1e-3
+# A prior is made wrong by so many sigmas, but not by more than a search has to forgive.
+_PRIOR_SIGMAS = 10.0
+_PRIOR_LIMITS = np.repeat([0.005, 0.02], 3)
+_SHIFT_PX = 8
+_SHIFT_DEPTH_M = 5.0
+
+
+class ContractError(AssertionError):
+    """A front-end breaks its contract; the message says how, in one line."""
+
+
+def check_frontend(
+    frontend: Frontend[Any], frames: Sequence[Stamped], *, blank: Stamped | None = None
+) -> None:
+    """Check that a front-end keeps its contract on consecutive frames of a recording.
+
+    - `extract` keeps the stamp and leaves the frame as it is;
+    - a frame registered against itself has not moved;
+    - T_reference_current is rigid, its covariance symmetric and positive definite, both float64;
+    - forth and back are inverse to each other, and with a prior (10 sigma off) comes the same
+      as without, both within 5 sigma of their covariances;
+    - it maps the current frame to the reference, not the other way round (camera images only);
+    - the same call gives the same result, bit for bit, and changes none of its arguments;
+    - where nothing can be seen there is a falsy `Failure` with a reason, and no exception.
+
+    Differences below 0.1 mrad and 1 mm count as none.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    frames : sequence of at least three frames
+        Consecutive ones, with motion and something to see.
+    blank : frame, optional
+        One without anything to see, stamped later than the others; made from the first where
+        this is a StereoFrame or RgbdFrame, else left out.
+
+    Raises
+    ------
+    ContractError
+        With the first breach. It is an AssertionError, so that test runners show it as one.
+    ValueError
+        For fewer than three frames.
+
+    Examples
+    --------
+    In a test of your own::
+
+        def test_my_front_end_keeps_the_contract() -> None:
+            recording = gvo.SyntheticRecording("handheld", "stereo", n_frames=3)
+            frames = list(gvo.frames(recording, gvo.Config()))
+            check_frontend(MyFrontend(recording.info.camera), frames)
+    """
+    if len(frames) < 3:
+        raise ValueError(f"the contract is checked on at least three frames, got {len(frames)}")
+    observations = [_check_extract(frontend, frame) for frame in frames]
+    for each in observations[:3]:
+        _check_standing_still(frontend, each)
+    for reference, current in pairwise(observations):
+        result = _check_pair(frontend, reference, current)
+        _check_inverse(frontend, result, reference, current)
+        _check_prior(frontend, result, reference, current)
+    _check_direction(frontend, frames[0])
+    for nothing in _without_anything(frames[0], frames[-1], blank):
+        _check_nothing_seen(frontend, observations[0], nothing)
+
+
+def _require(is_kept: bool | np.bool_, message: str) -> None:
+    if not is_kept:
+        raise ContractError(message)
+
+
+def _check_extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
+    before = fingerprint(frame)
+    first = frontend.extract(frame)
+    _require(fingerprint(frame) == before, f"extract changes the frame at {frame.stamp_ns}")
+    second = frontend.extract(frame)
+    stamp_ns = getattr(first, "stamp_ns", None)
+    _require(
+        stamp_ns == frame.stamp_ns,
+        f"extract must keep the stamp {frame.stamp_ns}, its observations have {stamp_ns}",
+    )
+    _require(
+        fingerprint(first) == fingerprint(second),
+        f"extract gives other observations of the frame at {frame.stamp_ns} when called again",
+    )
+    observations: Stamped = first
+    return observations
+
+
+def _register(
+    frontend: Frontend[Any], reference: Stamped, current: Stamped, prior: FloatArray | None
+) -> RelativePose | Failure:
+    """Register twice, and check what holds for any arguments."""
+    name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+    given = None if prior is None else prior.copy()
+    before = [fingerprint(value) for value in (reference, current, prior)]
+    results = [frontend.register(reference, current, given) for _ in range(2)]
+    after = [fingerprint(value) for value in (reference, current, given)]
+    for part, is_same in zip(
+        ("reference", "current", "prior"), np.equal(before, after), strict=True
+    ):
+        _require(is_same, f"{name} changes its argument {part}")
+    first, second = results
+    _require(
+        isinstance(first, RelativePose | Failure),
+        f"{name} must return RelativePose or Failure, got {type(first).__name__}",
+    )
+    _require(
+        fingerprint(first) == fingerprint(second),
+        f"{name} gives another result when called again with the same arguments",
+    )
+    if isinstance(first, RelativePose):
+        fault = find_fault(first)
+        _require(not fault, f"{name}: {fault}")
+    return first
+
+
+def _check_pair(frontend: Frontend[Any], reference: Stamped, current: Stamped) -> RelativePose:
+    result = _register(frontend, reference, current, None)
+    if isinstance(result, Failure):
+        raise ContractError(
+            f"register({reference.stamp_ns}, {current.stamp_ns}) fails on consecutive frames: "
+            f"{result.reason}"
+        )
+    return result
+
+
+def _check_standing_still(frontend: Frontend[Any], observations: Stamped) -> None:
+    result = _check_pair(frontend, observations, observations)
+    _check_agreement(
+        f"register of the frame at {observations.stamp_ns} with itself and the identity",
+        result.T_reference_current,
+        result.covariance,
+    )
+
+
+def _check_inverse(
+    frontend: Frontend[Any], forth: RelativePose, reference: Stamped, current: Stamped
+) -> None:
+    back = _check_pair(frontend, current, reference)
+    covariance = se3.compose_covariance(forth.covariance, back.T_reference_current, back.covariance)
+    _check_agreement(
+        f"register({reference.stamp_ns}, {current.stamp_ns}) and the inverse of what it gives "
+        "the other way round",
+        forth.T_reference_current @ back.T_reference_current,
+        covariance,
+    )
+
+
+def _check_prior(
+    frontend: Frontend[Any], result: RelativePose, reference: Stamped, current: Stamped
+) -> None:
+    sigmas: FloatArray = np.sqrt(np.diag(result.covariance))
+    signs = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    error: FloatArray = signs * np.minimum(_PRIOR_SIGMAS * sigmas, _PRIOR_LIMITS)
+    for prior in (result.T_reference_current, result.T_reference_current @ se3.exp(error)):
+        guided = _register(frontend, reference, current, prior)
+        name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+        if isinstance(guided, Failure):
+            raise ContractError(f"{name} fails with a prior and not without: {guided.reason}")
+        _check_agreement(
+            f"{name} with and without a prior",
+            se3.invert(result.T_reference_current) @ guided.T_reference_current,
+            result.covariance + guided.covariance,
+        )
+
+
+def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) -> None:
+    twist = se3.log(difference)
+    rotation, translation = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
+    if rotation < _NEGLIGIBLE_RAD and translation < _NEGLIGIBLE_M:
+        return
+    n_sigmas = float(np.sqrt(max(float(twist @ np.linalg.solve(covariance, twist)), 0.0)))
+    _require(
+        n_sigmas <= _AGREEMENT_SIGMAS,
+        f"{name} disagree by {n_sigmas:.1f} sigma of their covariances "
+        f"({1e3 * rotation:.2f} mrad, {1e3 * translation:.2f} mm)",
+    )
+
+
+def _check_direction(frontend: Frontend[Any], frame: Stamped) -> None:
+    """Shift images to the left: the camera has turned, or moved, to the right."""
+    if not isinstance(frame, StereoFrame | RgbdFrame):
+        return
+    arrays = _images_of(frame)
+    shifted: dict[str, Any] = {
+        name: np.concatenate(
+            [image[:, _SHIFT_PX:], np.repeat(image[:, -1:], _SHIFT_PX, axis=1)], axis=1
+        )
+        for name, image in arrays.items()
+    }
+    turned = replace(frame, stamp_ns=frame.stamp_ns + 1, **shifted)
+    result = _check_pair(frontend, frontend.extract(frame), frontend.extract(turned))
+    ahead = result.T_reference_current @ [0.0, 0.0, _SHIFT_DEPTH_M, 1.0]
+    _require(
+        ahead[0] > 0.0,
+        "register must return T_reference_current, which maps the current frame to the "
+        "reference: images shifted to the left are a turn to the right, and it says the opposite",
+    )
+
+
+def _without_anything(first: Stamped, last: Stamped, blank: Stamped | None) -> list[Stamped]:
+    """Return frames that have nothing in common with any other."""
+    frames = [] if blank is None else [blank]
+    if not isinstance(first, StereoFrame | RgbdFrame):
+        return frames
+    rng = np.random.default_rng(0)
+    arrays = _images_of(first)
+    uniform: dict[str, Any] = {name: np.full_like(array, 100) for name, array in arrays.items()}
+    unknown = {"depth": np.full_like(arrays["depth"], np.nan)} if "depth" in arrays else {}
+    strange = {
+        name: rng.integers(0, 256, array.shape, dtype=np.uint8)
+        for name, array in arrays.items()
+        if name != "depth"
+    }
+    for n, content in enumerate((uniform | unknown, strange)):
+        frames.append(replace(first, stamp_ns=last.stamp_ns + 1 + n, **content))
+    return frames
+
+
+def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:
+    if isinstance(frame, StereoFrame):
+        return {"left": frame.left, "right": frame.right}
+    return {"image": frame.image, "depth": frame.depth}
+
+
+def _check_nothing_seen(frontend: Frontend[Any], observations: Stamped, frame: Stamped) -> None:
+    stamps = f"{observations.stamp_ns}, {frame.stamp_ns}"
+    try:
+        nothing = frontend.extract(frame)
+        results = [
+            _register(frontend, reference, current, prior)
+            for reference, current in ((observations, nothing), (nothing, observations))
+            for prior in (None, np.eye(4))
+        ]
+    except ContractError:
+        raise
+    except Exception as error:  # whatever it is, it is the breach that is looked for
+        raise ContractError(
+            f"frames without anything in common ({stamps}) raise {type(error).__name__}: {error}; "
+            "a Failure is expected"
+        ) from error
+    for result in results:
+        is_failure = isinstance(result, Failure) and not result
+        _require(is_failure, f"frames without anything in common ({stamps}) are registered")
+        _require(
+            isinstance(result, Failure) and bool(result.reason.strip()),
+            f"the Failure of frames without anything in common ({stamps}) gives no reason",
+        )

@@ -1,0 +1,123 @@
+"""Factors against the costs that the kernels' authors give."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import integrate, stats
+
+from gvo.backend.factors import Factors
+from gvo.config import Kernel, WindowConfig
+from gvo.types import Edge, FloatArray, PositionPrior
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+KERNELS: tuple[Kernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
+CONSTANTS: dict[Kernel, float] = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
+
+
+def expected_cost(kernel: Kernel, r: float, k: float) -> float:
+    """Return the published costs of a residual of norm r."""
+    if kernel == "huber":
+        return 0.5 * r**2 if r <= k else k * (r - 0.5 * k)
+    if kernel == "cauchy":
+        return float(0.5 * k**2 * np.log1p((r / k) ** 2))
+    if kernel == "geman_mcclure":
+        return 0.5 * k**2 * r**2 / (k**2 + r**2)
+    if kernel == "dcs":
+        scale = min(1.0, 2.0 * k / (k + r**2))
+        return 0.5 * scale**2 * r**2 + 0.5 * k * (1.0 - scale) ** 2
+    return 0.5 * r**2
+
+
+def weight(kernel: Kernel, r: FloatArray, k: float) -> FloatArray:
+    """Return the weights that belong to the costs: their slope over r."""
+    if kernel == "huber":
+        return np.minimum(1.0, k / r)
+    if kernel == "cauchy":
+        return 1.0 / (1.0 + (r / k) ** 2)
+    if kernel == "geman_mcclure":
+        return (k**2 / (k**2 + r**2)) ** 2
+    return np.minimum(1.0, 2.0 * k / (k + r**2)) ** 2
+
+
+@settings(deadline=None)
+@given(seed=seeds, size=st.floats(0.01, 40.0), kernel=st.sampled_from(KERNELS))
+def test_the_cost_of_an_edge_is_that_of_its_kernel(seed: int, size: float, kernel: Kernel) -> None:
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(6, 6)) * 10.0 ** rng.uniform(-3, -1, size=6)
+    covariance = factor.T @ factor
+    direction = rng.normal(size=6)
+    xi = size * direction / np.sqrt(direction @ np.linalg.solve(covariance, direction))
+    if np.linalg.norm(xi[:3]) > 3.0:  # beyond half a turn the twist is another one
+        return
+    edge = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=covariance)
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose3())
+    values.insert(1, gtsam.Pose3.Expmap(xi))
+    for made in (
+        Factors(WindowConfig(kernel=kernel)).between(0, 1, edge),
+        Factors(WindowConfig(kernel="none")).between(
+            0,
+            1,
+            Edge(
+                reference_id=0,
+                T_reference_frame=np.eye(4),
+                covariance=covariance,
+                kernel=kernel,
+            ),
+        ),
+    ):
+        expected = expected_cost(kernel, size, CONSTANTS.get(kernel, 0.0))
+        if kernel != "dcs":  # GTSAM counts the cost of DCS without what is constant in it
+            assert made.error(values) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("kernel", [kernel for kernel in KERNELS if kernel != "none"])
+def test_the_constants_lose_as_little_of_good_data(kernel: Kernel) -> None:
+    # Asymptotic efficiency of an M-estimator of location in six dimensions, of its weights.
+    k, p = CONSTANTS[kernel], 6
+
+    def mean(function: FloatArray, r: FloatArray) -> float:
+        return float(integrate.trapezoid(function * stats.chi(p).pdf(r), r))
+
+    r = np.linspace(1e-4, 15.0, 60001)
+    psi = weight(kernel, r, k) * r
+    slope = mean(np.gradient(psi, r) / p + (1.0 - 1.0 / p) * psi / r, r)
+    efficiency = slope**2 / (mean(psi**2, r) / p)
+    assert efficiency == pytest.approx(0.9984, abs=2e-4)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_residual_names_the_weight_of_its_kernel(kernel: Kernel) -> None:
+    T = np.eye(4)
+    T[0, 3] = 6.0
+    edge = Edge(reference_id="a", T_reference_frame=T, covariance=np.eye(6), kernel=kernel)
+    found = Factors(WindowConfig()).residual_of_edge(edge, "b", np.eye(4), np.eye(4))
+    np.testing.assert_allclose(found.residual, [0, 0, 0, -6, 0, 0], atol=1e-12)
+    expected = 1.0 if kernel == "none" else float(weight(kernel, np.array(6.0), CONSTANTS[kernel]))
+    assert found.weight == pytest.approx(expected)
+    assert found.chi2 == pytest.approx(36.0)
+
+
+def test_a_configured_constant_replaces_that_of_the_configured_kernel_alone() -> None:
+    factors = Factors(WindowConfig(kernel="huber", kernel_threshold=2.0))
+    T = np.eye(4)
+    T[0, 3] = 8.0
+    weights = {}
+    for kernel in ("huber", "cauchy"):
+        edge = Edge(reference_id="a", T_reference_frame=T, covariance=np.eye(6), kernel=kernel)
+        weights[kernel] = factors.residual_of_edge(edge, "b", np.eye(4), np.eye(4)).weight
+    assert weights["huber"] == pytest.approx(0.25)
+    assert weights["cauchy"] == pytest.approx(1.0 / (1.0 + (8.0 / 9.4) ** 2))
+
+
+def test_a_position_weighs_along_the_axes_of_the_world() -> None:
+    prior = PositionPrior(position_world=np.zeros(3), covariance=np.diag([1.0, 4.0, 9.0]))
+    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, 0.4, 0.5), np.array([1.0, 2.0, 3.0]))
+    values = gtsam.Values()
+    values.insert(7, T)
+    factors = Factors(WindowConfig())
+    assert factors.prior(7, prior).error(values) == pytest.approx(1.5)
+    found = factors.residual_of_prior(prior, "a", T.matrix())
+    np.testing.assert_allclose(found.residual, [1.0, 1.0, 1.0])

@@ -1,0 +1,740 @@
+"""The window against GTSAM's batch optimiser on the same measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.backend.window import SlidingWindow
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.types import (
+    Edge,
+    Estimate,
+    FloatArray,
+    FrameId,
+    GraphEdge,
+    PosePrior,
+    PositionPrior,
+    Prior,
+    Rejected,
+    Status,
+)
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+STEP_NS = 100_000_000
+KERNELS = ["none", "huber", "cauchy", "geman_mcclure", "dcs"]
+THRESHOLDS = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
+
+
+def wander(rng: np.random.Generator, n: int) -> list[FloatArray]:
+    """Return n poses on a winding way, the first the identity."""
+    poses = [np.eye(4)]
+    for _ in range(n - 1):
+        twist = np.r_[0.1 * rng.normal(size=3), [0.0, 0.0, 0.3] + 0.1 * rng.normal(size=3)]
+        poses.append(se3.normalize(poses[-1] @ se3.exp(twist)))
+    return poses
+
+
+def random_covariance(rng: np.random.Generator, sigma: float, n: int = 6) -> FloatArray:
+    sigmas = sigma * rng.uniform(0.5, 2.0, size=n)
+    factor = np.eye(n) + 0.2 * rng.normal(size=(n, n))
+    return np.asarray((sigmas[:, None] * (factor @ factor.T)) * sigmas)
+
+
+def measure(
+    poses: Sequence[FloatArray], i: int, j: int, rng: np.random.Generator, sigma: float
+) -> Edge:
+    covariance = random_covariance(rng, sigma)
+    noise = se3.exp(rng.multivariate_normal(np.zeros(6), covariance))
+    T = se3.normalize(np.linalg.inv(poses[i]) @ poses[j] @ noise)
+    return Edge(reference_id=i, T_reference_frame=T, covariance=covariance)
+
+
+def number(frame_id: FrameId) -> int:
+    assert isinstance(frame_id, int)
+    return frame_id
+
+
+def make_kernel(kernel: str, threshold: float | None = None) -> Any:
+    makers: dict[str, Any] = {
+        "huber": gtsam.noiseModel.mEstimator.Huber,
+        "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+        "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
+        "dcs": gtsam.noiseModel.mEstimator.DCS,
+    }
+    return makers[kernel].Create(THRESHOLDS[kernel] if threshold is None else threshold)
+
+
+def make_noise(covariance: FloatArray, kernel: str, threshold: float | None = None) -> Any:
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    if kernel == "none":
+        return gaussian
+    return gtsam.noiseModel.Robust.Create(make_kernel(kernel, threshold), gaussian)
+
+
+def between_factor(frame: int, edge: Edge, kernel: str, threshold: float | None = None) -> Any:
+    noise = make_noise(edge.covariance, edge.kernel or kernel, threshold)
+    measured = gtsam.Pose3(edge.T_reference_frame)
+    return gtsam.BetweenFactorPose3(number(edge.reference_id), frame, measured, noise)
+
+
+def prior_factor(frame: int, prior: Prior) -> Any:
+    noise = make_noise(prior.covariance, prior.kernel)
+    if isinstance(prior, PosePrior):
+        return gtsam.PriorFactorPose3(frame, gtsam.Pose3(prior.T_world_frame), noise)
+    return gtsam.GPSFactor(frame, prior.position_world, noise)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Measurements in the order of their coming."""
+
+    poses: list[FloatArray]
+    edges: list[list[Edge]]
+    """With each pose."""
+    late_edges: dict[int, list[tuple[int, Edge]]] = field(default_factory=dict)
+    """By the pose after which they come: frame and edge."""
+    priors: dict[int, Prior] = field(default_factory=dict)
+    """With their pose."""
+    late_priors: dict[int, list[tuple[int, Prior]]] = field(default_factory=dict)
+    """By the pose after which they come: frame and prior."""
+
+    def all_edges(self, n: int) -> list[tuple[int, Edge]]:
+        """Return frame and edge of all that came with the first n poses."""
+        found = [(frame, edge) for frame in range(n) for edge in self.edges[frame]]
+        return found + [late for after in range(n) for late in self.late_edges.get(after, [])]
+
+    def all_priors(self, n: int) -> list[tuple[int, Prior]]:
+        found = [(frame, prior) for frame, prior in self.priors.items() if frame < n]
+        return found + [late for after in range(n) for late in self.late_priors.get(after, [])]
+
+
+def feed(window: SlidingWindow, problem: Problem) -> list[Estimate]:
+    """Give a window all measurements; none may be refused."""
+    causal = []
+    for frame, frame_edges in enumerate(problem.edges):
+        stamp = frame * STEP_NS
+        estimate = window.add_pose(frame, stamp, frame_edges, problem.priors.get(frame))
+        assert estimate.rejected == ()
+        for late_frame, edge in problem.late_edges.get(frame, []):
+            answer: object = window.add_edge(late_frame, edge)
+            assert isinstance(answer, Estimate), answer
+        for late_frame, prior in problem.late_priors.get(frame, []):
+            answer = window.add_prior(late_frame, prior)
+            assert isinstance(answer, Estimate), answer
+        causal.append(estimate)
+    return causal
+
+
+def build(
+    problem: Problem, kernel: str = "none", n: int | None = None, threshold: float | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """Return the graph of the first n poses in GTSAM's own words."""
+    n = len(problem.poses) if n is None else n
+    graph = gtsam.NonlinearFactorGraph()
+    if not isinstance(problem.priors.get(0), PosePrior):
+        sigmas = np.full(6, 1e-5)
+        if isinstance(problem.priors.get(0), PositionPrior):
+            sigmas = np.r_[np.ones(3), np.full(3, 1e6)]
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
+    for frame, edge in problem.all_edges(n):
+        graph.add(between_factor(frame, edge, kernel, threshold))
+    for frame, prior in problem.all_priors(n):
+        graph.add(prior_factor(frame, prior))
+    return graph
+
+
+def values_of(poses: Mapping[Any, FloatArray]) -> gtsam.Values:
+    values = gtsam.Values()
+    for frame, T in poses.items():
+        values.insert(frame, gtsam.Pose3(T))
+    return values
+
+
+def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-15)
+    parameters.setAbsoluteErrorTol(1e-15)
+    parameters.setMaxIterations(200)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+
+
+def batch(
+    problem: Problem, kernel: str = "none", n: int | None = None
+) -> tuple[gtsam.Values, gtsam.Marginals]:
+    """Optimise all measurements of the first n poses at once, from the true poses."""
+    n = len(problem.poses) if n is None else n
+    graph = build(problem, kernel, n)
+    optimum = optimise(graph, values_of(dict(enumerate(problem.poses[:n]))))
+    return optimum, gtsam.Marginals(graph, optimum)
+
+
+def loopy_problem(seed: int, n: int, sigma: float, *, with_priors: bool = False) -> Problem:
+    """Return a chain with random links, loops that come late, and absolute measurements."""
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, n)
+    edges: list[list[Edge]] = [[]]
+    late_edges: dict[int, list[tuple[int, Edge]]] = {}
+    for frame in range(1, n):
+        older = rng.permutation(np.arange(max(frame - 6, 0), frame - 1))[: rng.integers(3)]
+        references = [frame - 1, *older.tolist()]
+        edges.append([measure(poses, i, frame, rng, sigma) for i in references])
+        if frame > 5 and rng.random() < 0.3:
+            i, j = sorted(rng.choice(frame + 1, size=2, replace=False).tolist())
+            if rng.random() < 0.5:
+                i, j = j, i  # a late edge may point either way
+            late_edges.setdefault(frame, []).append((j, measure(poses, i, j, rng, sigma)))
+    problem = Problem(poses=poses, edges=edges, late_edges=late_edges)
+    return add_priors(problem, rng, sigma) if with_priors else problem
+
+
+def random_prior(rng: np.random.Generator, T: FloatArray, sigma: float) -> Prior:
+    if rng.random() < 0.5:
+        covariance = random_covariance(rng, sigma)
+        noise = se3.exp(rng.multivariate_normal(np.zeros(6), covariance))
+        return PosePrior(T_world_frame=se3.normalize(T @ noise), covariance=covariance)
+    covariance = random_covariance(rng, sigma, 3)
+    position = rng.multivariate_normal(T[:3, 3], covariance)
+    return PositionPrior(position_world=position, covariance=covariance)
+
+
+def add_priors(problem: Problem, rng: np.random.Generator, sigma: float) -> Problem:
+    start = PosePrior(T_world_frame=np.eye(4), covariance=random_covariance(rng, sigma))
+    priors: dict[int, Prior] = {0: start}
+    late_priors: dict[int, list[tuple[int, Prior]]] = {}
+    for frame in range(1, len(problem.poses)):
+        if rng.random() < 0.2:
+            priors[frame] = random_prior(rng, problem.poses[frame], sigma)
+        if rng.random() < 0.1:
+            older = int(rng.integers(frame + 1))
+            late = random_prior(rng, problem.poses[older], sigma)
+            late_priors.setdefault(frame, []).append((older, late))
+    return replace(problem, priors=priors, late_priors=late_priors)
+
+
+def assert_equal_covariances(found: FloatArray, expected: FloatArray, tolerance: float) -> None:
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=tolerance)
+
+
+# Full smoothing is the batch optimum.
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds, with_priors=st.booleans())
+def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_priors: bool) -> None:
+    problem = loopy_problem(seed, 40, 0.01, with_priors=with_priors)
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    feed(window, problem)
+    smoothed = window.finish()
+    optimum, marginals = batch(problem)
+    assert [e.frame_id for e in smoothed] == list(range(40))
+    for frame, estimate in enumerate(smoothed):
+        expected = optimum.atPose3(frame).matrix()
+        np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-6)
+        assert_equal_covariances(estimate.covariance, marginals.marginalCovariance(frame), 0.05)
+    assert window.polish is not None
+    error = build(problem).error(optimum)
+    assert window.polish.error_after == pytest.approx(error, rel=1e-6)
+    assert window.polish.error_before >= window.polish.error_after * (1 - 1e-9)
+
+
+@settings(deadline=None, max_examples=6)
+@given(seed=seeds, with_priors=st.booleans())
+def test_each_answer_is_the_batch_optimum_of_what_was_known(seed: int, with_priors: bool) -> None:
+    # Measurements so good that one linearization is as good as many.
+    problem = loopy_problem(seed, 20, 2e-5, with_priors=with_priors)
+    causal = feed(SlidingWindow(WindowConfig(size=None, kernel="none")), problem)
+    for n in (3, 8, 14, 20):
+        known = replace(
+            problem,
+            late_edges={k: v for k, v in problem.late_edges.items() if k < n - 1},
+            late_priors={k: v for k, v in problem.late_priors.items() if k < n - 1},
+        )
+        optimum, marginals = batch(known, n=n)
+        expected = optimum.atPose3(n - 1).matrix()
+        np.testing.assert_allclose(causal[n - 1].T_world_cam, expected, atol=1e-7)
+        covariance = marginals.marginalCovariance(n - 1)
+        assert_equal_covariances(causal[n - 1].covariance, covariance, 1e-3)
+
+
+def test_a_late_loop_answers_with_the_pose_it_moved() -> None:
+    rng = np.random.default_rng(1)
+    poses = wander(rng, 30)
+    edges = [[], *([measure(poses, i - 1, i, rng, 1e-4)] for i in range(1, 30))]
+    problem = Problem(poses=poses, edges=edges)
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    feed(window, problem)
+    before = window.pose(29)
+    loop = measure(poses, 0, 29, rng, 1e-5)
+    answer = window.add_edge(29, loop)
+    assert isinstance(answer, Estimate)
+    assert (answer.frame_id, answer.stamp_ns) == (29, 29 * STEP_NS)
+    optimum, marginals = batch(replace(problem, late_edges={29: [(29, loop)]}))
+    expected = optimum.atPose3(29).matrix()
+    assert np.abs(before - expected).max() > 1e-4  # there was something to close
+    np.testing.assert_allclose(answer.T_world_cam, expected, atol=1e-5)
+    np.testing.assert_allclose(answer.T_world_cam, window.pose(29), atol=1e-12)
+    assert_equal_covariances(answer.covariance, marginals.marginalCovariance(29), 5e-3)
+
+
+# Marginals of the window.
+
+
+def small_window(seed: int, size: int | None) -> tuple[SlidingWindow, Problem]:
+    """Return a window of very good measurements, fed with short links alone."""
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, 25)
+    edges: list[list[Edge]] = [[]]
+    for frame in range(1, 25):
+        references = range(max(frame - 3, 0), frame)
+        edges.append([measure(poses, i, frame, rng, 2e-5) for i in references])
+    problem = Problem(poses=poses, edges=edges)
+    window = SlidingWindow(WindowConfig(size=size, kernel="none"))
+    feed(window, problem)
+    return window, problem
+
+
+@pytest.mark.parametrize("size", [5, 8, None])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_poses_and_covariances_of_the_window_are_those_of_the_batch(
+    seed: int, size: int | None
+) -> None:
+    window, problem = small_window(seed, size)
+    optimum, marginals = batch(problem)
+    poses = window.poses()
+    assert list(poses) == list(range(25 - (size or 25), 25))
+    for frame, T in poses.items():
+        # A whole graph relinearizes rarely; it is polished at its end.
+        atol = 1e-7 if size else 1e-5
+        np.testing.assert_allclose(T, optimum.atPose3(number(frame)).matrix(), atol=atol)
+        np.testing.assert_array_equal(T, window.pose(frame))
+        expected = marginals.marginalCovariance(number(frame))
+        assert_equal_covariances(window.covariance(frame), expected, 1e-3)
+
+
+def relative_covariance(marginals: gtsam.Marginals, values: gtsam.Values, a: int, b: int) -> Any:
+    """Propagate the joint covariance of two poses by GTSAM's own derivatives of `between`."""
+    joint = marginals.jointMarginalCovariance(gtsam.KeyVector([a, b]))
+    H_a, H_b = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
+    values.atPose3(a).between(values.atPose3(b), H_a, H_b)
+    H = np.hstack([H_a, H_b])
+    full = np.block([[joint.at(i, j) for j in (a, b)] for i in (a, b)])
+    return H @ full @ H.T
+
+
+@pytest.mark.parametrize("size", [5, None])
+@pytest.mark.parametrize(("back_a", "back_b"), [(1, 0), (3, 1), (0, 4), (2, 3)])
+def test_relative_poses_carry_the_joint_covariance(
+    size: int | None, back_a: int, back_b: int
+) -> None:
+    window, problem = small_window(2, size)
+    optimum, marginals = batch(problem)
+    a, b = 24 - back_a, 24 - back_b
+    edge = window.relative_pose(a, b)
+    assert edge.reference_id == a
+    expected = optimum.atPose3(a).between(optimum.atPose3(b)).matrix()
+    np.testing.assert_allclose(edge.T_reference_frame, expected, atol=1e-7)
+    covariance = relative_covariance(marginals, optimum, a, b)
+    # Far less than two independent poses would give.
+    assert np.trace(edge.covariance) < 0.5 * np.trace(window.covariance(b))
+    assert_equal_covariances(edge.covariance, covariance, 2e-3)
+
+
+def test_the_relative_pose_of_a_single_edge_is_the_edge() -> None:
+    rng = np.random.default_rng(4)
+    poses = wander(rng, 12)
+    edges = [[], *([measure(poses, i - 1, i, rng, 0.01)] for i in range(1, 12))]
+    window = SlidingWindow(WindowConfig(size=4))
+    feed(window, Problem(poses=poses, edges=edges))
+    found = window.relative_pose(10, 11)
+    np.testing.assert_allclose(found.T_reference_frame, edges[11][0].T_reference_frame, atol=1e-6)
+    assert_equal_covariances(found.covariance, edges[11][0].covariance, 1e-3)
+    back = window.relative_pose(11, 10)
+    np.testing.assert_allclose(
+        back.T_reference_frame, np.linalg.inv(found.T_reference_frame), atol=1e-9
+    )
+    Ad = se3.adjoint(found.T_reference_frame)
+    assert_equal_covariances(back.covariance, Ad @ found.covariance @ Ad.T, 1e-3)
+
+
+# The graph as edges.
+
+
+def expected_factor(problem: Problem, edge: GraphEdge, kernel: str) -> tuple[Any, Any]:
+    """Return the measurement that an edge of the graph tells of, as a factor, and its kernel."""
+    frame = number(edge.frame_id)
+    if edge.reference_id is not None:
+        for candidate_frame, candidate in problem.all_edges(len(problem.poses)):
+            if (candidate_frame, candidate.reference_id) == (frame, edge.reference_id) and (
+                np.array_equal(candidate.covariance, edge.covariance)
+            ):
+                np.testing.assert_allclose(
+                    edge.T_reference_frame, candidate.T_reference_frame, atol=1e-12
+                )
+                return between_factor(frame, candidate, "none"), candidate.kernel or kernel
+    for candidate_frame, prior in problem.all_priors(len(problem.poses)):
+        if candidate_frame == frame and np.array_equal(prior.covariance, edge.covariance):
+            return prior_factor(frame, replace(prior, kernel="none")), prior.kernel
+    raise AssertionError(f"the graph tells of {edge.reference_id} -> {frame}, nobody gave it")
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("size", [6, None])
+def test_the_graph_tells_residuals_and_weights_as_gtsam_does(kernel: Any, size: int | None) -> None:
+    problem = loopy_problem(11, 30, 0.02, with_priors=True)
+    if size is not None:  # loops to poses that left are another matter
+        problem = replace(problem, late_edges={}, late_priors={})
+        problem = replace(
+            problem,
+            edges=[
+                [edge for edge in frame_edges if number(edge.reference_id) >= frame - 5]
+                for frame, frame_edges in enumerate(problem.edges)
+            ],
+        )
+    window = SlidingWindow(WindowConfig(size=size, kernel=kernel, gate=None))
+    feed(window, problem)
+    values = values_of(window.poses())
+    graph = window.graph()
+    alive = set(window.poses())
+    n_expected = sum(
+        {frame, edge.reference_id} <= alive for frame, edge in problem.all_edges(30)
+    ) + sum(frame in alive for frame, _ in problem.all_priors(30))
+    assert len(graph) == n_expected
+    weights = []
+    for edge in graph:
+        factor, its_kernel = expected_factor(problem, edge, kernel)
+        expected = factor.whitenedError(values)
+        assert edge.residual.shape == expected.shape
+        assert edge.chi2 == pytest.approx(2 * factor.error(values), rel=1e-6, abs=1e-9)
+        # Which square root of the information whitens is free; what it makes of noise is not.
+        assert np.linalg.norm(edge.residual) == pytest.approx(np.linalg.norm(expected), abs=1e-6)
+        norm = float(np.linalg.norm(expected))
+        weight = 1.0 if its_kernel == "none" else make_kernel(its_kernel).weight(norm)
+        assert edge.weight == pytest.approx(weight, rel=1e-6)
+        weights.append(edge.weight)
+    assert kernel in ("none", "huber", "dcs") or min(weights) < 0.99
+
+
+def test_without_a_prior_the_graph_tells_at_most_the_start_beside_the_edges() -> None:
+    problem = loopy_problem(3, 10, 0.01)
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    feed(window, problem)
+    graph = window.graph()
+    edges = [edge for edge in graph if edge.reference_id is not None]
+    assert len(edges) == len(problem.all_edges(10))
+    assert all(edge.frame_id == 0 for edge in graph if edge.reference_id is None)
+    chi2 = sum(edge.chi2 for edge in edges)
+    window.finish()
+    assert window.polish is not None
+    assert window.polish.error_before == pytest.approx(0.5 * chi2, rel=1e-3)
+
+
+# Robust kernels.
+
+
+@pytest.mark.parametrize("kernel", KERNELS[1:])
+@pytest.mark.parametrize("threshold", [None, 5.0])
+def test_full_smoothing_with_a_kernel_reaches_the_cost_of_the_batch(
+    kernel: Any, threshold: float | None
+) -> None:
+    problem = loopy_problem(12, 30, 0.01)
+    for frame in (10, 20):  # a dozen sigmas, one of several edges each
+        edge = problem.edges[frame][0]
+        wrong = edge.T_reference_frame @ se3.exp(np.array([0.05, -0.05, 0.0, 0.1, 0.0, 0.1]))
+        problem.edges[frame][0] = replace(edge, T_reference_frame=wrong)
+    config = WindowConfig(size=None, kernel=kernel, kernel_threshold=threshold, gate=None)
+    window = SlidingWindow(config)
+    feed(window, problem)
+    assert min(edge.weight for edge in window.graph()) < 0.9  # the kernel has something to do
+    smoothed = window.finish()
+    graph = build(problem, kernel, threshold=threshold)
+    found = values_of({number(e.frame_id): e.T_world_cam for e in smoothed})
+    truth = values_of(dict(enumerate(problem.poses)))
+    assert graph.error(found) <= graph.error(optimise(graph, found)) * (1 + 1e-6)
+    if kernel in ("huber", "cauchy"):  # the others have many optima
+        assert graph.error(found) <= graph.error(optimise(graph, truth)) * (1 + 1e-6)
+    assert window.polish is not None
+    assert window.polish.error_after == pytest.approx(graph.error(found), rel=1e-6)
+    if kernel in ("huber", "cauchy"):
+        assert graph.error(found) < graph.error(optimise(build(problem), truth))
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber"])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2), (1, 2, 0)])
+def test_edges_that_agree_within_the_kernel_give_their_mean_in_any_order(
+    kernel: Any, order: tuple[int, ...]
+) -> None:
+    window = SlidingWindow(WindowConfig(kernel=kernel))
+    window.add_pose(0, 0, [])
+    edges = []
+    for x in (-0.0025, 0.0025, 0.0015):  # 2.5 sigma at most from their mean
+        T = np.eye(4)
+        T[0, 3] = x
+        edges.append(Edge(reference_id=0, T_reference_frame=T, covariance=1e-6 * np.eye(6)))
+    estimate = window.add_pose(1, 1, [edges[i] for i in order])
+    assert [edge.weight for edge in window.graph() if edge.reference_id == 0] == [1.0, 1.0, 1.0]
+    assert estimate.T_world_cam[0, 3] == pytest.approx(0.0005, abs=2e-5)
+
+
+@pytest.mark.parametrize("kernel", KERNELS[1:])
+def test_an_edge_may_have_its_own_kernel(kernel: Any) -> None:
+    def second_pose(ours: Any, windows: Any) -> list[float]:
+        window = SlidingWindow(WindowConfig(kernel=windows, gate=None))
+        window.add_pose(0, 0, [])
+        edges = []
+        for x in (0.0, 0.01, 0.09):
+            T = np.eye(4)
+            T[0, 3] = x
+            edges.append(
+                Edge(reference_id=0, T_reference_frame=T, covariance=1e-4 * np.eye(6), kernel=ours)
+            )
+        window.add_pose(1, 1, edges)
+        return [edge.weight for edge in window.graph() if edge.reference_id == 0]
+
+    assert second_pose(kernel, "none") == pytest.approx(second_pose(None, kernel), rel=1e-9)
+    assert second_pose("none", kernel) == [1.0, 1.0, 1.0]
+    assert min(second_pose(kernel, "none")) < 1.0
+
+
+# Gating.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gross:
+    """A window of eight poses, and a ninth with one gross outlier among its edges."""
+
+    fed: list[list[Edge]]
+    edges: list[Edge]
+    place: int
+
+    def window(self, kernel: Any) -> SlidingWindow:
+        window = SlidingWindow(WindowConfig(size=8, kernel=kernel))
+        for frame, frame_edges in enumerate(self.fed):
+            assert window.add_pose(frame, frame, frame_edges).rejected == ()
+        return window
+
+
+def make_gross(
+    seed: int, place: int, n_edges: int, offset: FloatArray, sigma: float = 1e-3
+) -> Gross:
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, 9)
+    fed = [
+        [measure(poses, i, frame, rng, sigma) for i in range(max(frame - 3, 0), frame)]
+        for frame in range(8)
+    ]
+    edges = [measure(poses, i, 8, rng, 1e-3) for i in range(8 - n_edges, 8)]
+    wrong = se3.normalize(edges[place].T_reference_frame @ se3.exp(offset))
+    edges[place] = replace(edges[place], T_reference_frame=wrong)
+    return Gross(fed=fed, edges=edges, place=place)
+
+
+def assert_refused(gross: Gross, kernel: Any, atol: float) -> None:
+    """Check that the outlier alone is refused, and that the pose is that without it."""
+    window, twin = gross.window(kernel), gross.window(kernel)
+    wrong = gross.edges[gross.place]
+    found = window.add_pose(8, 8, gross.edges)
+    expected = twin.add_pose(8, 8, [edge for edge in gross.edges if edge is not wrong])
+    assert [r.reference_id for r in found.rejected] == [wrong.reference_id]
+    assert found.rejected[0].reason
+    assert (window.counts.n_gated, twin.counts.n_gated) == (1, 0)
+    np.testing.assert_allclose(found.T_world_cam, expected.T_world_cam, atol=atol)
+    # Of other start values: linearized a hundredth elsewhere.
+    assert_equal_covariances(found.covariance, expected.covariance, 0.03)
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    seed=seeds,
+    n_edges=st.integers(3, 5),
+    place=st.integers(0, 4),
+    size=st.floats(0.3, 1000.0),
+    is_turn=st.booleans(),
+)
+def test_one_gross_outlier_is_refused_wherever_it_stands(
+    seed: int, n_edges: int, place: int, size: float, is_turn: bool
+) -> None:
+    direction = np.random.default_rng(seed).normal(size=3)
+    direction /= np.linalg.norm(direction)
+    offset = np.r_[np.zeros(3), size * direction]
+    if is_turn:
+        offset = np.r_[min(size, 2.0) * direction, np.zeros(3)]
+    gross = make_gross(seed, place % n_edges, n_edges, offset)
+    assert_refused(gross, "none", 2e-5)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize("size", [1.0, 10.0, 1000.0])
+@pytest.mark.parametrize("sigma", [1e-4, 1e-2])
+def test_a_gross_outlier_is_refused_in_sure_and_unsure_windows(
+    place: int, size: float, sigma: float
+) -> None:
+    offset = np.array([0.0, 0.0, 0.0, size, 0.0, 0.0])
+    assert_refused(make_gross(0, place, 3, offset, sigma), "none", 1e-4)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_gross_outlier_that_is_refused_leaves_no_trace_under_a_kernel(place: int) -> None:
+    offset = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    assert_refused(make_gross(0, place, 3, offset), "huber", 1e-4)
+
+
+def test_without_a_gate_nothing_is_gated() -> None:
+    window = SlidingWindow(WindowConfig(gate=None, kernel="huber"))
+    window.add_pose(0, 0, [])
+    moved = np.eye(4)
+    moved[0, 3] = 0.5
+    edges = [
+        Edge(reference_id=0, T_reference_frame=T, covariance=1e-4 * np.eye(6))
+        for T in (np.eye(4), moved, np.eye(4))
+    ]
+    assert window.add_pose(1, 1, edges).rejected == ()
+    assert (window.counts.n_gated, window.counts.n_edges) == (0, 3)
+
+
+@settings(deadline=None, max_examples=5)
+@given(seed=seeds)
+def test_edges_whose_covariance_is_true_are_not_refused(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, 200)
+    window = SlidingWindow(WindowConfig(size=6))
+    for frame in range(200):
+        sigma = 10 ** rng.uniform(-4, -1.5)
+        references = range(max(frame - 4, 0), frame)
+        edges = [measure(poses, i, frame, rng, sigma) for i in references]
+        assert window.add_pose(frame, frame, edges).rejected == ()
+    assert window.counts.n_rejected == 0
+
+
+def drifting(seed: int, n: int) -> tuple[list[FloatArray], list[list[Edge]], Edge]:
+    """Return poses, a noisy chain with short links, and a good edge from the first to the last."""
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, n)
+    edges: list[list[Edge]] = [[]]
+    for frame in range(1, n):
+        references = range(max(frame - 2, 0), frame)
+        edges.append([measure(poses, i, frame, rng, 0.01) for i in references])
+    return poses, edges, measure(poses, 0, n - 1, rng, 1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_loop_closure_after_long_drift_is_not_refused_with_a_pose(seed: int) -> None:
+    poses, edges, loop = drifting(seed, 300)
+    window = SlidingWindow(WindowConfig(size=5))
+    for frame in range(299):
+        window.add_pose(frame, frame, edges[frame])
+        if frame == 0:
+            window.keep(0)
+    drifted = window.pose(298) @ edges[299][-1].T_reference_frame
+    estimate = window.add_pose(299, 299, [*edges[299], loop])
+    expected = loop.T_reference_frame
+    # The drift is many sigmas of the loop.
+    assert np.linalg.norm(drifted[:3, 3] - expected[:3, 3]) > 0.1
+    assert estimate.rejected == ()
+    np.testing.assert_allclose(estimate.T_world_cam, expected, atol=0.1)
+    following = replace(edges[1][0], reference_id=299)
+    assert window.add_pose(300, 300, [following]).rejected == ()
+    np.testing.assert_allclose(window.pose(299), expected, atol=0.01)
+    np.testing.assert_allclose(expected, poses[299], atol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_loop_closure_after_long_drift_is_not_refused_later(seed: int) -> None:
+    poses, edges, loop = drifting(seed, 150)
+    window = SlidingWindow(WindowConfig(size=None))
+    feed(window, Problem(poses=poses, edges=edges))
+    assert np.linalg.norm(window.pose(149)[:3, 3] - poses[149][:3, 3]) > 0.05
+    answer = window.add_edge(149, loop)
+    assert not isinstance(answer, Rejected)
+    np.testing.assert_allclose(answer.T_world_cam, poses[149], atol=0.1)
+    np.testing.assert_allclose(window.finish()[149].T_world_cam, poses[149], atol=0.01)
+
+
+# Absolute measurements.
+
+
+def test_a_known_start_places_the_first_pose() -> None:
+    start = se3.exp(np.array([0.3, -0.2, 0.1, 4.0, 5.0, 6.0]))
+    prior = PosePrior(
+        T_world_frame=start, covariance=random_covariance(np.random.default_rng(0), 0.1)
+    )
+    window = SlidingWindow(WindowConfig(size=5))
+    first = window.add_pose("a", 0, [], prior)
+    np.testing.assert_allclose(first.T_world_cam, start, atol=1e-9)
+    assert_equal_covariances(first.covariance, prior.covariance, 1e-6)
+    assert (first.status, first.rejected) == (Status.OK, ())
+
+
+def test_a_known_position_leaves_the_first_orientation_open() -> None:
+    covariance = random_covariance(np.random.default_rng(1), 0.1, 3)
+    prior = PositionPrior(position_world=np.array([4.0, 5.0, 6.0]), covariance=covariance)
+    window = SlidingWindow(WindowConfig(size=5))
+    first = window.add_pose("a", 0, [], prior)
+    np.testing.assert_allclose(first.T_world_cam[:3, 3], [4.0, 5.0, 6.0], atol=1e-9)
+    np.testing.assert_allclose(first.T_world_cam[:3, :3], np.eye(3), atol=1e-9)
+    expected = np.zeros((6, 6))
+    expected[:3, :3], expected[3:, 3:] = np.eye(3), covariance
+    assert_equal_covariances(first.covariance, expected, 1e-6)
+
+
+def test_without_a_prior_the_first_pose_is_the_identity_and_nearly_sure() -> None:
+    first = SlidingWindow().add_pose("a", 0, [])
+    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(first.covariance, 1e-10 * np.eye(6), atol=1e-16)
+
+
+@pytest.mark.parametrize("size", [10, None])
+def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) -> None:
+    rng = np.random.default_rng(8)
+    T_world_start = se3.exp(np.array([0.2, 0.6, -0.3, 10.0, -4.0, 2.0]))
+    poses = [T_world_start @ T for T in wander(rng, 80)]
+    edges = [[], *([measure(poses, i - 1, i, rng, 2e-3)] for i in range(1, 80))]
+    priors: dict[int, Prior] = {
+        frame: PositionPrior(
+            position_world=poses[frame][:3, 3] + 0.01 * rng.normal(size=3),
+            covariance=1e-4 * np.eye(3),
+        )
+        for frame in range(80)
+    }
+    problem = Problem(poses=poses, edges=edges, priors=priors)
+    window = SlidingWindow(WindowConfig(size=size, kernel="none"))
+    causal = feed(window, problem)
+    optimum, _ = batch(problem)
+    np.testing.assert_allclose(causal[-1].T_world_cam, poses[-1], atol=0.05)
+    np.testing.assert_allclose(causal[-1].T_world_cam, optimum.atPose3(79).matrix(), atol=0.01)
+    if size is None:
+        for estimate in window.finish():
+            expected = optimum.atPose3(number(estimate.frame_id)).matrix()
+            np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-5)
+
+
+# What redundancy does, and what it does not.
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(("size", "n"), [(2, 300), (5, 1000), (None, 300)])
+def test_smoothing_consecutive_edges_returns_the_chain(
+    kernel: Any, size: int | None, n: int
+) -> None:
+    rng = np.random.default_rng(n)
+    poses = wander(rng, n)
+    edges = [[], *([measure(poses, i - 1, i, rng, 0.02)] for i in range(1, n))]
+    window = SlidingWindow(WindowConfig(size=size, kernel=kernel))
+    causal = feed(window, Problem(poses=poses, edges=edges))
+    smoothed = window.pop_finished() + window.finish()
+    chained = np.eye(4)
+    for frame in range(n):
+        if frame:
+            chained = chained @ edges[frame][0].T_reference_frame
+        np.testing.assert_allclose(causal[frame].T_world_cam, chained, atol=1e-6)
+        np.testing.assert_allclose(smoothed[frame].T_world_cam, chained, atol=1e-6)

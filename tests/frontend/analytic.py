@@ -1,0 +1,31 @@
+"""Images of an analytic texture, shifted and sheared to any fraction of a pixel."""
+
+import numpy as np
+
+from gvo.types import FloatArray, ImageArray
+
+SHAPE = (120, 240)
+_N_WAVES = 60
+_RNG = np.random.default_rng(4)
+_ANGLES = _RNG.uniform(0, np.pi, _N_WAVES)
+_WAVE_NUMBERS = 2 * np.pi / _RNG.uniform(6.0, 40.0, _N_WAVES)
+_PHASES = _RNG.uniform(0, 2 * np.pi, _N_WAVES)
+
+
+def image(
+    shift_u: FloatArray | float = 0.0, shift_v: float = 0.0, *, gain: float = 1.0
+) -> ImageArray:
+    """Return the texture moved to the right and down; `shift_u` may differ by row."""
+    u, v = np.arange(SHAPE[1])[:, np.newaxis], np.arange(SHAPE[0])[:, np.newaxis]
+    shifts = np.broadcast_to(np.asarray(shift_u, dtype=float), SHAPE[0])[:, np.newaxis]
+    along_u, along_v = _WAVE_NUMBERS * np.cos(_ANGLES), _WAVE_NUMBERS * np.sin(_ANGLES)
+    rows = np.exp(1j * (along_v * (v - shift_v) - along_u * shifts + _PHASES))
+    waves = np.real(rows @ np.exp(1j * along_u * u).T)
+    grey = 120.0 + gain * 67.0 * waves / np.sqrt(_N_WAVES)
+    return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+
+
+def grid(border: int = 30, step: int = 11) -> FloatArray:
+    """Return whole pixels away from the border, shape (n, 2)."""
+    v, u = np.mgrid[border : SHAPE[0] - border : step, border : SHAPE[1] - border : step]
+    return np.column_stack([u.ravel(), v.ravel()]).astype(float)

@@ -1,0 +1,117 @@
+"""Disparities of pixels, on images whose disparities are exact."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.config import StereoConfig
+from gvo.frontend.disparity import COARSE_ERROR_PX, measure_disparities, search_disparities
+from gvo.types import FloatArray, ImageArray
+from tests.frontend.analytic import SHAPE, grid, image
+
+CONFIG = StereoConfig(patch_radius_px=5)
+
+
+def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, ImageArray]:
+    return image(), image(-disparity, **right)
+
+
+@settings(deadline=None, max_examples=10)
+@given(disparity=st.floats(0.0, 60.0))
+def test_the_coarse_search_finds_any_disparity_to_a_few_pixels(disparity: float) -> None:
+    pixels = grid(border=12)
+    pixels = pixels[pixels[:, 0] > disparity + 14]
+    found, is_found = search_disparities(pair(disparity), pixels, 70.0)
+    assert is_found.mean() > 0.9
+    is_near = np.abs(found - disparity) <= COARSE_ERROR_PX
+    assert is_near[is_found].mean() > 0.9
+
+
+def test_the_coarse_search_does_not_leave_the_image() -> None:
+    found, _ = search_disparities(pair(20.0), grid(border=0), 1000.0)
+    assert np.all(found <= grid(border=0)[:, 0] + COARSE_ERROR_PX)
+    assert np.all(found >= 0)
+
+
+def test_flat_images_hold_no_disparities() -> None:
+    flat = np.full(SHAPE, 90, dtype=np.uint8)
+    _, is_found = search_disparities((flat, flat), grid(), 50.0)
+    assert not is_found.any()
+    _, is_valid = measure_disparities(
+        (flat, flat), grid(), np.full(len(grid()), 5.0), CONFIG, reach_px=3
+    )
+    assert not is_valid.any()
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    disparity=st.floats(0.0, 20.0),
+    error=st.floats(-2.0, 2.0),
+    fraction=st.floats(0.0, 1.0),
+)
+def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
+    disparity: float, error: float, fraction: float
+) -> None:
+    pixels = grid() + fraction
+    predicted = np.full(len(pixels), disparity + error)
+    found, is_valid = measure_disparities(pair(disparity), pixels, predicted, CONFIG, reach_px=3)
+    assert is_valid.mean() > 0.9
+    errors = found[is_valid] - disparity
+    assert abs(np.median(errors)) < 0.02
+    assert np.quantile(np.abs(errors), 0.9) < 0.06
+
+
+def test_unequal_exposure_does_not_shift_disparities() -> None:
+    predicted = np.full(len(grid()), 7.0)
+    found, is_valid = measure_disparities(
+        pair(7.3, gain=0.9), grid(), predicted, CONFIG, reach_px=3
+    )
+    assert abs(np.median(found[is_valid]) - 7.3) < 0.02
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5, 0.75])
+def test_the_disparity_is_that_of_the_very_pixel(fraction: float) -> None:
+    # On a road the disparity grows with the row: between rows it lies between theirs.
+    rows = np.arange(SHAPE[0]).astype(float)
+    pixels = grid() + np.array([0.0, fraction])
+    expected = 2.0 + 0.2 * pixels[:, 1]
+    found, is_valid = measure_disparities(
+        pair(2.0 + 0.2 * rows), pixels, np.rint(expected), CONFIG, reach_px=3
+    )
+    assert is_valid.mean() > 0.8
+    assert abs(np.median((found - expected)[is_valid])) < 0.03  # half a row is 0.1
+
+
+def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
+    predicted = np.full(len(grid()), 2.0)
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted, CONFIG, reach_px=2)
+    assert is_valid.mean() < 0.5
+    _, is_valid = measure_disparities(pair(12.0), grid(), predicted + 9.0, CONFIG, reach_px=2)
+    assert is_valid.mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "pixel",
+    [(4.0, 60.0), (235.5, 60.0), (100.0, 4.9), (100.0, 114.5), (14.0, 60.0)],
+)
+def test_patches_that_leave_an_image_are_not_measured(pixel: tuple[float, float]) -> None:
+    pixels, predicted = np.array([pixel, (100.0, 60.0)]), np.full(2, 10.0)
+    found, is_valid = measure_disparities(pair(10.0), pixels, predicted, CONFIG, reach_px=3)
+    assert is_valid.tolist() == [False, True]
+    assert np.isnan(found[0])
+    assert found[1] == pytest.approx(10.0, abs=0.05)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (8, 200), (200, 8)])
+def test_images_smaller_than_a_patch_give_nothing(shape: tuple[int, int]) -> None:
+    tiny = np.zeros(shape, dtype=np.uint8)
+    pixels = np.array([[1.0, 1.0]])
+    assert not search_disparities((tiny, tiny), pixels, 50.0)[1].any()
+    assert not measure_disparities((tiny, tiny), pixels, np.ones(1), CONFIG, reach_px=3)[1].any()
+
+
+def test_no_pixels_give_no_disparities() -> None:
+    nothing = np.zeros((0, 2))
+    assert search_disparities(pair(3.0), nothing, 50.0)[0].shape == (0,)
+    assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG, reach_px=3)[0].shape == (0,)

@@ -1,0 +1,195 @@
+"""The front-end of tracks, on rendered rooms with known poses and depths."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.config import Config
+from gvo.frontend.descriptor import DescriptorFrontend
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.klt import KltFrontend, KltObservations
+from gvo.geometry import se3
+from gvo.sources.recording import Sensor
+from gvo.types import (
+    Failure,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    RelativePose,
+    RgbdFrame,
+    StereoFrame,
+)
+
+N_FRAMES = 6
+SENSORS: list[Sensor] = ["stereo", "rgbd"]
+
+
+@cache
+def recording(sensor: Sensor) -> gvo.SyntheticRecording:
+    return gvo.SyntheticRecording("handheld", sensor, n_frames=N_FRAMES, seed=1, scale=0.5)
+
+
+@cache
+def frames(sensor: Sensor) -> list[Frame]:
+    return [
+        frame
+        for frame in gvo.frames(recording(sensor), Config())
+        if not isinstance(frame, FaultyFrame)
+    ]
+
+
+def frontend(sensor: Sensor, **sections: dict[str, Any]) -> KltFrontend:
+    return KltFrontend(recording(sensor).info.camera, Config.model_validate(sections))
+
+
+@cache
+def observations(sensor: Sensor) -> list[KltObservations]:
+    return [frontend(sensor).extract(frame) for frame in frames(sensor)]
+
+
+def true_motion(sensor: Sensor, reference: int, current: int) -> FloatArray:
+    poses = recording(sensor).ground_truth().T_world_cam
+    return np.asarray(se3.invert(poses[reference]) @ poses[current])
+
+
+def wrong(T: FloatArray, size_rad: float) -> FloatArray:
+    return np.asarray(T @ se3.exp(size_rad * np.array([1.0, -1.0, 0.5, 2.0, -2.0, 2.0])))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_points_lie_on_the_surfaces(sensor: Sensor) -> None:
+    seen = observations(sensor)[0]
+    assert seen.stamp_ns == frames(sensor)[0].stamp_ns
+    assert seen.n_keypoints >= len(seen) > 150
+    camera = frontend(sensor).camera
+    uvd = np.column_stack([seen.keypoints, seen.disparities])
+    np.testing.assert_allclose(camera.project_stereo(seen.points_cam), uvd, atol=1e-9)
+    columns, rows = seen.keypoints.astype(int).T
+    depth = recording(sensor).render_depth(0)[rows, columns].astype(float)
+    errors = camera.depth_to_disparity(depth) - seen.disparities
+    assert np.median(np.abs(errors)) < (0.1 if sensor == "stereo" else 0.2)
+    assert np.mean(np.abs(errors) < 1.0) > 0.85
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("prior", ["none", "true", "wrong", "far off"])
+def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior: str) -> None:
+    T = true_motion(sensor, 0, 2)
+    priors = {"none": None, "true": T, "wrong": wrong(T, 0.005), "far off": wrong(T, 0.02)}
+    first, _, third = observations(sensor)[:3]
+    result = frontend(sensor).register(first, third, priors[prior])
+    assert isinstance(result, RelativePose)
+    error = se3.log(se3.invert(result.T_reference_current) @ T)
+    assert np.linalg.norm(error[:3]) < 1.5e-3
+    assert np.linalg.norm(error[3:]) < 4e-3
+    assert result.n_inliers > 100
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_what_a_registration_rests_on_is_told(sensor: Sensor) -> None:
+    first, second = observations(sensor)[:2]
+    result = frontend(sensor).register(first, second)
+    assert isinstance(result, RelativePose)
+    indices = result.matches[:, 0]
+    assert len(np.unique(indices)) == len(indices)
+    assert indices.min() >= 0
+    assert indices.max() < len(first)
+    np.testing.assert_array_equal(result.matches[:, 1], -1)
+    assert len(result.inliers) == len(indices)
+    chosen = indices[result.inliers]
+    T_current_reference = se3.invert(true_motion(sensor, 0, 1))
+    points = se3.transform_points(T_current_reference, first.points_cam[chosen])
+    flow = frontend(sensor).camera.project(points) - first.keypoints[chosen]
+    expected = np.median(np.linalg.norm(flow, axis=1))
+    assert result.flow_px == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_the_errors_are_of_the_size_that_the_covariance_says(sensor: Sensor) -> None:
+    squares = []
+    seen = observations(sensor)
+    for reference in range(N_FRAMES):
+        for current in range(N_FRAMES):
+            if reference == current:
+                continue
+            T = true_motion(sensor, reference, current)
+            result = frontend(sensor).register(seen[reference], seen[current], wrong(T, 0.002))
+            assert isinstance(result, RelativePose)
+            error = se3.log(se3.invert(result.T_reference_current) @ T)
+            squares.append(error @ np.linalg.solve(result.covariance, error) / 6)
+    # Few frames, of one scene, that share their noise: a wide interval around one.
+    assert 0.1 < np.mean(squares) < 4.0
+
+
+def test_the_covariance_grows_with_the_factor() -> None:
+    first, second = observations("stereo")[:2]
+    one, three = (
+        frontend("stereo", klt={"sigma_factor": factor}).register(first, second)
+        for factor in (1.0, 3.0)
+    )
+    assert isinstance(one, RelativePose)
+    assert isinstance(three, RelativePose)
+    np.testing.assert_allclose(three.covariance, 9.0 * one.covariance)
+    np.testing.assert_array_equal(three.T_reference_current, one.T_reference_current)
+
+
+def test_points_out_of_the_limits_of_depth_are_left_out() -> None:
+    near = frontend("stereo", stereo={"min_depth_m": 1.5, "max_depth_m": 2.5})
+    depths = near.extract(frames("stereo")[0]).points_cam[:, 2]
+    assert len(depths) > 20
+    assert depths.min() >= 1.5
+    assert depths.max() <= 2.5
+    assert observations("stereo")[0].points_cam[:, 2].max() > 2.5
+
+
+def test_points_of_unknown_depth_are_left_out() -> None:
+    frame = frames("rgbd")[0]
+    assert isinstance(frame, RgbdFrame)
+    depth = frame.depth.copy()
+    depth[:, 160:] = np.nan
+    seen = frontend("rgbd").extract(replace(frame, depth=depth))
+    assert len(seen) > 20
+    assert seen.keypoints[:, 0].max() < 160
+
+
+def blank(sensor: Sensor) -> Frame:
+    frame = frames(sensor)[0]
+    grey = np.full((240, 320), 90, dtype=np.uint8)
+    if isinstance(frame, StereoFrame):
+        return replace(frame, left=grey, right=grey)
+    return replace(frame, image=grey, depth=np.full_like(frame.depth, np.nan))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_blank_images_give_no_points_and_no_motion(sensor: Sensor) -> None:
+    klt = frontend(sensor)
+    nothing, something = klt.extract(blank(sensor)), observations(sensor)[0]
+    assert len(nothing) == 0
+    for pair in ((nothing, something), (something, nothing), (nothing, nothing)):
+        for prior in (None, np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])):
+            result = klt.register(*pair, prior)
+            assert isinstance(result, Failure)
+            assert "ransac.min_inliers" in result.reason
+
+
+def test_a_view_from_elsewhere_is_no_motion() -> None:
+    other = gvo.SyntheticRecording("handheld", "stereo", n_frames=1, seed=9, scale=0.5)
+    frame = next(iter(gvo.frames(other, Config())))
+    assert isinstance(frame, StereoFrame)
+    klt = frontend("stereo")
+    upside_down = replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
+    result = klt.register(observations("stereo")[0], klt.extract(upside_down))
+    assert isinstance(result, Failure)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("descriptor", DescriptorFrontend), ("klt", KltFrontend)]
+)
+def test_the_configuration_names_the_front_end(kind: str, expected: type) -> None:
+    config = Config.model_validate({"frontend": {"kind": kind}})
+    assert type(make_frontend(recording("stereo").info.camera, config)) is expected
+    assert type(make_frontend(recording("rgbd").info.camera)) is DescriptorFrontend

@@ -1,0 +1,146 @@
+"""Lines of g2o against GTSAM's own parser, and there and back."""
+
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.g2o import (
+    Fix,
+    Measurement,
+    Vertex,
+    convert_line,
+    format_edge,
+    format_vertex,
+    parse_line,
+)
+from gvo.geometry import se3
+
+EXAMPLES = (
+    "sphere2500.txt",
+    "pose3example-grid.txt",
+    "pose3example.txt",
+    "pose3example-offdiagonal.txt",
+)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_pose(rng: np.random.Generator) -> np.ndarray:
+    R = Rotation.random(rng=rng).as_matrix()
+    return se3.make_transform(np.asarray(R), rng.normal(0.0, 10.0, 3))
+
+
+def random_covariance(rng: np.random.Generator) -> np.ndarray:
+    A = rng.normal(size=(6, 6))
+    return np.asarray(A @ A.T + 0.1 * np.eye(6)) * 1e-3
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_files_mean_what_gtsam_reads_in_them(name: str) -> None:
+    path = str(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]
+    graph, values = gtsam.readG2o(path, True)
+    lines = [parse_line(line) for line in Path(path).read_text().splitlines()]
+    vertices = [line for line in lines if isinstance(line, Vertex)]
+    edges = [line for line in lines if isinstance(line, Measurement)]
+    assert len(vertices) == values.size()
+    assert len(edges) == graph.size()
+    for vertex in vertices:
+        expected = values.atPose3(vertex.frame_id).matrix()
+        np.testing.assert_allclose(vertex.T_world_frame, expected, atol=1e-9)
+    for index, edge in enumerate(edges):
+        factor: Any = graph.at(index)
+        assert list(factor.keys()) == [edge.reference_id, edge.frame_id]
+        np.testing.assert_allclose(edge.T_reference_frame, factor.measured().matrix(), atol=1e-9)
+        expected = factor.noiseModel().covariance()
+        np.testing.assert_allclose(edge.covariance, expected, rtol=1e-9, atol=1e-15)
+
+
+@given(seeds)
+def test_gtsam_reads_the_formatted_lines_without_loss(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_a, T_b, T_a_b = (random_pose(rng) for _ in range(3))
+    covariance = random_covariance(rng)
+    path = tmp_path_factory.mktemp("g2o") / "a.g2o"
+    lines = [format_vertex(3, T_a), format_vertex(8, T_b), format_edge(3, 8, T_a_b, covariance)]
+    path.write_text("\n".join(lines) + "\n")
+    graph, values = gtsam.readG2o(str(path), True)
+    error = se3.log(se3.invert(T_a_b) @ se3.invert(T_a) @ T_b)
+    expected = 0.5 * error @ np.linalg.solve(covariance, error)
+    assert graph.error(values) == pytest.approx(expected, rel=1e-6)
+
+
+@given(seeds)
+def test_formatted_lines_are_parsed_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, covariance = random_pose(rng), random_covariance(rng)
+    vertex = parse_line(format_vertex(5, T))
+    edge = parse_line(format_edge(5, 6, T, covariance))
+    assert isinstance(vertex, Vertex)
+    assert isinstance(edge, Measurement)
+    assert (vertex.frame_id, edge.reference_id, edge.frame_id) == (5, 5, 6)
+    np.testing.assert_allclose(vertex.T_world_frame, T, atol=1e-13)
+    np.testing.assert_allclose(edge.T_reference_frame, T, atol=1e-13)
+    np.testing.assert_allclose(edge.covariance, covariance, rtol=1e-9, atol=1e-12)
+
+
+@given(seeds)
+def test_a_converted_line_says_the_same(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    information = np.linalg.inv(random_covariance(rng))
+    numbers = [*rng.normal(size=3), *rng.uniform(-1.5, 1.5, 3), *information[np.triu_indices(6)]]
+    old = "EDGE3 4 9 " + " ".join(repr(float(value)) for value in numbers)
+    new = convert_line(old)
+    assert new.startswith("EDGE_SE3:QUAT 4 9 ")
+    before, after = parse_line(old), parse_line(new)
+    assert isinstance(before, Measurement)
+    assert isinstance(after, Measurement)
+    np.testing.assert_allclose(after.T_reference_frame, before.T_reference_frame, atol=1e-14)
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-12, atol=1e-15)
+
+
+def test_an_edge_of_the_older_form_without_information_has_unit_covariance() -> None:
+    edge = parse_line("EDGE3 0 1 1 2 3 0 0 0")
+    assert isinstance(edge, Measurement)
+    np.testing.assert_array_equal(edge.covariance, np.eye(6))
+
+
+def test_fixed_poses_are_listed() -> None:
+    line = parse_line("FIX 3 5  # both")
+    assert isinstance(line, Fix)
+    assert line.frame_ids == (3, 5)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "# comment", "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1", "EDGE_SE2 0"]
+)
+def test_lines_of_other_kinds_are_passed_over(text: str) -> None:
+    assert parse_line(text) is None
+
+
+def test_a_singular_information_matrix_gives_no_covariance() -> None:
+    edge = parse_line("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1" + " 0" * 21)
+    assert isinstance(edge, Measurement)
+    assert np.isnan(edge.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0", "needs 8 numbers, got 7"),
+        ("VERTEX_SE3:QUAT 0.5 1 2 3 0 0 0 1", "no whole number"),
+        ("VERTEX_SE3:QUAT 0 1 2 x 0 0 0 1", "x"),
+        ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 2", "length 2"),
+        ("VERTEX_SE3:QUAT 0 1 2 3 0 0 0 nan", "length nan"),
+        ("EDGE_SE3:QUAT 0 1 1 2 3 0 0 0 1", "needs 30 numbers"),
+    ],
+)
+def test_a_malformed_line_is_refused(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        parse_line(text)

@@ -1,0 +1,132 @@
+"""The policy of keyframes over scores."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.keyframe_policy import choose_links, choose_released, is_needed, proximity
+
+twists = st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6).map(np.array)
+
+
+def configure(**changes: Any) -> WindowConfig:
+    values = {
+        "n_keyframes": 3,
+        "n_links": 3,
+        "min_overlap": 0.3,
+        "keyframe_overlap": 0.75,
+        "keyframe_distance_m": 2.0,
+        "keyframe_angle_deg": 20.0,
+    }
+    return WindowConfig.model_validate(values | changes)
+
+
+def moved(distance_m: float, angle_deg: float = 0.0) -> np.ndarray[Any, np.dtype[np.float64]]:
+    T = se3.exp(np.radians([0.0, angle_deg, 0.0, 0.0, 0.0, 0.0]))
+    T[:3, 3] = np.array([0.6, 0.0, -0.8]) * distance_m
+    return T
+
+
+def test_the_same_place_is_as_near_as_can_be() -> None:
+    assert proximity(np.eye(4), configure()) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "angle_deg", "score"),
+    [
+        (2.0, 0.0, 0.75),
+        (0.0, 20.0, 0.75),
+        (2.0, 20.0, 0.75),
+        (1.0, 20.0, 0.75),
+        (2.0, 5.0, 0.75),
+        (1.0, 5.0, 0.875),
+        (4.0, 0.0, 0.5),
+        (8.0, 0.0, 0.0),
+        (80.0, 0.0, 0.0),
+        (0.0, 170.0, 0.0),
+    ],
+)
+def test_the_score_falls_linearly_with_the_larger_ratio(
+    distance_m: float, angle_deg: float, score: float
+) -> None:
+    assert proximity(moved(distance_m, angle_deg), configure()) == pytest.approx(score, abs=1e-9)
+
+
+@settings(deadline=None)
+@given(twist=twists)
+def test_two_poses_are_as_near_from_either_side(twist: np.ndarray[Any, Any]) -> None:
+    T = se3.exp(twist)
+    there, back = proximity(T, configure()), proximity(se3.invert(T), configure())
+    assert there == pytest.approx(back, abs=1e-9)
+    assert 0.0 <= there <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("scores", "expected"),
+    [({}, True), ({1: 0.74}, True), ({1: 0.2, 2: 0.76}, False), ({1: 0.75}, False)],
+)
+def test_a_keyframe_is_needed_where_all_others_are_too_far(
+    scores: dict[int, float], expected: bool
+) -> None:
+    assert is_needed(scores, configure()) == expected
+
+
+def test_links_go_to_the_oldest_and_to_the_nearest() -> None:
+    scores = {5: 0.1, 10: 0.4, 20: 0.9, 30: 0.5, 40: 0.95, 50: 0.99}
+    assert choose_links(scores, configure(n_links=3), exclude=50) == [10, 40]
+    assert choose_links(scores, configure(n_links=5), exclude=50) == [10, 20, 40, 30]
+    assert choose_links(scores, configure(n_links=3)) == [10, 50]
+    assert choose_links(scores, configure(n_links=1), exclude=50) == []
+    assert choose_links({}, configure(n_links=3), exclude=0) == []
+
+
+def test_frames_need_no_order_of_their_own() -> None:
+    scores = {"zebra": 0.4, "ape": 0.9, ("a", 1): 0.9}
+    assert choose_links(scores, configure(n_links=3), exclude="none") == ["zebra", "ape"]
+    assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
+
+
+@settings(deadline=None)
+@given(
+    scores=st.dictionaries(st.integers(0, 50), st.floats(0.0, 1.0), max_size=12),
+    n_links=st.integers(1, 8),
+    exclude=st.integers(0, 50),
+)
+def test_links_are_near_once_each_and_not_to_the_predecessor(
+    scores: dict[int, float], n_links: int, exclude: int
+) -> None:
+    links = choose_links(scores, configure(n_links=n_links), exclude=exclude)
+    usable = {frame for frame, score in scores.items() if score >= 0.3} - {exclude}
+    assert len(links) == len(set(links)) == min(n_links - 1, len(usable))
+    assert set(links) <= usable
+
+
+@settings(deadline=None)
+@given(
+    shares=st.lists(st.floats(0.0, 1.0), max_size=8),
+    n_keyframes=st.integers(0, 6),
+    n_new=st.integers(0, 1),
+)
+def test_released_are_those_too_far_and_the_farthest_beyond_the_limit(
+    shares: list[float], n_keyframes: int, n_new: int
+) -> None:
+    scores = dict(enumerate(shares))
+    released = choose_released(
+        scores, configure(n_keyframes=n_keyframes), n_kept=len(scores) + n_new
+    )
+    assert len(released) == len(set(released))
+    remaining = {frame: score for frame, score in scores.items() if frame not in released}
+    assert all(score >= 0.3 for score in remaining.values())
+    n_near = sum(score >= 0.3 for score in shares)
+    assert len(remaining) == min(n_near, max(n_keyframes - n_new, 0))
+    near_released = [scores[frame] for frame in released if scores[frame] >= 0.3]
+    assert max(near_released, default=0.0) <= min(remaining.values(), default=1.0)
+
+
+def test_the_newest_keyframe_counts_but_is_not_released_at_once() -> None:
+    assert choose_released({1: 0.5, 2: 0.4, 3: 0.6}, configure(n_keyframes=3), n_kept=4) == [2]

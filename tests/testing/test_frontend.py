@@ -1,0 +1,269 @@
+"""The contract test passes for the front-ends of the project and finds planted faults."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.config import Config
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.klt import KltFrontend, KltObservations
+from gvo.geometry import se3
+from gvo.sources.recording import Sensor
+from gvo.testing import ContractError, check_frontend
+from gvo.testing.fingerprint import fingerprint
+from gvo.types import Failure, FaultyFrame, FloatArray, Frame, RelativePose
+
+Result = RelativePose | Failure
+
+
+@cache
+def recording(sensor: Sensor) -> gvo.SyntheticRecording:
+    return gvo.SyntheticRecording("handheld", sensor, n_frames=3, scale=0.4)
+
+
+@cache
+def frames(sensor: Sensor) -> list[Frame]:
+    return [
+        frame
+        for frame in gvo.frames(recording(sensor), Config())
+        if not isinstance(frame, FaultyFrame)
+    ]
+
+
+def configure(kind: str = "klt") -> Config:
+    return Config.model_validate({"frontend": {"kind": kind}, "klt": {"n_corners": 300}})
+
+
+@pytest.mark.parametrize("kind", ["descriptor", "klt"])
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_the_front_ends_of_the_project_keep_the_contract(kind: str, sensor: Sensor) -> None:
+    check_frontend(make_frontend(recording(sensor).info.camera, configure(kind)), frames(sensor))
+
+
+class Faulty(KltFrontend):
+    """A front-end that spoils what it returns."""
+
+    def __init__(self, spoil: Callable[[RelativePose], Any]) -> None:
+        super().__init__(recording("stereo").info.camera, configure())
+        self._spoil = spoil
+
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        spoilt: Result = self._spoil(result) if isinstance(result, RelativePose) else result
+        return spoilt
+
+
+def spoil_pose(change: Callable[[FloatArray], FloatArray]) -> Faulty:
+    return Faulty(
+        lambda result: replace(result, T_reference_current=change(result.T_reference_current))
+    )
+
+
+def spoil_covariance(change: Callable[[FloatArray], FloatArray]) -> Faulty:
+    return Faulty(lambda result: replace(result, covariance=change(result.covariance)))
+
+
+def offset(T: FloatArray) -> FloatArray:
+    return np.asarray(T @ se3.exp(np.array([0.0, 0.0, 0.0, 0.05, 0.0, 0.0])))
+
+
+def scaled(T: FloatArray) -> FloatArray:
+    return np.asarray(T * [1.001, 1.001, 1.001, 1.0])
+
+
+def noisy(T: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(T @ se3.exp(1e-9 * rng.normal(size=6)))
+
+
+def lopsided(covariance: FloatArray) -> FloatArray:
+    changed = covariance.copy()
+    changed[0, 1] += 0.1 * covariance[0, 0]
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("frontend", "reason"),
+    [
+        (spoil_pose(se3.invert), "maps the current frame to the reference"),
+        (spoil_pose(offset), "with itself and the identity disagree"),
+        (spoil_pose(scaled), "holds no rotation"),
+        (spoil_pose(lambda T: T.astype(np.float32)), "no array of float64"),
+        (spoil_pose(lambda T: np.full_like(T, np.nan)), "not finite"),
+        (spoil_pose(lambda T: noisy(T, np.random.default_rng())), "gives another result"),
+        (spoil_covariance(lambda C: C[:3, :3]), r"shape \(6, 6\)"),
+        (spoil_covariance(lambda C: -C), "not positive definite"),
+        (spoil_covariance(lopsided), "not symmetric"),
+        (spoil_covariance(lambda C: 1e-6 * C), "disagree by"),
+        (Faulty(lambda result: None), "must return RelativePose or Failure, got NoneType"),
+        (Faulty(lambda result: Failure(reason="no idea")), "fails on consecutive frames: no idea"),
+    ],
+)
+def test_a_spoilt_result_is_found(frontend: Faulty, reason: str) -> None:
+    with pytest.raises(ContractError, match=reason) as caught:
+        check_frontend(frontend, frames("stereo"))
+    assert "\n" not in str(caught.value)
+
+
+class Sound(KltFrontend):
+    """The base of front-ends with faults of other kinds."""
+
+    def __init__(self) -> None:
+        super().__init__(recording("stereo").info.camera, configure())
+
+
+class ChangesTheFrame(Sound):
+    def extract(self, frame: Frame) -> KltObservations:
+        observations = super().extract(frame)
+        assert isinstance(frame, gvo.StereoFrame)
+        frame.left[:] //= 2
+        return observations
+
+
+class LosesTheStamp(Sound):
+    def extract(self, frame: Frame) -> KltObservations:
+        return super().extract(replace(frame, stamp_ns=frame.stamp_ns // 1000))
+
+
+class ExtractsAtRandom(Sound):
+    def extract(self, frame: Frame) -> KltObservations:
+        observations = super().extract(frame)
+        return replace(observations, n_keypoints=int(np.random.default_rng().integers(2**62)))
+
+
+class BelievesThePrior(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure) or prior is None:
+            return result
+        return replace(result, T_reference_current=prior.copy())
+
+
+class ChangesThePrior(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if prior is not None:
+            prior[0, 3] += 1.0
+        return result
+
+
+class ChangesObservations(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        current.points_cam[:1] += 1.0
+        return result
+
+
+class RaisesOnNothing(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure):
+            raise IndexError("no matches")
+        return result
+
+
+class AlwaysFindsSomething(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure):
+            return RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6))
+        return result
+
+
+class GivesNoReason(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        return Failure(reason=" ") if isinstance(result, Failure) else result
+
+
+@pytest.mark.parametrize(
+    ("frontend", "reason"),
+    [
+        (ChangesTheFrame, "extract changes the frame"),
+        (LosesTheStamp, "must keep the stamp"),
+        (ExtractsAtRandom, "other observations"),
+        (BelievesThePrior, "with and without a prior disagree"),
+        (ChangesThePrior, "changes its argument prior"),
+        (ChangesObservations, "changes its argument"),
+        (RaisesOnNothing, "raise IndexError: no matches"),
+        (AlwaysFindsSomething, "are registered"),
+        (GivesNoReason, "gives no reason"),
+    ],
+)
+def test_a_fault_in_behaviour_is_found(frontend: type[Sound], reason: str) -> None:
+    own = [
+        replace(frame, left=frame.left.copy())
+        for frame in frames("stereo")
+        if isinstance(frame, gvo.StereoFrame)
+    ]
+    with pytest.raises(ContractError, match=reason):
+        check_frontend(frontend(), own)
+
+
+def test_two_frames_are_too_few() -> None:
+    with pytest.raises(ValueError, match="at least three frames, got 2"):
+        check_frontend(Sound(), frames("stereo")[:2])
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A frame of another sensor: the pose itself, or nothing."""
+
+    stamp_ns: int
+    T_world_scan: FloatArray | None
+
+
+class ScanFrontend:
+    """Takes any frames, and keeps nothing but them."""
+
+    def extract(self, frame: Scan) -> Scan:
+        return frame
+
+    def register(self, reference: Scan, current: Scan, prior: FloatArray | None) -> Result:
+        if reference.T_world_scan is None or current.T_world_scan is None:
+            return Failure(reason="an empty scan")
+        T = se3.invert(reference.T_world_scan) @ current.T_world_scan
+        return RelativePose(T_reference_current=T, covariance=1e-6 * np.eye(6))
+
+
+def test_front_ends_of_other_sensors_are_checked_with_their_own_blank_frame() -> None:
+    rng = np.random.default_rng(0)
+    scans = [Scan(n, se3.exp(0.1 * rng.normal(size=6))) for n in range(3)]
+    check_frontend(ScanFrontend(), scans)
+    check_frontend(ScanFrontend(), scans, blank=Scan(9, None))
+    with pytest.raises(ContractError, match="are registered"):
+        check_frontend(ScanFrontend(), scans, blank=Scan(9, np.eye(4)))
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        (np.zeros(3), np.zeros(3, dtype=np.float32)),
+        (np.zeros((2, 3)), np.zeros((3, 2))),
+        ([1, 2], [2, 1]),
+        ({"a": np.ones(2)}, {"b": np.ones(2)}),
+        (Scan(1, np.eye(4)), Scan(1, np.eye(4) + 1e-16 * np.ones((4, 4)))),
+        ((1, None), (1, 0)),
+    ],
+)
+def test_different_values_have_different_fingerprints(pair: tuple[object, object]) -> None:
+    assert fingerprint(pair[0]) != fingerprint(pair[1])
+    assert fingerprint(pair[0]) == fingerprint(pair[0])
