@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal, get_args
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.types import FloatArray, IntArray
+from gvo.types import Estimate, FloatArray, IntArray
 
 StampsFrom = Literal["file", "times", "rows"]
 
@@ -61,6 +62,22 @@ class Trajectory:
         if self.covariances is not None:
             covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
             object.__setattr__(self, "covariances", covariances)
+
+    @classmethod
+    def of(cls, estimates: Iterable[Estimate]) -> Trajectory:
+        """Collect estimates, in any order, into a trajectory with covariances.
+
+        Parameters
+        ----------
+        estimates : iterable of Estimate
+            Of different stamps.
+        """
+        ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
+        return cls(
+            stamps_ns=np.array([estimate.stamp_ns for estimate in ordered], dtype=np.int64),
+            T_world_cam=np.array([e.T_world_cam for e in ordered]).reshape(-1, 4, 4),
+            covariances=np.array([e.covariance for e in ordered]).reshape(-1, 6, 6),
+        )
 
     def __len__(self) -> int:
         """Return the number of poses."""

@@ -5,6 +5,9 @@ and 95th percentile), CPU time per frame, peak memory, and the ratio of the time
 yardstick measured in the same run: ORB with 8 octaves and 2000 features on the images of a
 frame. Absolute times depend on the machine and on what else it does; ratios less so.
 
+`--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
+it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
+
 Example: python scripts/benchmark.py kitti_06_start euroc_mh01_start
 """
 
@@ -13,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 
+import benchmark_window  # type: ignore[import-not-found]  # beside this one
 import cv2
 import numpy as np
 
@@ -24,9 +28,27 @@ from gvo.types import FaultyFrame, Frame
 def main() -> None:
     """Parse the arguments and measure each recording."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("recordings", type=Path, nargs="+", help="bags or data-set folders")
+    parser.add_argument("recordings", type=Path, nargs="*", help="bags or data-set folders")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument(
+        "--window", type=int, nargs="?", const=3000, metavar="N", help="cost, of N poses"
+    )
+    parser.add_argument(
+        "--soak", type=int, nargs="?", const=1_000_000, metavar="N", help="a life of N poses"
+    )
+    parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
     arguments = parser.parse_args()
+    lengths = [n for n in (arguments.window, arguments.soak) if n is not None]
+    if not (arguments.recordings or lengths):
+        parser.error("name recordings, or --window, or --soak")
+    if min(lengths, default=1000) < 1000:
+        parser.error("--window and --soak take at least 1000 poses")
+    if arguments.window is not None:
+        benchmark_window.measure_cost(arguments.window)
+    if arguments.soak is not None:
+        faults = benchmark_window.soak(arguments.soak, is_timed=not arguments.untimed)
+        if faults:
+            sys.exit("benchmark: " + "; ".join(faults))
     for path in arguments.recordings:
         measure(path, arguments.set)
 

@@ -37,7 +37,7 @@ def main() -> None:
     """Parse the arguments and print one row for each kind of recording and estimate."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings", type=Path, nargs="*", help="instead of rendered ones")
-    parser.add_argument("--seeds", default="0-9", help="first and last seed (default: %(default)s)")
+    parser.add_argument("--seeds", type=seeds, default="0-9", help="first and last, or one")
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()
@@ -46,10 +46,14 @@ def main() -> None:
     for path in arguments.recordings:
         report(path.name, [gvo.open_recording(path, config=config)], config)
     if not arguments.recordings:
-        first, _, last = arguments.seeds.partition("-")
-        seeds = range(int(first), int(last or first) + 1)
         for name in arguments.worlds:
-            report(name, (rendered(name, seed) for seed in seeds), config)
+            report(name, (rendered(name, seed) for seed in arguments.seeds), config)
+
+
+def seeds(text: str) -> range:
+    """Return the seeds of a text such as 10-19 or 7."""
+    first, _, last = text.partition("-")
+    return range(int(first), int(last or first) + 1)
 
 
 def rendered(name: str, seed: int) -> Source:

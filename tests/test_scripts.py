@@ -55,6 +55,14 @@ def test_the_benchmark_prints_errors_stages_and_the_yardstick(drive_bag: Path) -
         assert word in measured.stdout
 
 
+def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
+    measured = run("benchmark", "--window", 1000)
+    assert measured.returncode == 0, measured.stderr
+    rows = [line.split() for line in measured.stdout.splitlines()[1:]]
+    assert [row[0] for row in rows] == ["nearest", "random", "farthest"]
+    assert all(float(number) > 0.0 for row in rows for number in row[1:])
+
+
 @pytest.mark.recorded
 def test_a_data_set_folder_becomes_a_bag(gvo_data: Path, tmp_path: Path) -> None:
     converted = run("convert_dataset", gvo_data / "euroc_mh01_start", tmp_path / "e.mcap")
@@ -132,6 +140,8 @@ def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(tmp_path: P
         ("compare_trajectories", ["missing.txt", "missing.txt"]),
         ("convert_dataset", ["missing", "out.bag"]),
         ("benchmark", ["missing.bag"]),
+        ("benchmark", []),
+        ("benchmark", ["--soak", "10"]),
         ("make_demo_bag", ["missing/folder/that/is.a.txt"]),
         ("make_demo_bag", ["x.bag", "--frames", "0"]),
     ],
@@ -141,3 +151,20 @@ def test_bad_input_is_told_without_a_traceback(name: str, arguments: list[str]) 
     assert answer.returncode == 2
     assert "Traceback" not in answer.stderr
     assert "error" in answer.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["descriptor", "klt"])
+def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at(kind: str) -> None:
+    # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of two they spread more.
+    measured = run("consistency", "--seeds", "10-11", "--set", f"frontend.kind={kind}")
+    assert measured.returncode == 0, measured.stderr
+    rows = [line.split() for line in measured.stdout.splitlines()[1:]]
+    assert [row[:2] for row in rows] == [
+        [w, k] for w in ("drive", "room") for k in ("raw", "window")
+    ]
+    for row in rows:
+        n_pairs, rotation, translation = int(row[2]), float(row[3]), float(row[4])
+        assert n_pairs > 100
+        assert 0.3 < rotation < 2.3
+        assert 0.3 < translation < 2.3

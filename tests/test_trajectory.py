@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.trajectory import Trajectory, format_stamp
+from gvo.types import Estimate
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 
@@ -167,3 +168,21 @@ def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
     np.testing.assert_array_equal(chosen.T_world_cam, trajectory.T_world_cam[[2, 5]])
     np.testing.assert_array_equal(chosen.covariances, trajectory.covariances[[2, 5]])
     assert len(trajectory.select(trajectory.stamps_ns > trajectory.stamps_ns[8])) == 3
+
+
+def test_estimates_in_any_order_become_a_trajectory_with_covariances() -> None:
+    rng = np.random.default_rng(2)
+    estimates = [
+        Estimate(
+            stamp_ns=stamp_ns,
+            T_world_cam=se3.exp(rng.normal(size=6)),
+            covariance=stamp_ns * np.eye(6),
+        )
+        for stamp_ns in (30, 10, 20)
+    ]
+    collected = Trajectory.of(estimates)
+    assert collected.stamps_ns.tolist() == [10, 20, 30]
+    np.testing.assert_array_equal(collected.T_world_cam[2], estimates[0].T_world_cam)
+    assert collected.covariances is not None
+    np.testing.assert_array_equal(collected.covariances[1], 20.0 * np.eye(6))
+    assert len(Trajectory.of([])) == 0

@@ -12,12 +12,14 @@ from functools import lru_cache
 
 import gtsam
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from gvo.geometry import se3
-from gvo.types import Edge, FloatArray, FrameId, IntArray
+from gvo.types import BoolArray, Edge, FloatArray, FrameId, IntArray
 
 # Sigmas of the difference of two edges, a 6-vector: all but a thousandth of good ones.
 _AGREEMENT = 5.0
+_IDENTITY = np.eye(6)
 _TRACE = 1e-9 * np.eye(6)
 
 
@@ -71,19 +73,25 @@ def judge(
     if len(edges) == 1:
         return Verdict(T_world_start=predictions[0], reasons=[""])
     covariances = np.array([edge.covariance for edge in edges])
+    # By LAPACK itself, in a third of the time of numpy.
+    informations = np.array([dposv(covariance, _IDENTITY)[1] for covariance in covariances])
     twists = _twists(predictions)
-    distances = _distances(twists, covariances)
     reasons = [""] * len(edges)
+    mean = _mean(twists, informations)
+    if _spread(twists - mean, informations) <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
+        return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
+    distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
         voters = [*edges, *filter(None, [motion()])]
         true_distances = _true_distances(voters, pose_of, relative_covariance)
         reasons = _outvoted(edges, true_distances, gate=gate)
     if any(reasons):
         left = [index for index, reason in enumerate(reasons) if not reason]
-        predictions, covariances = [predictions[index] for index in left], covariances[left]
+        predictions, informations = [predictions[index] for index in left], informations[left]
         twists = _twists(predictions)
-        distances = _distances(twists, covariances)
-    start = predictions[0].retract(_mean(twists, covariances, distances))
+        distances = _distances(twists, covariances[left])
+    is_near = _are_near_medoid(distances)
+    start = predictions[0].retract(_mean(twists[is_near], informations[is_near]))
     return Verdict(T_world_start=start, reasons=reasons)
 
 
@@ -149,16 +157,27 @@ def _true_distances(
     return distances + distances.T
 
 
-def _mean(twists: FloatArray, covariances: FloatArray, distances: FloatArray) -> FloatArray:
-    """Return the weighted mean of the twists that agree with their medoid.
+def _are_near_medoid(distances: FloatArray) -> BoolArray:
+    """Tell which predictions, shape (n,), agree with the one that most agree with."""
+    medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
+    return np.asarray(distances[medoid] <= _AGREEMENT)
+
+
+def _mean(twists: FloatArray, informations: FloatArray) -> FloatArray:
+    """Return the weighted mean, shape (6,), of twists.
 
     So a robust kernel weighs each edge near where it will be, not from where one of them was.
     """
-    medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
-    is_near = distances[medoid] <= _AGREEMENT
-    information = np.linalg.inv(covariances[is_near])
-    weighted = np.einsum("nij,nj->i", information, twists[is_near])
-    return np.asarray(np.linalg.solve(information.sum(axis=0), weighted))
+    weighted = np.einsum("nij,nj->i", informations, twists)
+    return np.asarray(dposv(informations.sum(axis=0), weighted)[1])
+
+
+def _spread(deviations: FloatArray, informations: FloatArray) -> float:
+    """Return the sum of the squared lengths of deviations from one point, in sigmas.
+
+    No two of them are farther apart, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
+    """
+    return float(np.einsum("ni,nij,nj", deviations, informations, deviations))
 
 
 @lru_cache(maxsize=32)

@@ -8,12 +8,14 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
 import gtsam
 import numpy as np
 
+from gvo.backend.checks import is_definite
 from gvo.errors import SmoothingError
 from gvo.types import FloatArray
 
@@ -119,14 +121,17 @@ class PoseGraph:
         if not leaving:
             self._isam.update(factors, values)
             return
-        groups = {key: group for group, key in enumerate(leaving)}
-        last = len(leaving)
+        n_leaving = len(leaving)
+        # Last comes what the factors tie: its covariances are cheap then, and as a rule the next
+        # pose is tied to the same.
+        groups = dict.fromkeys(factors.keyVector(), n_leaving + 1)
+        groups |= {key: group for group, key in enumerate(leaving)}
         constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
         for key in alive:
-            constrained.insert2(key, groups.get(key, last))
+            constrained.insert2(key, groups.get(key, n_leaving))
             reeliminate.push_back(key)
         for key in values.keys():  # noqa: SIM118 - not a dict
-            constrained.insert2(key, last)
+            constrained.insert2(key, n_leaving + 1)
         self._isam.update(factors, values, [], constrained, None, reeliminate, False)
 
     def settle(
@@ -154,7 +159,7 @@ class PoseGraph:
         limit = _FAR
         for _ in range(0 if self._is_whole else _MAX_STEPS):
             after = self.pose3(key)
-            if np.abs(before.localCoordinates(after)).max() < limit:
+            if max(map(abs, before.localCoordinates(after).tolist())) < limit:
                 return
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -179,9 +184,20 @@ class PoseGraph:
         """Return the marginal covariance of a pose, shape (6, 6), symmetric positive definite."""
         return definite(self._isam.marginalCovariance(key))
 
+    def covariances(self, keys: Sequence[int]) -> list[FloatArray]:
+        """Return the marginal covariances of poses; of several at once, they share their work."""
+        if len(keys) == 1:
+            return [self.covariance(keys[0])]
+        joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
+        return [definite(joint[row : row + 6, row : row + 6]) for row in range(0, len(joint), 6)]
+
     def joint_covariance(self, first: int, second: int) -> FloatArray:
         """Return the joint covariance of two poses, shape (12, 12), in the order asked for."""
         return np.asarray(self._isam.jointMarginalCovariance([first, second]).fullMatrix())
+
+    def positions(self) -> FloatArray:
+        """Return the positions of all poses in the world, shape (n, 3), metres."""
+        return np.asarray(gtsam.utilities.extractPose3(self.values())[:, 9:])
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors, marginals among them."""
@@ -204,16 +220,16 @@ def definite(covariance: FloatArray) -> FloatArray:
     correlations at or below zero.
     """
     symmetric = 0.5 * (covariance + covariance.T)
-    if not np.isfinite(symmetric).all():
+    if not math.isfinite(symmetric.sum()):
         raise SmoothingError("GTSAM: a covariance is not finite")
-    try:
-        np.linalg.cholesky(symmetric)
-    except np.linalg.LinAlgError:
-        sigmas = np.sqrt(np.maximum(np.diag(symmetric), np.finfo(float).tiny))
-        scale = np.outer(sigmas, sigmas)
-        eigenvalues, vectors = np.linalg.eigh(symmetric / scale)
-        if eigenvalues[0] < -_MAX_ROUNDING:
-            raise SmoothingError("GTSAM: a covariance is not positive definite") from None
-        clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
-        return np.asarray((vectors * clipped) @ vectors.T * scale)
-    return np.asarray(symmetric)
+    if is_definite(symmetric):
+        return np.asarray(symmetric)
+    variances = np.diag(symmetric)
+    if variances.min() <= 0.0:
+        raise SmoothingError("GTSAM: a variance is not positive")
+    scale = np.outer(np.sqrt(variances), np.sqrt(variances))
+    eigenvalues, vectors = np.linalg.eigh(symmetric / scale)
+    if eigenvalues[0] < -_MAX_ROUNDING:
+        raise SmoothingError("GTSAM: a covariance is not positive definite")
+    clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
+    return np.asarray((vectors * clipped) @ vectors.T * scale)

@@ -55,7 +55,8 @@ class Ledger:
 
     def add(self, **numbers: int) -> None:
         """Add to counts by their names."""
-        self._numbers.update(numbers)
+        for name, number in numbers.items():
+            self._numbers[name] += number
 
     def reject(
         self,

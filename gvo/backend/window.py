@@ -11,7 +11,13 @@ from typing import Literal, get_args
 import gtsam
 import numpy as np
 
-from gvo.backend.checks import find_faults, pose_fault, prior_fault, sane_covariance
+from gvo.backend.checks import (
+    find_faults,
+    place_fault,
+    pose_fault,
+    prior_fault,
+    sane_covariance,
+)
 from gvo.backend.comparison import MeasurementLog
 from gvo.backend.export import g2o_lines
 from gvo.backend.factors import Factors
@@ -534,11 +540,18 @@ class SlidingWindow:
         """Return the covariance (6, 6) of T_reference_frame, zero of a pose to itself."""
         if reference_key == key:
             return np.zeros((6, 6))
-        joint = self._graph.joint_covariance(reference_key, key)
         T = se3.invert(self._graph.pose(reference_key)) @ self._graph.pose(key)
         # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
         J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
-        return definite(J @ joint @ J.T)
+        try:
+            joint = self._graph.joint_covariance(reference_key, key)
+            return definite(J @ joint @ J.T)
+        except (RuntimeError, SmoothingError):
+            # What they share is lost in rounding: as if they shared nothing, which is no less.
+            apart = np.zeros((12, 12))
+            apart[:6, :6] = self._graph.covariance(reference_key)
+            apart[6:, 6:] = self._graph.covariance(key)
+            return definite(J @ apart @ J.T)
 
     # What goes into the graph
 
@@ -638,10 +651,11 @@ class SlidingWindow:
             self._graph.settle(
                 arrival.key, arrival.T_world_start, alive=[*alive, arrival.key], leaving=keys
             )
-            # In this order, before anything leaves: the covariances share most of their work.
-            finished = [self._estimate(frame_id) for frame_id in leaving]
-            pose = self._graph.pose(arrival.key), self._graph.covariance(arrival.key)
+            covariances = self._graph.covariances([*keys, arrival.key])
+            pose = self._graph.pose(arrival.key), covariances.pop()
             _check_result(*pose)
+            finished = list(map(self._estimate, leaving, covariances))
+            self._check_others()
             self._graph.marginalize(keys)
         if self._log is not None:
             self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)
@@ -668,6 +682,7 @@ class SlidingWindow:
                 self._graph.settle(self._members[frame_id].key, before)
                 estimate = self._estimate(frame_id)
                 _check_result(estimate.T_world_cam, estimate.covariance)
+                self._check_others()
         except SmoothingError as error:
             self._ledger.add(n_restored=1)
             _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
@@ -675,6 +690,11 @@ class SlidingWindow:
         if self._log is not None:
             self._log.add(factors, gtsam.Values(), keys={})
         return estimate
+
+    def _check_others(self) -> None:
+        """Raise where an update sent a pose to infinity; a whole graph is too large to look at."""
+        if self._config.size is not None and (fault := place_fault(self._graph.positions())):
+            raise SmoothingError(f"GTSAM: {fault}")
 
     def _leaving(self) -> list[FrameId]:
         """Return who leaves with the next pose: neither recent then, nor kept."""
@@ -719,12 +739,12 @@ class SlidingWindow:
         except TypeError:
             raise ValueError(f"a frame_id must be hashable, got {frame_id!r}") from None
 
-    def _estimate(self, frame_id: FrameId) -> Estimate:
+    def _estimate(self, frame_id: FrameId, covariance: FloatArray | None = None) -> Estimate:
         member = self._members[frame_id]
         return Estimate(
             stamp_ns=member.stamp_ns,
             T_world_cam=self._graph.pose(member.key),
-            covariance=self._graph.covariance(member.key),
+            covariance=self._graph.covariance(member.key) if covariance is None else covariance,
             status=member.status,
             frame_id=frame_id,
         )
