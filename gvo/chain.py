@@ -99,7 +99,10 @@ class RawChain(Generic[ObservationsT]):
                 f"stamp {current.stamp_ns} is not after {predecessor.observations.stamp_ns}, "
                 "that of the frame before"
             )
-        predicted = predict_step(self._velocity, elapsed_s, self._config)
+        coasted_ns = predecessor.observations.stamp_ns - anchor.observations.stamp_ns
+        predicted = predict_step(
+            self._velocity, elapsed_s, self._config, coasted_s=1e-9 * coasted_ns
+        )
         T_world_predicted = predecessor.T_world_frame @ predicted[0]
         failure = Failure(reason="")
         for link in [predecessor] if anchor is predecessor else [predecessor, anchor]:

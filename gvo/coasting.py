@@ -17,7 +17,7 @@ _ANYWHERE_M = 1e5
 
 
 def predict_step(
-    velocity: FloatArray | None, elapsed_s: float, config: WindowConfig
+    velocity: FloatArray | None, elapsed_s: float, config: WindowConfig, *, coasted_s: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Continue the last velocity.
 
@@ -29,17 +29,21 @@ def predict_step(
         Seconds since the last pose.
     config : WindowConfig
         Sigmas of a second without a measurement.
+    coasted_s : float
+        Seconds that went by without a measurement before.
 
     Returns
     -------
     T_last_frame : ndarray of float64, shape (4, 4)
     covariance : ndarray of float64, shape (6, 6)
-        Its sigmas grow in proportion to the time.
+        Steps of it add up to sigmas in proportion to the whole time without a measurement,
+        however short they are: a velocity that is wrong stays wrong.
     """
     T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, _MAX_EXTRAPOLATION_S))
     elapsed_s = max(elapsed_s, _MIN_ELAPSED_S)
-    turn = min(np.radians(config.coasting_sigma_deg_per_s) * elapsed_s, _ANY_TURN)
-    shift = min(config.coasting_sigma_m_per_s * elapsed_s, _ANYWHERE_M)
+    grown_s = np.sqrt(elapsed_s * (elapsed_s + 2.0 * coasted_s))  # (t + dt)^2 - t^2
+    turn = min(np.radians(config.coasting_sigma_deg_per_s) * grown_s, _ANY_TURN)
+    shift = min(config.coasting_sigma_m_per_s * grown_s, _ANYWHERE_M)
     return T, np.diag(np.repeat([turn, shift], 3)) ** 2
 
 

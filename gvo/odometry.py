@@ -13,7 +13,6 @@ import numpy as np
 from gvo.backend.comparison import MeasurementLog
 from gvo.backend.window import SlidingWindow
 from gvo.chain import RawChain, RawStep
-from gvo.coasting import StatusClock
 from gvo.config import Config, WindowConfig
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import make_frontend
@@ -101,14 +100,15 @@ class Odometry:
     ) -> None:
         self._config = config or Config()
         self._frontend = _choose_frontend(camera, self._config, frontend)
-        view = getattr(self._frontend, "camera", None) or camera
+        view = getattr(self._frontend, "camera", None)
+        if not isinstance(view, StereoCamera | PinholeCamera):
+            view = camera
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window, log=log)
         self._keyframes: Keyframes[Any] = Keyframes(
             None if view is None else as_stereo(view, self._config), self._config.window
         )
         self._anchor_ns: int | None = None
-        self._clock = StatusClock(self._config.window.lost_after_s)
 
     @property
     def window(self) -> SlidingWindow:
@@ -135,24 +135,22 @@ class Odometry:
             step = self._chain.advance(observations)
         with watch.stage("links"):
             edges, scores = self._edges(observations, step)
-        is_tied = step.is_registered or len(edges) > 1
-        status = self._clock.next(frame.stamp_ns, is_tied=is_tied)
         with watch.stage("window"):
-            causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges, status=status)
-            self._update_keyframes(observations, scores, is_tied=is_tied)
+            causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges)
+            self._update_keyframes(observations, scores, causal)
             self._hold_anchor()
         n_points = _count_points(observations)
         return FrameResult(
             raw=replace(step.estimate, frame_id=frame.stamp_ns),
             causal=causal,
             finished=tuple(self._window.pop_finished()),
-            status=status,
+            status=causal.status,
             reason=step.reason,
             n_keypoints=getattr(observations, "n_keypoints", n_points),
             n_points=n_points,
             n_matches=step.n_matches,
             n_inliers=step.n_inliers,
-            n_links=len(edges),
+            n_links=len(edges) - len(causal.rejected),
             stage_ms=watch.stage_ms,
         )
 
@@ -164,13 +162,10 @@ class Odometry:
         """Return the edges of a frame, to its predecessor first, and the keyframes' scores."""
         if step.reference_ns is None:
             return [], {}
-        first = Edge(
-            reference_id=step.reference_ns,
-            T_reference_frame=step.T_reference_frame,
-            covariance=step.covariance,
-        )
-        if step.reference_ns not in self._window:  # it had to start anew
-            return [first], {}
+        # A step that only goes on as before is no measurement: the window does that by itself.
+        first = _edge_of(step) if step.is_registered else None
+        if step.reference_ns not in self._window:  # not even alone would it go in
+            return list(filter(None, [first])), {}
         T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
         T_frame_keyframes = {
             stamp_ns: se3.invert(T_world_frame) @ self._window.pose(stamp_ns)
@@ -184,7 +179,7 @@ class Odometry:
             for stamp_ns in chosen
         ]
         links.append(zero_motion_edge(step, self._config.window))
-        return [first, *(link for link in links if link is not None)], scores
+        return list(filter(None, [first, *links])), scores
 
     def _link(
         self,
@@ -206,11 +201,11 @@ class Odometry:
         self,
         observations: Any,  # noqa: ANN401 - the front-end's own
         scores: dict[int, float],
-        *,
-        is_tied: bool,
+        causal: Estimate,
     ) -> None:
         """Keep and release keyframes; none while the pose is only a guess."""
-        if not is_tied:
+        is_tied = causal.status in (Status.OK, Status.RESUMED)
+        if not is_tied or causal.frame_id not in self._window:
             return
         config = self._config.window
         if config.n_keyframes > 0 and is_needed(scores, config):
@@ -230,6 +225,14 @@ class Odometry:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
+
+
+def _edge_of(step: RawStep) -> Edge:
+    return Edge(
+        reference_id=step.reference_ns,
+        T_reference_frame=step.T_reference_frame,
+        covariance=step.covariance,
+    )
 
 
 def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:

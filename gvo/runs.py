@@ -349,8 +349,12 @@ def _warnings(tally: _Tally) -> list[str]:
         )
     if tally.window.n_restored:
         warnings.append(
-            f"{tally.window.n_restored} updates of the window failed and were undone; the poses "
-            "behind them continue the last velocity"
+            f"{tally.window.n_restored} updates of the window failed and were done again with less"
+        )
+    if tally.window.n_rejected:
+        warnings.append(
+            f"{tally.window.n_rejected} edges were refused, {tally.window.n_gated} of them because "
+            f"others contradict them; the first: {tally.window.first_rejected}"
         )
     return warnings
 

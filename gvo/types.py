@@ -266,8 +266,10 @@ class Edge:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        if not isinstance(self.reference_id, Hashable):
-            raise ValueError(f"reference_id must be hashable, got {self.reference_id!r}")
+        try:
+            hash(self.reference_id)
+        except TypeError:
+            raise ValueError(f"reference_id must be hashable: {self.reference_id!r}") from None
         _freeze_shaped(self, T_reference_frame=(4, 4), covariance=(6, 6))
         _check_kernel(self.kernel)
 
@@ -307,12 +309,12 @@ class PositionPrior:
     covariance : ndarray of float64, shape (3, 3)
         Along the axes of the world, metres squared.
     kernel : {"none", "huber", "cauchy", "geman_mcclure", "dcs"}
-        Robust kernel.
+        Robust kernel: fixes by satellites are off by far more than they say now and then.
     """
 
     position_world: FloatArray
     covariance: FloatArray
-    kernel: Kernel = "none"
+    kernel: Kernel = "huber"
 
     def __post_init__(self) -> None:
         """Copy the arrays."""

@@ -512,3 +512,21 @@ def test_standstill_is_no_flow_and_no_significant_motion(
         np.testing.assert_array_equal(edge.T_reference_frame, np.eye(4))
         np.testing.assert_allclose(edge.covariance, 0.25e-6 * np.eye(6))
     assert zero_motion_edge(step, WindowConfig(zero_motion=False)) is None
+
+
+@pytest.mark.parametrize("factor", [0.5, 3.0])
+def test_links_to_keyframes_have_sigmas_larger_by_their_factor(factor: float) -> None:
+    values = {"size": 3, "link_sigma_factor": factor, "keyframe_distance_m": 1.0}
+    odometry = Odometry(config=Config.model_validate({"window": values}), frontend=ScanFrontend())
+    spans: list[int] = []
+    for index in range(20):
+        odometry.track(Scan(index * STEP_NS, scan_pose(index)))
+        for edge in odometry.window.graph():
+            if edge.reference_id is None:
+                continue
+            span = (edge.frame_id - edge.reference_id) // STEP_NS
+            sigma = 1e-3 if span == 1 else 1e-3 * factor
+            np.testing.assert_allclose(np.sqrt(np.diag(edge.covariance)), np.full(6, sigma))
+            spans.append(span)
+    assert min(spans) == 1
+    assert sum(span > 1 for span in spans) > 20

@@ -10,6 +10,7 @@ import gtsam
 
 from gvo.backend.graph import PoseGraph
 from gvo.backend.polish import polish
+from gvo.errors import SmoothingError
 from gvo.types import Estimate, FloatArray, FrameId
 
 
@@ -71,6 +72,11 @@ class MeasurementLog:
         """Return the number of poses."""
         return len(self._keys)
 
+    @property
+    def is_windowed(self) -> bool:
+        """Tell whether poses left: else the window is full smoothing itself."""
+        return any(update.leaving for update in self._updates)
+
     def compare(self, smoothed: Sequence[Estimate]) -> list[Smoothing]:
         """Smooth everything again, as a whole and in a batch.
 
@@ -82,34 +88,51 @@ class MeasurementLog:
         Returns
         -------
         list of Smoothing
-            The window; iSAM2 without marginalization; Levenberg-Marquardt over all factors,
-            started where iSAM2 ended.
+            The window, if poses left it; iSAM2 without marginalization; Levenberg-Marquardt over
+            all factors, started where iSAM2 ended.
         """
         factors = gtsam.NonlinearFactorGraph()
         for update in self._updates:
             factors.push_back(update.factors)
-        _, windowed_s = self._replay(is_windowed=True)
-        graph, whole_s = self._replay(is_windowed=False)
+        graph, whole_s = self._replay_whole()
         whole = graph.values()
         start = time.perf_counter()
         optimum, _ = polish(factors, whole)
         batch_s = time.perf_counter() - start
-        return [
-            self._smoothing("window", factors, self._values(smoothed, whole), windowed_s),
+        smoothings = [
             self._smoothing("full iSAM2", factors, whole, whole_s),
             self._smoothing("batch LM", factors, optimum, batch_s),
         ]
+        if self.is_windowed:
+            values, elapsed_s = self._values(smoothed, whole), self._replay_windowed()
+            smoothings.insert(0, self._smoothing("window", factors, values, elapsed_s))
+        return smoothings
 
-    def _replay(self, *, is_windowed: bool) -> tuple[PoseGraph, float]:
-        graph, alive = PoseGraph(is_whole=not is_windowed), dict[int, None]()
+    def _replay_windowed(self) -> float:
+        """Do the window's updates again, and return how long they took."""
+        graph, alive = PoseGraph(), dict[int, None]()
         start = time.perf_counter()
         for update in self._updates:
-            leaving = update.leaving if is_windowed else ()
-            graph.update(update.factors, update.values, alive=alive, leaving=leaving)
-            graph.marginalize(leaving)
+            graph.update(update.factors, update.values, alive=alive, leaving=update.leaving)
             alive |= dict.fromkeys(update.values.keys())
-            for key in leaving:
+            for key in update.values.keys():  # noqa: SIM118 - not a dict
+                before = update.values.atPose3(key)
+                graph.settle(key, before, alive=alive, leaving=update.leaving)
+            graph.marginalize(update.leaving)
+            for key in update.leaving:
                 del alive[key]
+        return time.perf_counter() - start
+
+    def _replay_whole(self) -> tuple[PoseGraph, float]:
+        graph = PoseGraph(is_whole=True)
+        start = time.perf_counter()
+        for update in self._updates:
+            try:
+                with graph.restored_on_error():
+                    graph.update(update.factors, update.values)
+            except SmoothingError:
+                graph = graph.hardened()
+                graph.update(update.factors, update.values)
         return graph, time.perf_counter() - start
 
     def _values(self, smoothed: Sequence[Estimate], others: gtsam.Values) -> gtsam.Values:

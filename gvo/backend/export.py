@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
+
 from gvo.g2o import format_edge, format_vertex
 from gvo.types import FloatArray, FrameId, GraphEdge
 
@@ -21,12 +23,14 @@ def g2o_lines(poses: Mapping[FrameId, FloatArray], graph: Sequence[GraphEdge]) -
         T_world_frame.
     graph : sequence of GraphEdge
     """
-    is_numbered = all(type(frame_id) is int and frame_id >= 0 for frame_id in poses)
+    is_numbered = all(
+        isinstance(frame_id, int | np.integer) and frame_id >= 0 for frame_id in poses
+    )
     numbers = {
         frame_id: frame_id if is_numbered else number for number, frame_id in enumerate(poses)
     }
     for frame_id, T in poses.items():
-        comment = "" if is_numbered else f"  # {frame_id!s}"
+        comment = "" if is_numbered else f"  # {frame_id!r}"
         yield f"{format_vertex(str(numbers[frame_id]), T)}{comment}"
     for edge in graph:
         if edge.reference_id is not None:

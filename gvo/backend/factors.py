@@ -123,4 +123,6 @@ class Factors:
 
 def _whiten(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the error in units of its covariance: R e with R^T R its inverse, R upper."""
-    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T @ error)
+    # L of the covariance with its axes reversed gives R = L^-1 reversed, without inverting first.
+    L = np.linalg.cholesky(covariance[::-1, ::-1])
+    return np.asarray(np.linalg.solve(L, error[::-1])[::-1])

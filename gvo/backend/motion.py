@@ -5,7 +5,7 @@ from __future__ import annotations
 from gvo.coasting import predict_step
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Estimate, FloatArray
+from gvo.types import Estimate, FloatArray, FrameId
 
 
 class Motion:
@@ -19,19 +19,50 @@ class Motion:
 
     def __init__(self, config: WindowConfig) -> None:
         self._config = config
-        self._measured: tuple[Estimate | None, Estimate | None] = (None, None)
+        self._measured: Estimate | None = None
+        self._velocity: FloatArray | None = None
         self.last: Estimate | None = None
 
-    def append(self, estimate: Estimate, *, is_measured: bool) -> None:
-        """Take the pose of the next frame."""
+    @property
+    def measured_id(self) -> FrameId:
+        """The last frame that a measurement tied; None before the first."""
+        return None if self._measured is None else self._measured.frame_id
+
+    def append(
+        self, estimate: Estimate, *, is_measured: bool, T_world_measured: FloatArray | None = None
+    ) -> None:
+        """Take the pose of the next frame.
+
+        Parameters
+        ----------
+        estimate : Estimate
+        is_measured : bool
+            Whether a measurement ties it.
+        T_world_measured : ndarray of float64, shape (4, 4), optional
+            Present pose of `measured_id`, where the new one is tied to the same graph: between
+            estimates of different moments a correction would look like a motion.
+        """
         self.last = estimate
-        if is_measured:
-            self._measured = (self._measured[1], estimate)
+        if not is_measured:
+            return
+        self._velocity = None
+        if self._measured is not None and T_world_measured is not None:
+            T_before_last = se3.invert(T_world_measured) @ estimate.T_world_cam
+            elapsed_s = 1e-9 * (estimate.stamp_ns - self._measured.stamp_ns)
+            self._velocity = se3.log(T_before_last) / elapsed_s
+        self._measured = estimate
 
     def predict_step(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return T_last_frame, shape (4, 4), of a later frame, and its covariance (6, 6)."""
-        elapsed_s = 0.0 if self.last is None else 1e-9 * (stamp_ns - self.last.stamp_ns)
-        return predict_step(self._velocity(), elapsed_s, self._config)
+        if self.last is None:
+            return predict_step(None, 0.0, self._config)
+        measured_ns = (self._measured or self.last).stamp_ns
+        return predict_step(
+            self._velocity,
+            1e-9 * (stamp_ns - self.last.stamp_ns),
+            self._config,
+            coasted_s=1e-9 * (self.last.stamp_ns - measured_ns),
+        )
 
     def predict_pose(self, stamp_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """Return T_world_frame of a later frame, and its covariance; None without a last pose."""
@@ -42,10 +73,3 @@ class Motion:
             se3.normalize(self.last.T_world_cam @ T_last_frame),
             se3.compose_covariance(self.last.covariance, T_last_frame, covariance),
         )
-
-    def _velocity(self) -> FloatArray | None:
-        before, last = self._measured
-        if before is None or last is None:
-            return None
-        T_before_last = se3.invert(before.T_world_cam) @ last.T_world_cam
-        return se3.log(T_before_last) / (1e-9 * (last.stamp_ns - before.stamp_ns))

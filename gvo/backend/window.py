@@ -83,11 +83,12 @@ class _Arrival:
     rejected: list[Rejected] = field(default_factory=list)
     anchor: PosePrior | None = None
     coasting: Edge | None = None
+    is_origin: bool = False
 
     @property
     def is_measured(self) -> bool:
         """Tell whether a measurement ties the pose, or it is the origin."""
-        return bool(self.edges or self.priors or self.anchor is _ORIGIN)
+        return bool(self.edges or self.priors or self.is_origin)
 
 
 class SlidingWindow:
@@ -132,6 +133,8 @@ class SlidingWindow:
     ) -> None:
         if keyframes not in get_args(Keeping):
             raise ValueError(f"keyframes must be one of {get_args(Keeping)}, got {keyframes!r}")
+        if config is not None and not isinstance(config, WindowConfig):
+            raise ValueError(f"config must be a gvo.WindowConfig, got {type(config).__name__}")
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
         self._factors = Factors(self._config)
@@ -210,7 +213,7 @@ class SlidingWindow:
         self._check_arrival(frame_id, stamp_ns, edges, prior)
         arrival = self._receive(frame_id, int(stamp_ns), edges, prior)
         estimate = self._enter(arrival, status)
-        self._motion.append(estimate, is_measured=arrival.is_measured)
+        self._note_motion(arrival, estimate)
         if self._keeps_by_distance and frame_id in self._members:
             self._keep_by_distance(frame_id)
         return estimate
@@ -284,7 +287,11 @@ class SlidingWindow:
 
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        return self._graph.pose(self._member(frame_id).key)
+        member = self._member(frame_id)
+        T_world_frame = self._graph.pose(member.key)
+        if member.causal is not None and place_fault(T_world_frame[:3, 3]):
+            return member.causal.T_world_cam
+        return T_world_frame
 
     def poses(self) -> dict[FrameId, FloatArray]:
         """Return T_world_frame of all poses of the window, oldest first."""
@@ -313,12 +320,10 @@ class SlidingWindow:
             T_reference_frame; its covariance comes of the joint one of both poses, so that what
             they do not know together does not count.
         """
-        reference, member = self._member(reference_id), self._member(frame_id)
         return Edge(
             reference_id=reference_id,
-            T_reference_frame=se3.invert(self._graph.pose(reference.key))
-            @ self._graph.pose(member.key),
-            covariance=self._relative_covariance(reference.key, member.key),
+            T_reference_frame=se3.invert(self.pose(reference_id)) @ self.pose(frame_id),
+            covariance=self._relative_covariance(reference_id, frame_id),
         )
 
     def graph(self) -> list[GraphEdge]:
@@ -373,6 +378,7 @@ class SlidingWindow:
         Where the window kept everything they are polished first. It is empty afterwards, ready
         for another first pose.
         """
+        self._polish = None
         if self._config.size is None and self._members:
             self._finished += self._polished()
         else:
@@ -467,7 +473,7 @@ class SlidingWindow:
                 T_world_frame=arrival.T_world_start.matrix(), covariance=np.diag(_UNKNOWN_SIGMAS**2)
             )
         else:
-            arrival.anchor = _ORIGIN
+            arrival.anchor, arrival.is_origin = _ORIGIN, True
 
     def _coast(self, arrival: _Arrival) -> None:
         """Tie the pose to the last one by the velocity so far."""
@@ -509,9 +515,7 @@ class SlidingWindow:
         return judge(
             edges,
             pose_of=lambda frame_id: self._graph.pose3(self._members[frame_id].key),
-            relative_covariance=lambda reference_id, frame_id: self._relative_covariance(
-                self._members[reference_id].key, self._members[frame_id].key
-            ),
+            relative_covariance=self._relative_covariance,
             motion=lambda: self._coasting_edge(stamp_ns),
             gate=self._config.gate,
         )
@@ -531,29 +535,39 @@ class SlidingWindow:
 
     def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
         """Return why an edge between known poses is refused; empty where it fits them."""
-        reference_key, key = self._members[edge.reference_id].key, self._members[frame_id].key
-        T = se3.invert(self._graph.pose(reference_key)) @ self._graph.pose(key)
-        covariance = self._relative_covariance(reference_key, key)
+        T = se3.invert(self.pose(edge.reference_id)) @ self.pose(frame_id)
+        covariance = self._relative_covariance(edge.reference_id, frame_id)
         return disagreement(edge, T, covariance, gate=self._config.gate)
 
-    def _relative_covariance(self, reference_key: int, key: int) -> FloatArray:
+    def _relative_covariance(self, reference_id: FrameId, frame_id: FrameId) -> FloatArray:
         """Return the covariance (6, 6) of T_reference_frame, zero of a pose to itself."""
-        if reference_key == key:
+        if reference_id == frame_id:
             return np.zeros((6, 6))
-        T = se3.invert(self._graph.pose(reference_key)) @ self._graph.pose(key)
+        T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
         # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
         J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
         try:
-            joint = self._graph.joint_covariance(reference_key, key)
+            keys = self._members[reference_id].key, self._members[frame_id].key
+            joint = self._graph.joint_covariance(*keys)
             return definite(J @ joint @ J.T)
         except (RuntimeError, SmoothingError):
             # What they share is lost in rounding: as if they shared nothing, which is no less.
             apart = np.zeros((12, 12))
-            apart[:6, :6] = self._graph.covariance(reference_key)
-            apart[6:, 6:] = self._graph.covariance(key)
-            return definite(J @ apart @ J.T)
+            apart[:6, :6] = self._final_estimate(reference_id).covariance
+            apart[6:, 6:] = self._final_estimate(frame_id).covariance
+            return sane_covariance(J @ apart @ J.T)
 
     # What goes into the graph
+
+    def _note_motion(self, arrival: _Arrival, estimate: Estimate) -> None:
+        """Remember how the camera moved, if the graph says so and not a prior alone."""
+        measured_id = self._motion.measured_id
+        is_known = bool(arrival.edges) and measured_id in self._members
+        self._motion.append(
+            estimate,
+            is_measured=arrival.is_measured,
+            T_world_measured=self.pose(measured_id) if is_known else None,
+        )
 
     def _enter(self, arrival: _Arrival, status: Status | None) -> Estimate:
         """Put the pose into the graph; where GTSAM gives up, with ever less beside it."""
@@ -611,7 +625,8 @@ class SlidingWindow:
                 arrival.frame_id, arrival.stamp_ns, "GTSAM gave up on the update"
             )
             arrival.rejected.append(rejected)
-        arrival.edges, arrival.priors, arrival.anchor = [], [], None
+        arrival.edges, arrival.priors = [], []
+        arrival.anchor, arrival.is_origin = None, False
         self._receive_without_edges(arrival)
 
     def _rebuild_for(self, arrival: _Arrival) -> None:

@@ -15,6 +15,7 @@ from gvo.trajectory import Trajectory
 from gvo.trajectory_files import write_tum
 from gvo.types import Estimate
 
+_ROUNDING = 1e-6
 _HEADER = ("smoothing", "error", "above least [%]", "off least [m]", "ATE RMSE [m]", "ms per pose")
 FILES = {"full iSAM2": "full_isam2.txt", "batch LM": "batch_lm.txt"}
 """Trajectories that `SmoothingComparison` writes, by the name of the smoothing."""
@@ -44,9 +45,9 @@ class SmoothingComparison:
         Returns
         -------
         list of dict
-            A row for the window, for iSAM2 without marginalization and for batch
-            Levenberg-Marquardt: error (half the chi-square), by how much it and the positions
-            (RMS) are off the least, ATE, milliseconds per pose.
+            A row for the window (where poses left it), for iSAM2 without marginalization and for
+            batch Levenberg-Marquardt: error (half the chi-square), by how much it and the
+            positions (RMS) are off the least, ATE, milliseconds per pose.
         """
         smoothings = self.log.compare(self._smoothed)
         stamps_ns = {estimate.frame_id: estimate.stamp_ns for estimate in self._smoothed}
@@ -60,7 +61,7 @@ class SmoothingComparison:
             {
                 "smoothing": smoothing.name,
                 "error": smoothing.error,
-                "above_least_pct": 100.0 * (smoothing.error / max(least.error, 1e-12) - 1.0),
+                "above_least_pct": _percent_above(smoothing.error, least.error),
                 "off_least_m": _distance(trajectories[smoothing.name], trajectories[least.name]),
                 "ate_m": _ate(truth, trajectories[smoothing.name]),
                 "ms_per_pose": 1e3 * smoothing.elapsed_s / len(stamps_ns),
@@ -104,3 +105,8 @@ def _distance(first: Trajectory, second: Trajectory) -> float:
 
 def _ate(truth: Trajectory | None, estimate: Trajectory) -> float | None:
     return None if truth is None else evaluate(truth, estimate, name="").ate_m
+
+
+def _percent_above(error: float, least: float) -> float:
+    # A chain alone has no error but that of rounding.
+    return 100.0 * (error / least - 1.0) if error > _ROUNDING else 0.0

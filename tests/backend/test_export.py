@@ -49,7 +49,7 @@ def test_names_that_are_no_numbers_are_numbered_and_told(tmp_path: Path) -> None
     window.write_g2o(tmp_path / "window.g2o")
     lines = (tmp_path / "window.g2o").read_text().splitlines()
     assert lines[0].startswith("VERTEX_SE3:QUAT 0 ")
-    assert lines[0].endswith("# left")
+    assert lines[0].endswith("# 'left'")
     assert lines[2].startswith("EDGE_SE3:QUAT 0 1 ")
 
 

@@ -402,7 +402,7 @@ def test_a_prior_that_contradicts_a_sure_window_is_believed_and_the_window_goes_
         )
     else:
         position = POSITION_PRIOR.position_world + np.array([jump, 0.0, 0.0])
-        moved = PositionPrior(position_world=position, covariance=1e-6 * np.eye(3))
+        moved = PositionPrior(position_world=position, covariance=1e-6 * np.eye(3), kernel="none")
     for found in (run(lambda window: window.add_prior(NEWEST, moved)), run(prior=moved)):
         if jump < 100.0:  # beyond, no step of Gauss-Newton comes back
             assert found.window.counts.n_priors == 1

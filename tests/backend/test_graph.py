@@ -204,7 +204,7 @@ def random_prior(rng: np.random.Generator, T: FloatArray, sigma: float) -> Prior
         return PosePrior(T_world_frame=se3.normalize(T @ noise), covariance=covariance)
     covariance = random_covariance(rng, sigma, 3)
     position = rng.multivariate_normal(T[:3, 3], covariance)
-    return PositionPrior(position_world=position, covariance=covariance)
+    return PositionPrior(position_world=position, covariance=covariance, kernel="none")
 
 
 def add_priors(problem: Problem, rng: np.random.Generator, sigma: float) -> Problem:

@@ -299,3 +299,39 @@ def test_an_unrefined_pose_keeps_its_place_and_gets_the_covariance_of_its_residu
     refined = refine(T, matches.select(inliers), np.ones(50, dtype=np.bool_))
     ratios = np.diag(result.covariance) / np.diag(refined.covariance)
     assert np.all((ratios > 0.5) & (ratios < 2.0))
+
+
+def measure_target(rng: np.random.Generator, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return trace(covariance H) / 6 and the NEES per degree of freedom of one registration.
+
+    Noise (n, 3), in sigmas, spoils the target frame alone; H is the information of its n
+    matches by the derivatives at the true pose.
+    """
+    n, sigmas = len(noise), 0.1 * SIGMAS
+    T, exact = measure(rng, n, noise=0.0, sigmas=sigmas)
+    target = exact.source_points @ T[:3, :3].T + T[:3, 3]
+    target_uvd = exact.target_uvd + sigmas * noise
+    matches = replace(
+        exact,
+        target_points=unproject(target_uvd),
+        target_uvd=target_uvd,
+        source_sigmas=np.full((n, 3), 1e-9),
+    )
+    # Kernel and gate out of reach leave plain least squares, of which the theory is exact.
+    wide = RegistrationConfig(n_iterations=20, huber=1e6, gate=1e6)
+    result = refine_pose(T, matches, all_of(matches), CAMERA, wide)
+    assert isinstance(result, Refinement)
+    J = (pose_jacobian(target, CAMERA) / sigmas[:, np.newaxis]).reshape(-1, 6)
+    error = error_of(result, T)
+    nees = error @ np.linalg.solve(result.covariance, error)
+    return np.trace(result.covariance @ J.T @ J) / 6, nees / 6
+
+
+def test_the_covariance_of_few_matches_is_on_average_that_of_least_squares() -> None:
+    # Residuals are smaller than the noise: the pose is fitted to them, here by 8 %.
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(1500, 24, 3))
+    noise /= np.sqrt(np.mean(noise**2))  # so many runs are enough
+    size, nees = np.mean([measure_target(rng, each) for each in noise], axis=0)
+    assert 0.94 < size < 1.03
+    assert 0.85 < nees < 1.25

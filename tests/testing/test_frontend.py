@@ -267,3 +267,39 @@ def test_front_ends_of_other_sensors_are_checked_with_their_own_blank_frame() ->
 def test_different_values_have_different_fingerprints(pair: tuple[object, object]) -> None:
     assert fingerprint(pair[0]) != fingerprint(pair[1])
     assert fingerprint(pair[0]) == fingerprint(pair[0])
+
+
+class OffByAFewSigmas(ScanFrontend):
+    """Turns about one axis, and contradicts itself in one respect by so many sigmas."""
+
+    def __init__(self, respect: str, n_sigmas: float) -> None:
+        # What two registrations have different of each other counts in sigmas of both.
+        n_each = n_sigmas if respect == "itself" else np.sqrt(2.0) * n_sigmas
+        self._respect = respect
+        self._error = se3.exp(np.array([0.0, 1e-3 * n_each, 0.0, 0.0, 0.0, 0.0]))
+
+    def register(self, reference: Scan, current: Scan, prior: FloatArray | None) -> Result:
+        result = super().register(reference, current, prior)
+        is_off = {
+            "itself": reference.stamp_ns == current.stamp_ns,
+            "the way back": reference.stamp_ns > current.stamp_ns,
+            "a prior": prior is not None,
+        }[self._respect]
+        if isinstance(result, Failure) or not is_off:
+            return result
+        return replace(result, T_reference_current=result.T_reference_current @ self._error)
+
+
+@pytest.mark.parametrize(
+    ("respect", "reason"),
+    [
+        ("itself", "with itself and the identity disagree by 5.1 sigma"),
+        ("the way back", "the other way round disagree by 5.1 sigma"),
+        ("a prior", "with and without a prior disagree by 5.1 sigma"),
+    ],
+)
+def test_contradictions_are_let_pass_up_to_five_sigma(respect: str, reason: str) -> None:
+    scans = [Scan(n, se3.exp(np.array([0.0, 0.1 * n, 0.0, 0.0, 0.0, 0.0]))) for n in range(3)]
+    check_frontend(OffByAFewSigmas(respect, 4.9), scans)
+    with pytest.raises(ContractError, match=reason):
+        check_frontend(OffByAFewSigmas(respect, 5.1), scans)
