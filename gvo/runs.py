@@ -15,6 +15,7 @@ import numpy as np
 
 from gvo import __version__
 from gvo.backend.ledger import WindowCounts
+from gvo.backend.polish import Polish
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, SmoothingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
@@ -102,6 +103,7 @@ class _Tally:
     first_untied: str = ""
     broken_off: str = ""
     window: WindowCounts = field(default_factory=WindowCounts)
+    polish: Polish | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
 
     @property
@@ -202,7 +204,7 @@ def run_recording(
         finally:
             # Also where the run is interrupted: what the window holds was computed.
             folder.add_smoothed(odometry.finish())
-    tally.window = odometry.window.counts
+    tally.window, tally.polish = odometry.window.counts, odometry.window.polish
     return _conclude(
         source, folder, tally, config=config, ground_truth=ground_truth, comparison=comparison
     )
@@ -380,6 +382,7 @@ def _summary(
         "status_counts": {status.value: tally.statuses[status] for status in Status},
         "unpaired_images": tally.n_unpaired,
         "window": asdict(tally.window),
+        "polish": None if tally.polish is None else tally.polish.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],

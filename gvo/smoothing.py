@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from gvo import __version__
-from gvo.backend.polish import Polish
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.edge_chain import EdgeChain
@@ -34,8 +33,8 @@ POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reas
 # What a pose graph's file says: its noise is stated, its loops reach far back.
 _GRAPH_DEFAULTS: dict[str, tuple[object, str]] = {
     "size": (None, "loops refer to poses of any age"),
-    "kernel": ("none", "the file states the noise of its edges"),
-    "gate": (None, "the file states the noise of its edges"),
+    "kernel": ("none", "edges are taken at the noise that the file states; 1 where it does not"),
+    "gate": (None, "edges are taken at the noise that the file states; 1 where it does not"),
 }
 
 
@@ -287,11 +286,12 @@ def conclude(
 ) -> RunResult:
     """Write summary and picture of a finished run, and compare with the truth."""
     if smoother.n_poses == 0:
-        reason = notes.broken_off or "it holds no pose"
+        reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
         raise RecordingError(f"{name}: nothing to smooth: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     warnings = [*_warnings(smoother, notes), *notes.warnings]
-    is_partly = bool(notes.warnings or notes.broken_off or smoother.window.counts.n_coasting)
+    counts = smoother.window.counts
+    is_partly = bool(notes.warnings or notes.broken_off or counts.n_coasting or counts.n_rejected)
     evaluations: tuple[Evaluation, ...] = ()
     if truth is not None:
         try:
@@ -330,7 +330,7 @@ def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
             "the last velocity (frames.csv: coasting, lost)"
         )
     if counts.n_restored:
-        warnings.append(f"{counts.n_restored} updates failed and were undone")
+        warnings.append(f"{counts.n_restored} updates failed and were done again with less")
     return warnings
 
 
@@ -345,14 +345,6 @@ def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, 
         "tracked": n_tied,
         "status_counts": {status.value: smoother.statuses[status] for status in Status},
         "window": asdict(smoother.window.counts),
-        "polish": None if polish is None else _polish(polish),
+        "polish": None if polish is None else polish.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
-    }
-
-
-def _polish(polish: Polish) -> dict[str, float | int]:
-    return {
-        "error_isam2": polish.error_before,
-        "error": polish.error_after,
-        "iterations": polish.n_iterations,
     }

@@ -59,8 +59,8 @@ def smooth_lines(
         smoother = Smoother(folder, config, keyframes=keyframes)
         try:
             _answer_all(lines, answer, smoother, faults)
-        except BrokenPipeError:
-            faults.add("reader of the answers is gone", "the stream ends there")
+        except OSError as error:
+            faults.add("answers could not be written", f"the stream ends there: {error.strerror}")
         finally:
             smoother.finish()
     notes = SmoothingNotes(warnings=faults.warnings())

@@ -38,6 +38,8 @@ def main() -> None:
     parser.add_argument("--loops", type=Path, help="poses with less drift, row by row")
     parser.add_argument("--every", type=int, default=20, help="rows from keyframe to keyframe")
     arguments = parser.parse_args()
+    if arguments.every < 1:
+        parser.error("--every must be at least 1")
 
     poses = gvo.read_trajectory(arguments.poses)
     loops = None if arguments.loops is None else gvo.read_trajectory(arguments.loops)

@@ -524,6 +524,8 @@ def test_links_to_keyframes_have_sigmas_larger_by_their_factor(factor: float) ->
         for edge in odometry.window.graph():
             if edge.reference_id is None:
                 continue
+            assert isinstance(edge.frame_id, int)
+            assert isinstance(edge.reference_id, int)
             span = (edge.frame_id - edge.reference_id) // STEP_NS
             sigma = 1e-3 if span == 1 else 1e-3 * factor
             np.testing.assert_allclose(np.sqrt(np.diag(edge.covariance)), np.full(6, sigma))

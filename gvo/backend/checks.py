@@ -62,7 +62,7 @@ def pose_fault(T_world_frame: FloatArray, covariance: FloatArray) -> str:
 def sane_covariance(covariance: FloatArray) -> FloatArray:
     """Return the covariance, or one of the same sigmas, bounded, where it is none to work with."""
     if not covariance_fault(covariance):
-        return covariance
+        return np.asarray(0.5 * (covariance + covariance.T))
     variances = np.nan_to_num(
         np.diag(covariance), nan=_MAX_SANE_SIGMA**2, posinf=_MAX_SANE_SIGMA**2
     )

@@ -232,4 +232,5 @@ def definite(covariance: FloatArray) -> FloatArray:
     if eigenvalues[0] < -_MAX_ROUNDING:
         raise SmoothingError("GTSAM: a covariance is not positive definite")
     clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
-    return np.asarray((vectors * clipped) @ vectors.T * scale)
+    repaired = (vectors * clipped) @ vectors.T * scale
+    return np.asarray(0.5 * (repaired + repaired.T))

@@ -27,6 +27,14 @@ class Polish:
     error_after: float
     n_iterations: int
 
+    def as_json(self) -> dict[str, float | int]:
+        """Return the values under their names in `summary.json`."""
+        return {
+            "error_isam2": self.error_before,
+            "error": self.error_after,
+            "iterations": self.n_iterations,
+        }
+
 
 def polish(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values

@@ -24,7 +24,7 @@ import csv
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -104,7 +104,10 @@ def parse_csv(line: str) -> Request:
     >>> parse_csv("b,100000000,a,0,0,1,0,0,0,1").edges[0].reference_id
     'a'
     """
-    fields = [field.strip() for field in next(csv.reader([line]), [])]
+    try:
+        fields = [field.strip() for field in next(csv.reader([line]), [])]
+    except csv.Error as error:
+        raise ValueError(f"no line of CSV: {error}") from None
     if len(fields) == 2 and fields[0] in _ACTIONS:
         return Request(frame_id=_csv_id(fields[1]), keep=fields[0] == "keep")
     if len(fields) < 2:
@@ -223,7 +226,7 @@ def _json_prior(content: object) -> Prior | None:
     if len(values) != size:
         raise ValueError(f"a {name} needs {size} numbers, got {len(values)}")
     noise = _json_noise(content, 3 if size == 3 else 6)
-    return _prior(values, noise, content.get("kernel", "none"))
+    return _prior(values, noise, content.get("kernel"))
 
 
 def _json_noise(content: Mapping[str, object], size: int) -> FloatArray | None:
@@ -271,6 +274,8 @@ def _noise(numbers: FloatArray, size: int) -> FloatArray | None:
     if len(numbers) == 0:
         return None
     if len(numbers) == size:
+        if (numbers < 0.0).any():
+            raise ValueError("a sigma is negative")
         with np.errstate(over="ignore"):  # infinite: the window refuses it
             return np.diag(numbers**2)
     if len(numbers) != n_upper:
@@ -312,16 +317,9 @@ def _edge(
     )
 
 
-def _prior(numbers: FloatArray, noise: FloatArray | None, kernel: object = "none") -> Prior:
+def _prior(numbers: FloatArray, noise: FloatArray | None, kernel: object = None) -> Prior:
     covariance = np.diag(_PRIOR_SIGMAS**2) if noise is None else noise
+    chosen: dict[str, Any] = {} if kernel is None else {"kernel": kernel}  # checked by the prior
     if len(numbers) == 3:
-        return PositionPrior(
-            position_world=numbers,
-            covariance=covariance[-3:, -3:],
-            kernel=kernel,  # type: ignore[arg-type] # checked by PositionPrior
-        )
-    return PosePrior(
-        T_world_frame=_pose(numbers),
-        covariance=covariance,
-        kernel=kernel,  # type: ignore[arg-type] # checked by PosePrior
-    )
+        return PositionPrior(position_world=numbers, covariance=covariance[-3:, -3:], **chosen)
+    return PosePrior(T_world_frame=_pose(numbers), covariance=covariance, **chosen)

@@ -316,8 +316,9 @@ class WindowMachine(RuleBasedStateMachine):
         np.testing.assert_allclose(edge.T_reference_frame, between, atol=1e-6)
         # The difference of two joint blocks: exact to the rounding of these.
         np.testing.assert_array_equal(edge.covariance, edge.covariance.T)
-        rounding = 1e-10 * max(self.window.covariance(frame).max() for frame in (a, b))
-        assert np.linalg.eigvalsh(edge.covariance)[0] > -rounding
+        sigmas = np.sqrt(np.diag(edge.covariance))
+        assert (sigmas > 0).all()
+        assert np.linalg.eigvalsh(edge.covariance / np.outer(sigmas, sigmas))[0] > -1e-9
 
     @rule()
     def pop_finished(self) -> None:

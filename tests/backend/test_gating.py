@@ -1,0 +1,146 @@
+"""Which of two edges is believed, and what the references' own uncertainty excuses."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.backend.window import SlidingWindow
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.types import Edge, FloatArray, FrameId
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+STEP_NS = 100_000_000
+GATE = 10.0
+
+
+def edge(reference_id: FrameId, T: FloatArray, covariance: FloatArray) -> Edge:
+    return Edge(reference_id=reference_id, T_reference_frame=T, covariance=covariance)
+
+
+def shifted(*translation: float) -> FloatArray:
+    T = np.eye(4)
+    T[:3, 3] = translation
+    return T
+
+
+# Two edges alone cannot outvote each other; the motion so far decides.
+
+
+def walk(step: FloatArray, n: int = 5) -> SlidingWindow:
+    """Return a window of n poses a step apart, seen from one reference each."""
+    window = SlidingWindow(WindowConfig(size=8, kernel="none", gate=GATE))
+    window.add_pose(0, 0, [])
+    for frame in range(1, n):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, step, 1e-4 * np.eye(6))])
+    return window
+
+
+@pytest.mark.parametrize("is_wrong_first", [False, True])
+@pytest.mark.parametrize("is_wrong_nearer", [False, True])
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds, offset_m=st.floats(8.0, 1000.0))
+def test_of_two_edges_that_disagree_the_one_that_fits_the_motion_stays(
+    is_wrong_first: bool, is_wrong_nearer: bool, seed: int, offset_m: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    step = se3.exp(np.r_[0.05 * rng.normal(size=3), 0.5 * rng.normal(size=3)])
+    direction = rng.normal(size=3)
+    jump = shifted(*(offset_m * direction / np.linalg.norm(direction)))
+    nearer, farther = (4, step), (3, step @ step)
+    (right, T_right), (wrong, T_wrong) = (farther, nearer) if is_wrong_nearer else (nearer, farther)
+    edges = [
+        edge(right, se3.normalize(T_right), 1e-4 * np.eye(6)),
+        edge(wrong, se3.normalize(T_wrong @ jump), 1e-4 * np.eye(6)),
+    ]
+    window = walk(step)
+    expected = window.pose(4) @ step
+    estimate = window.add_pose(5, 5 * STEP_NS, edges[::-1] if is_wrong_first else edges)
+    assert [refused.reference_id for refused in estimate.rejected] == [wrong]
+    assert window.counts.n_gated == 1
+    np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_where_the_motion_fits_neither_of_two_edges_both_stay(is_swapped: bool) -> None:
+    # One against one, and nobody to tell which is right.
+    window = walk(shifted(0.0, 0.0, 0.5))
+    edges = [
+        edge(4, shifted(100.0, 0.0, 0.0), 1e-4 * np.eye(6)),
+        edge(3, shifted(-100.0, 0.0, 0.0), 1e-4 * np.eye(6)),
+    ]
+    estimate = window.add_pose(5, 5 * STEP_NS, edges[::-1] if is_swapped else edges)
+    assert estimate.rejected == ()
+
+
+# References that are uncertain of each other excuse a disagreement, by their lever arm.
+
+SURE = 1e-6 * np.eye(6)
+TURN_SIGMA = 0.05
+ARM_M = 30.0
+
+
+def two_references(T_0_1: FloatArray, axis: FloatArray) -> SlidingWindow:
+    """Return a window of two poses; how they are turned about an axis of pose 1 is ill known."""
+    covariance = SURE.copy()
+    covariance[:3, :3] += TURN_SIGMA**2 * np.outer(axis, axis)
+    window = SlidingWindow(WindowConfig(size=5, kernel="none", gate=GATE))
+    window.add_pose(0, 0, [])
+    window.add_pose(1, STEP_NS, [edge(0, T_0_1, covariance)])
+    return window
+
+
+def arriving(T_0_1: FloatArray, twist_of_1: FloatArray, T_1_2: FloatArray) -> list[Edge]:
+    """Return two edges from pose 1, and one from pose 0 as if pose 1 were off by a twist."""
+    T_0_2 = se3.normalize(T_0_1 @ se3.exp(twist_of_1) @ T_1_2)
+    return [edge(1, T_1_2, SURE), edge(1, T_1_2, SURE), edge(0, T_0_2, SURE)]
+
+
+def first_to_last(edges: list[Edge]) -> list[Edge]:
+    return [*edges[1:], edges[0]]
+
+
+def last_to_first(edges: list[Edge]) -> list[Edge]:
+    return edges[::-1]
+
+
+@pytest.mark.parametrize("rearrange", [list, first_to_last, last_to_first])
+@settings(deadline=None, max_examples=15)
+@given(seed=seeds)
+def test_a_loop_that_turns_uncertain_references_is_believed_at_the_end_of_a_long_arm(
+    rearrange: Callable[[list[Edge]], list[Edge]], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_0_1, T_1_2 = (se3.exp(np.r_[rng.normal(size=3), np.zeros(3)]) for _ in range(2))
+    arm = rng.normal(size=3)
+    T_1_2[:3, 3] = ARM_M * arm / np.linalg.norm(arm)
+    # Off by two sigmas of the turn, across the arm: three metres, thousands of the edges' sigmas.
+    axis = np.cross(arm, rng.normal(size=3))
+    axis /= np.linalg.norm(axis)
+    twist = np.r_[2.0 * TURN_SIGMA * axis, np.zeros(3)]
+    edges = rearrange(arriving(T_0_1, twist, T_1_2))
+    window = two_references(T_0_1, axis)
+    estimate = window.add_pose(2, 2 * STEP_NS, edges)
+    assert estimate.rejected == ()
+
+
+@pytest.mark.parametrize("rearrange", [list, first_to_last, last_to_first])
+@settings(deadline=None, max_examples=15)
+@given(seed=seeds)
+def test_a_stretch_of_the_arm_is_not_excused_by_turns_of_the_references(
+    rearrange: Callable[[list[Edge]], list[Edge]], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_0_1, T_1_2 = (se3.exp(np.r_[rng.normal(size=3), np.zeros(3)]) for _ in range(2))
+    arm = rng.normal(size=3)
+    T_1_2[:3, 3] = ARM_M * arm / np.linalg.norm(arm)
+    # No turn of pose 1 lengthens the arm: two metres are far beyond the millimetres known.
+    twist = np.r_[np.zeros(3), 2.0 * arm / np.linalg.norm(arm)]
+    edges = rearrange(arriving(T_0_1, twist, T_1_2))
+    axis = np.cross(arm, rng.normal(size=3))
+    window = two_references(T_0_1, axis / np.linalg.norm(axis))
+    estimate = window.add_pose(2, 2 * STEP_NS, edges)
+    assert [refused.reference_id for refused in estimate.rejected] == [0]
