@@ -113,11 +113,12 @@ class MeasurementLog:
         graph, alive = PoseGraph(), dict[int, None]()
         start = time.perf_counter()
         for update in self._updates:
+            new = update.values.keys()
+            before = {key: graph.pose3(key) for key in update.factors.keyVector() if key in alive}
+            before |= {key: update.values.atPose3(key) for key in new}
             graph.update(update.factors, update.values, alive=alive, leaving=update.leaving)
-            alive |= dict.fromkeys(update.values.keys())
-            for key in update.values.keys():  # noqa: SIM118 - not a dict
-                before = update.values.atPose3(key)
-                graph.settle(key, before, alive=alive, leaving=update.leaving)
+            alive |= dict.fromkeys(new)
+            graph.settle(before, alive=alive, leaving=update.leaving)
             graph.marginalize(update.leaving)
             for key in update.leaving:
                 del alive[key]

@@ -9,7 +9,7 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import gtsam
@@ -136,30 +136,28 @@ class PoseGraph:
 
     def settle(
         self,
-        key: int,
-        before: gtsam.Pose3,
+        before: Mapping[int, gtsam.Pose3],
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),
     ) -> None:
-        """Go on until a pose stands still, where the update just done moved it far.
+        """Go on until poses stand still, where the update just done moved them far.
 
         One step of Gauss-Newton is exact for what moves by a fraction of a radian only; after a
         loop closes it takes a few. A whole graph is left to the polish at its end.
 
         Parameters
         ----------
-        key : int
-            Of the pose that the update was about.
-        before : gtsam.Pose3
-            Where it was, or started.
+        before : mapping of int to gtsam.Pose3
+            Where the poses that the update was about were, or started, by their keys.
         alive, leaving
             As for the update.
         """
         limit = _FAR
         for _ in range(0 if self._is_whole else _MAX_STEPS):
-            after = self.pose3(key)
-            if max(map(abs, before.localCoordinates(after).tolist())) < limit:
+            after = {key: self.pose3(key) for key in before}
+            moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
+            if max(max(map(abs, move)) for move in moves) < limit:
                 return
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -661,11 +661,12 @@ class SlidingWindow:
         leaving = self._leaving()
         keys = [self._members[frame_id].key for frame_id in leaving]
         alive = [member.key for member in self._members.values()]
+        references = {self._members[edge.reference_id].key for edge in arrival.edges}
+        before = {key: self._graph.pose3(key) for key in references}
+        before[arrival.key] = arrival.T_world_start
         with self._graph.restored_on_error():
             self._graph.update(factors, values, alive=alive, leaving=keys)
-            self._graph.settle(
-                arrival.key, arrival.T_world_start, alive=[*alive, arrival.key], leaving=keys
-            )
+            self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
             covariances = self._graph.covariances([*keys, arrival.key])
             pose = self._graph.pose(arrival.key), covariances.pop()
             _check_result(*pose)
@@ -690,20 +691,31 @@ class SlidingWindow:
         """Add a factor between poses that are there."""
         factors = gtsam.NonlinearFactorGraph()
         factors.add(factor)
-        try:
-            with self._graph.restored_on_error():
-                before = self._graph.pose3(self._members[frame_id].key)
-                self._graph.update(factors, gtsam.Values())
-                self._graph.settle(self._members[frame_id].key, before)
-                estimate = self._estimate(frame_id)
-                _check_result(estimate.T_world_cam, estimate.covariance)
-                self._check_others()
-        except SmoothingError as error:
-            self._ledger.add(n_restored=1)
-            _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
-            return self._reject(frame_id, f"GTSAM gave up on the update: {error}", edge=edge)
-        if self._log is not None:
-            self._log.add(factors, gtsam.Values(), keys={})
+        for _ in range(2 if self._graph.can_be_hardened else 1):
+            try:
+                estimate = self._updated(frame_id, factors)
+            except SmoothingError as error:
+                self._ledger.add(n_restored=1)
+                _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
+                reason = f"GTSAM gave up on the update: {error}"
+                if self._graph.can_be_hardened:
+                    self._graph = self._graph.hardened()
+            else:
+                if self._log is not None:
+                    self._log.add(factors, gtsam.Values(), keys={})
+                return estimate
+        return self._reject(frame_id, reason, edge=edge)
+
+    def _updated(self, frame_id: FrameId, factors: gtsam.NonlinearFactorGraph) -> Estimate:
+        """Return a pose after factors between known poses were added."""
+        key = self._members[frame_id].key
+        with self._graph.restored_on_error():
+            before = {key: self._graph.pose3(key)}
+            self._graph.update(factors, gtsam.Values())
+            self._graph.settle(before)
+            estimate = self._estimate(frame_id)
+            _check_result(estimate.T_world_cam, estimate.covariance)
+            self._check_others()
         return estimate
 
     def _check_others(self) -> None:
@@ -724,8 +736,7 @@ class SlidingWindow:
             del self._members[frame_id]
         gone = set(leaving)
         for member in self._members.values():
-            if member.is_kept:  # the others leave soon themselves
-                member.edges = [edge for edge in member.edges if edge.reference_id not in gone]
+            member.edges = [edge for edge in member.edges if edge.reference_id not in gone]
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))

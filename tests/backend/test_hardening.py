@@ -165,3 +165,34 @@ def test_a_keyframe_keeps_edges_to_keyframes_only() -> None:
             assert isinstance(window.add_edge(1, loop), Estimate)
     ends = [(each.reference_id, each.frame_id) for each in window.graph()]
     assert sorted(ends, key=str) == sorted([(0, 1), (28, 1), (29, 1), (28, 29)], key=str)
+
+
+def test_a_pose_that_closes_a_loop_with_a_large_turn_settles_the_others_too() -> None:
+    window, edges, _ = drifted_chain(-1.2)
+    before = window.poses()
+    arriving = [edge(0, power(STEP, N), 1e-3), edge(N - 1, STEP, 0.1)]
+    window.add_pose(N, N * STEP_NS, arriving)
+    everything = [*edges, *((N, each) for each in arriving)]
+    optimum, _ = optimum_of(ORIGIN, everything, [*before.values(), power(STEP, N)])
+    for frame, T in enumerate(window.poses().values()):
+        np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
+
+
+def test_a_late_edge_at_which_cholesky_gives_up_is_taken() -> None:
+    start = PosePrior(T_world_frame=np.eye(4), covariance=1e4 * np.eye(6))
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    window.add_pose(0, 0, [], start)
+    for frame in range(1, N):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 1.0)])
+    assert window.counts.n_restored == 0
+    answer = window.add_edge(N - 1, edge(0, power(STEP, N - 1), 1e-6))
+    assert isinstance(answer, Estimate), answer
+
+
+def test_an_edge_to_a_name_that_left_is_not_told_of_its_next_bearer() -> None:
+    window = SlidingWindow(WindowConfig(size=3, kernel="none"))
+    for frame in range(4):
+        window.add_pose(frame, frame * STEP_NS, two_edges(frame))
+    window.add_pose(0, 4 * STEP_NS, [edge(3, STEP, 0.01)])
+    ends = [(each.reference_id, each.frame_id) for each in window.graph()]
+    assert ends == [(2, 3), (3, 0)]
