@@ -53,7 +53,10 @@ def main() -> None:
 def seeds(text: str) -> range:
     """Return the seeds of a text such as 10-19 or 7."""
     first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
+    found = range(int(first), int(last or first) + 1)
+    if not found:
+        raise ValueError(text)
+    return found
 
 
 def rendered(name: str, seed: int) -> Source:

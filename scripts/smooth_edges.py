@@ -54,5 +54,5 @@ if __name__ == "__main__":
     try:
         main()
     except (OSError, ValueError, IndexError) as error:
-        print(f"smooth_edges: error: {error}", file=sys.stderr)
+        print(f"smooth_edges: error: {' '.join(sys.argv[1:])}: {error}", file=sys.stderr)
         sys.exit(2)

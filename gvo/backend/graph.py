@@ -140,7 +140,7 @@ class PoseGraph:
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),
-    ) -> None:
+    ) -> bool:
         """Go on until poses stand still, where the update just done moved them far.
 
         One step of Gauss-Newton is exact for what moves by a fraction of a radian only; after a
@@ -152,16 +152,22 @@ class PoseGraph:
             Where the poses that the update was about were, or started, by their keys.
         alive, leaving
             As for the update.
+
+        Returns
+        -------
+        bool
+            Whether they had moved far.
         """
         limit = _FAR
         for _ in range(0 if self._is_whole else _MAX_STEPS):
             after = {key: self.pose3(key) for key in before}
             moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
             if max(max(map(abs, move)) for move in moves) < limit:
-                return
+                return limit == _STILL
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
             self.update(*nothing, alive=alive, leaving=leaving)
+        return True
 
     def marginalize(self, keys: Sequence[int]) -> None:
         """Take out poses that the last update made ready; what they knew stays."""

@@ -666,12 +666,13 @@ class SlidingWindow:
         before[arrival.key] = arrival.T_world_start
         with self._graph.restored_on_error():
             self._graph.update(factors, values, alive=alive, leaving=keys)
-            self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
+            is_moved = self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
             covariances = self._graph.covariances([*keys, arrival.key])
             pose = self._graph.pose(arrival.key), covariances.pop()
             _check_result(*pose)
             finished = list(map(self._estimate, leaving, covariances))
-            self._check_others()
+            if is_moved:
+                self._check_others()
             self._graph.marginalize(keys)
         if self._log is not None:
             self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)

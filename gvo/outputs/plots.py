@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _FIXED_COLOURS = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
 _FREE_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
 _LINE_STYLES = ("-", "-.", ":")
+_FLAT = 0.05
 _SIZE_INCHES = (11.0, 5.5)
 # a line ends where the next pose is later than so many median steps
 _GAP = 10.0
@@ -178,10 +179,15 @@ def _aligned(reference: Trajectory, name: str, estimate: Trajectory, align: Alig
 
 
 def _plane(reference: Trajectory) -> tuple[int, int]:
-    """Return the axes to look at: x and z of a camera's world, else the two of most motion."""
-    if np.allclose(reference.T_world_cam[0], np.eye(4), atol=1e-3):
-        return 0, 2
+    """Return the axes to look at: x and z of a camera's world, else the two of most motion.
+
+    A world that begins with the identity is a camera's, unless it is as flat along z as that of a
+    robot with z upwards.
+    """
     extents = np.ptp(reference.positions, axis=0)
+    is_camera = np.allclose(reference.T_world_cam[0], np.eye(4), atol=1e-3)
+    if is_camera and extents[2] >= _FLAT * extents[1]:
+        return 0, 2
     least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds
     horizontal, vertical = (axis for axis in range(3) if axis != least)
     return horizontal, vertical
