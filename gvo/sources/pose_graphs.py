@@ -80,18 +80,21 @@ class PoseGraphSource:
     def measurement_lines(self) -> Iterator[str]:
         """Yield the lines of all edges and of `FIX`, edges in the newer form, else as read.
 
+        They end where the events end: at the first line that is not understood.
+
         Raises
         ------
         TrajectoryError
             When the file cannot be read again.
         """
-        for number, text in self._texts():
+        for _, text in self._texts():
             tag = text.split(maxsplit=1)[0]
             if tag in MEASUREMENT_TAGS or tag == "FIX":
                 try:
-                    yield convert_line(text)
-                except ValueError as error:
-                    raise TrajectoryError(f"{self._path}:{number}: {error}") from None
+                    line = convert_line(text)
+                except ValueError:
+                    return
+                yield line
 
     def _scan(self) -> None:
         """Find what holds the world, and the tags that are not understood, in one quick pass."""
