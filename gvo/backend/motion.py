@@ -20,7 +20,7 @@ class Motion:
     def __init__(self, config: WindowConfig) -> None:
         self._config = config
         self._measured: Estimate | None = None
-        self._velocity: FloatArray | None = None
+        self._step: tuple[FloatArray, FloatArray, float] | None = None
         self.last: Estimate | None = None
 
     @property
@@ -45,11 +45,10 @@ class Motion:
         self.last = estimate
         if not is_measured:
             return
-        self._velocity = None
+        self._step = None
         if self._measured is not None and T_world_measured is not None:
-            T_before_last = se3.invert(T_world_measured) @ estimate.T_world_cam
             elapsed_s = 1e-9 * (estimate.stamp_ns - self._measured.stamp_ns)
-            self._velocity = se3.log(T_before_last) / elapsed_s
+            self._step = T_world_measured, estimate.T_world_cam, elapsed_s
         self._measured = estimate
 
     def predict_step(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
@@ -58,7 +57,7 @@ class Motion:
             return predict_step(None, 0.0, self._config)
         measured_ns = (self._measured or self.last).stamp_ns
         return predict_step(
-            self._velocity,
+            self._velocity(),
             1e-9 * (stamp_ns - self.last.stamp_ns),
             self._config,
             coasted_s=1e-9 * (self.last.stamp_ns - measured_ns),
@@ -73,3 +72,10 @@ class Motion:
             se3.normalize(self.last.T_world_cam @ T_last_frame),
             se3.compose_covariance(self.last.covariance, T_last_frame, covariance),
         )
+
+    def _velocity(self) -> FloatArray | None:
+        """Return the twist per second, computed only where it is asked for, which is rare."""
+        if self._step is None:
+            return None
+        T_world_before, T_world_last, elapsed_s = self._step
+        return se3.log(se3.invert(T_world_before) @ T_world_last) / elapsed_s
