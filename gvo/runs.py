@@ -353,10 +353,11 @@ def _warnings(tally: _Tally) -> list[str]:
         warnings.append(
             f"{tally.window.n_restored} updates of the window failed and were done again with less"
         )
-    if tally.window.n_rejected:
+    # Gating is the window's daily work, and counted in the summary; anything else is a fault.
+    n_faulty = tally.window.n_rejected - tally.window.n_gated
+    if n_faulty:
         warnings.append(
-            f"{tally.window.n_rejected} edges were refused, {tally.window.n_gated} of them because "
-            f"others contradict them; the first: {tally.window.first_rejected}"
+            f"{n_faulty} edges were refused; the first refusal: {tally.window.first_rejected}"
         )
     return warnings
 
