@@ -17,7 +17,7 @@ from gvo import __version__
 from gvo.backend.ledger import WindowCounts
 from gvo.backend.polish import Polish
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError, SmoothingError, TrajectoryError
+from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
 from gvo.odometry import FrameResult, Odometry
 from gvo.outputs.plots import plot_trajectories
@@ -199,8 +199,6 @@ def run_recording(
                 _take(item, odometry, folder, tally, sensor=source.info.sensor)
                 if on_progress is not None:
                     on_progress(tally.progress(source.info.n_images))
-        except SmoothingError as error:
-            tally.broken_off = str(error)
         finally:
             # Also where the run is interrupted: what the window holds was computed.
             folder.add_smoothed(odometry.finish())

@@ -25,7 +25,7 @@ from gvo.sources.edges import EdgeEvent, EdgeSource, Event, PoseEvent
 from gvo.sources.pose_graphs import PoseGraphSource
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
-from gvo.types import Estimate, FrameId, Rejected, Status
+from gvo.types import Estimate, Rejected, Status
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""
@@ -111,7 +111,6 @@ class Smoother:
         self._folder = folder
         self._graph_file = graph_file
         self.chain = EdgeChain(config.window)
-        self._status_of: dict[FrameId, Status] = {}
 
     @property
     def n_poses(self) -> int:
@@ -139,22 +138,11 @@ class Smoother:
         causal = self.window.add_pose(event.frame_id, event.stamp_ns, event.edges, event.prior)
         raw = self.chain.advance(causal, event.edges, event.prior)
         self.statuses[causal.status] += 1
-        self._status_of[causal.frame_id] = causal.status
         reason = str(causal.rejected[0]) if causal.rejected else ""
         row = (causal.stamp_ns, causal.frame_id, causal.status, len(event.edges))
         self._folder.add_poses(raw, causal, (*row, len(causal.rejected), reason))
         self._add_finished(self.window.pop_finished())
         return causal
-
-    def estimate(self, frame_id: FrameId) -> Estimate:
-        """Return the present estimate of a pose of the window."""
-        return Estimate(
-            stamp_ns=self.window.stamp_ns(frame_id),
-            T_world_cam=self.window.pose(frame_id),
-            covariance=self.window.covariance(frame_id),
-            status=self._status_of[frame_id],
-            frame_id=frame_id,
-        )
 
     def finish(self) -> None:
         """Write the poses that are still in the window."""
@@ -165,8 +153,6 @@ class Smoother:
         if self._graph_file is not None:
             self._graph_file.add(finished)
         self.chain.forget(estimate.frame_id for estimate in finished)
-        for estimate in finished:
-            self._status_of.pop(estimate.frame_id, None)
 
 
 def smooth_edges(

@@ -130,4 +130,4 @@ def _extend(request: Request, smoother: Smoother) -> tuple[Estimate, list[Reject
     if request.prior is not None:
         answers.append(window.add_prior(frame_id, request.prior))
     rejected = [reply for reply in answers if isinstance(reply, Rejected)]
-    return smoother.estimate(frame_id), rejected
+    return window.estimate(frame_id), rejected

@@ -111,11 +111,7 @@ def print_errors(truth: gvo.Trajectory | None, estimates: dict[str, list[gvo.Est
         return
     evaluations = []
     for name, poses in estimates.items():
-        trajectory = gvo.Trajectory(
-            stamps_ns=np.array([pose.stamp_ns for pose in poses]),
-            T_world_cam=np.array([pose.T_world_cam for pose in poses]),
-        )
-        evaluations.append(gvo.evaluate(truth, trajectory, name=name))
+        evaluations.append(gvo.evaluate(truth, gvo.Trajectory.of(poses), name=name))
     print(gvo.format_evaluations(evaluations), end="")
 
 

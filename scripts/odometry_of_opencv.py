@@ -110,11 +110,7 @@ def main() -> int:
     estimates["smoothed"] += odometry.finish()
     truth = source.ground_truth()
     for name, poses in estimates.items():
-        poses.sort(key=lambda estimate: estimate.stamp_ns)
-        trajectory = gvo.Trajectory(
-            stamps_ns=np.array([pose.stamp_ns for pose in poses]),
-            T_world_cam=np.stack([pose.T_world_cam for pose in poses]),
-        )
+        trajectory = gvo.Trajectory.of(poses)
         error = (
             ""
             if truth is None

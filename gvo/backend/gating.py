@@ -96,7 +96,7 @@ def judge(
 
 
 def disagreement(
-    edge: Edge, T_reference_frame: FloatArray, covariance: FloatArray, *, gate: float | None
+    edge: Edge, T_reference_frame: FloatArray, covariance: FloatArray, *, gate: float
 ) -> str:
     """Return why an edge contradicts what is known of its two poses; empty where it does not.
 
@@ -107,12 +107,12 @@ def disagreement(
         As known.
     covariance : ndarray of float64, shape (6, 6)
         Of T_reference_frame.
-    gate : float or None
-        In sigmas of the difference; None contradicts nothing.
+    gate : float
+        In sigmas of the difference.
     """
     difference = se3.log(se3.invert(T_reference_frame) @ edge.T_reference_frame)
     sigmas = _mahalanobis(difference, covariance + edge.covariance)
-    if gate is None or sigmas <= gate:
+    if sigmas <= gate:
         return ""
     return f"it disagrees by {sigmas:.3g} sigma with the window (window.gate: {gate:g})"
 

@@ -67,14 +67,14 @@ class PoseGraph:
 
     def hardened(self) -> PoseGraph:
         """Return a whole graph of the same factors that takes worse conditioned ones."""
-        graph = PoseGraph(is_whole=True, is_hardened=True)
-        with graph.restored_on_error():
-            graph.update(self.factors(), self.values())
-        return graph
+        return self._remade(self.values(), is_hardened=True)
 
     def moved(self, values: gtsam.Values) -> PoseGraph:
         """Return a graph of the same factors, linearized at other poses."""
-        graph = PoseGraph(is_whole=self._is_whole, is_hardened=self._is_hardened)
+        return self._remade(values, is_hardened=self._is_hardened)
+
+    def _remade(self, values: gtsam.Values, *, is_hardened: bool) -> PoseGraph:
+        graph = PoseGraph(is_whole=self._is_whole, is_hardened=is_hardened)
         with graph.restored_on_error():
             graph.update(self.factors(), values)
         return graph
@@ -182,7 +182,7 @@ class PoseGraph:
 
     def pose(self, key: int) -> FloatArray:
         """Return T_world_frame, shape (4, 4)."""
-        return np.asarray(self._isam.calculateEstimatePose3(key).matrix())
+        return np.asarray(self.pose3(key).matrix())
 
     def covariance(self, key: int) -> FloatArray:
         """Return the marginal covariance of a pose, shape (6, 6), symmetric positive definite."""

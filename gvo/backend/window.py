@@ -235,7 +235,7 @@ class SlidingWindow:
         self._find(frame_id)
         _as_edges(frame_id, [edge])
         fault = self._membership_fault(frame_id, edge) or find_faults([edge])[0]
-        gated = "" if fault or self._config.gate is None else self._gate_loop(frame_id, edge)
+        gated = "" if fault else self._gate_loop(frame_id, edge)
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
         member = self._members[frame_id]
@@ -301,10 +301,14 @@ class SlidingWindow:
         """Return the stamp of a pose of the window, nanoseconds."""
         return self._member(frame_id).stamp_ns
 
+    def estimate(self, frame_id: FrameId) -> Estimate:
+        """Return what is known now of a pose of the window."""
+        self._member(frame_id)
+        return self._final_estimate(frame_id)
+
     def covariance(self, frame_id: FrameId) -> FloatArray:
         """Return the marginal covariance, shape (6, 6), of a pose of the window."""
-        self._member(frame_id)
-        return self._final_estimate(frame_id).covariance
+        return self.estimate(frame_id).covariance
 
     def relative_pose(self, reference_id: FrameId, frame_id: FrameId) -> Edge:
         """Return the pose of one frame of the window in another, with its covariance.
@@ -394,10 +398,7 @@ class SlidingWindow:
     def _check_arrival(
         self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
     ) -> None:
-        try:
-            is_known = frame_id in self._members
-        except TypeError:
-            raise ValueError(f"frame_id must be hashable, got {type(frame_id).__name__}") from None
+        is_known = self._find(frame_id) is not None
         if frame_id is None or is_known:
             raise ValueError(
                 f"{frame_id!r} is in the window already" if is_known else "no frame_id"
@@ -447,7 +448,7 @@ class SlidingWindow:
 
     def _receive_prior(self, arrival: _Arrival, prior: Prior) -> None:
         if fault := prior_fault(prior):
-            arrival.rejected.append(self._ledger.reject(arrival.frame_id, arrival.stamp_ns, fault))
+            self._refuse(arrival, None, fault)
         else:
             arrival.priors.append(prior)
 
@@ -487,14 +488,15 @@ class SlidingWindow:
             arrival.anchor = PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
 
     def _refuse(
-        self, arrival: _Arrival, edge: Edge, reason: str, *, is_gated: bool = False
+        self, arrival: _Arrival, edge: Edge | None, reason: str, *, is_gated: bool = False
     ) -> None:
+        """Refuse an edge of a new pose, or its prior."""
         arrival.rejected.append(
             self._ledger.reject(
                 arrival.frame_id,
                 arrival.stamp_ns,
                 reason,
-                reference_id=edge.reference_id,
+                reference_id=None if edge is None else edge.reference_id,
                 is_gated=is_gated,
             )
         )
@@ -535,9 +537,10 @@ class SlidingWindow:
 
     def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
         """Return why an edge between known poses is refused; empty where it fits them."""
-        T = se3.invert(self.pose(edge.reference_id)) @ self.pose(frame_id)
-        covariance = self._relative_covariance(edge.reference_id, frame_id)
-        return disagreement(edge, T, covariance, gate=self._config.gate)
+        if self._config.gate is None:
+            return ""
+        known = self.relative_pose(edge.reference_id, frame_id)
+        return disagreement(edge, known.T_reference_frame, known.covariance, gate=self._config.gate)
 
     def _relative_covariance(self, reference_id: FrameId, frame_id: FrameId) -> FloatArray:
         """Return the covariance (6, 6) of T_reference_frame, zero of a pose to itself."""
@@ -618,13 +621,8 @@ class SlidingWindow:
         self._graph = self._graph.hardened()
 
     def _drop_measurements(self, arrival: _Arrival) -> None:
-        for edge in arrival.edges:
+        for edge in [*arrival.edges, *(None for _ in arrival.priors)]:
             self._refuse(arrival, edge, "GTSAM gave up on the update")
-        for _ in arrival.priors:
-            rejected = self._ledger.reject(
-                arrival.frame_id, arrival.stamp_ns, "GTSAM gave up on the update"
-            )
-            arrival.rejected.append(rejected)
         arrival.edges, arrival.priors = [], []
         arrival.anchor, arrival.is_origin = None, False
         self._receive_without_edges(arrival)
