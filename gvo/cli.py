@@ -329,6 +329,13 @@ def _report(result: RunResult, out: Path) -> NoReturn:
         typer.echo(format_evaluations(result.evaluations), nl=False)
     _print_smoothings(result)
     frames, tracked = result.summary["frames"], result.summary["tracked"]
+    offsets = result.summary["rig_offsets"]
+    if offsets is not None:
+        typer.echo(
+            f"learnt of the rig: disparities too large by {offsets['disparity_px']:.3f} px, "
+            f"sigma {offsets['disparity_sigma_px']:.3f}; rows of the right image too large by "
+            f"{offsets['row_px']:.3f} px"
+        )
     typer.echo(f"{tracked} of {frames} frames tracked; {out / 'trajectories.png'}")
     _warn(result.warnings)
     raise typer.Exit(result.exit_code)

@@ -75,15 +75,15 @@ class DepthConfig(Section):
 class FrontendConfig(Section):
     """How two frames are registered."""
 
-    kind: Literal["descriptor", "klt"] = _parameter(
-        "descriptor", "corners matched by descriptors, or tracked by Lucas-Kanade"
+    kind: Literal["klt", "descriptor"] = _parameter(
+        "klt", "corners tracked by Lucas-Kanade, or matched by descriptors"
     )
 
 
 class KltConfig(Section):
     """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
 
-    n_corners: int = _parameter(500, "corners kept per image", ge=50, le=20000)
+    n_corners: int = _parameter(300, "corners kept per image", ge=50, le=20000)
     min_eigenvalue: float = _parameter(
         1e-4,
         "weakest corner: smaller eigenvalue of the gradients' covariance, grey in [0, 1]",
@@ -94,7 +94,7 @@ class KltConfig(Section):
     )
     cell_size_px: int = _parameter(40, "size of the grid cells that share the budget", "px", ge=8)
     window_radius_px: int = _parameter(
-        5, "half size of the window that is tracked", "px", ge=2, le=50
+        4, "half size of the window that is tracked", "px", ge=2, le=50
     )
     n_levels: int = _parameter(2, "pyramid levels above the image, from a prediction", ge=0, le=8)
     n_wide_levels: int = _parameter(
@@ -146,6 +146,10 @@ class StereoConfig(Section):
     patch_radius_px: int = _parameter(5, "half size of the patches", "px", ge=1, le=20)
     search_radius_px: int = _parameter(3, "columns searched on either side", "px", ge=1, le=20)
     sigma_px: float = _parameter(0.3, "noise of the disparity", "px", gt=0)
+    estimate_offset: bool = _parameter(
+        True, "learn the constant error of the rig's disparities while running"
+    )
+    offset_sigma_px: float = _parameter(0.1, "how large that error may be", "px", gt=0)
 
 
 class TemporalConfig(Section):
@@ -163,7 +167,7 @@ class TemporalConfig(Section):
 class RansacConfig(Section):
     """Minimal samples of three points."""
 
-    n_hypotheses: int = _parameter(128, "samples drawn", ge=1, le=100000)
+    n_hypotheses: int = _parameter(128, "samples drawn at most", ge=1, le=100000)
     inlier_metric: Literal["reprojection", "distance"] = _parameter(
         "reprojection", "residual in the image (u, v, disparity), or between the points"
     )
@@ -187,10 +191,10 @@ class RegistrationConfig(Section):
     )
     n_iterations: int = _parameter(10, "at most, of the refinement", ge=1, le=100)
     huber: float = _parameter(
-        2.8, "threshold of the robust kernel, on a match's residual", "sigma", gt=0
+        1.5, "threshold of the robust kernel, on a match's residual", "sigma", gt=0
     )
     gate: float = _parameter(
-        4.0, "matches nearer to the refined pose than this become its inliers", "sigma", gt=0
+        3.0, "matches nearer to the refined pose than this become its inliers", "sigma", gt=0
     )
     pixel_sigma_px: float = _parameter(0.7, "noise of a keypoint's pixel", "px", gt=0)
     sigma_factor: float = _parameter(
@@ -254,7 +258,10 @@ class RuntimeConfig(Section):
     """How the work is done."""
 
     threads: int = _parameter(
-        2, "images worked on side by side; a frame has two, more change nothing", ge=1, le=64
+        2,
+        "1: one thing after the other; 2: images decoded ahead and worked on side by side",
+        ge=1,
+        le=64,
     )
 
 

@@ -16,6 +16,7 @@ from gvo.chain import RawChain, RawStep
 from gvo.config import Config, WindowConfig
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import make_frontend
+from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Frontend, Stamped, register_checked
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -114,6 +115,12 @@ class Odometry:
     def window(self) -> SlidingWindow:
         """The sliding window: its poses by stamp, covariances, edges and counts."""
         return self._window
+
+    @property
+    def rig_offsets(self) -> RigOffsets | None:
+        """What was learnt of a stereo rig; None of other sensors."""
+        offsets = getattr(self._frontend, "rig_offsets", None)
+        return offsets if isinstance(offsets, RigOffsets) else None
 
     def track(self, frame: Stamped) -> FrameResult:
         """Take the next frame and return its poses.

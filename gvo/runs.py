@@ -19,6 +19,7 @@ from gvo.backend.polish import Polish
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
+from gvo.frontend.offset import RigOffsets
 from gvo.odometry import FrameResult, Odometry
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
@@ -104,6 +105,7 @@ class _Tally:
     broken_off: str = ""
     window: WindowCounts = field(default_factory=WindowCounts)
     polish: Polish | None = None
+    rig_offsets: RigOffsets | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
 
     @property
@@ -203,6 +205,7 @@ def run_recording(
             # Also where the run is interrupted: what the window holds was computed.
             folder.add_smoothed(odometry.finish())
     tally.window, tally.polish = odometry.window.counts, odometry.window.polish
+    tally.rig_offsets = odometry.rig_offsets
     return _conclude(
         source, folder, tally, config=config, ground_truth=ground_truth, comparison=comparison
     )
@@ -382,6 +385,7 @@ def _summary(
         "unpaired_images": tally.n_unpaired,
         "window": asdict(tally.window),
         "polish": None if tally.polish is None else tally.polish.as_json(),
+        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],

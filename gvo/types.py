@@ -216,6 +216,10 @@ class RelativePose:
         Which matches the pose rests on.
     flow_px : float or None
         Median displacement of the inliers between the images, where the front-end tells.
+    offset_px, offset_sigma_px : float or None
+        By how much the disparities of both frames seem to be measured too large, alike for all,
+        and the standard deviation of this estimate, pixels; None where it was not asked for or
+        is not observable.
     """
 
     T_reference_current: FloatArray
@@ -223,6 +227,8 @@ class RelativePose:
     matches: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     flow_px: float | None = None
+    offset_px: float | None = None
+    offset_sigma_px: float | None = None
 
     @property
     def n_matches(self) -> int:

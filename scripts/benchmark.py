@@ -1,10 +1,14 @@
-"""Measure speed, memory and accuracy on recordings.
+"""Measure accuracy, speed and memory on recordings.
 
 Prints for each recording the errors of the three trajectories, milliseconds by stage (median
-and 95th percentile), CPU time per frame, peak memory, and the ratio of the time per frame to a
-yardstick measured in the same run: ORB with 8 octaves and 2000 features on the images of a
-frame. Absolute times depend on the machine and on what else it does; ratios less so.
+and 95th percentile), and what a whole run costs: CPU and elapsed time per frame as `gvo run`
+spends them until the last frame is written, with reading ahead on its threads, peak memory, and
+both times as multiples of a yardstick: reading the frames and finding 2000 ORB features in 8
+octaves on their images (of RGB-D the colour image), CPU time on one thread. Whole run and
+yardstick take turns for some rounds, and medians are printed: times depend on the machine and on
+what else it does, ratios less so. Starting up and drawing are left out.
 
+`--ablation` adds the errors under settings that leave a part of the method out.
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 
@@ -13,23 +17,38 @@ Example: python scripts/benchmark.py kitti_06_start euroc_mh01_start
 
 import argparse
 import sys
-import time
+from collections.abc import Sequence
 from pathlib import Path
 
-import benchmark_window  # type: ignore[import-not-found]  # beside this one
-import cv2
+import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
+import benchmark_tables as tables  # type: ignore[import-not-found]
+import benchmark_window  # type: ignore[import-not-found]
 import numpy as np
 
 import gvo
-from gvo.runs import peak_memory_mb
-from gvo.types import FaultyFrame, Frame
 
 
 def main() -> None:
     """Parse the arguments and measure each recording."""
+    arguments = parse()
+    if arguments.window is not None:
+        benchmark_window.measure_cost(arguments.window)
+    if arguments.soak is not None:
+        faults = benchmark_window.soak(arguments.soak, is_timed=not arguments.untimed)
+        if faults:
+            sys.exit("benchmark: " + "; ".join(faults))
+    measure_all(arguments)
+
+
+def parse() -> argparse.Namespace:
+    """Return the arguments of the command line, checked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings", type=Path, nargs="*", help="bags or data-set folders")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--ablation", action="store_true", help="also leave out part after part")
+    parser.add_argument(
+        "--rounds", type=int, default=3, metavar="N", help="whole runs, each with a yardstick"
+    )
     parser.add_argument(
         "--window", type=int, nargs="?", const=3000, metavar="N", help="cost, of N poses"
     )
@@ -43,95 +62,92 @@ def main() -> None:
         parser.error("name recordings, or --window, or --soak")
     if min(lengths, default=1000) < 1000:
         parser.error("--window and --soak take at least 1000 poses")
-    if arguments.window is not None:
-        benchmark_window.measure_cost(arguments.window)
-    if arguments.soak is not None:
-        faults = benchmark_window.soak(arguments.soak, is_timed=not arguments.untimed)
-        if faults:
-            sys.exit("benchmark: " + "; ".join(faults))
+    if arguments.rounds < 1:
+        parser.error("--rounds takes at least 1")
+    return arguments
+
+
+def measure_all(arguments: argparse.Namespace) -> None:
+    """Measure each recording, and print all of them side by side."""
+    errors: list[list[str]] = []
+    costs: list[list[str]] = []
     for path in arguments.recordings:
-        measure(path, arguments.set)
+        stages, rounds = measure(path, arguments.set, n_rounds=arguments.rounds)
+        if stages.evaluations:
+            errors.append(tables.errors_row(stages.name, **stages.evaluations))
+        costs.append(costs_row(stages.name, rounds))
+        if arguments.ablation:
+            print_ablation(path, arguments.set)
+    for header, rows in ((tables.ERRORS_HEADER, errors), (tables.COSTS_HEADER, costs)):
+        if rows:
+            print(f"\n{tables.markdown_table(header, rows)}", end="")
 
 
-def measure(path: Path, settings: list[str]) -> None:
+def measure(
+    path: Path, settings: Sequence[str], *, n_rounds: int
+) -> tuple[passes.Stages, list[passes.Round]]:
     """Run odometry over one recording and print its figures."""
-    config = gvo.load_configuration(settings=settings)
-    source = gvo.open_recording(path, config=config)
-    odometry = gvo.Odometry(source.info.camera, config)
-    results: list[gvo.FrameResult] = []
-    smoothed: list[gvo.Estimate] = []
-    yardsticks_ms: list[float] = []
-    stages: dict[str, list[float]] = {"read": []}
-    cpu_s = 0.0
-    # Read on this thread, so that decoding does not run beside the stages that are timed.
-    alone = gvo.load_configuration(settings=[*settings, "runtime.threads=1"])
-    items = gvo.frames(source, alone)
-    while True:
-        start = time.perf_counter()
-        cpu_start = time.process_time()
-        item = next(items, None)
-        if item is None:
-            break
-        stages["read"].append(1e3 * (time.perf_counter() - start))
-        if isinstance(item, FaultyFrame):
-            continue
-        result = odometry.track(item)
-        cpu_s += time.process_time() - cpu_start
-        yardsticks_ms.append(yardstick_ms(item))
-        results.append(result)
-        smoothed += result.finished
-        for stage, elapsed in result.stage_ms.items():
-            stages.setdefault(stage, []).append(elapsed)
-    smoothed += odometry.finish()
-    if not results:
-        raise gvo.GvoError(f"{path}: no usable frame")
-    print(f"\n{source.info.name}: {len(results)} frames")
-    estimates = {
-        "raw": [result.raw for result in results],
-        "causal": [result.causal for result in results],
-        "smoothed": sorted(smoothed, key=lambda estimate: estimate.stamp_ns),
-    }
-    print_errors(source.ground_truth(), estimates)
-    print_times(stages, results, cpu_s=cpu_s, yardstick_ms=float(np.median(yardsticks_ms)))
-
-
-def yardstick_ms(frame: Frame) -> float:
-    """Return the milliseconds that ORB of 8 octaves takes on the images of a frame."""
-    orb = cv2.ORB_create(nfeatures=2000, nlevels=8)  # type: ignore[attr-defined]
-    images = [frame.left, frame.right] if isinstance(frame, gvo.StereoFrame) else [frame.image]
-    start = time.perf_counter()
-    for image in images:
-        orb.detectAndCompute(image, None)
-    return 1e3 * (time.perf_counter() - start)
-
-
-def print_errors(truth: gvo.Trajectory | None, estimates: dict[str, list[gvo.Estimate]]) -> None:
-    """Print the errors of the three trajectories where the truth is known."""
-    if truth is None:
-        return
-    evaluations = []
-    for name, poses in estimates.items():
-        evaluations.append(gvo.evaluate(truth, gvo.Trajectory.of(poses), name=name))
-    print(gvo.format_evaluations(evaluations), end="")
-
-
-def print_times(
-    stages: dict[str, list[float]],
-    results: list[gvo.FrameResult],
-    *,
-    cpu_s: float,
-    yardstick_ms: float,
-) -> None:
-    """Print milliseconds by stage, the total per frame, memory and the yardstick."""
-    totals = [sum(result.stage_ms.values()) for result in results]
+    stages = passes.in_child(passes.run_by_stages, path, settings)
+    print(f"\n{stages.name}: {stages.n_frames} frames")
+    if stages.evaluations:
+        print(gvo.format_evaluations(list(stages.evaluations.values())), end="")
     print(f"{'stage':<10} {'median ms':>10} {'95 % ms':>10}")
-    for stage, elapsed in [*stages.items(), ("total", totals)]:
-        print(f"{stage:<10} {np.median(elapsed):>10.2f} {np.percentile(elapsed, 95):>10.2f}")
-    print("total: decoded images to causal pose, reading apart")
-    print(f"CPU {1e3 * cpu_s / len(results):.1f} ms per frame, peak {peak_memory_mb():.0f} MB")
+    for stage, elapsed_ms in stages.stage_ms.items():
+        print(f"{stage:<10} {np.median(elapsed_ms):>10.2f} {np.percentile(elapsed_ms, 95):>10.2f}")
+    print("total: decoded images to causal pose, reading apart", flush=True)
+    rounds = [passes.in_child(passes.run_whole, path, settings) for _ in range(n_rounds)]
+    print_costs(rounds)
+    return stages, rounds
+
+
+def median(rounds: list[passes.Round], name: str) -> float:
+    """Return the median of a figure over the rounds."""
+    return float(np.median([getattr(measured, name) for measured in rounds]))
+
+
+def print_costs(rounds: list[passes.Round]) -> None:
+    """Print what a frame of the whole run costs, by itself and against the yardstick."""
+    wall_ms = median(rounds, "wall_ms")
     print(
-        f"yardstick {yardstick_ms:.1f} ms; total / yardstick {np.median(totals) / yardstick_ms:.2f}"
+        f"whole run: CPU {median(rounds, 'cpu_ms'):.1f} ms, wall {wall_ms:.1f} ms per frame, "
+        f"{1e3 / wall_ms:.1f} frames/s"
     )
+    print(
+        f"memory: peak {median(rounds, 'peak_mb'):.0f} MB, "
+        f"{median(rounds, 'growth_mb'):.1f} MB more than in the first third of the frames"
+    )
+    print(f"yardstick: CPU {median(rounds, 'yardstick_ms'):.1f} ms per frame, reading included")
+    ratios = []
+    for name in ("cpu_ratio", "wall_ratio"):
+        values = sorted(getattr(measured, name) for measured in rounds)
+        ratios.append(f"{median(rounds, name):.2f} ({values[0]:.2f} to {values[-1]:.2f})")
+    print(
+        f"whole run / yardstick: CPU {ratios[0]}, wall {ratios[1]}, of {len(rounds)} rounds",
+        flush=True,
+    )
+
+
+def costs_row(name: str, rounds: list[passes.Round]) -> list[str]:
+    """Return the cells of a recording in the table of costs."""
+    wall_ms = median(rounds, "wall_ms")
+    return [
+        name,
+        f"{median(rounds, 'cpu_ms'):.1f}",
+        f"{wall_ms:.1f}",
+        f"{1e3 / wall_ms:.1f}",
+        f"{median(rounds, 'yardstick_ms'):.1f}",
+        f"{median(rounds, 'cpu_ratio'):.2f}",
+        f"{median(rounds, 'wall_ratio'):.2f}",
+        f"{median(rounds, 'peak_mb'):.0f}",
+        f"{median(rounds, 'growth_mb'):.1f}",
+    ]
+
+
+def print_ablation(path: Path, settings: Sequence[str]) -> None:
+    """Print the errors under settings that leave a part of the method out."""
+    found = passes.in_child(passes.ablate, path, settings)
+    rows = [tables.ablation_row(name, e["raw"], e["smoothed"]) for name, e in found]
+    print(f"\n{tables.markdown_table(tables.ABLATION_HEADER, rows)}", end="", flush=True)
 
 
 if __name__ == "__main__":

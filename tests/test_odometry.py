@@ -114,6 +114,7 @@ def blank(index: int) -> StereoFrame:
 def configure(threads: int = 1, **window: object) -> Config:
     return Config.model_validate(
         {
+            "frontend": {"kind": "descriptor"},
             "features": {"n_features": 300, "cell_size_px": 40, "kind": "orb", "n_octaves": 1},
             "stereo": {"min_depth_m": 0.5, "max_depth_m": 30.0},
             "depth": {"min_depth_m": 0.5, "max_depth_m": 10.0},
@@ -476,7 +477,7 @@ def test_a_creeping_camera_is_not_frozen() -> None:
     results, smoothed = walk(steps, config)
     true_length = float(steps[-1] * np.hypot(1.0, 0.5))
     went = np.linalg.norm(smoothed[-1].T_world_cam[:3, 3])
-    assert went == pytest.approx(true_length, rel=0.02)
+    assert went == pytest.approx(true_length, rel=0.04)
     assert path_length(smoothed) > 0.98 * true_length  # noise lengthens a path
     off, _ = walk(steps, configure_klt(zero_motion=False))
     assert sum(r.n_links for r in results) == sum(r.n_links for r in off)

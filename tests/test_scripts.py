@@ -1,8 +1,10 @@
 """The scripts run as programs, as a reader would copy them."""
 
 import os
+import re
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import cv2
@@ -47,12 +49,67 @@ def test_a_rendered_bag_can_be_run(tmp_path: Path) -> None:
     assert source.ground_truth() is not None
 
 
-def test_the_benchmark_prints_errors_stages_and_the_yardstick(drive_bag: Path) -> None:
-    measured = run("benchmark", drive_bag)
+def table(lines: list[str], first: str) -> dict[str, list[str]]:
+    """Return the rows of the Markdown table whose first heading is given, by their first cell."""
+    start = next(n for n, line in enumerate(lines) if line.startswith(f"| {first} "))
+    rows = takewhile(lambda line: line.startswith("|"), lines[start + 2 :])
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    return {name: numbers for name, *numbers in cells}
+
+
+@pytest.fixture(scope="module")
+def benchmark_lines(drive_bag: Path) -> list[str]:
+    """Return what the benchmark prints about a rendered drive."""
+    measured = run("benchmark", drive_bag, "--rounds", 1)
     assert measured.returncode == 0, measured.stderr
-    words = ("raw", "smoothed", "read", "extract", "register", "links", "window", "total")
-    for word in (*words, "CPU", "yardstick"):
-        assert word in measured.stdout
+    return measured.stdout.splitlines()
+
+
+def test_the_benchmark_prints_errors_and_stages(benchmark_lines: list[str]) -> None:
+    words = ("raw", "causal", "smoothed", "read", "extract", "register", "links", "window", "total")
+    for word in words:
+        assert sum(line.startswith(f"{word} ") for line in benchmark_lines) == 1, word
+    errors = table(benchmark_lines, "recording")["drive"]
+    assert errors[0] == "20"
+    assert all(float(error) > 0.0 for error in errors[1:4])
+
+
+def test_the_benchmark_compares_the_whole_run_with_the_yardstick(
+    benchmark_lines: list[str],
+) -> None:
+    found = [line for line in benchmark_lines if line.startswith(("whole", "memory", "yardstick"))]
+    assert len(found) == 4
+    spent, memory, yardstick, ratios = [
+        [float(text) for text in re.findall(r"\d+\.?\d*", line.partition(":")[2])] for line in found
+    ]
+    cpu_ms, wall_ms, rate = spent
+    assert rate == pytest.approx(1000.0 / wall_ms, rel=0.02)
+    assert memory[0] > memory[1]
+    assert ratios[0] == pytest.approx(cpu_ms / yardstick[0], rel=0.05)
+    assert ratios[3] == pytest.approx(wall_ms / yardstick[0], rel=0.05)
+
+
+@pytest.mark.slow
+def test_the_ablation_leaves_out_what_its_rows_say(drive_bag: Path) -> None:
+    measured = run("benchmark", drive_bag, "--rounds", 1, "--ablation")
+    assert measured.returncode == 0, measured.stderr
+    rows = table(measured.stdout.splitlines(), "settings")
+    assert rows["as set"] == rows["refined"]
+    assert rows["plain Umeyama"] != rows["weighted Umeyama"] != rows["refined"]
+    chain = rows["without links to keyframes"]
+    assert chain[:4] == chain[4:] == rows["as set"][:4]
+
+
+@pytest.mark.slow
+def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
+    options = ["--set", "frontend.kind=klt", "--rounds", 1, "--ablation"]
+    measured = run("benchmark", room_bag, *options)
+    assert measured.returncode == 0, measured.stderr
+    rows = table(measured.stdout.splitlines(), "settings")
+    assert not any("disparity" in name for name in rows)
+    assert [name for name in rows if "frontend" in name] == ["frontend.kind=descriptor"]
+    # only the truth has no error: those of a trajectory are measured, not copied
+    assert all(float(row[0]) > 0.0 for row in rows.values())
 
 
 def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
@@ -142,6 +199,7 @@ def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(tmp_path: P
         ("benchmark", ["missing.bag"]),
         ("benchmark", []),
         ("benchmark", ["--soak", "10"]),
+        ("benchmark", ["x.bag", "--rounds", "0"]),
         ("make_demo_bag", ["missing/folder/that/is.a.txt"]),
         ("make_demo_bag", ["x.bag", "--frames", "0"]),
     ],

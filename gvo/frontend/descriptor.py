@@ -9,11 +9,13 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.features import FeatureExtractor, Features
-from gvo.frontend.registration import register_matches
+from gvo.frontend.offset import RigOffsets
+from gvo.frontend.registration import register_correspondences
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import match_stereo, refine_disparities
 from gvo.frontend.temporal import match_temporal, predict_pixels
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.geometry.correspondences import Correspondences
 from gvo.types import (
     Failure,
     FloatArray,
@@ -38,6 +40,7 @@ class DescriptorFrontend:
 
     def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
         self.camera = as_stereo(camera, config)
+        self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
@@ -49,6 +52,8 @@ class DescriptorFrontend:
         ----------
         frame : StereoFrame or RgbdFrame
         """
+        if self.rig_offsets is not None:
+            self.rig_offsets.advance()
         if isinstance(frame, StereoFrame):
             return self._extract_stereo(frame)
         return self._extract_rgbd(frame)
@@ -68,7 +73,8 @@ class DescriptorFrontend:
             right.keypoints[pairs[:, 1]],
             config,
         )
-        depths = self.camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
+        true = disparities - self._offset_px()
+        depths = self.camera.disparity_to_depth(np.where(true > 0, true, np.nan))
         with np.errstate(invalid="ignore"):
             is_valid &= (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
@@ -94,7 +100,7 @@ class DescriptorFrontend:
             stamp_ns=stamp_ns,
             keypoints=keypoints,
             disparities=disparities,
-            points_cam=self.camera.unproject_stereo(keypoints, disparities),
+            points_cam=self.camera.unproject_stereo(keypoints, disparities - self._offset_px()),
             sigmas=self._sigmas(left.octaves[pairs[:, 0]], is_stereo=right is not None),
             descriptors_left=left.descriptors[pairs[:, 0]],
             descriptors_right=None if right is None else right.descriptors[pairs[:, 1]],
@@ -134,6 +140,9 @@ class DescriptorFrontend:
             result = self._register_within(reference, current, prior, wide)
         return result
 
+    def _offset_px(self) -> float:
+        return 0.0 if self.rig_offsets is None else self.rig_offsets.disparity.value_px
+
     def _register_within(
         self,
         reference: Observations,
@@ -148,9 +157,20 @@ class DescriptorFrontend:
             radius_px=radius_px,
             max_distance=self._config.temporal.max_distance,
         )
-        result = register_matches(reference, current, matches, self.camera, self._config)
+        correspondences = Correspondences.of(reference, current, matches)
+        result = register_correspondences(
+            correspondences.without_offset(self._offset_px(), self.camera),
+            matches,
+            self.camera,
+            self._config,
+            stamps_ns=(reference.stamp_ns, current.stamp_ns),
+            start=prior,
+            with_offset=self.rig_offsets is not None,
+        )
         if isinstance(result, Failure):
             return result
+        if self.rig_offsets is not None:
+            self.rig_offsets.note(result, current.stamp_ns)
         factor = self._config.registration.sigma_factor
         return replace(result, covariance=factor**2 * result.covariance)
 

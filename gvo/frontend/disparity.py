@@ -16,13 +16,20 @@ from gvo.frontend.stereo import parabola_minimum
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # The coarse search: images reduced by this, patches of this half size there.
-_REDUCTION = 4
+_N_HALVINGS = 2
+_REDUCTION = 2**_N_HALVINGS
 _COARSE_RADIUS_PX = 2
 _MIN_CORRELATION = 0.7
 # Grey values squared, over a patch: below this it is flat, and correlates with anything.
 _MIN_ENERGY = 50.0
 # Steps of the fine search after the parabola: the second moves by less than 0.01 pixels.
 _N_STEPS = 2
+# The same from a prediction: so many, each at most so long, the last one as good as none.
+_N_FOLLOWING_STEPS = 3
+_MAX_STEP_PX = 1.5
+_MAX_LAST_STEP_PX = 0.3
+# Fewer say nothing of the rows.
+_MIN_ROW_SHIFTS = 50
 # What the coarse search leaves open on either side, in pixels of the full image.
 COARSE_ERROR_PX = _REDUCTION + 1
 
@@ -61,10 +68,12 @@ def search_disparities(
 
 
 def _reduce(image: ImageArray) -> NDArray[np.float32]:
-    height, width = image.shape
-    shape = (max(width // _REDUCTION, 1), max(height // _REDUCTION, 1))
-    reduced = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
-    return np.asarray(reduced, dtype=np.float32)
+    # Halved twice: a tenth of the time of a reduction by four.
+    for _ in range(_N_HALVINGS):
+        height, width = image.shape
+        shape = (max(width // 2, 1), max(height // 2, 1))
+        image = np.asarray(cv2.resize(image, shape, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return image.astype(np.float32)
 
 
 def _correlate(
@@ -109,6 +118,7 @@ def measure_disparities(
     config: StereoConfig,
     *,
     reach_px: int,
+    row_offset_px: float = 0.0,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels near predicted ones, to a fraction of a pixel.
 
@@ -129,6 +139,8 @@ def measure_disparities(
         Size of the patches.
     reach_px : int
         How far to search on either side.
+    row_offset_px : float
+        By how much rows of the right image are larger.
 
     Returns
     -------
@@ -144,15 +156,112 @@ def measure_disparities(
         return disparities, is_valid
     u, v = pixels[chosen].T
     patches = _sample(images[0], u, v, radius + 1, radius)
-    strips = _sample(images[1], u - predicted[chosen], v, radius + reach_px, radius)
+    v_right = v + row_offset_px
+    strips = _sample(images[1], u - predicted[chosen], v_right, radius + reach_px, radius)
     offsets, is_minimum = parabola_minimum(_squared_differences(patches[:, :, 1:-1], strips))
     found = predicted[chosen] - (offsets - reach_px)
-    for _ in range(_N_STEPS):
-        strips = _sample(images[1], u - found, v, radius + 1, radius)
-        found = found + np.clip(_newton_step(patches, strips), -0.5, 0.5)
+    if config.subpixel == "none":
+        found = np.rint(found)
+    else:
+        for _ in range(_N_STEPS):
+            found = found + np.clip(_step_from(images[1], (patches, u, v_right), found), -0.5, 0.5)
     disparities[chosen] = found
     is_valid[chosen] = is_minimum
     return disparities, is_valid
+
+
+def follow_disparities(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    predicted: FloatArray,
+    config: StereoConfig,
+    *,
+    row_offset_px: float = 0.0,
+) -> tuple[FloatArray, BoolArray]:
+    """Measure the disparities of pixels from predictions right to a pixel or two.
+
+    As `measure_disparities`, by the Gauss-Newton steps alone, in half the time.
+
+    Parameters and results are those of `measure_disparities`; `is_valid` is False where the steps
+    do not come to rest.
+    """
+    if config.subpixel == "none":
+        return measure_disparities(
+            images,
+            pixels,
+            predicted,
+            config,
+            reach_px=config.search_radius_px,
+            row_offset_px=row_offset_px,
+        )
+    radius = config.patch_radius_px
+    disparities = np.full(len(pixels), np.nan)
+    is_valid = _have_room(images[0].shape, pixels, predicted, radius)
+    chosen = np.flatnonzero(is_valid)
+    if len(chosen) == 0:
+        return disparities, is_valid
+    u, v = pixels[chosen].T
+    patches = _sample(images[0], u, v, radius + 1, radius)
+    found, step = predicted[chosen], np.zeros(len(chosen))
+    place = patches, u, v + row_offset_px
+    for _ in range(_N_FOLLOWING_STEPS):
+        step = np.clip(_step_from(images[1], place, found), -_MAX_STEP_PX, _MAX_STEP_PX)
+        found = found + step
+    disparities[chosen] = found
+    is_at_rest = np.abs(step) < _MAX_LAST_STEP_PX
+    is_near = np.abs(found - predicted[chosen]) < config.search_radius_px
+    is_valid[chosen] = is_at_rest & is_near
+    return disparities, is_valid
+
+
+def measure_row_shift(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    disparities: FloatArray,
+    config: StereoConfig,
+    *,
+    row_offset_px: float = 0.0,
+) -> float | None:
+    """Measure by how much the rows of left and right still differ.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+    pixels : ndarray of float64, shape (n, 2)
+        In the left image.
+    disparities : ndarray of float64, shape (n,)
+        Measured ones.
+    config : StereoConfig
+        Size of the patches.
+    row_offset_px : float
+        The difference that is known.
+
+    Returns
+    -------
+    float or None
+        Median of what is left, pixels; None where too few patches show it.
+    """
+    if len(pixels) < _MIN_ROW_SHIFTS:
+        return None
+    radius = config.patch_radius_px
+    u, v = pixels.T
+    # Transposed, a step along the rows becomes one across them.
+    left = np.swapaxes(_sample(images[0], u, v, radius, radius + 1), 1, 2)
+    right = _sample(images[1], u - disparities, v + row_offset_px, radius, radius + 1)
+    steps = -_newton_step(left, np.swapaxes(right, 1, 2))
+    steps = steps[np.abs(steps) < _MAX_STEP_PX]
+    return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
+
+
+def _step_from(
+    right: ImageArray,
+    patches_and_place: tuple[NDArray[np.float32], FloatArray, FloatArray],
+    disparities: FloatArray,
+) -> NDArray[np.float32]:
+    """Return the Gauss-Newton step of disparities; the patches are one wider on either side."""
+    patches, u, v = patches_and_place
+    radius = patches.shape[1] // 2
+    return _newton_step(patches, _sample(right, u - disparities, v, radius + 1, radius))
 
 
 def _newton_step(

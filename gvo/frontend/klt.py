@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +11,14 @@ import numpy as np
 from gvo.config import Config
 from gvo.frontend.corners import detect_corners
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.disparity import COARSE_ERROR_PX, measure_disparities, search_disparities
+from gvo.frontend.disparity import (
+    COARSE_ERROR_PX,
+    follow_disparities,
+    measure_disparities,
+    measure_row_shift,
+    search_disparities,
+)
+from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.tracking import track_pixels
@@ -32,27 +41,44 @@ _MIN_DEPTH_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KltObservations:
-    """The corners of a frame that are measured in 3-D, and the frame to follow others into.
+class KltCorners:
+    """The corners of a frame that are measured in 3-D.
 
     Parameters
     ----------
-    frame : StereoFrame or RgbdFrame
     keypoints : ndarray of float64, shape (n, 2)
         Pixels (u, v) in the left or colour image.
     disparities : ndarray of float64, shape (n,)
-        Disparity in pixels; for RGB-D the virtual one, fx * baseline / depth.
+        Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
     points_cam : ndarray of float64, shape (n, 3)
-        Points in the `cam` frame, metres.
+        Points in the `cam` frame, metres, by what was known of the disparities' offset then.
     n_keypoints : int
         Corners detected, measured or not.
+    row_shift_px : float or None
+        By how much the rows of left and right still differ; None where that is not known.
     """
 
-    frame: Frame
     keypoints: FloatArray
     disparities: FloatArray
     points_cam: FloatArray
     n_keypoints: int
+    row_shift_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KltObservations:
+    """A frame that others' corners are followed into, and its own corners.
+
+    Parameters
+    ----------
+    frame : StereoFrame or RgbdFrame
+    find_corners : callable
+        Returns its KltCorners. They may still be looked for on another thread: only when the
+        next frame comes are they needed.
+    """
+
+    frame: Frame
+    find_corners: Callable[[], KltCorners]
 
     @property
     def stamp_ns(self) -> int:
@@ -64,6 +90,26 @@ class KltObservations:
         """The image that is tracked in, left or colour."""
         return _image_of(self.frame)
 
+    @property
+    def keypoints(self) -> FloatArray:
+        """Pixels (u, v) of the corners, shape (n, 2)."""
+        return self.find_corners().keypoints
+
+    @property
+    def disparities(self) -> FloatArray:
+        """Disparities of the corners as measured, shape (n,)."""
+        return self.find_corners().disparities
+
+    @property
+    def points_cam(self) -> FloatArray:
+        """The corners as points in the `cam` frame, metres, shape (n, 3)."""
+        return self.find_corners().points_cam
+
+    @property
+    def n_keypoints(self) -> int:
+        """Corners detected, measured or not."""
+        return self.find_corners().n_keypoints
+
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.keypoints)
@@ -74,7 +120,8 @@ class KltFrontend:
 
     Each registration starts from the corners of its reference, so that patches do not drift
     over many frames. The tracked corners are measured in 3-D in the current frame too: in its
-    right image, or in its depth.
+    right image, or in its depth. What a stereo rig gets wrong all the time is learnt on the way
+    (`rig_offsets`) and taken off.
 
     Parameters
     ----------
@@ -85,28 +132,54 @@ class KltFrontend:
 
     def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
         self.camera = as_stereo(camera, config)
+        self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
         self._config = config
+        self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 1 else None
 
     def extract(self, frame: Frame) -> KltObservations:
-        """Return the corners of a frame that are measured in 3-D.
+        """Return a frame with its corners that are measured in 3-D.
 
         Parameters
         ----------
         frame : StereoFrame or RgbdFrame
         """
+        if self.rig_offsets is not None:
+            self.rig_offsets.advance()
+        offsets_px = self._offsets_px()
+        if self._pool is not None:
+            pending = self._pool.submit(self._find_corners, frame, *offsets_px)
+            return KltObservations(frame=frame, find_corners=pending.result)
+        corners = self._find_corners(frame, *offsets_px)
+        return KltObservations(frame=frame, find_corners=lambda: corners)
+
+    def _find_corners(self, frame: Frame, offset_px: float, row_offset_px: float) -> KltCorners:
         corners = detect_corners(_image_of(frame), self._config.klt)
+        row_shift_px = None
         if isinstance(frame, StereoFrame):
-            disparities, is_valid = self._search_stereo(frame, corners)
+            disparities, is_valid = self._search_stereo(frame, corners, row_offset_px)
+            is_valid &= self._is_in_range(disparities - offset_px)
+            row_shift_px = measure_row_shift(
+                (frame.left, frame.right),
+                corners[is_valid],
+                disparities[is_valid],
+                self._config.stereo,
+                row_offset_px=row_offset_px,
+            )
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
         keypoints, disparities = corners[is_valid], disparities[is_valid]
-        return KltObservations(
-            frame=frame,
+        return KltCorners(
             keypoints=keypoints,
             disparities=disparities,
-            points_cam=self.camera.unproject_stereo(keypoints, disparities),
+            points_cam=self.camera.unproject_stereo(keypoints, disparities - offset_px),
             n_keypoints=len(corners),
+            row_shift_px=row_shift_px,
         )
+
+    def _offsets_px(self) -> tuple[float, float]:
+        """Return what is to be taken off disparities, and added to rows of the right image."""
+        offsets = self.rig_offsets
+        return (0.0, 0.0) if offsets is None else (offsets.disparity.value_px, offsets.row.value_px)
 
     def register(
         self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
@@ -127,109 +200,140 @@ class KltFrontend:
         RelativePose or Failure
             The second column of `matches` is -1: tracks do not end at observations.
         """
-        config = self._config.klt
+        result: RelativePose | Failure | None = None
         if prior is not None:
-            result = self._register_from(prior, reference, current, config.n_levels)
-            if isinstance(result, RelativePose):
-                return result
-        start = np.eye(4) if prior is None else prior
-        rough = self._register_from(start, reference, current, config.n_wide_levels)
-        if isinstance(rough, Failure):
-            return rough
-        return self._register_from(rough.T_reference_current, reference, current, config.n_levels)
+            result = self._register_from(prior, reference, current)
+        if not result:
+            start = np.eye(4) if prior is None else prior
+            rough = self._register_from(start, reference, current, is_wide=True)
+            if isinstance(rough, Failure):
+                return rough
+            result = self._register_from(rough.T_reference_current, reference, current)
+        if isinstance(result, RelativePose) and self.rig_offsets is not None:
+            self.rig_offsets.note(result, current.stamp_ns)
+            row_shift_px = reference.find_corners().row_shift_px
+            self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
+        return result
 
     def _register_from(
         self,
         T_reference_current: FloatArray,
         reference: KltObservations,
         current: KltObservations,
-        n_levels: int,
+        *,
+        is_wide: bool = False,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
-        predicted, indices = self._predict(T_reference_current, reference)
+        klt = self._config.klt
+        source_uvd = np.column_stack([reference.keypoints, reference.disparities])
+        predicted, indices = self._predict(T_reference_current, source_uvd)
         pixels, is_tracked = track_pixels(
             (reference.image, current.image),
-            reference.keypoints[indices],
+            source_uvd[indices, :2],
             predicted[:, :2],
-            self._config.klt,
-            n_levels=n_levels,
+            klt,
+            n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
-        if isinstance(current.frame, StereoFrame):
-            disparities, is_valid = self._measure_stereo(
-                current.frame, pixels, predicted[:, 2], self._config.stereo.search_radius_px
-            )
-        else:
+        if isinstance(current.frame, RgbdFrame):
             disparities, is_valid = self._measure_depth(current.frame, pixels)
-        uvd = np.column_stack([pixels, disparities])[is_valid]
-        return self._register_tracks(reference, current, indices[is_valid], uvd)
+        else:
+            disparities, is_valid = self._measure_stereo(
+                current.frame, pixels, predicted[:, 2], is_wide=is_wide
+            )
+        chosen = indices[is_valid]
+        result = register_correspondences(
+            self._correspondences(
+                source_uvd[chosen],
+                np.column_stack([pixels, disparities])[is_valid],
+                is_stereo=isinstance(current.frame, StereoFrame),
+            ),
+            np.column_stack([chosen, np.full_like(chosen, -1)]),
+            self.camera,
+            self._config,
+            stamps_ns=(reference.stamp_ns, current.stamp_ns),
+            start=None if is_wide else T_reference_current,
+            with_offset=self.rig_offsets is not None and not is_wide,
+        )
+        if isinstance(result, Failure):
+            return result
+        return replace(result, covariance=klt.sigma_factor**2 * result.covariance)
 
     def _predict(
-        self, T_reference_current: FloatArray, reference: KltObservations
+        self, T_reference_current: FloatArray, source_uvd: FloatArray
     ) -> tuple[FloatArray, IntArray]:
-        """Return (u, v, disparity) of the reference's points in view of the current camera."""
-        points = se3.transform_points(se3.invert(T_reference_current), reference.points_cam)
+        """Return (u, v, disparity), as measured, of the points in view of the current camera."""
+        offset_px, _ = self._offsets_px()
+        points = se3.transform_points(
+            se3.invert(T_reference_current),
+            self.camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2] - offset_px),
+        )
         in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
         uvd = self.camera.project_stereo(points[in_front])
+        uvd[:, 2] += offset_px
         limits = np.array([self.camera.width, self.camera.height]) - 1
         is_in_view = np.all((uvd[:, :2] >= 0) & (uvd[:, :2] <= limits), axis=1)
         return uvd[is_in_view], in_front[is_in_view]
 
-    def _register_tracks(
-        self,
-        reference: KltObservations,
-        current: KltObservations,
-        indices: IntArray,
-        uvd: FloatArray,
-    ) -> RelativePose | Failure:
-        sigmas = self._sigmas(current.frame)
-        correspondences = Correspondences(
-            source_points=reference.points_cam[indices],
-            target_points=self.camera.unproject_stereo(uvd[:, :2], uvd[:, 2]),
-            source_uvd=np.column_stack([reference.keypoints, reference.disparities])[indices],
-            target_uvd=uvd,
-            # A corner is where it was cut out: only the track into the current frame is noisy.
-            source_sigmas=np.tile(sigmas * [0.0, 0.0, 1.0], (len(uvd), 1)),
-            target_sigmas=np.tile(sigmas, (len(uvd), 1)),
-        )
-        result = register_correspondences(
-            correspondences,
-            np.column_stack([indices, np.full_like(indices, -1)]),
-            self.camera,
-            self._config,
-            stamps_ns=(reference.stamp_ns, current.stamp_ns),
-        )
-        if isinstance(result, Failure):
-            return result
-        factor = self._config.klt.sigma_factor
-        return replace(result, covariance=factor**2 * result.covariance)
-
-    def _sigmas(self, frame: Frame) -> FloatArray:
-        """Return the standard deviations of (u, v, disparity) of a track, pixels."""
+    def _correspondences(
+        self, source_uvd: FloatArray, target_uvd: FloatArray, *, is_stereo: bool
+    ) -> Correspondences:
         config = self._config
-        is_stereo = isinstance(frame, StereoFrame)
         disparity = config.klt.disparity_sigma_px if is_stereo else config.depth.sigma_px
-        return np.array([config.klt.pixel_sigma_px, config.klt.pixel_sigma_px, disparity])
+        pixel = config.klt.pixel_sigma_px
+        n = len(source_uvd)
+        correspondences = Correspondences(
+            source_points=self.camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2]),
+            target_points=self.camera.unproject_stereo(target_uvd[:, :2], target_uvd[:, 2]),
+            source_uvd=source_uvd,
+            target_uvd=target_uvd,
+            # A corner is where it was cut out: only the track into the current frame is noisy.
+            source_sigmas=np.tile([0.0, 0.0, disparity], (n, 1)),
+            target_sigmas=np.tile([pixel, pixel, disparity], (n, 1)),
+        )
+        return correspondences.without_offset(self._offsets_px()[0], self.camera)
 
     def _search_stereo(
-        self, frame: StereoFrame, corners: FloatArray
+        self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
     ) -> tuple[FloatArray, BoolArray]:
         farthest = float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
         rough, is_found = search_disparities((frame.left, frame.right), corners, farthest)
-        disparities, is_valid = self._measure_stereo(frame, corners, rough, COARSE_ERROR_PX)
-        return disparities, is_valid & is_found
+        disparities, is_valid = measure_disparities(
+            (frame.left, frame.right),
+            corners,
+            rough,
+            self._config.stereo,
+            reach_px=COARSE_ERROR_PX,
+            row_offset_px=row_offset_px,
+        )
+        return disparities, is_found & is_valid
 
     def _measure_stereo(
-        self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, reach_px: int
+        self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool
     ) -> tuple[FloatArray, BoolArray]:
+        """Measure the disparities of tracks near predicted ones."""
+        config, images = self._config.stereo, (frame.left, frame.right)
+        offset_px, row_offset_px = self._offsets_px()
+        if is_wide:
+            disparities, is_valid = measure_disparities(
+                images,
+                pixels,
+                predicted,
+                config,
+                reach_px=config.search_radius_px,
+                row_offset_px=row_offset_px,
+            )
+        else:
+            disparities, is_valid = follow_disparities(
+                images, pixels, predicted, config, row_offset_px=row_offset_px
+            )
+        return disparities, is_valid & self._is_in_range(disparities - offset_px)
+
+    def _is_in_range(self, disparities: FloatArray) -> BoolArray:
         config = self._config.stereo
-        disparities, is_valid = measure_disparities(
-            (frame.left, frame.right), pixels, predicted, config, reach_px=reach_px
-        )
         depths = self.camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
         with np.errstate(invalid="ignore"):
-            is_valid &= (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
-        return disparities, is_valid
+            return np.asarray((depths >= config.min_depth_m) & (depths <= config.max_depth_m))
 
     def _measure_depth(self, frame: RgbdFrame, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         depths, is_valid = sample_depth(frame.depth, pixels, self._config.depth)

@@ -1,4 +1,4 @@
-"""Relative pose from 3D-3D correspondences: RANSAC-Umeyama, then refinement."""
+"""Relative pose from 3D-3D correspondences: consensus, then refinement."""
 
 from __future__ import annotations
 
@@ -8,41 +8,12 @@ from gvo.config import Config
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.ransac import ransac_rigid
-from gvo.geometry.refinement import fit_covariance, refine_pose
-from gvo.types import Failure, FloatArray, IntArray, Observations, RelativePose
+from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
+from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
+from gvo.types import BoolArray, Failure, FloatArray, IntArray, RelativePose
 
-
-def register_matches(
-    reference: Observations,
-    current: Observations,
-    matches: IntArray,
-    camera: StereoCamera,
-    config: Config,
-) -> RelativePose | Failure:
-    """Estimate the motion between two frames from matched observations.
-
-    Parameters
-    ----------
-    reference, current : Observations
-    matches : ndarray of int64, shape (n, 2)
-        Indices into reference and current.
-    camera : StereoCamera
-        Of both frames.
-    config : Config
-        Sections `ransac` and `registration`.
-
-    Returns
-    -------
-    RelativePose or Failure
-    """
-    return register_correspondences(
-        Correspondences.of(reference, current, matches),
-        matches,
-        camera,
-        config,
-        stamps_ns=(reference.stamp_ns, current.stamp_ns),
-    )
+# Wrong matches never agree in such numbers by chance: samples could only find the same motion.
+_MIN_KNOWN_SHARE = 0.7
 
 
 def register_correspondences(
@@ -52,6 +23,8 @@ def register_correspondences(
     config: Config,
     *,
     stamps_ns: tuple[int, int],
+    start: FloatArray | None = None,
+    with_offset: bool = False,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
 
@@ -67,21 +40,20 @@ def register_correspondences(
         Sections `ransac` and `registration`.
     stamps_ns : tuple of two int
         Stamps of reference and current.
+    start : ndarray of float64, shape (4, 4), optional
+        Predicted T_reference_current. Where most matches agree with it already, nothing is
+        left for samples to find: these matches and this motion are where the refinement
+        starts, which chooses its matches again anyhow. Of no use with `registration.refine`
+        none, where the fit to the consensus is the result.
+    with_offset : bool
+        Estimate a constant offset of the disparities too, `RelativePose.offset_px`.
 
     Returns
     -------
     RelativePose or Failure
     """
-    # The generator depends on the two frames alone, so that a run that starts
-    # anywhere draws the same samples for them.
-    seeds = [config.ransac.seed, *stamps_ns]
-    consensus = ransac_rigid(
-        correspondences,
-        camera,
-        config.ransac,
-        weights=_weights(correspondences, config),
-        rng=np.random.default_rng([abs(seed) for seed in seeds]),
-    )
+    known = _known_consensus(start, correspondences, camera, config)
+    consensus = known or _search_consensus(correspondences, camera, config, stamps_ns)
     if isinstance(consensus, Failure):
         return consensus
     finish = fit_covariance if config.registration.refine == "none" else refine_pose
@@ -91,6 +63,7 @@ def register_correspondences(
         consensus.inliers,
         camera,
         config.registration,
+        with_offset=with_offset,
     )
     n_inliers = int(np.count_nonzero(consensus.inliers))
     if isinstance(refined, Failure):
@@ -103,18 +76,59 @@ def register_correspondences(
             n_matches=len(matches),
             n_inliers=n_inliers,
         )
+    return _relative_pose(refined, correspondences, matches)
+
+
+def _known_consensus(
+    start: FloatArray | None, correspondences: Correspondences, camera: StereoCamera, config: Config
+) -> Consensus | None:
+    """Return the matches that agree with a prediction, if they are most of them."""
+    if start is None or config.registration.refine == "none":
+        return None
+    T = se3.invert(start)
+    inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
+    n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
+    if np.count_nonzero(inliers) < n_needed:
+        return None
+    return Consensus(T_target_source=T, inliers=inliers)
+
+
+def _search_consensus(
+    correspondences: Correspondences,
+    camera: StereoCamera,
+    config: Config,
+    stamps_ns: tuple[int, int],
+) -> Consensus | Failure:
+    # The generator depends on the two frames alone, so that a run that starts
+    # anywhere draws the same samples for them.
+    seeds = [config.ransac.seed, *stamps_ns]
+    return ransac_rigid(
+        correspondences,
+        camera,
+        config.ransac,
+        weights=_weights(correspondences, config),
+        rng=np.random.default_rng([abs(seed) for seed in seeds]),
+    )
+
+
+def _relative_pose(
+    refined: Refinement, correspondences: Correspondences, matches: IntArray
+) -> RelativePose:
+    offset = refined.offset
     return RelativePose(
         T_reference_current=se3.invert(refined.T_target_source),
         covariance=refined.covariance,
         matches=matches,
         inliers=refined.inliers,
-        flow_px=_flow(correspondences.select(refined.inliers)),
+        flow_px=_flow(correspondences, refined.inliers),
+        offset_px=None if offset is None else offset.offset_px,
+        offset_sigma_px=None if offset is None else offset.sigma_px,
     )
 
 
-def _flow(correspondences: Correspondences) -> float:
+def _flow(correspondences: Correspondences, inliers: BoolArray) -> float:
     displacements = correspondences.target_uvd[:, :2] - correspondences.source_uvd[:, :2]
-    return float(np.median(np.linalg.norm(displacements, axis=1)))
+    return float(np.median(np.hypot(*displacements[inliers].T)))
 
 
 def _weights(correspondences: Correspondences, config: Config) -> FloatArray | None:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from gvo.config import DepthConfig
-from gvo.types import BoolArray, DepthArray, FloatArray
+from gvo.types import BoolArray, DepthArray, FloatArray, IntArray
+
+_MIN_KNOWN_SHARE = 0.5
+"""Of a window; with less, a plane says more about its noise than about the surface."""
 
 
 def sample_depth(
     depth: DepthArray, keypoints: FloatArray, config: DepthConfig
 ) -> tuple[FloatArray, BoolArray]:
     """Read the depth at keypoints and tell which can be trusted.
+
+    The inverse depth of a plane is linear in the pixel, and structured light measures it with
+    the same noise near and far. So the depth is that of the plane fitted to the inverse depths
+    around the keypoint, at its fraction of a pixel; where less than half of them are known, that
+    of the nearest pixel.
 
     Parameters
     ----------
@@ -31,17 +38,70 @@ def sample_depth(
         False where depth is unknown, out of range, or breaks around the keypoint: there a
         shift of a pixel between colour and depth changes the point by metres.
     """
-    height, width = depth.shape
-    columns, rows = np.rint(keypoints).astype(np.int64).T
-    is_inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    rows, columns = np.where(is_inside, rows, 0), np.where(is_inside, columns, 0)
-    depths = depth[rows, columns].astype(np.float64)
-    radius = config.edge_radius_px
-    padded = np.pad(depth, radius, constant_values=np.nan)
-    windows = sliding_window_view(padded, (2 * radius + 1, 2 * radius + 1))[rows, columns]
+    pixels = np.rint(keypoints).astype(np.int64)
+    offsets = _offsets(config.edge_radius_px)
+    windows = _read_windows(depth, pixels, offsets)
+    depths = windows[len(offsets) // 2].astype(np.float64)
     # fmin and fmax pass over NaN, and give it only where nothing else is.
-    lowest, highest = (ufunc.reduce(windows, axis=(1, 2)) for ufunc in (np.fmin, np.fmax))
+    lowest, highest = (ufunc.reduce(windows, axis=0) for ufunc in (np.fmin, np.fmax))
     with np.errstate(invalid="ignore"):
         is_smooth = highest - lowest <= config.max_edge_step * depths
         is_in_range = (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
-    return depths, is_inside & is_in_range & is_smooth
+    is_valid = is_in_range & is_smooth
+    chosen = np.flatnonzero(is_valid & (lowest > 0))
+    fractions = (keypoints - pixels)[chosen]
+    fitted, is_fitted = _fit_planes(windows[:, chosen], offsets, fractions)
+    # Beside a hole or the border the plane continues, but not beyond all that was seen.
+    fitted = np.clip(fitted, lowest[chosen], highest[chosen])
+    depths[chosen] = np.where(is_fitted, fitted, depths[chosen])
+    return depths, is_valid
+
+
+def _offsets(radius: int) -> IntArray:
+    """List (u, v) of the pixels of a window from its centre, shape ((2 * radius + 1)^2, 2)."""
+    rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return np.stack([columns.ravel(), rows.ravel()], axis=1)
+
+
+def _read_windows(depth: DepthArray, pixels: IntArray, offsets: IntArray) -> DepthArray:
+    """Return the depths around pixels, shape (m, n); NaN beyond the image."""
+    height, width = depth.shape
+    columns = pixels[:, 0] + offsets[:, :1]
+    rows = pixels[:, 1] + offsets[:, 1:]
+    is_inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    windows = depth.take(np.where(is_inside, rows * width + columns, 0))
+    windows[~is_inside] = np.nan
+    return windows
+
+
+def _fit_planes(
+    windows: DepthArray, offsets: IntArray, fractions: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Fit planes to windows of positive depths, m pixels of n keypoints.
+
+    Returns
+    -------
+    depths : ndarray of float64, shape (n,)
+        Of the planes at the keypoints, which lie off the centre by the fractions.
+    is_fitted : ndarray of bool, shape (n,)
+        False where too little is known.
+    """
+    is_known = ~np.isnan(windows)
+    inverse_depths = np.where(is_known, 1.0 / windows.astype(np.float64), 0.0)
+    u, v = offsets.T.astype(np.float64)
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+    sums = basis @ is_known
+    n_known = sums[0]
+    # Means, then the second moments about them: two slopes are left to solve for.
+    scale = 1.0 / np.maximum(n_known, 1.0)
+    _, mean_u, mean_v, uu, uv, vv = sums * scale
+    mean, us, vs = (basis[:3] @ inverse_depths) * scale
+    uu, uv, vv = uu - mean_u**2, uv - mean_u * mean_v, vv - mean_v**2
+    us, vs = us - mean_u * mean, vs - mean_v * mean
+    determinant = uu * vv - uv**2
+    is_fitted = (n_known > _MIN_KNOWN_SHARE * len(offsets)) & (determinant > 0)
+    du, dv = fractions[:, 0] - mean_u, fractions[:, 1] - mean_v
+    rise = (vv * us - uv * vs) * du + (uu * vs - uv * us) * dv
+    at_keypoints = mean + rise / np.where(is_fitted, determinant, 1.0)
+    is_fitted &= at_keypoints > 0
+    return 1.0 / np.where(is_fitted, at_keypoints, 1.0), is_fitted

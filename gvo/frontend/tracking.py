@@ -15,8 +15,8 @@ import numpy as np
 from gvo.config import KltConfig
 from gvo.types import BoolArray, FloatArray, ImageArray
 
-_MAX_ITERATIONS = 20
-_MIN_STEP_PX = 0.01
+_MAX_ITERATIONS = 10
+_MIN_STEP_PX = 0.02
 # The way back starts at its goal and needs no pyramid: a track that went astray does not find
 # the first corner in what it sees.
 _BACK_LEVELS = 0

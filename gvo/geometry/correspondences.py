@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gvo.geometry.camera import StereoCamera
 from gvo.types import BoolArray, FloatArray, IntArray, Observations
 
 
@@ -45,6 +46,20 @@ class Correspondences:
             target_uvd=np.column_stack([target.keypoints[j], target.disparities[j]]),
             source_sigmas=source.sigmas[i],
             target_sigmas=target.sigmas[j],
+        )
+
+    def without_offset(self, offset_px: float, camera: StereoCamera) -> Correspondences:
+        """Take a constant error off all disparities, and move the points accordingly."""
+        if offset_px == 0.0:
+            return self
+        offset = np.array([0.0, 0.0, offset_px])
+        source_uvd, target_uvd = self.source_uvd - offset, self.target_uvd - offset
+        return replace(
+            self,
+            source_points=camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2]),
+            target_points=camera.unproject_stereo(target_uvd[:, :2], target_uvd[:, 2]),
+            source_uvd=source_uvd,
+            target_uvd=target_uvd,
         )
 
     def select(self, chosen: BoolArray | IntArray) -> Correspondences:

@@ -19,6 +19,9 @@ from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.sources.sync import Pair, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
+# Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
+_N_AHEAD = 2
+
 
 def frames(source: Source, config: Config) -> Iterator[Frame | FaultyFrame]:
     """Read a recording as frames.
@@ -29,7 +32,7 @@ def frames(source: Source, config: Config) -> Iterator[Frame | FaultyFrame]:
         The recording.
     config : Config
         `sync` decides which images make one frame; with `runtime.threads` above one the images
-        of a frame are decoded side by side, one frame ahead. The result does not depend on the
+        of a frame are decoded side by side, two frames ahead. The result does not depend on the
         number of threads.
 
     Yields
@@ -156,7 +159,7 @@ def _ahead(
                 fault = error  # what was read before it counts
             else:
                 started.append(_start(pool.submit, item, preparers, sensor))
-                if len(started) > 1:
+                if len(started) > _N_AHEAD:
                     yield _finish(started.popleft(), sensor)
         while started:
             yield _finish(started.popleft(), sensor)

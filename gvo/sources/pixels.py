@@ -15,7 +15,6 @@ from gvo.types import DepthArray, ImageArray
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _MAX_PIXELS = 100_000_000
-_UNKNOWN_COUNTS = (0, 65535)
 _JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -145,9 +144,10 @@ def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthAr
         raise RecordingError(
             f"{where}: expected depth as 16-bit grey, got {counts.dtype} of shape {counts.shape}"
         )
-    depth = counts.astype(np.float32) / np.float32(scale)
-    depth[np.isin(counts, _UNKNOWN_COUNTS)] = np.nan
-    return np.asarray(depth, dtype=np.float32)
+    depth: DepthArray = np.divide(counts, np.float32(scale), dtype=np.float32)
+    # One look at each pixel for both: with one added, 65535 becomes 0 and 0 becomes 1.
+    depth[counts + np.uint16(1) <= 1] = np.nan
+    return depth
 
 
 def depth_from_metres(metres: NDArray[Any]) -> DepthArray:

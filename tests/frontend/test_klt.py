@@ -192,4 +192,4 @@ def test_a_view_from_elsewhere_is_no_motion() -> None:
 def test_the_configuration_names_the_front_end(kind: str, expected: type) -> None:
     config = Config.model_validate({"frontend": {"kind": kind}})
     assert type(make_frontend(recording("stereo").info.camera, config)) is expected
-    assert type(make_frontend(recording("rgbd").info.camera)) is DescriptorFrontend
+    assert type(make_frontend(recording("rgbd").info.camera)) is KltFrontend

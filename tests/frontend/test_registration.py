@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.config import Config
-from gvo.frontend.registration import register_matches
+from gvo.frontend import registration
+from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
 from gvo.types import Failure, FloatArray, IntArray, Observations, RelativePose
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -44,6 +46,27 @@ def observe(
         points_cam=CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2]),
         sigmas=np.tile(SIGMAS, (n, 1)),
         descriptors_left=np.zeros((n, 32), dtype=np.uint8),
+    )
+
+
+def register_matches(
+    reference: Observations,
+    current: Observations,
+    matches: IntArray,
+    camera: StereoCamera,
+    config: Config,
+    *,
+    start: FloatArray | None = None,
+    with_offset: bool = False,
+) -> RelativePose | Failure:
+    return register_correspondences(
+        Correspondences.of(reference, current, matches),
+        matches,
+        camera,
+        config,
+        stamps_ns=(reference.stamp_ns, current.stamp_ns),
+        start=start,
+        with_offset=with_offset,
     )
 
 
@@ -176,3 +199,96 @@ def test_matches_without_a_common_motion_are_a_failure_that_counts_them() -> Non
     assert isinstance(result, Failure)
     assert result.n_matches == 80
     assert result.n_inliers < 12
+
+
+def forbid_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def search(*_: object, **__: object) -> None:
+        raise AssertionError("samples are drawn")
+
+    monkeypatch.setattr(registration, "ransac_rigid", search)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds)
+def test_a_prediction_that_most_matches_confirm_is_refined_without_samples(seed: int) -> None:
+    T, reference, current, matches = two_frames(seed, n_outliers=20)
+    start = T @ se3.exp(np.random.default_rng(seed).normal(size=6) * np.repeat([0.0005, 0.002], 3))
+    searched = register_matches(reference, current, matches, CAMERA, configure())
+    with pytest.MonkeyPatch.context() as patch:
+        forbid_search(patch)
+        known = register_matches(reference, current, matches, CAMERA, configure(), start=start)
+    assert isinstance(searched, RelativePose)
+    assert isinstance(known, RelativePose)
+    difference = se3.log(np.linalg.inv(searched.T_reference_current) @ known.T_reference_current)
+    # The same optimum, but for a match or two that the gate decides otherwise.
+    assert difference @ np.linalg.solve(searched.covariance, difference) / 6 < 0.3
+    assert known.inliers[20:].mean() > 0.8
+    assert known.inliers[:20].mean() < 0.2
+
+
+@pytest.mark.parametrize("error", [0.1, 1.0])
+def test_a_prediction_that_few_matches_confirm_changes_nothing(error: float) -> None:
+    T, reference, current, matches = two_frames(4)
+    start = T @ se3.exp(np.array([0.0, error, 0.0, 0.0, 0.0, 0.0]))
+    searched = register_matches(reference, current, matches, CAMERA, configure())
+    result = register_matches(reference, current, matches, CAMERA, configure(), start=start)
+    assert isinstance(searched, RelativePose)
+    assert isinstance(result, RelativePose)
+    np.testing.assert_array_equal(result.T_reference_current, searched.T_reference_current)
+
+
+@pytest.mark.parametrize(("n_outliers", "is_known"), [(30, True), (45, False)])
+def test_seven_in_ten_matches_must_confirm_a_prediction(
+    monkeypatch: pytest.MonkeyPatch, n_outliers: int, is_known: bool
+) -> None:
+    T, reference, current, matches = two_frames(5, n_outliers=n_outliers, noise=0.0)
+    forbid_search(monkeypatch)
+    if is_known:
+        register_matches(reference, current, matches, CAMERA, configure(), start=T)
+        return
+    with pytest.raises(AssertionError, match="samples"):
+        register_matches(reference, current, matches, CAMERA, configure(), start=T)
+
+
+def test_a_prediction_does_not_make_up_for_too_few_matches() -> None:
+    T, reference, current, matches = two_frames(6, n_outliers=0)
+    result = register_matches(reference, current, matches[:11], CAMERA, configure(), start=T)
+    assert isinstance(result, Failure)
+    assert result.n_matches == 11
+
+
+def test_without_refinement_the_fit_to_the_consensus_is_the_result_whatever_was_predicted() -> None:
+    T, reference, current, matches = two_frames(7, n_outliers=0)
+    config = configure("none")
+    plain = register_matches(reference, current, matches, CAMERA, config)
+    predicted = register_matches(reference, current, matches, CAMERA, config, start=T)
+    assert isinstance(plain, RelativePose)
+    assert isinstance(predicted, RelativePose)
+    np.testing.assert_array_equal(plain.T_reference_current, predicted.T_reference_current)
+
+
+@pytest.mark.parametrize("refine", ["gauss_newton", "none"])
+def test_the_offset_of_disparities_is_told_where_asked_for(
+    refine: Literal["gauss_newton", "none"],
+) -> None:
+    _, reference, current, matches = two_frames(8, n_outliers=0)
+    without = register_matches(reference, current, matches, CAMERA, configure(refine))
+    result = register_matches(
+        reference, current, matches, CAMERA, configure(refine), with_offset=True
+    )
+    assert isinstance(without, RelativePose)
+    assert isinstance(result, RelativePose)
+    assert without.offset_px is None
+    assert without.offset_sigma_px is None
+    assert result.offset_px is not None
+    assert result.offset_sigma_px is not None
+    assert abs(result.offset_px) < 4.0 * result.offset_sigma_px
+
+
+def test_the_flow_is_the_median_displacement_of_the_inliers() -> None:
+    T, reference, current, matches = two_frames(9, noise=0.0)
+    result = register_matches(reference, current, matches, CAMERA, configure(), start=T)
+    assert isinstance(result, RelativePose)
+    i, j = matches[result.inliers].T
+    displacements = current.keypoints[j] - reference.keypoints[i]
+    assert result.flow_px == pytest.approx(np.median(np.linalg.norm(displacements, axis=1)))

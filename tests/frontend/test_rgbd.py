@@ -1,4 +1,4 @@
-"""Depth at keypoints against a plain look at every window."""
+"""Depth at keypoints against a plain look at every window, and against planes."""
 
 import numpy as np
 import pytest
@@ -22,11 +22,87 @@ def sample(depth: DepthArray, *keypoints: tuple[float, float]) -> tuple[FloatArr
     return depths, is_valid.tolist()
 
 
-def test_depth_is_read_at_the_nearest_pixel() -> None:
-    depth = 2.0 + 1e-4 * np.arange(600, dtype=np.float32).reshape(20, 30)
-    depths, is_valid = sample(depth, (10.0, 5.0), (10.4, 5.4), (9.6, 4.6))
+def inverse_plane(coefficients: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (coefficients[0] + coefficients[1] * u + coefficients[2] * v))
+
+
+def tilted(seed: int) -> tuple[DepthArray, FloatArray]:
+    """Return the depth of a plane in space, and the coefficients of its inverse depth."""
+    rng = np.random.default_rng(seed)
+    coefficients = np.array([rng.uniform(0.3, 1.5), *rng.uniform(-0.003, 0.003, 2)])
+    v, u = np.mgrid[:20, :30].astype(float)
+    return inverse_plane(coefficients, u, v).astype(np.float32), coefficients
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds)
+def test_the_depth_of_a_plane_is_exact_between_pixels_and_beside_holes(seed: int) -> None:
+    depth, coefficients = tilted(seed)
+    rng = np.random.default_rng(seed)
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    keypoints = rng.uniform([2.0, 2.0], [27.0, 17.0], size=(40, 2))
+    depths, is_valid = sample_depth(depth, keypoints, SETTINGS)
+    windows = [depth[v - 2 : v + 3, u - 2 : u + 3] for u, v in np.rint(keypoints).astype(int)]
+    is_fitted = is_valid & [np.count_nonzero(~np.isnan(window)) > 12 for window in windows]
+    spreads = [[np.nanmin(window), np.nanmax(window)] for window in windows]
+    expected = np.clip(inverse_plane(coefficients, *keypoints.T), *np.transpose(spreads))
+    assert is_fitted.any()
+    np.testing.assert_allclose(depths[is_fitted], expected[is_fitted], rtol=1e-6)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds)
+def test_noisy_depth_is_that_of_the_least_squares_plane(seed: int) -> None:
+    depth, _ = tilted(seed)
+    rng = np.random.default_rng(seed)
+    depth *= (1.0 + 0.005 * rng.standard_normal(depth.shape)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    keypoints = rng.uniform([0.0, 0.0], [29.0, 19.0], size=(20, 2))
+    depths, is_valid = sample_depth(depth, keypoints, SETTINGS)
+    for keypoint, value in zip(keypoints[is_valid], depths[is_valid], strict=True):
+        column, row = np.rint(keypoint).astype(int)
+        rows, columns = np.mgrid[row - 2 : row + 3, column - 2 : column + 3].reshape(2, -1)
+        is_inside = (rows >= 0) & (rows < 20) & (columns >= 0) & (columns < 30)
+        rows, columns = rows[is_inside], columns[is_inside]
+        known = np.flatnonzero(~np.isnan(depth[rows, columns]))
+        samples = depth[rows, columns][known].astype(float)
+        if len(known) <= 12:  # half of the window
+            assert value == depth[row, column]
+            continue
+        design = np.column_stack([np.ones(len(known)), columns[known], rows[known]])
+        solution, *_ = np.linalg.lstsq(design, 1.0 / samples)
+        expected = np.clip(inverse_plane(solution, *keypoint), samples.min(), samples.max())
+        np.testing.assert_allclose(value, expected, rtol=1e-9)
+
+
+def test_the_noise_of_the_pixels_around_is_averaged() -> None:
+    rng = np.random.default_rng(1)
+    clean = 1.0 / np.linspace(0.5, 0.55, 300)[np.newaxis] * np.ones((200, 1))
+    noisy = (1.0 / (1.0 / clean + 0.001 * rng.standard_normal(clean.shape))).astype(np.float32)
+    keypoints = rng.integers([5, 5], [295, 195], size=(500, 2)).astype(float)
+    depths, is_valid = sample_depth(noisy, keypoints, SETTINGS)
+    assert is_valid.all()
+    truth = clean[0, keypoints[:, 0].astype(int)]
+    # By 25 equal pixels, a fifth of 0.001.
+    assert np.std(1.0 / depths - 1.0 / truth) < 0.25 * 0.001
+
+
+def test_depth_is_that_of_the_nearest_pixel_where_most_around_is_unknown() -> None:
+    depth, _ = tilted(0)
+    depth[:9] = np.nan
+    depth[10:] = np.nan
+    depths, is_valid = sample(depth, (10.0, 9.0), (10.4, 9.4), (9.6, 8.6))
     assert is_valid == [True] * 3
-    np.testing.assert_allclose(depths, depth[5, 10])
+    np.testing.assert_array_equal(depths, depth[9, 10])
+
+
+def test_a_plane_beside_a_hole_does_not_leave_what_was_seen() -> None:
+    depth = np.full((20, 30), np.nan, dtype=np.float32)
+    depth[:, :16] = 1.0 / np.linspace(1.0, 0.25, 16)
+    config = SETTINGS.model_copy(update={"max_edge_step": 10.0})
+    depths, is_valid = sample_depth(depth, np.array([[15.49, 10.0], [14.5, 10.0]]), config)
+    assert is_valid.all()
+    np.testing.assert_allclose(depths, [4.0, 1.0 / 0.275], rtol=1e-6)
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 0.49, 6.01, np.inf, -1.0])
@@ -108,4 +184,4 @@ def test_what_is_valid_is_what_a_plain_loop_finds(seed: int, radius: int) -> Non
             )
         assert valid == expected
         if valid:
-            assert value == np.float32(depth[row, column])
+            assert known.min() <= value <= known.max()

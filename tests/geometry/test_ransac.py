@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare
 
 from gvo.config import RansacConfig
+from gvo.geometry import ransac
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, draw_samples, find_inliers, ransac_rigid
+from gvo.geometry.umeyama import fit_rigid_triples
 from gvo.types import BoolArray, Failure, FloatArray
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -241,3 +243,58 @@ def test_weights_enter_the_last_fit() -> None:
     result = ransac_rigid(noisy, CAMERA, config, weights=weights, rng=np.random.default_rng(0))
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
+
+
+def count_hypotheses(
+    monkeypatch: pytest.MonkeyPatch, matches: Correspondences, config: RansacConfig
+) -> int:
+    """Return how many triples a search fits."""
+    n_fitted = []
+
+    def fit(source: FloatArray, target: FloatArray) -> tuple[FloatArray, BoolArray]:
+        n_fitted.append(len(source))
+        return fit_rigid_triples(source, target)
+
+    monkeypatch.setattr(ransac, "fit_rigid_triples", fit)
+    run(matches, config)
+    return sum(n_fitted)
+
+
+def test_the_search_stops_when_a_better_sample_is_no_longer_to_be_expected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    numbers = {}
+    for n_outliers in (0, 60, 120, 200):
+        _, matches, _ = scene(np.random.default_rng(1), 200, n_outliers)
+        config = SETTINGS.model_copy(update={"n_hypotheses": 1000})
+        numbers[n_outliers] = count_hypotheses(monkeypatch, matches, config)
+        share = 1.0 - n_outliers / 200
+        if share > 0:
+            # log(0.001) / log(1 - share^3), in blocks, and all hypotheses have some luck.
+            needed = np.log(1e-3) / np.log1p(-(min(share, 0.999) ** 3))
+            assert 0.8 * needed <= numbers[n_outliers] <= 1.2 * needed + 80
+    assert numbers[0] == numbers[60] < numbers[120] < numbers[200] == 1000
+
+
+def test_only_inliers_among_the_near_points_shorten_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # All far points agree, two of three near ones do not: samples are drawn of those.
+    _, matches, is_inlier = scene(np.random.default_rng(2), 200, 60)
+    is_near = ~is_inlier | (np.cumsum(is_inlier) <= 30)
+    measured = matches.source_uvd.copy()
+    measured[:, 2] = np.where(is_near, 100.0, 5.0)
+    near = replace(matches, source_uvd=measured)
+    config = SETTINGS.model_copy(update={"n_hypotheses": 1000})
+    everywhere = count_hypotheses(monkeypatch, near, config)
+    config = config.model_copy(update={"min_disparity_px": 8.0})
+    assert everywhere <= 64 < count_hypotheses(monkeypatch, near, config)
+
+
+@pytest.mark.parametrize("n", [1, 63, 64, 65, 200])
+def test_no_more_hypotheses_are_tried_than_configured(
+    monkeypatch: pytest.MonkeyPatch, n: int
+) -> None:
+    _, matches, _ = scene(np.random.default_rng(3), 60, 60)
+    config = SETTINGS.model_copy(update={"n_hypotheses": n})
+    assert count_hypotheses(monkeypatch, matches, config) == n

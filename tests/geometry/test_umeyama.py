@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo.geometry.umeyama import fit_rigid, fit_rigid_batch
+from gvo.geometry.umeyama import fit_rigid, fit_rigid_batch, fit_rigid_triples
 from gvo.types import Failure, FloatArray
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -180,3 +180,37 @@ def test_negative_weights_are_misuse() -> None:
     points = np.eye(3)
     with pytest.raises(ValueError, match="negative"):
         fit_rigid(points, points, weights=np.array([1.0, -1.0, 1.0]))
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds, noise=st.sampled_from([0.0, 0.1, 1.0, 10.0]))
+def test_the_fit_to_triples_is_that_of_scipy(seed: int, noise: float) -> None:
+    # Noise up to triangles that have nothing in common.
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(5, 3, 3)) + 10.0 * rng.normal(size=3)
+    target = np.stack([move(random_transform(rng), triple) for triple in source])
+    target += noise * rng.normal(size=(5, 3, 3))
+    T, is_valid = fit_rigid_triples(source, target)
+    assert is_valid.all()
+    np.testing.assert_array_equal(T[:, 3], np.tile([0.0, 0, 0, 1], (5, 1)))
+    for each, a, b in zip(T, source, target, strict=True):
+        theirs = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0]
+        expected = np.sum((theirs.apply(a - a.mean(axis=0)) - b + b.mean(axis=0)) ** 2)
+        cost = np.sum((move(each, a) - b) ** 2)
+        assert cost == pytest.approx(expected, rel=1e-6, abs=1e-12)
+        np.testing.assert_allclose(each[:3, :3] @ each[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(each[:3, :3]) == pytest.approx(1.0)
+
+
+def test_triples_without_an_answer_are_told_from_the_others() -> None:
+    rng = np.random.default_rng(4)
+    source = 100.0 * rng.normal(size=(6, 3, 3))
+    target = source + 1.0
+    source[1] = source[1, 0] + np.outer([0.0, 1.0, 2.5], [1.0, 2.0, 3.0])
+    target[2] = target[2, 0] + np.outer([0.0, 1.0, -2.5], [1.0, 2.0, 3.0])
+    source[3] = source[3, 0]
+    target[4, 2, 0] = np.nan
+    T, is_valid = fit_rigid_triples(source, target)
+    assert is_valid.tolist() == [True, False, False, False, False, True]
+    np.testing.assert_allclose(T[[0, 5], :3, 3], 1.0)
+    np.testing.assert_array_equal(T[1:4, :3, :3], np.tile(np.eye(3), (3, 1, 1)))

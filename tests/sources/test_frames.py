@@ -1,5 +1,6 @@
 """From images to frames."""
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,8 @@ from gvo.geometry.camera import Calibration
 from gvo.sources.frames import frames
 from gvo.sources.kitti import KittiSource
 from gvo.sources.recording import StampedImage
+from gvo.sources.sync import pair_images
+from gvo.sources.tum import TumSource
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
 
 _THREADS = pytest.mark.parametrize("threads", [1, 2, 4])
@@ -134,6 +137,54 @@ def test_reading_can_be_stopped(tiny: Any) -> None:
     next(iterator)
     iterator.close()  # type: ignore[attr-defined]
     assert len(loaded) <= 8
+
+
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_a_reading_that_is_given_up_leaves_no_thread_behind(tiny: Any, is_closed: bool) -> None:
+    source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(50) for s in (0, 1)])
+    iterator = frames(source, Config(runtime=RuntimeConfig(threads=2)))
+    next(iterator)
+    assert _decoding_threads()
+    if is_closed:
+        iterator.close()  # type: ignore[attr-defined]
+    del iterator
+    assert not _decoding_threads()
+
+
+def _decoding_threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("decode")]
+
+
+@pytest.mark.recorded
+def test_recorded_depth_is_the_count_of_the_nearest_pixel(gvo_data: Path) -> None:
+    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    frame = next(item for item in frames(source, Config()) if isinstance(item, RgbdFrame))
+    _, second = next(
+        pair
+        for pair in pair_images(source.images(), limit_ns=20_000_000, partner="depth")
+        if isinstance(pair, tuple) and pair[0].stamp_ns == frame.stamp_ns
+    )
+    stamps = {image.stamp_ns: n for n, image in enumerate(_of_stream(source, 1))}
+    table = (gvo_data / "rgbd_dataset_freiburg1_xyz_start" / "depth.txt").read_text()
+    rows = [line.split()[1] for line in table.splitlines() if not line.startswith("#")]
+    path = gvo_data / "rgbd_dataset_freiburg1_xyz_start" / rows[stamps[second.stamp_ns]]
+    counts = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+    camera = source.info.calibrations[0]
+    rng = np.random.default_rng(0)
+    for u, v in rng.integers([0, 0], [640, 480], size=(3000, 2)):
+        ray = np.linalg.solve(camera.P[:, :3], [u, v, 1.0])
+        raw, _ = cv2.projectPoints(ray[np.newaxis], np.zeros(3), np.zeros(3), camera.K, camera.D)
+        column, row = np.rint(raw.ravel()).astype(int)
+        if np.abs(np.abs(raw.ravel() - [column, row]) - 0.5).min() < 1e-3:
+            continue  # a tie, for single precision
+        is_inside = 0 <= column < 640 and 0 <= row < 480
+        count = int(counts[row, column]) if is_inside else 0
+        expected = np.nan if count in (0, 65535) else np.float32(count) / np.float32(5000)
+        np.testing.assert_equal(float(frame.depth[v, u]), float(expected))
+
+
+def _of_stream(source: Any, stream: int) -> list[StampedImage]:
+    return [image for image in source.images() if image.stream == stream]
 
 
 @pytest.mark.recorded

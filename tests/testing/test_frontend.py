@@ -10,13 +10,14 @@ import pytest
 
 import gvo
 from gvo.config import Config
+from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
 from gvo.sources.recording import Sensor
 from gvo.testing import ContractError, check_frontend
 from gvo.testing.fingerprint import fingerprint
-from gvo.types import Failure, FaultyFrame, FloatArray, Frame, RelativePose
+from gvo.types import Failure, FaultyFrame, FloatArray, Frame, Observations, RelativePose
 
 Result = RelativePose | Failure
 
@@ -131,8 +132,15 @@ class LosesTheStamp(Sound):
         return super().extract(replace(frame, stamp_ns=frame.stamp_ns // 1000))
 
 
-class ExtractsAtRandom(Sound):
-    def extract(self, frame: Frame) -> KltObservations:
+class SoundDescriptor(DescriptorFrontend):
+    """The same, of observations that are open to view."""
+
+    def __init__(self) -> None:
+        super().__init__(recording("stereo").info.camera, configure("descriptor"))
+
+
+class ExtractsAtRandom(SoundDescriptor):
+    def extract(self, frame: Frame) -> Observations:
         observations = super().extract(frame)
         return replace(observations, n_keypoints=int(np.random.default_rng().integers(2**62)))
 
@@ -157,9 +165,9 @@ class ChangesThePrior(Sound):
         return result
 
 
-class ChangesObservations(Sound):
+class ChangesObservations(SoundDescriptor):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: Observations, current: Observations, prior: FloatArray | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         current.points_cam[:1] += 1.0

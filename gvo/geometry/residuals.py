@@ -1,0 +1,226 @@
+"""Stereo reprojection residuals of matches, whitened, and their derivatives.
+
+The residual of a match is its measurement in the target frame, (u, v, disparity), less the
+projection of the source frame's point. Both frames are noisy: the source's noise is carried
+through the motion and added before the residual is whitened.
+
+Arrays hold one match per column, so that every operation runs along contiguous memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.types import BoolArray, Failure, FloatArray
+
+_MIN_DEPTH_M = 1e-3
+# Nearer points, or points behind the camera, have no noise to speak of: they are no inliers.
+_MIN_NOISE_DEPTH_M = 0.1
+
+
+def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
+    """Differentiate (u, v, disparity) of points by a motion of theirs.
+
+    Parameters
+    ----------
+    points_cam : ndarray of float64, shape (3, n)
+        Points in the `cam` frame, metres.
+    camera : StereoCamera
+
+    Returns
+    -------
+    ndarray of float64, shape (6, 3, n)
+        By (rx, ry, rz, tx, ty, tz), perturbing on the left: of (u, v, disparity).
+    """
+    inverse_z = 1.0 / points_cam[2]
+    x, y = points_cam[:2] * inverse_z
+    xy = x * y
+    J = np.zeros((6, 3, len(x)))
+    J[0, 0], J[0, 1] = -camera.fx * xy, -camera.fy * (1.0 + y * y)
+    J[1, 0], J[1, 1] = camera.fx * (1.0 + x * x), camera.fy * xy
+    J[2, 0], J[2, 1] = -camera.fx * y, camera.fy * x
+    J[3, 0] = camera.fx * inverse_z
+    J[4, 1] = camera.fy * inverse_z
+    J[5, 0], J[5, 1] = -x * J[3, 0], -y * J[4, 1]
+    disparities = camera.baseline * J[3, 0]
+    J[0, 2] = -disparities * y
+    J[1, 2] = disparities * x
+    J[5, 2] = -disparities * inverse_z
+    return J
+
+
+def source_jacobian(
+    T_target_source: FloatArray, source_points: FloatArray, camera: StereoCamera
+) -> FloatArray:
+    """Differentiate the prediction in the target frame by the measurement in the source frame.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+    source_points : ndarray of float64, shape (3, n)
+        Points in the source frame, metres.
+    camera : StereoCamera
+        Of both frames.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3, n)
+        By (u, v, disparity) of the source: of (u, v, disparity) of the target. Of no account,
+        but finite, for points that are not well in front of the target.
+    """
+    R, t = T_target_source[:3, :3], T_target_source[:3, 3:]
+    rotated = R @ source_points
+    points = rotated + t
+    points[:, points[2] < _MIN_NOISE_DEPTH_M] = ((0.0,), (0.0,), (1.0,))
+    inverse_z = 1.0 / points[2]
+    x, y = points[:2] * inverse_z
+    depths = source_points[2]
+    moved = np.empty((3, 3, len(depths)))  # the point's motion in the target frame
+    moved[0] = R[:, :1] * (depths / camera.fx)
+    moved[1] = R[:, 1:2] * (depths / camera.fy)
+    moved[2] = rotated * (depths / (-camera.fx * camera.baseline))
+    forward = moved[:, 2] * inverse_z
+    J = np.empty_like(moved)
+    J[:, 0] = camera.fx * (moved[:, 0] * inverse_z - x * forward)
+    J[:, 1] = camera.fy * (moved[:, 1] * inverse_z - y * forward)
+    J[:, 2] = (-camera.fx * camera.baseline * inverse_z) * forward
+    return J
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearization:
+    """Residuals and derivatives at one pose, whitened, times the root of the robust weights.
+
+    Parameters
+    ----------
+    J : ndarray of float64, shape (6, 3, n)
+        Of the predictions by the pose.
+    r : ndarray of float64, shape (3, n)
+        Residuals: measurement less prediction.
+    factors : ndarray of float64, shape (6, n)
+        What whitened and weighed them, see `StereoResiduals`.
+    H : ndarray of float64, shape (6, 6)
+    g : ndarray of float64, shape (6,)
+        The normal equations H step = g.
+    """
+
+    J: FloatArray
+    r: FloatArray
+    factors: FloatArray
+    H: FloatArray
+    g: FloatArray
+
+    def scores(self) -> FloatArray:
+        """Return the share of each match in g, shape (6, n); at the optimum they sum to zero."""
+        return np.asarray(np.einsum("kin,in->kn", self.J, self.r))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StereoResiduals:
+    """Matches with what whitens their residuals.
+
+    Parameters
+    ----------
+    columns : ndarray of float64, shape (12, n)
+        Points in the source frame, (u, v, disparity) in the target frame, and the lower
+        triangle (00, 10, 11, 20, 21, 22) of the factor W with W^T W the inverse covariance of
+        the residual.
+    camera : StereoCamera
+    huber : float
+        Threshold of the robust kernel, sigmas.
+    """
+
+    columns: FloatArray
+    camera: StereoCamera
+    huber: float
+
+    @classmethod
+    def of(
+        cls, T: FloatArray, matches: Correspondences, camera: StereoCamera, *, huber: float
+    ) -> StereoResiduals:
+        """Whiten by the noise of both frames, carried through the start value T.
+
+        It is not carried again: it changes by far less than it is known.
+        """
+        columns = np.empty((12, len(matches)))
+        columns[:3] = matches.source_points.T
+        columns[3:6] = matches.target_uvd.T
+        J = source_jacobian(T, columns[:3], camera)
+        J *= matches.source_sigmas.T[:, np.newaxis]
+        _write_factors(columns[6:], J, matches.target_sigmas.T**2)
+        return cls(columns=columns, camera=camera, huber=huber)
+
+    @property
+    def source_points(self) -> FloatArray:
+        """Points in the source frame, shape (3, n), metres."""
+        return self.columns[:3]
+
+    def select(self, chosen: BoolArray) -> StereoResiduals:
+        """Return those of some matches."""
+        columns = self.columns.take(np.flatnonzero(chosen), axis=1)
+        return StereoResiduals(columns=columns, camera=self.camera, huber=self.huber)
+
+    def linearize(self, T: FloatArray) -> Linearization | Failure:
+        """Differentiate at T; a failure where points come to lie behind the camera."""
+        points = T[:3, :3] @ self.columns[:3] + T[:3, 3:]
+        if np.any(points[2] < _MIN_DEPTH_M):
+            return Failure(reason="the motion puts points behind the camera")
+        r, squared = self._whitened(points)
+        roots = np.sqrt(self.huber / np.maximum(np.sqrt(squared), self.huber))
+        factors = self.columns[6:] * roots
+        r *= roots
+        J = pose_jacobian(points, self.camera)
+        whiten_in_place(factors, J)
+        flat = J.reshape(6, -1)
+        return Linearization(J=J, r=r, factors=factors, H=flat @ flat.T, g=flat @ r.ravel())
+
+    def within(self, T: FloatArray, gate: float) -> BoolArray:
+        """Tell which residuals are shorter than the gate, in sigmas; none behind the camera."""
+        points = T[:3, :3] @ self.columns[:3] + T[:3, 3:]
+        is_in_front = points[2] > _MIN_DEPTH_M
+        points[2, ~is_in_front] = 1.0
+        _, squared = self._whitened(points)
+        return np.asarray(is_in_front & (squared < gate**2))
+
+    def _whitened(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return whitened residuals (3, n) and their squared norms (n,)."""
+        camera = self.camera
+        scaled = camera.fx / points[2]
+        r = self.columns[3:6].copy()
+        r[0] -= points[0] * scaled + camera.cx
+        r[1] -= points[1] * scaled * (camera.fy / camera.fx) + camera.cy
+        r[2] -= camera.baseline * scaled
+        whiten_in_place(self.columns[6:], r)
+        return r, r[0] ** 2 + r[1] ** 2 + r[2] ** 2
+
+
+def whiten_in_place(factors: FloatArray, rows: FloatArray) -> None:
+    """Multiply (u, v, disparity), shape (..., 3, n), by lower triangles (6, n)."""
+    u, v, d = rows[..., 0, :], rows[..., 1, :], rows[..., 2, :]
+    d *= factors[5]
+    d += factors[4] * v
+    d += factors[3] * u
+    v *= factors[2]
+    v += factors[1] * u
+    u *= factors[0]
+
+
+def _write_factors(out: FloatArray, J: FloatArray, target_variances: FloatArray) -> None:
+    """Write the inverse Cholesky factors of J^T J + diag(target_variances), shape (6, n).
+
+    The squared pivots are no less than the target's variances, but for rounding.
+    """
+    covariance = np.einsum("kin,kjn->ijn", J, J)
+    var_u, var_v, var_d = target_variances
+    out[0] = 1.0 / np.sqrt(covariance[0, 0] + var_u)
+    l_vu, l_du = covariance[1:, 0] * out[0]
+    out[2] = 1.0 / np.sqrt(np.maximum(covariance[1, 1] + var_v - l_vu**2, var_v))
+    l_dv = (covariance[2, 1] - l_du * l_vu) * out[2]
+    out[5] = 1.0 / np.sqrt(np.maximum(covariance[2, 2] + var_d - l_du**2 - l_dv**2, var_d))
+    out[1] = -l_vu * out[0] * out[2]
+    out[4] = -l_dv * out[2] * out[5]
+    out[3] = -(l_du * out[0] + l_dv * out[1]) * out[5]

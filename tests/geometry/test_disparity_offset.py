@@ -1,0 +1,132 @@
+"""The offset of a rig's disparities, planted in simulated matches and found again."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gvo.config import RegistrationConfig
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.disparity_offset import DisparityOffset
+from gvo.geometry.refinement import Refinement, refine_pose
+from gvo.types import FloatArray
+
+CAMERA = StereoCamera(fx=700.0, fy=690.0, cx=600.0, cy=180.0, width=1226, height=370, baseline=0.5)
+SETTINGS = RegistrationConfig(n_iterations=20, huber=2.8, gate=5.0)
+SIGMAS = np.array([0.2, 0.2, 0.2])
+
+
+def project(points: FloatArray) -> FloatArray:
+    x, y, z = points.T
+    return np.stack([700 * x / z + 600, 690 * y / z + 180, 350 / z], axis=1)
+
+
+def unproject(uvd: FloatArray) -> FloatArray:
+    z = 350 / uvd[:, 2]
+    return np.stack([(uvd[:, 0] - 600) * z / 700, (uvd[:, 1] - 180) * z / 690, z], axis=1)
+
+
+def drive(
+    seed: int,
+    offset_px: float,
+    *,
+    noise: float = 1.0,
+) -> tuple[FloatArray, Correspondences]:
+    """Return T_target_source and matches, the disparities of both frames too large."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.01 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = [0.02, 0.01, -1.0]
+    inverse_depths = rng.uniform(1 / 50, 1 / 5, 400)
+    pixels = rng.uniform([100, 40], [1100, 330], size=(400, 2))
+    source = unproject(np.column_stack([pixels, 350 * inverse_depths]))
+    target = source @ T[:3, :3].T + T[:3, 3]
+    uvds = [
+        project(points) + noise * SIGMAS * rng.normal(size=(400, 3)) + [0.0, 0.0, offset_px]
+        for points in (source, target)
+    ]
+    return T, Correspondences(
+        source_points=unproject(uvds[0]),
+        target_points=unproject(uvds[1]),
+        source_uvd=uvds[0],
+        target_uvd=uvds[1],
+        source_sigmas=np.tile(SIGMAS, (400, 1)),
+        target_sigmas=np.tile(SIGMAS, (400, 1)),
+    )
+
+
+def refine(T: FloatArray, matches: Correspondences, *, with_offset: bool = True) -> Refinement:
+    everything = np.ones(len(matches), dtype=np.bool_)
+    result = refine_pose(T, matches, everything, CAMERA, SETTINGS, with_offset=with_offset)
+    assert isinstance(result, Refinement), result
+    return result
+
+
+def estimate(T: FloatArray, matches: Correspondences) -> DisparityOffset:
+    offset = refine(T, matches).offset
+    assert offset is not None
+    return offset
+
+
+@pytest.mark.parametrize("planted_px", [-0.3, 0.0, 0.1, 0.3])
+def test_a_planted_offset_is_found_within_its_sigma(planted_px: float) -> None:
+    errors = []
+    for seed in range(40):
+        found = estimate(*drive(seed, planted_px))
+        assert abs(found.offset_px - planted_px) < 4.0 * found.sigma_px
+        errors.append((found.offset_px - planted_px) / found.sigma_px)
+    assert abs(np.mean(errors)) < 3.0 / np.sqrt(40)
+    assert 0.7 < np.std(errors) < 1.4
+
+
+def test_the_mean_of_many_registrations_tells_a_small_offset_from_none() -> None:
+    for planted_px in (0.0, 0.08):
+        found = [estimate(*drive(seed, planted_px)) for seed in range(100, 160)]
+        weights = np.array([1.0 / each.sigma_px**2 for each in found])
+        mean = np.average([each.offset_px for each in found], weights=weights)
+        sigma = 1.0 / np.sqrt(weights.sum())
+        assert sigma < 0.02
+        assert abs(mean - planted_px) < 3.0 * sigma
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.5])
+def test_sigmas_are_those_of_the_residuals_not_the_stated_ones(noise: float) -> None:
+    stated, actual = estimate(*drive(0, 0.0)), estimate(*drive(0, 0.0, noise=noise))
+    assert actual.sigma_px / stated.sigma_px == pytest.approx(noise, rel=0.25)
+
+
+def test_the_estimate_is_that_of_least_squares_over_pose_and_offset() -> None:
+    T, matches = drive(3, 0.2, noise=0.01)
+
+    def residuals(x: FloatArray) -> FloatArray:
+        source = unproject(matches.source_uvd - [0.0, 0.0, x[6]])
+        moved = source @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        return np.asarray((matches.target_uvd - [0.0, 0.0, x[6]] - project(moved)).ravel())
+
+    start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0]])
+    optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    # Other weights and one step only: equal but for the noise, which is nearly none.
+    assert estimate(T, matches).offset_px == pytest.approx(optimum.x[6], abs=0.005)
+
+
+def test_the_pose_is_the_same_with_and_without_the_estimate() -> None:
+    T, matches = drive(1, 0.2)
+    with_it, without = refine(T, matches), refine(T, matches, with_offset=False)
+    assert without.offset is None
+    np.testing.assert_array_equal(with_it.T_target_source, without.T_target_source)
+    np.testing.assert_array_equal(with_it.covariance, without.covariance)
+
+
+def test_a_camera_at_rest_says_nothing_of_the_offset() -> None:
+    # Both frames are wrong alike: the residuals are those of a rig without offset.
+    _, matches = drive(2, 0.3, noise=0.0)
+    same = Correspondences(
+        source_points=matches.source_points,
+        target_points=matches.source_points,
+        source_uvd=matches.source_uvd,
+        target_uvd=matches.source_uvd,
+        source_sigmas=matches.source_sigmas,
+        target_sigmas=matches.target_sigmas,
+    )
+    assert refine(np.eye(4), same).offset is None

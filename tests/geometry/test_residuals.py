@@ -1,0 +1,136 @@
+"""Residuals of stereo matches: derivatives, whitening, weights, what lies behind the camera."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.residuals import (
+    Linearization,
+    StereoResiduals,
+    pose_jacobian,
+    source_jacobian,
+)
+from gvo.types import Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+
+
+def project(point: FloatArray) -> FloatArray:
+    x, y, z = point
+    return np.array([500 * x / z + 320, 480 * y / z + 240, 100 / z])
+
+
+def unproject(uvd: FloatArray) -> FloatArray:
+    z = 100 / uvd[2]
+    return np.array([(uvd[0] - 320) * z / 500, (uvd[1] - 240) * z / 480, z])
+
+
+def motion(rng: np.random.Generator) -> FloatArray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = 0.2 * rng.normal(size=3)
+    return T
+
+
+def random_matches(rng: np.random.Generator, T: FloatArray, n: int) -> Correspondences:
+    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
+    target = source @ T[:3, :3].T + T[:3, 3]
+    uvd = np.array([project(point) for point in target]) + rng.normal(size=(n, 3))
+    return Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=np.array([project(point) for point in source]),
+        target_uvd=uvd,
+        source_sigmas=rng.uniform(0.0, 1.0, size=(n, 3)),
+        target_sigmas=rng.uniform(0.1, 1.0, size=(n, 3)),
+    )
+
+
+def linearize(residuals: StereoResiduals, T: FloatArray) -> Linearization:
+    at = residuals.linearize(T)
+    assert isinstance(at, Linearization)
+    return at
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_the_derivatives_by_the_pose_are_the_numerical_ones(seed: int) -> None:
+    point = np.random.default_rng(seed).uniform([-2, -2, 1], [2, 2, 9])
+
+    def perturbed(xi: FloatArray) -> FloatArray:
+        return project(Rotation.from_rotvec(xi[:3]).as_matrix() @ point + xi[3:])
+
+    expected = approx_fprime(np.zeros(6), perturbed, 1e-7)
+    J = pose_jacobian(point[:, np.newaxis], CAMERA)[..., 0].T
+    np.testing.assert_allclose(J, expected, atol=5e-3)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_the_derivatives_by_the_source_are_the_numerical_ones(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T, point = motion(rng), rng.uniform([-2, -2, 2], [2, 2, 9])
+
+    def predicted(uvd: FloatArray) -> FloatArray:
+        return project(T[:3, :3] @ unproject(uvd) + T[:3, 3])
+
+    expected = approx_fprime(project(point), predicted, 1e-6)
+    J = source_jacobian(T, point[:, np.newaxis], CAMERA)[..., 0].T
+    np.testing.assert_allclose(J, expected, rtol=1e-3, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_normal_equations_are_those_of_the_inverse_covariances(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = motion(rng)
+    matches = random_matches(rng, T, 9)
+    at = linearize(StereoResiduals.of(T, matches, CAMERA, huber=1.5), T)
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    for i in range(9):
+        point = T[:3, :3] @ matches.source_points[i] + T[:3, 3]
+        J_source = source_jacobian(T, matches.source_points[i][:, np.newaxis], CAMERA)[..., 0].T
+        covariance = J_source @ np.diag(matches.source_sigmas[i] ** 2) @ J_source.T
+        covariance += np.diag(matches.target_sigmas[i] ** 2)
+        r = matches.target_uvd[i] - project(point)
+        length = np.sqrt(r @ np.linalg.solve(covariance, r))
+        weighted = min(1.0, 1.5 / length) * np.linalg.inv(covariance)
+        J = pose_jacobian(point[:, np.newaxis], CAMERA)[..., 0].T
+        H += J.T @ weighted @ J
+        g += J.T @ weighted @ r
+    np.testing.assert_allclose(at.H, H, rtol=1e-7, atol=1e-7 * np.abs(H).max())
+    np.testing.assert_allclose(at.g, g, rtol=1e-7, atol=1e-7 * np.abs(g).max())
+    np.testing.assert_allclose(at.scores().sum(axis=1), at.g, rtol=1e-7, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_the_gate_counts_sigmas_of_the_residual(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = motion(rng)
+    residuals = StereoResiduals.of(T, random_matches(rng, T, 30), CAMERA, huber=1e9)
+    lengths = np.linalg.norm(linearize(residuals, T).r, axis=0)
+    gate = float(np.median(lengths)) + 1e-6
+    np.testing.assert_array_equal(residuals.within(T, gate), lengths < gate)
+    chosen = lengths < gate
+    np.testing.assert_array_equal(
+        linearize(residuals.select(chosen), T).r, linearize(residuals, T).r[:, chosen]
+    )
+
+
+def test_points_behind_the_camera_are_in_no_gate_and_have_no_derivative() -> None:
+    rng = np.random.default_rng(0)
+    matches = random_matches(rng, np.eye(4), 30)
+    back = se3.make_transform(np.eye(3), np.array([0.0, 0.0, -6.0]))
+    is_behind = matches.source_points[:, 2] < 6.0
+    assert 0 < is_behind.sum() < 30
+    residuals = StereoResiduals.of(back, matches, CAMERA, huber=2.8)
+    assert np.isfinite(residuals.columns).all()
+    np.testing.assert_array_equal(residuals.within(back, 1e9), ~is_behind)
+    assert isinstance(residuals.linearize(back), Failure)
