@@ -101,7 +101,7 @@ class KltConfig(Section):
         4, "the same where there is no prediction, or it led to nothing", ge=0, le=8
     )
     max_return_px: float = _parameter(
-        0.5, "how far from its corner a track may end when it is followed back", "px", gt=0
+        0.5, "the same: how far from its corner a track may end that is followed back", "px", gt=0
     )
     pixel_sigma_px: float = _parameter(0.15, "noise of a tracked pixel", "px", gt=0)
     disparity_sigma_px: float = _parameter(

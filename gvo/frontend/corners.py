@@ -42,16 +42,15 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
         Whole pixels (u, v), with room for the window that is tracked.
     """
     border = (config.window_radius_px + 1) // _REDUCTION + 1
-    shape = (image.shape[1] // _REDUCTION, image.shape[0] // _REDUCTION)
-    if min(shape) <= 2 * border:
+    if min(image.shape) // _REDUCTION <= 2 * border:
         return np.zeros((0, 2))
-    reduced = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
+    reduced = halve(image)
     scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
     neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
     is_corner = (scores == neighbours) & (scores > config.min_eigenvalue)
     # The indices of a flat array are found several times faster than those of two axes.
     found = np.flatnonzero(is_corner[border:-border, border:-border])
-    rows, columns = np.divmod(found, shape[0] - 2 * border)
+    rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)
     rows, columns = rows + border, columns + border
     responses = scores[rows, columns]
     pixels = _REDUCTION * np.column_stack([columns, rows])
@@ -70,8 +69,20 @@ def _best_of_cells(
     pixels: IntArray, responses: NDArray[Any], size_px: int, *, width: int
 ) -> IntArray:
     """Return the index of the strongest corner of each cell, sorted."""
-    cells = pixels[:, 1] // size_px * (width // size_px + 1) + pixels[:, 0] // size_px
-    order = np.lexsort((-responses, cells))
-    is_best = np.ones(len(order), dtype=np.bool_)
-    is_best[1:] = np.diff(cells[order]) > 0
-    return np.sort(order[is_best])
+    columns, rows = width // size_px + 1, int(pixels[:, 1].max(initial=0)) // size_px + 1
+    cells = pixels[:, 1] // size_px * columns + pixels[:, 0] // size_px
+    weakest_first = np.argsort(responses, kind="stable")
+    best = np.full(rows * columns, -1)
+    best[cells[weakest_first]] = weakest_first  # of several in a cell the last stays
+    return np.sort(best[best >= 0])
+
+
+def halve(image: ImageArray) -> ImageArray:
+    """Return an image of half the size, each pixel the mean of four; an odd edge is left out."""
+    height, width = (size // 2 for size in image.shape)
+    if min(height, width) == 0:
+        return image
+    # Of exactly twice the size OpenCV has a path that is ten times as fast as the general one.
+    even = image[: 2 * height, : 2 * width]
+    half = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(half, dtype=np.uint8)

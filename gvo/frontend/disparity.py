@@ -6,12 +6,15 @@ over all disparities in small images, then a fine one around what it gave.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
+from gvo.frontend.corners import halve
 from gvo.frontend.stereo import parabola_minimum
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -22,10 +25,9 @@ _COARSE_RADIUS_PX = 2
 _MIN_CORRELATION = 0.7
 # Grey values squared, over a patch: below this it is flat, and correlates with anything.
 _MIN_ENERGY = 50.0
-# Steps of the fine search after the parabola: the second moves by less than 0.01 pixels.
-_N_STEPS = 2
-# The same from a prediction: so many, each at most so long, the last one as good as none.
-_N_FOLLOWING_STEPS = 3
+# Steps of the fine search after the parabola: the last moves by less than 0.01 pixels.
+_N_STEPS = 3
+# The same from a prediction: each at most so long, the last one as good as none.
 _MAX_STEP_PX = 1.5
 _MAX_LAST_STEP_PX = 0.3
 # Fewer say nothing of the rows.
@@ -64,15 +66,15 @@ def search_disparities(
     correlations[disparities > columns[:, np.newaxis]] = -1.0  # left of the right image
     best = np.argmax(correlations, axis=1)
     is_found = correlations[np.arange(len(best)), best] > _MIN_CORRELATION
-    return float(_REDUCTION) * disparities[best], is_found
+    between, is_between = parabola_minimum(-correlations)
+    steps = n_steps - np.where(is_between, between, best)
+    return float(_REDUCTION) * steps, is_found
 
 
 def _reduce(image: ImageArray) -> NDArray[np.float32]:
     # Halved twice: a tenth of the time of a reduction by four.
     for _ in range(_N_HALVINGS):
-        height, width = image.shape
-        shape = (max(width // 2, 1), max(height // 2, 1))
-        image = np.asarray(cv2.resize(image, shape, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        image = halve(image)
     return image.astype(np.float32)
 
 
@@ -163,8 +165,10 @@ def measure_disparities(
     if config.subpixel == "none":
         found = np.rint(found)
     else:
+        left = _Patches.of(patches)
         for _ in range(_N_STEPS):
-            found = found + np.clip(_step_from(images[1], (patches, u, v_right), found), -0.5, 0.5)
+            steps = left.steps(_sample(images[1], u - found, v_right, radius, radius))
+            found = found + np.clip(steps, -0.5, 0.5)
     disparities[chosen] = found
     is_valid[chosen] = is_minimum
     return disparities, is_valid
@@ -176,14 +180,15 @@ def follow_disparities(
     predicted: FloatArray,
     config: StereoConfig,
     *,
+    n_steps: int,
     row_offset_px: float = 0.0,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels from predictions right to a pixel or two.
 
     As `measure_disparities`, by the Gauss-Newton steps alone, in half the time.
 
-    Parameters and results are those of `measure_disparities`; `is_valid` is False where the steps
-    do not come to rest.
+    Parameters and results are those of `measure_disparities`, but for `n_steps`, the number of
+    steps; `is_valid` is False where they do not come to rest.
     """
     if config.subpixel == "none":
         return measure_disparities(
@@ -201,11 +206,11 @@ def follow_disparities(
     if len(chosen) == 0:
         return disparities, is_valid
     u, v = pixels[chosen].T
-    patches = _sample(images[0], u, v, radius + 1, radius)
+    patches = _Patches.of(_sample(images[0], u, v, radius + 1, radius))
     found, step = predicted[chosen], np.zeros(len(chosen))
-    place = patches, u, v + row_offset_px
-    for _ in range(_N_FOLLOWING_STEPS):
-        step = np.clip(_step_from(images[1], place, found), -_MAX_STEP_PX, _MAX_STEP_PX)
+    for _ in range(n_steps):
+        right = _sample(images[1], u - found, v + row_offset_px, radius, radius)
+        step = np.clip(patches.steps(right), -_MAX_STEP_PX, _MAX_STEP_PX)
         found = found + step
     disparities[chosen] = found
     is_at_rest = np.abs(step) < _MAX_LAST_STEP_PX
@@ -247,35 +252,43 @@ def measure_row_shift(
     u, v = pixels.T
     # Transposed, a step along the rows becomes one across them.
     left = np.swapaxes(_sample(images[0], u, v, radius, radius + 1), 1, 2)
-    right = _sample(images[1], u - disparities, v + row_offset_px, radius, radius + 1)
-    steps = -_newton_step(left, np.swapaxes(right, 1, 2))
+    right = _sample(images[1], u - disparities, v + row_offset_px, radius, radius)
+    steps = -_Patches.of(left).steps(np.swapaxes(right, 1, 2))
     steps = steps[np.abs(steps) < _MAX_STEP_PX]
     return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
 
 
-def _step_from(
-    right: ImageArray,
-    patches_and_place: tuple[NDArray[np.float32], FloatArray, FloatArray],
-    disparities: FloatArray,
-) -> NDArray[np.float32]:
-    """Return the Gauss-Newton step of disparities; the patches are one wider on either side."""
-    patches, u, v = patches_and_place
-    radius = patches.shape[1] // 2
-    return _newton_step(patches, _sample(right, u - disparities, v, radius + 1, radius))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Patches:
+    """Patches of the left image, ready to be compared with those of the right one.
 
+    As in the inverse compositional way, the gradients are those of the patches that stay: they
+    are computed once. Their mean is taken off, so that a difference of exposure has no effect.
 
-def _newton_step(
-    patches_left: NDArray[np.float32], patches_right: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return the growth of disparity that makes patches alike (n, s, s + 2), along the row."""
-    n = len(patches_left)
-    both = patches_left + patches_right
-    gradients = 0.25 * (both[:, :, 2:] - both[:, :, :-2]).reshape(n, -1)
-    differences = (patches_right - patches_left)[:, :, 1:-1].reshape(n, -1)
-    differences = differences - differences.mean(axis=1, keepdims=True)
-    energies = np.einsum("ni,ni->n", gradients, gradients)
-    products = np.einsum("ni,ni->n", gradients, differences)
-    return np.asarray(products / np.maximum(energies, np.float32(_MIN_ENERGY)))
+    References
+    ----------
+    S. Baker, I. Matthews, "Lucas-Kanade 20 years on: a unifying framework", IJCV 56(3), 2004,
+    doi:10.1023/B:VISI.0000011205.11775.fd.
+    """
+
+    weights: NDArray[np.float32]
+    at_rest: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, wide: NDArray[np.float32]) -> _Patches:
+        """Make them of patches (n, s, s + 2) that are one column wider on either side."""
+        n = len(wide)
+        gradients = (0.5 * (wide[:, :, 2:] - wide[:, :, :-2])).reshape(n, -1)
+        gradients -= gradients.mean(axis=1, keepdims=True)
+        energies = np.einsum("ni,ni->n", gradients, gradients)
+        gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))[:, np.newaxis]
+        inner = wide[:, :, 1:-1].reshape(n, -1)
+        return cls(weights=gradients, at_rest=np.einsum("ni,ni->n", gradients, inner))
+
+    def steps(self, right: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the growth of disparity that makes patches of the right image (n, s, s) alike."""
+        flat = right.reshape(len(right), -1)
+        return np.asarray(np.einsum("ni,ni->n", self.weights, flat) - self.at_rest)
 
 
 def _have_room(

@@ -12,7 +12,6 @@ from gvo.config import Config
 from gvo.frontend.corners import detect_corners
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.disparity import (
-    COARSE_ERROR_PX,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
@@ -38,6 +37,9 @@ from gvo.types import (
 )
 
 _MIN_DEPTH_M = 1e-3
+# Steps to the disparity of a corner, from the coarse search, and of a track, from its prediction.
+_N_SEARCH_STEPS = 4
+_N_TRACK_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,6 +235,7 @@ class KltFrontend:
             predicted[:, :2],
             klt,
             n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
+            is_checked=is_wide,
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
         if isinstance(current.frame, RgbdFrame):
@@ -298,12 +301,12 @@ class KltFrontend:
     ) -> tuple[FloatArray, BoolArray]:
         farthest = float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
         rough, is_found = search_disparities((frame.left, frame.right), corners, farthest)
-        disparities, is_valid = measure_disparities(
+        disparities, is_valid = follow_disparities(
             (frame.left, frame.right),
             corners,
             rough,
             self._config.stereo,
-            reach_px=COARSE_ERROR_PX,
+            n_steps=_N_SEARCH_STEPS,
             row_offset_px=row_offset_px,
         )
         return disparities, is_found & is_valid
@@ -325,7 +328,12 @@ class KltFrontend:
             )
         else:
             disparities, is_valid = follow_disparities(
-                images, pixels, predicted, config, row_offset_px=row_offset_px
+                images,
+                pixels,
+                predicted,
+                config,
+                n_steps=_N_TRACK_STEPS,
+                row_offset_px=row_offset_px,
             )
         return disparities, is_valid & self._is_in_range(disparities - offset_px)
 

@@ -29,8 +29,9 @@ def track_pixels(
     config: KltConfig,
     *,
     n_levels: int,
+    is_checked: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Follow pixels by pyramidal Lucas-Kanade, there and back.
+    """Follow pixels by pyramidal Lucas-Kanade, and back where they are to be checked.
 
     Parameters
     ----------
@@ -44,23 +45,27 @@ def track_pixels(
         Window, largest distance between a pixel and where the way back ends.
     n_levels : int
         Levels of the pyramid above the image itself.
+    is_checked : bool
+        Drop a track that does not lead back. From a good prediction the residuals of the
+        registration tell wrong tracks as well, for nothing.
 
     Returns
     -------
     tracked : ndarray of float64, shape (n, 2)
         In the second image.
     is_tracked : ndarray of bool, shape (n,)
-        False where the search got lost, left the image, or does not lead back.
+        False where the search got lost, left the image, or was checked and does not lead back.
     """
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
     first, begin = pixels.astype(np.float32), start.astype(np.float32)
     tracked, is_found = _follow(images, first, begin, config, n_levels=n_levels)
-    back, is_back = _follow(images[::-1], tracked, first.copy(), config, n_levels=_BACK_LEVELS)
-    is_back &= np.linalg.norm(back - first, axis=1) <= config.max_return_px
+    if is_checked:
+        back, is_back = _follow(images[::-1], tracked, first.copy(), config, n_levels=_BACK_LEVELS)
+        is_found &= is_back & (np.linalg.norm(back - first, axis=1) <= config.max_return_px)
     height, width = images[1].shape
     is_inside = np.all((tracked >= 0) & (tracked <= [width - 1, height - 1]), axis=1)
-    return tracked.astype(np.float64), is_found & is_back & is_inside
+    return tracked.astype(np.float64), is_found & is_inside
 
 
 def _follow(

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.disparity import COARSE_ERROR_PX, measure_disparities, search_disparities
+from gvo.frontend.disparity import (
+    COARSE_ERROR_PX,
+    follow_disparities,
+    measure_disparities,
+    measure_row_shift,
+    search_disparities,
+)
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
 
@@ -115,3 +121,59 @@ def test_no_pixels_give_no_disparities() -> None:
     nothing = np.zeros((0, 2))
     assert search_disparities(pair(3.0), nothing, 50.0)[0].shape == (0,)
     assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG, reach_px=3)[0].shape == (0,)
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    disparity=st.floats(0.0, 20.0),
+    error=st.floats(-1.5, 1.5),
+    fraction=st.floats(0.0, 1.0),
+)
+def test_from_a_prediction_steps_alone_lead_to_the_same(
+    disparity: float, error: float, fraction: float
+) -> None:
+    pixels = grid() + fraction
+    predicted = np.full(len(pixels), disparity + error)
+    found, is_valid = follow_disparities(
+        pair(disparity, gain=0.95), pixels, predicted, CONFIG, n_steps=4
+    )
+    assert is_valid.mean() > 0.8
+    errors = found[is_valid] - disparity
+    assert abs(np.median(errors)) < 0.02
+    assert np.quantile(np.abs(errors), 0.9) < 0.08
+
+
+def test_steps_that_do_not_come_to_rest_are_no_answer() -> None:
+    predicted = np.full(len(grid()), 2.0)
+    _, is_valid = follow_disparities(pair(12.0), grid(), predicted, CONFIG, n_steps=3)
+    assert is_valid.mean() < 0.3
+    flat = np.full(SHAPE, 90, dtype=np.uint8)
+    found, is_valid = follow_disparities((flat, flat), grid(), predicted, CONFIG, n_steps=3)
+    np.testing.assert_array_equal(found, predicted)  # nothing moves it
+
+
+def test_whole_disparities_are_found_from_a_prediction_too() -> None:
+    config = StereoConfig(subpixel="none")
+    predicted = np.full(len(grid()), 6.0)
+    found, is_valid = follow_disparities(pair(7.3), grid(), predicted, config, n_steps=3)
+    np.testing.assert_array_equal(np.unique(found[is_valid]), [7.0])
+
+
+@pytest.mark.parametrize("shift", [-1.2, -0.4, 0.0, 0.3, 1.0])
+def test_rows_that_differ_are_measured_and_taken_off(shift: float) -> None:
+    images = image(), image(-7.3, shift)
+    pixels, known = grid(), 0.0
+    for _ in range(3):
+        found, is_valid = measure_disparities(
+            images, pixels, np.full(len(pixels), 7.0), CONFIG, reach_px=3, row_offset_px=known
+        )
+        left = measure_row_shift(
+            images, pixels[is_valid], found[is_valid], CONFIG, row_offset_px=known
+        )
+        assert left is not None
+        known += left
+    assert known == pytest.approx(shift, abs=0.03)
+
+
+def test_few_patches_say_nothing_of_rows() -> None:
+    assert measure_row_shift(pair(3.0), grid()[:20], np.full(20, 3.0), CONFIG) is None
