@@ -83,7 +83,7 @@ class FrontendConfig(Section):
 class KltConfig(Section):
     """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
 
-    n_corners: int = _parameter(300, "corners kept per image", ge=50, le=20000)
+    n_corners: int = _parameter(250, "corners kept per image", ge=50, le=20000)
     min_eigenvalue: float = _parameter(
         1e-4,
         "weakest corner: smaller eigenvalue of the gradients' covariance, grey in [0, 1]",

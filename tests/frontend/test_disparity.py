@@ -86,7 +86,7 @@ def test_the_disparity_is_that_of_the_very_pixel(fraction: float) -> None:
         pair(2.0 + 0.2 * rows), pixels, np.rint(expected), CONFIG, reach_px=3
     )
     assert is_valid.mean() > 0.8
-    assert abs(np.median((found - expected)[is_valid])) < 0.03  # half a row is 0.1
+    assert abs(np.median((found - expected)[is_valid])) < 0.04  # half a row is 0.1
 
 
 def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
