@@ -7,6 +7,7 @@ over all disparities in small images, then a fine one around what it gave.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -306,19 +307,22 @@ def _sample(
     image: ImageArray, u: FloatArray, v: FloatArray, radius_u: int, radius_v: int
 ) -> NDArray[np.float32]:
     """Return patches around pixels, interpolated, shape (n, 2 radius_v + 1, 2 radius_u + 1)."""
-    steps_u = np.arange(-radius_u, radius_u + 1, dtype=np.float32)
-    steps_v = np.arange(-radius_v, radius_v + 1, dtype=np.float32)
-    shape = (len(u), len(steps_v), len(steps_u))
-    columns = u.astype(np.float32)[:, np.newaxis, np.newaxis] + steps_u
-    rows = v.astype(np.float32)[:, np.newaxis, np.newaxis] + steps_v[:, np.newaxis]
+    steps_u, steps_v = _steps_around(radius_u, radius_v)
     patches = cv2.remap(
         image,
-        np.broadcast_to(columns, shape).reshape(len(u), -1),
-        np.broadcast_to(rows, shape).reshape(len(u), -1),
+        u.astype(np.float32)[:, np.newaxis] + steps_u,
+        v.astype(np.float32)[:, np.newaxis] + steps_v,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.asarray(patches.reshape(shape), dtype=np.float32)
+    return patches.astype(np.float32).reshape(len(u), 2 * radius_v + 1, 2 * radius_u + 1)
+
+
+@lru_cache(maxsize=32)
+def _steps_around(radius_u: int, radius_v: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the steps from the middle of a patch to its pixels, row by row."""
+    v, u = np.mgrid[-radius_v : radius_v + 1, -radius_u : radius_u + 1].astype(np.float32)
+    return u.ravel(), v.ravel()
 
 
 def _squared_differences(

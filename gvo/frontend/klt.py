@@ -136,7 +136,7 @@ class KltFrontend:
         self.camera = as_stereo(camera, config)
         self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
         self._config = config
-        self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 1 else None
+        self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
     def extract(self, frame: Frame) -> KltObservations:
         """Return a frame with its corners that are measured in 3-D.
