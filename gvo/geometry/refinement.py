@@ -184,7 +184,7 @@ def _with_covariance(
     covariance = H_inverse @ _spread(last, scale) @ H_inverse
     offset = None
     if with_offset:
-        offset = estimate_disparity_offset(T, residuals.source_points, last, residuals.camera)
+        offset = estimate_disparity_offset(T, residuals, last)
     return Refinement(
         T_target_source=T,
         covariance=0.5 * (covariance + covariance.T),

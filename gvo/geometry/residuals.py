@@ -125,10 +125,10 @@ class StereoResiduals:
 
     Parameters
     ----------
-    columns : ndarray of float64, shape (12, n)
-        Points in the source frame, (u, v, disparity) in the target frame, and the lower
-        triangle (00, 10, 11, 20, 21, 22) of the factor W with W^T W the inverse covariance of
-        the residual.
+    columns : ndarray of float64, shape (15, n)
+        Points in the source frame, (u, v, disparity) in the target frame, the lower triangle
+        (00, 10, 11, 20, 21, 22) of the factor W with W^T W the inverse covariance of the
+        residual, and the variances of (u, v, disparity) in the source frame.
     camera : StereoCamera
     huber : float
         Threshold of the robust kernel, sigmas.
@@ -146,18 +146,45 @@ class StereoResiduals:
 
         It is not carried again: it changes by far less than it is known.
         """
-        columns = np.empty((12, len(matches)))
+        columns = np.empty((15, len(matches)))
         columns[:3] = matches.source_points.T
         columns[3:6] = matches.target_uvd.T
+        columns[12:] = matches.source_sigmas.T**2
         J = source_jacobian(T, columns[:3], camera)
         J *= matches.source_sigmas.T[:, np.newaxis]
-        _write_factors(columns[6:], J, matches.target_sigmas.T**2)
+        _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
         return cls(columns=columns, camera=camera, huber=huber)
 
     @property
     def source_points(self) -> FloatArray:
         """Points in the source frame, shape (3, n), metres."""
         return self.columns[:3]
+
+    def settled_points(self, T: FloatArray, at: Linearization) -> FloatArray:
+        """Return the source points where both frames together see them, shape (3, n), metres.
+
+        What the source measured is moved by its share of the residual. So moved, points do not
+        lean to the side of their own residuals, as measured ones do.
+
+        Parameters
+        ----------
+        T : ndarray of float64, shape (4, 4)
+            T_target_source.
+        at : Linearization
+            At that pose.
+        """
+        f, r = at.factors, at.r
+        back = np.stack([f[0] * r[0] + f[1] * r[1] + f[3] * r[2], f[2] * r[1] + f[4] * r[2]])
+        back = np.concatenate([back, [f[5] * r[2]]])  # W^T W times the residual
+        shift = np.einsum("kin,in->kn", source_jacobian(T, self.source_points, self.camera), back)
+        shift *= self.columns[12:]
+        camera, (x, y, z) = self.camera, self.source_points
+        disparity = camera.fx * camera.baseline / z
+        moved = np.maximum(disparity + shift[2], 0.5 * disparity)
+        z_moved = camera.fx * camera.baseline / moved
+        x_moved = (x / z + shift[0] / camera.fx) * z_moved
+        y_moved = (y / z + shift[1] / camera.fy) * z_moved
+        return np.stack([x_moved, y_moved, z_moved])
 
     def select(self, chosen: BoolArray) -> StereoResiduals:
         """Return those of some matches."""
@@ -171,7 +198,7 @@ class StereoResiduals:
             return Failure(reason="the motion puts points behind the camera")
         r, squared = self._whitened(points)
         roots = np.sqrt(self.huber / np.maximum(np.sqrt(squared), self.huber))
-        factors = self.columns[6:] * roots
+        factors = self.columns[6:12] * roots
         r *= roots
         J = pose_jacobian(points, self.camera)
         whiten_in_place(factors, J)
@@ -194,7 +221,7 @@ class StereoResiduals:
         r[0] -= points[0] * scaled + camera.cx
         r[1] -= points[1] * scaled * (camera.fy / camera.fx) + camera.cy
         r[2] -= camera.baseline * scaled
-        whiten_in_place(self.columns[6:], r)
+        whiten_in_place(self.columns[6:12], r)
         return r, r[0] ** 2 + r[1] ** 2 + r[2] ** 2
 
 
