@@ -10,7 +10,7 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.corners import detect_corners
-from gvo.frontend.descriptor import as_stereo
+from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.disparity import (
     follow_disparities,
     measure_disparities,
@@ -31,6 +31,7 @@ from gvo.types import (
     Frame,
     ImageArray,
     IntArray,
+    Observations,
     RelativePose,
     RgbdFrame,
     StereoFrame,
@@ -40,6 +41,8 @@ _MIN_DEPTH_M = 1e-3
 # Steps to the disparity of a corner, from the coarse search, and of a track, from its prediction.
 _N_SEARCH_STEPS = 4
 _N_TRACK_STEPS = 3
+# Frames whose descriptors are kept, in case that the next one needs them too.
+_N_DESCRIBED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,6 +139,8 @@ class KltFrontend:
         self.camera = as_stereo(camera, config)
         self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
         self._config = config
+        self._descriptors = DescriptorFrontend(camera, config)
+        self._described: dict[int, Observations] = {}
         self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
     def extract(self, frame: Frame) -> KltObservations:
@@ -194,8 +199,8 @@ class KltFrontend:
         prior : ndarray of float64, shape (4, 4), optional
             Predicted T_reference_current; tracks start at the pixels it predicts. Without it
             they start at the previous pixels. Then, and where the prediction leads to nothing,
-            more levels of the pyramid are searched, and what this gives is the prediction of
-            a second round.
+            more levels of the pyramid are searched, without a prediction descriptors are matched
+            as well, and what this gives is the prediction of a second round.
 
         Returns
         -------
@@ -208,6 +213,8 @@ class KltFrontend:
         if not result:
             start = np.eye(4) if prior is None else prior
             rough = self._register_from(start, reference, current, is_wide=True)
+            if isinstance(rough, Failure) and prior is None:
+                rough = self._register_descriptors(reference, current)
             if isinstance(rough, Failure):
                 return rough
             result = self._register_from(rough.T_reference_current, reference, current)
@@ -216,6 +223,21 @@ class KltFrontend:
             row_shift_px = reference.find_corners().row_shift_px
             self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
         return result
+
+    def _register_descriptors(
+        self, reference: KltObservations, current: KltObservations
+    ) -> RelativePose | Failure:
+        """Register by descriptors, which find corners again that moved too far for a track."""
+        result = self._descriptors.register(self._describe(reference), self._describe(current))
+        for stamp_ns in sorted(self._described)[:-_N_DESCRIBED]:
+            del self._described[stamp_ns]
+        return result
+
+    def _describe(self, observations: KltObservations) -> Observations:
+        stamp_ns = observations.stamp_ns
+        if stamp_ns not in self._described:
+            self._described[stamp_ns] = self._descriptors.extract(observations.frame)
+        return self._described[stamp_ns]
 
     def _register_from(
         self,
