@@ -28,6 +28,7 @@ class EdgeChain:
         self._poses: dict[FrameId, Estimate] = {}
         self._newest: Estimate | None = None
         self._velocity: FloatArray | None = None
+        self._coasted_s = 0.0
         self._status = StatusClock(config.lost_after_s)
 
     def __len__(self) -> int:
@@ -79,13 +80,16 @@ class EdgeChain:
             T, covariance = _compose(
                 self._poses[edge.reference_id], edge.T_reference_frame, edge.covariance
             )
-            step = se3.invert(newest.T_world_cam) @ T
-            self._velocity = se3.log(step) / elapsed_s if elapsed_s > 0 else None
+            T_newest_frame = se3.invert(newest.T_world_cam) @ T
+            self._velocity = se3.log(T_newest_frame) / elapsed_s if elapsed_s > 0 else None
+            self._coasted_s = 0.0
             return T, covariance, True
         if isinstance(prior, PosePrior):
-            self._velocity = None
+            self._velocity, self._coasted_s = None, 0.0
             return prior.T_world_frame, prior.covariance, True
-        return *_compose(newest, *predict_step(self._velocity, elapsed_s, self._config)), False
+        step = predict_step(self._velocity, elapsed_s, self._config, coasted_s=self._coasted_s)
+        self._coasted_s += elapsed_s
+        return *_compose(newest, *step), False
 
     def _usable(self, edges: Sequence[Edge]) -> Edge | None:
         known = [edge for edge in edges if edge.reference_id in self._poses]

@@ -69,6 +69,24 @@ def test_without_an_edge_the_last_velocity_goes_on() -> None:
     assert chain.advance(causal(3), [edge(2, step)], None).status is Status.RESUMED
 
 
+def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
+    sigmas = []
+    for n_steps in (1, 10):
+        chain = EdgeChain(WindowConfig())
+        chain.advance(causal(0), [], None)
+        chain.advance(causal(1), [edge(0, np.eye(4))], None)
+        for step in range(1, n_steps + 1):
+            late = Estimate(
+                stamp_ns=SECOND + step * SECOND // n_steps,
+                T_world_cam=np.eye(4),
+                covariance=1e-10 * np.eye(6),
+                frame_id=1 + step,
+            )
+            raw = chain.advance(late, [], None)
+        sigmas.append(np.sqrt(raw.covariance[0, 0]))
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.01)
+
+
 def test_without_an_edge_a_known_pose_begins_the_chain_anew() -> None:
     chain = EdgeChain(WindowConfig())
     chain.advance(causal(0), [], None)
