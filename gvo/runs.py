@@ -405,13 +405,17 @@ def _summary(
         "unpaired_images": tally.n_unpaired,
         "window": asdict(tally.window),
         "polish": None if tally.polish is None else tally.polish.as_json(),
-        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
+        "rig_offsets": _offsets_json(tally.rig_offsets),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],
         "warnings": warnings,
         "configuration": config.model_dump(),
     }
+
+
+def _offsets_json(offsets: RigOffsets | None) -> dict[str, float] | None:
+    return offsets.as_json() if offsets is not None and offsets.is_learning else None
 
 
 def peak_memory_mb() -> float:
