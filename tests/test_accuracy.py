@@ -40,11 +40,11 @@ class Limits:
 # Recorded starts, then rendered ones of the worlds and sensors that they are named after. Their
 # errors are printed by scripts/benchmark.py, and in the message of a limit that is exceeded.
 LIMITS = {
-    KITTI: Limits(raw_ate_m=0.034, smoothed_ate_m=0.034, t_pct=0.82, path_error=0.002),
-    EUROC: Limits(raw_ate_m=0.0054, smoothed_ate_m=0.0052),
+    KITTI: Limits(raw_ate_m=0.033, smoothed_ate_m=0.031, t_pct=0.85, path_error=0.002),
+    EUROC: Limits(raw_ate_m=0.0051, smoothed_ate_m=0.0051),
     XYZ: Limits(raw_ate_m=0.0136, smoothed_ate_m=0.0120),
-    ROOM: Limits(raw_ate_m=0.032, smoothed_ate_m=0.0267, gain=0.95),
-    DRIVE: Limits(raw_ate_m=0.0124, smoothed_ate_m=0.0127, t_pct=0.12, path_error=0.001),
+    ROOM: Limits(raw_ate_m=0.029, smoothed_ate_m=0.0253, gain=0.95),
+    DRIVE: Limits(raw_ate_m=0.022, smoothed_ate_m=0.0215, t_pct=0.185, path_error=0.0013),
     HAND: Limits(raw_ate_m=0.0043, smoothed_ate_m=0.0015, gain=0.95),
     HAND_RGBD: Limits(raw_ate_m=0.0024, smoothed_ate_m=0.0026),
 }
