@@ -10,6 +10,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.disparity_offset import DisparityOffset
 from gvo.geometry.refinement import Refinement, refine_pose
+from gvo.geometry.residuals import Linearization, StereoResiduals
 from gvo.types import FloatArray
 
 CAMERA = StereoCamera(fx=700.0, fy=690.0, cx=600.0, cy=180.0, width=1226, height=370, baseline=0.5)
@@ -130,3 +131,17 @@ def test_a_camera_at_rest_says_nothing_of_the_offset() -> None:
         target_sigmas=matches.target_sigmas,
     )
     assert refine(np.eye(4), same).offset is None
+
+
+def test_settled_points_do_not_lean_to_their_own_residuals() -> None:
+    T, matches = drive(11, 0.0)
+    residuals = StereoResiduals.of(T, matches, CAMERA, huber=100.0)
+    at = residuals.linearize(T)
+    assert isinstance(at, Linearization)
+    truth = 350 / drive(11, 0.0, noise=0.0)[1].source_points[:, 2]
+    settled = 350 / residuals.settled_points(T, at)[2]
+    errors = {"measured": matches.source_uvd[:, 2] - truth, "settled": settled - truth}
+    leanings = {name: np.corrcoef(error, at.r[2])[0, 1] for name, error in errors.items()}
+    assert abs(leanings["measured"]) > 0.4
+    assert abs(leanings["settled"]) < 0.15
+    assert np.std(errors["settled"]) < np.std(errors["measured"])
