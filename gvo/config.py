@@ -108,7 +108,7 @@ class KltConfig(Section):
         0.15, "noise of the disparity of a corner or a track, for stereo", "px", gt=0
     )
     sigma_factor: float = _parameter(
-        2.2, "factor on the sigmas of a registration: neighbouring tracks share their errors", gt=0
+        3.1, "factor on the sigmas of a registration: neighbouring tracks share their errors", gt=0
     )
 
 
@@ -198,7 +198,7 @@ class RegistrationConfig(Section):
     )
     pixel_sigma_px: float = _parameter(0.7, "noise of a keypoint's pixel", "px", gt=0)
     sigma_factor: float = _parameter(
-        1.28, "factor on the sigmas of a registration: matches share errors residuals hide", gt=0
+        1.2, "factor on the sigmas of a registration: matches share errors residuals hide", gt=0
     )
 
 
@@ -217,7 +217,7 @@ class WindowConfig(Section):
         0.9, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1
     )
     link_sigma_factor: float = _parameter(
-        2.0, "factor on the sigmas of links to keyframes: a frame's links share its noise", gt=0
+        2.5, "factor on the sigmas of links to keyframes: a frame's links share its noise", gt=0
     )
     keyframe_distance_m: float = _parameter(
         1.0, "a frame this far from all keyframes becomes one, where no overlap is known", "m", gt=0

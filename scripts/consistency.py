@@ -25,7 +25,11 @@ from gvo.geometry import se3
 from gvo.sources.recording import Source
 from gvo.types import FaultyFrame, FloatArray
 
-WORLDS = {"drive": ("driving", "stereo", 80), "room": ("handheld", "rgbd", 120)}
+WORLDS = {
+    "drive": ("driving", "stereo", 80),
+    "room": ("handheld", "rgbd", 120),
+    "stereo_room": ("handheld", "stereo", 120),
+}
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 SPAN_NS = 1_000_000_000
 

@@ -31,6 +31,10 @@ _N_STEPS = 3
 # The same from a prediction: each at most so long, the last one as good as none.
 _MAX_STEP_PX = 1.5
 _MAX_LAST_STEP_PX = 0.3
+# What left and right may differ by at a point that both see: of the variance of the patch this
+# share, and the noise of the pixels, grey values squared.
+_MAX_UNLIKE = 0.2
+_UNLIKE_NOISE = 18.0
 # Fewer say nothing of the rows.
 _MIN_ROW_SHIFTS = 50
 # What the coarse search leaves open on either side, in pixels of the full image.
@@ -218,6 +222,50 @@ def follow_disparities(
     is_near = np.abs(found - predicted[chosen]) < config.search_radius_px
     is_valid[chosen] = is_at_rest & is_near
     return disparities, is_valid
+
+
+def are_alike(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    disparities: FloatArray,
+    config: StereoConfig,
+    *,
+    row_offset_px: float = 0.0,
+) -> BoolArray:
+    """Tell whether left and right show the same at pixels and their disparities.
+
+    Where the depth breaks within a patch, its parts differ by more than one disparity aligns: the
+    disparity is that of neither surface. The error stays with the corner from frame to frame, so
+    that no residual shows it, and motions add it up.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+        Rectified left and right.
+    pixels : ndarray of float64, shape (n, 2)
+        In the left image.
+    disparities : ndarray of float64, shape (n,)
+        Measured ones; False where they are not a number.
+    config : StereoConfig
+        Size of the patches.
+    row_offset_px : float
+        By how much rows of the right image are larger.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    radius = config.patch_radius_px
+    is_alike = np.isfinite(disparities)
+    chosen = np.flatnonzero(is_alike)
+    if len(chosen) == 0:
+        return is_alike
+    u, v = pixels[chosen].T
+    left = _sample(images[0], u, v, radius, radius)
+    right = _sample(images[1], u - disparities[chosen], v + row_offset_px, radius, radius)
+    limits = _MAX_UNLIKE * left.var(axis=(1, 2)) + _UNLIKE_NOISE
+    is_alike[chosen] = (right - left).var(axis=(1, 2)) <= limits
+    return is_alike
 
 
 def measure_row_shift(

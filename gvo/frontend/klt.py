@@ -12,6 +12,7 @@ from gvo.config import Config
 from gvo.frontend.corners import detect_corners
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.disparity import (
+    are_alike,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
@@ -331,7 +332,15 @@ class KltFrontend:
             n_steps=_N_SEARCH_STEPS,
             row_offset_px=row_offset_px,
         )
-        return disparities, is_found & is_valid
+        is_valid &= is_found
+        is_valid[is_valid] = are_alike(
+            (frame.left, frame.right),
+            corners[is_valid],
+            disparities[is_valid],
+            self._config.stereo,
+            row_offset_px=row_offset_px,
+        )
+        return disparities, is_valid
 
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool

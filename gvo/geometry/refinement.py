@@ -1,8 +1,8 @@
 """Robust Gauss-Newton of a relative pose over stereo reprojection residuals.
 
-The covariance is H^-1 S H^-1 with S the spread that the matches' gradients show, not the one
-that their sigmas promise. A common scale would not do: where disparities are better than stated
-and pixels are not, it calls the pixels better as well.
+The covariance is A^-1 S A^-1 with A the second derivative of the robust cost and S the spread that
+the matches' gradients show, not the one that their sigmas promise. A common scale would not do:
+where disparities are better than stated and pixels are not, it calls the pixels better as well.
 
 References
 ----------
@@ -40,6 +40,9 @@ _MIN_SCALE = 0.1
 # The spread of the scores of few matches is itself uncertain: so many more stand in with the
 # spread that the sigmas promise. Without them 12 matches give an NEES of 3 where 1 is due.
 _N_PROMISED = 24
+# Where long residuals are all that holds a direction, their curvature is no measure of it: no more
+# variance than so many times that of the weights.
+_MAX_LOSS = 10.0
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
 _IDENTITY = np.eye(6)
@@ -181,7 +184,8 @@ def _with_covariance(
     if info != 0 or not np.all(inflation < _MAX_INFLATION):
         return Failure(reason=_OPEN)
     scale = _scale(last)
-    covariance = H_inverse @ _spread(last, scale) @ H_inverse
+    sensitivity = _sensitivity(last, H_inverse, residuals.huber)
+    covariance = sensitivity @ _spread(last, scale) @ sensitivity.T
     offset = None
     if with_offset:
         offset = estimate_disparity_offset(T, residuals, last)
@@ -192,6 +196,20 @@ def _with_covariance(
         scale=scale,
         offset=offset,
     )
+
+
+def _sensitivity(at: Linearization, H_inverse: FloatArray, huber: float) -> FloatArray:
+    """Return the inverse second derivative of the robust cost: how far a gradient moves the pose.
+
+    Beyond its threshold a residual pulls with the same force however long it is, so that along it
+    the cost does not curve. The weights of H say that it does; H alone calls the pose too sure.
+    """
+    squares = at.r[0] ** 2 + at.r[1] ** 2 + at.r[2] ** 2
+    far = np.flatnonzero(squares > huber**2)
+    pulls = np.einsum("kin,in->kn", at.J[:, :, far], at.r[:, far]) / np.sqrt(squares[far])
+    _, inverse, info = dposv(at.H - pulls @ pulls.T, _IDENTITY)
+    is_sane = info == 0 and np.all(np.diagonal(inverse) < _MAX_LOSS * np.diagonal(H_inverse))
+    return np.asarray(inverse) if is_sane else H_inverse
 
 
 def _scale(at: Linearization) -> float:
