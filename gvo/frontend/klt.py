@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,8 +15,9 @@ from gvo.frontend.disparity import (
     follow_disparities,
     measure_disparities,
     measure_row_shift,
-    search_disparities,
 )
+from gvo.frontend.disparity_search import search_disparities
+from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
 from gvo.frontend.rgbd import sample_depth
@@ -30,7 +30,6 @@ from gvo.types import (
     Failure,
     FloatArray,
     Frame,
-    ImageArray,
     IntArray,
     Observations,
     RelativePose,
@@ -44,81 +43,6 @@ _N_SEARCH_STEPS = 4
 _N_TRACK_STEPS = 3
 # Frames whose descriptors are kept, in case that the next one needs them too.
 _N_DESCRIBED = 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KltCorners:
-    """The corners of a frame that are measured in 3-D.
-
-    Parameters
-    ----------
-    keypoints : ndarray of float64, shape (n, 2)
-        Pixels (u, v) in the left or colour image.
-    disparities : ndarray of float64, shape (n,)
-        Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
-    points_cam : ndarray of float64, shape (n, 3)
-        Points in the `cam` frame, metres, by what was known of the disparities' offset then.
-    n_keypoints : int
-        Corners detected, measured or not.
-    row_shift_px : float or None
-        By how much the rows of left and right still differ; None where that is not known.
-    """
-
-    keypoints: FloatArray
-    disparities: FloatArray
-    points_cam: FloatArray
-    n_keypoints: int
-    row_shift_px: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KltObservations:
-    """A frame that others' corners are followed into, and its own corners.
-
-    Parameters
-    ----------
-    frame : StereoFrame or RgbdFrame
-    find_corners : callable
-        Returns its KltCorners. They may still be looked for on another thread: only when the
-        next frame comes are they needed.
-    """
-
-    frame: Frame
-    find_corners: Callable[[], KltCorners]
-
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame, nanoseconds."""
-        return self.frame.stamp_ns
-
-    @property
-    def image(self) -> ImageArray:
-        """The image that is tracked in, left or colour."""
-        return _image_of(self.frame)
-
-    @property
-    def keypoints(self) -> FloatArray:
-        """Pixels (u, v) of the corners, shape (n, 2)."""
-        return self.find_corners().keypoints
-
-    @property
-    def disparities(self) -> FloatArray:
-        """Disparities of the corners as measured, shape (n,)."""
-        return self.find_corners().disparities
-
-    @property
-    def points_cam(self) -> FloatArray:
-        """The corners as points in the `cam` frame, metres, shape (n, 3)."""
-        return self.find_corners().points_cam
-
-    @property
-    def n_keypoints(self) -> int:
-        """Corners detected, measured or not."""
-        return self.find_corners().n_keypoints
-
-    def __len__(self) -> int:
-        """Return the number of points."""
-        return len(self.keypoints)
 
 
 class KltFrontend:
@@ -161,7 +85,7 @@ class KltFrontend:
         return KltObservations(frame=frame, find_corners=lambda: corners)
 
     def _find_corners(self, frame: Frame, offset_px: float, row_offset_px: float) -> KltCorners:
-        corners = detect_corners(_image_of(frame), self._config.klt)
+        corners = detect_corners(image_of(frame), self._config.klt)
         row_shift_px = None
         if isinstance(frame, StereoFrame):
             disparities, is_valid = self._search_stereo(frame, corners, row_offset_px)
@@ -377,7 +301,3 @@ class KltFrontend:
     def _measure_depth(self, frame: RgbdFrame, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         depths, is_valid = sample_depth(frame.depth, pixels, self._config.depth)
         return self.camera.depth_to_disparity(np.where(is_valid, depths, np.nan)), is_valid
-
-
-def _image_of(frame: Frame) -> ImageArray:
-    return frame.left if isinstance(frame, StereoFrame) else frame.image

@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
 from gvo.frontend.disparity import (
-    COARSE_ERROR_PX,
     are_alike,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
-    search_disparities,
 )
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
@@ -24,27 +22,8 @@ def pair(disparity: FloatArray | float, **right: float) -> tuple[ImageArray, Ima
     return image(), image(-disparity, **right)
 
 
-@settings(deadline=None, max_examples=10)
-@given(disparity=st.floats(0.0, 60.0))
-def test_the_coarse_search_finds_any_disparity_to_a_few_pixels(disparity: float) -> None:
-    pixels = grid(border=12)
-    pixels = pixels[pixels[:, 0] > disparity + 14]
-    found, is_found = search_disparities(pair(disparity), pixels, 70.0)
-    assert is_found.mean() > 0.9
-    is_near = np.abs(found - disparity) <= COARSE_ERROR_PX
-    assert is_near[is_found].mean() > 0.9
-
-
-def test_the_coarse_search_does_not_leave_the_image() -> None:
-    found, _ = search_disparities(pair(20.0), grid(border=0), 1000.0)
-    assert np.all(found <= grid(border=0)[:, 0] + COARSE_ERROR_PX)
-    assert np.all(found >= 0)
-
-
 def test_flat_images_hold_no_disparities() -> None:
     flat = np.full(SHAPE, 90, dtype=np.uint8)
-    _, is_found = search_disparities((flat, flat), grid(), 50.0)
-    assert not is_found.any()
     _, is_valid = measure_disparities(
         (flat, flat), grid(), np.full(len(grid()), 5.0), CONFIG, reach_px=3
     )
@@ -114,13 +93,11 @@ def test_patches_that_leave_an_image_are_not_measured(pixel: tuple[float, float]
 def test_images_smaller_than_a_patch_give_nothing(shape: tuple[int, int]) -> None:
     tiny = np.zeros(shape, dtype=np.uint8)
     pixels = np.array([[1.0, 1.0]])
-    assert not search_disparities((tiny, tiny), pixels, 50.0)[1].any()
     assert not measure_disparities((tiny, tiny), pixels, np.ones(1), CONFIG, reach_px=3)[1].any()
 
 
 def test_no_pixels_give_no_disparities() -> None:
     nothing = np.zeros((0, 2))
-    assert search_disparities(pair(3.0), nothing, 50.0)[0].shape == (0,)
     assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG, reach_px=3)[0].shape == (0,)
 
 
