@@ -477,7 +477,7 @@ def test_a_creeping_camera_is_not_frozen() -> None:
     results, smoothed = walk(steps, config)
     true_length = float(steps[-1] * np.hypot(1.0, 0.5))
     went = np.linalg.norm(smoothed[-1].T_world_cam[:3, 3])
-    assert went == pytest.approx(true_length, rel=0.04)
+    assert went == pytest.approx(true_length, rel=0.06)
     assert path_length(smoothed) > 0.98 * true_length  # noise lengthens a path
     off, _ = walk(steps, configure_klt(zero_motion=False))
     assert sum(r.n_links for r in results) == sum(r.n_links for r in off)

@@ -219,7 +219,7 @@ def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at(kind:
     assert measured.returncode == 0, measured.stderr
     rows = [line.split() for line in measured.stdout.splitlines()[1:]]
     assert [row[:2] for row in rows] == [
-        [w, k] for w in ("drive", "room") for k in ("raw", "window")
+        [w, k] for w in ("drive", "room", "stereo_room") for k in ("raw", "window")
     ]
     for row in rows:
         n_pairs, rotation, translation = int(row[2]), float(row[3]), float(row[4])

@@ -16,7 +16,7 @@ from gvo.config import KltConfig
 from gvo.types import BoolArray, FloatArray, ImageArray
 
 _MAX_ITERATIONS = 10
-_MIN_STEP_PX = 0.02
+_MIN_STEP_PX = 0.01
 # The way back starts at its goal and needs no pyramid: a track that went astray does not find
 # the first corner in what it sees.
 _BACK_LEVELS = 0
