@@ -118,9 +118,9 @@ class Odometry:
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
-        """What was learnt of a stereo rig; None of other sensors."""
+        """What is learnt of a stereo rig; None where nothing is."""
         offsets = getattr(self._frontend, "rig_offsets", None)
-        return offsets if isinstance(offsets, RigOffsets) else None
+        return offsets if isinstance(offsets, RigOffsets) and offsets.is_learning else None
 
     def track(self, frame: Stamped) -> FrameResult:
         """Take the next frame and return its poses.

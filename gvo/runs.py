@@ -199,7 +199,7 @@ def run_recording(
     )
     with (
         RunFolder(Path(out), watch=None if comparison is None else comparison.add) as folder,
-        _one_opencv_thread(),
+        one_opencv_thread(),
     ):
         try:
             for item in _read_frames(source, config, tally):
@@ -241,8 +241,8 @@ def read_ground_truth(path: str | Path) -> Trajectory:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV from splitting single calls over threads.
+def one_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV, inside the context, from splitting single calls over threads.
 
     Images are worked on side by side already; splitting the small ones as well costs a tenth more
     CPU time and gains nothing.
@@ -405,17 +405,13 @@ def _summary(
         "unpaired_images": tally.n_unpaired,
         "window": asdict(tally.window),
         "polish": None if tally.polish is None else tally.polish.as_json(),
-        "rig_offsets": _offsets_json(tally.rig_offsets),
+        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],
         "warnings": warnings,
         "configuration": config.model_dump(),
     }
-
-
-def _offsets_json(offsets: RigOffsets | None) -> dict[str, float] | None:
-    return offsets.as_json() if offsets is not None and offsets.is_learning else None
 
 
 def peak_memory_mb() -> float:

@@ -20,7 +20,7 @@ import numpy as np
 
 import gvo
 from gvo.config import FrontendConfig
-from gvo.runs import Progress, peak_memory_mb
+from gvo.runs import Progress, one_opencv_thread, peak_memory_mb
 from gvo.sources.recording import Sensor, Source
 from gvo.types import FaultyFrame, Frame
 
@@ -205,9 +205,8 @@ def yardstick_ms(source: Source, settings: Sequence[str]) -> float:
     """
     alone = gvo.load_configuration(settings=[*settings, "runtime.threads=1"])
     orb = cv2.ORB_create(nfeatures=2000, nlevels=8)  # type: ignore[attr-defined]
-    n_threads, n_frames = cv2.getNumThreads(), 0
-    cv2.setNumThreads(1)
-    try:
+    n_frames = 0
+    with one_opencv_thread():
         for frame in islice(usable_frames(source, alone), N_WARM_UP):
             _detect(orb, frame)
         start = time.process_time()
@@ -215,8 +214,6 @@ def yardstick_ms(source: Source, settings: Sequence[str]) -> float:
             _detect(orb, frame)
             n_frames += 1
         return 1e3 * (time.process_time() - start) / n_frames
-    finally:
-        cv2.setNumThreads(n_threads)
 
 
 def _detect(orb: cv2.Feature2D, frame: Frame) -> None:

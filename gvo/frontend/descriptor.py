@@ -12,7 +12,7 @@ from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.stereo import match_stereo, refine_disparities
+from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparities
 from gvo.frontend.temporal import match_temporal, predict_pixels
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -40,7 +40,7 @@ class DescriptorFrontend:
 
     def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
         self.camera = as_stereo(camera, config)
-        self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
+        self.rig_offsets = RigOffsets(config.stereo, is_stereo=isinstance(camera, StereoCamera))
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
@@ -52,8 +52,7 @@ class DescriptorFrontend:
         ----------
         frame : StereoFrame or RgbdFrame
         """
-        if self.rig_offsets is not None:
-            self.rig_offsets.advance()
+        self.rig_offsets.advance()
         if isinstance(frame, StereoFrame):
             return self._extract_stereo(frame)
         return self._extract_rgbd(frame)
@@ -73,10 +72,7 @@ class DescriptorFrontend:
             right.keypoints[pairs[:, 1]],
             config,
         )
-        true = disparities - self._offset_px()
-        depths = self.camera.disparity_to_depth(np.where(true > 0, true, np.nan))
-        with np.errstate(invalid="ignore"):
-            is_valid &= (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
+        is_valid &= is_in_depth_range(disparities - self._offset_px(), self.camera, config)
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
 
     def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
@@ -141,7 +137,7 @@ class DescriptorFrontend:
         return result
 
     def _offset_px(self) -> float:
-        return 0.0 if self.rig_offsets is None else self.rig_offsets.disparity.value_px
+        return self.rig_offsets.disparity.value_px
 
     def _register_within(
         self,
@@ -165,12 +161,11 @@ class DescriptorFrontend:
             self._config,
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=prior,
-            with_offset=self.rig_offsets is not None,
+            with_offset=self.rig_offsets.is_learning,
         )
         if isinstance(result, Failure):
             return result
-        if self.rig_offsets is not None:
-            self.rig_offsets.note(result, current.stamp_ns)
+        self.rig_offsets.note(result, current.stamp_ns)
         factor = self._config.registration.sigma_factor
         return replace(result, covariance=factor**2 * result.covariance)
 

@@ -6,6 +6,8 @@ No keypoints of the right image are needed, so that any pixel can be measured, a
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,6 +23,7 @@ from gvo.types import BoolArray, FloatArray, ImageArray
 _MIN_ENERGY = 50.0
 # Steps of the fine search after the parabola: the last moves by less than 0.01 pixels.
 _N_STEPS = 3
+_MAX_FINE_STEP_PX = 0.5
 # The same from a prediction: each at most so long, the last one as good as none.
 _MAX_STEP_PX = 1.5
 _MAX_LAST_STEP_PX = 0.3
@@ -70,27 +73,20 @@ def measure_disparities(
         False where a patch leaves the image or the best step is the last one searched.
     """
     radius = config.patch_radius_px
-    disparities = np.full(len(pixels), np.nan)
-    is_valid = _have_room(images[0].shape, pixels, predicted, radius)
-    chosen = np.flatnonzero(is_valid)
-    if len(chosen) == 0:
-        return disparities, is_valid
-    u, v = pixels[chosen].T
-    patches = _sample(images[0], u, v, radius + 1, radius)
-    v_right = v + row_offset_px
-    strips = _sample(images[1], u - predicted[chosen], v_right, radius + reach_px, radius)
-    offsets, is_minimum = parabola_minimum(_squared_differences(patches[:, :, 1:-1], strips))
-    found = predicted[chosen] - (offsets - reach_px)
-    if config.subpixel == "none":
-        found = np.rint(found)
-    else:
-        left = _Patches.of(patches)
-        for _ in range(_N_STEPS):
-            steps = left.steps(_sample(images[1], u - found, v_right, radius, radius))
-            found = found + np.clip(steps, -0.5, 0.5)
-    disparities[chosen] = found
-    is_valid[chosen] = is_minimum
-    return disparities, is_valid
+
+    def search(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
+        patches = _sample(images[0], u, v, radius + 1, radius)
+        v_right = v + row_offset_px
+        strips = _sample(images[1], u - start, v_right, radius + reach_px, radius)
+        offsets, is_minimum = parabola_minimum(_squared_differences(patches[:, :, 1:-1], strips))
+        found = start - (offsets - reach_px)
+        if config.subpixel == "none":
+            return np.rint(found), is_minimum
+        left = _Patches.of(patches, u, v_right)
+        found, _ = left.descend(images[1], found, n_steps=_N_STEPS, max_step=_MAX_FINE_STEP_PX)
+        return found, is_minimum
+
+    return _measure_with_room(images[0].shape, pixels, predicted, radius, search)
 
 
 def follow_disparities(
@@ -119,23 +115,14 @@ def follow_disparities(
             row_offset_px=row_offset_px,
         )
     radius = config.patch_radius_px
-    disparities = np.full(len(pixels), np.nan)
-    is_valid = _have_room(images[0].shape, pixels, predicted, radius)
-    chosen = np.flatnonzero(is_valid)
-    if len(chosen) == 0:
-        return disparities, is_valid
-    u, v = pixels[chosen].T
-    patches = _Patches.of(_sample(images[0], u, v, radius + 1, radius))
-    found, step = predicted[chosen], np.zeros(len(chosen))
-    for _ in range(n_steps):
-        right = _sample(images[1], u - found, v + row_offset_px, radius, radius)
-        step = np.clip(patches.steps(right), -_MAX_STEP_PX, _MAX_STEP_PX)
-        found = found + step
-    disparities[chosen] = found
-    is_at_rest = np.abs(step) < _MAX_LAST_STEP_PX
-    is_near = np.abs(found - predicted[chosen]) < config.search_radius_px
-    is_valid[chosen] = is_at_rest & is_near
-    return disparities, is_valid
+
+    def follow(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
+        left = _Patches.of(_sample(images[0], u, v, radius + 1, radius), u, v + row_offset_px)
+        found, step = left.descend(images[1], start, n_steps=n_steps, max_step=_MAX_STEP_PX)
+        is_at_rest = np.abs(step) < _MAX_LAST_STEP_PX
+        return found, is_at_rest & (np.abs(found - start) < config.search_radius_px)
+
+    return _measure_with_room(images[0].shape, pixels, predicted, radius, follow)
 
 
 def are_alike(
@@ -216,7 +203,7 @@ def measure_row_shift(
     # Transposed, a step along the rows becomes one across them.
     left = np.swapaxes(_sample(images[0], u, v, radius, radius + 1), 1, 2)
     right = _sample(images[1], u - disparities, v + row_offset_px, radius, radius)
-    steps = -_Patches.of(left).steps(np.swapaxes(right, 1, 2))
+    steps = -_Patches.of(left, u, v).steps(np.swapaxes(right, 1, 2))
     steps = steps[np.abs(steps) < _MAX_STEP_PX]
     return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
 
@@ -234,24 +221,59 @@ class _Patches:
     doi:10.1023/B:VISI.0000011205.11775.fd.
     """
 
+    u: FloatArray
+    v_right: FloatArray
     weights: NDArray[np.float32]
     at_rest: NDArray[np.float32]
 
     @classmethod
-    def of(cls, wide: NDArray[np.float32]) -> _Patches:
-        """Make them of patches (n, s, s + 2) that are one column wider on either side."""
+    def of(cls, wide: NDArray[np.float32], u: FloatArray, v_right: FloatArray) -> _Patches:
+        """Make them of patches (n, s, s + 2) that are one column wider on either side.
+
+        Their middles are at columns u of the left and on rows v_right of the right image.
+        """
         n = len(wide)
         gradients = (0.5 * (wide[:, :, 2:] - wide[:, :, :-2])).reshape(n, -1)
         gradients -= gradients.mean(axis=1, keepdims=True)
         energies = np.einsum("ni,ni->n", gradients, gradients)
         gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))[:, np.newaxis]
         inner = wide[:, :, 1:-1].reshape(n, -1)
-        return cls(weights=gradients, at_rest=np.einsum("ni,ni->n", gradients, inner))
+        at_rest = np.einsum("ni,ni->n", gradients, inner)
+        return cls(u=u, v_right=v_right, weights=gradients, at_rest=at_rest)
 
     def steps(self, right: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the growth of disparity that makes patches of the right image (n, s, s) alike."""
         flat = right.reshape(len(right), -1)
         return np.asarray(np.einsum("ni,ni->n", self.weights, flat) - self.at_rest)
+
+    def descend(
+        self, right: ImageArray, disparities: FloatArray, *, n_steps: int, max_step: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the disparities after some steps, and the last step."""
+        radius = math.isqrt(self.weights.shape[1]) // 2
+        step = np.zeros(len(disparities))
+        for _ in range(n_steps):
+            patches = _sample(right, self.u - disparities, self.v_right, radius, radius)
+            step = np.clip(self.steps(patches), -max_step, max_step)
+            disparities = disparities + step
+        return disparities, step
+
+
+def _measure_with_room(
+    shape: tuple[int, ...],
+    pixels: FloatArray,
+    predicted: FloatArray,
+    radius: int,
+    measure: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, BoolArray]],
+) -> tuple[FloatArray, BoolArray]:
+    """Measure where patches lie in both images: from (u, v, predicted) disparity and validity."""
+    disparities = np.full(len(pixels), np.nan)
+    is_valid = _have_room(shape, pixels, predicted, radius)
+    chosen = np.flatnonzero(is_valid)
+    if len(chosen) > 0:
+        u, v = pixels[chosen].T
+        disparities[chosen], is_valid[chosen] = measure(u, v, predicted[chosen])
+    return disparities, is_valid
 
 
 def _have_room(

@@ -21,6 +21,7 @@ from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
 from gvo.frontend.rgbd import sample_depth
+from gvo.frontend.stereo import is_in_depth_range
 from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -62,7 +63,7 @@ class KltFrontend:
 
     def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
         self.camera = as_stereo(camera, config)
-        self.rig_offsets = RigOffsets(config.stereo) if isinstance(camera, StereoCamera) else None
+        self.rig_offsets = RigOffsets(config.stereo, is_stereo=isinstance(camera, StereoCamera))
         self._config = config
         self._descriptors = DescriptorFrontend(camera, config)
         self._described: dict[int, Observations] = {}
@@ -75,8 +76,7 @@ class KltFrontend:
         ----------
         frame : StereoFrame or RgbdFrame
         """
-        if self.rig_offsets is not None:
-            self.rig_offsets.advance()
+        self.rig_offsets.advance()
         offsets_px = self._offsets_px()
         if self._pool is not None:
             pending = self._pool.submit(self._find_corners, frame, *offsets_px)
@@ -89,7 +89,7 @@ class KltFrontend:
         row_shift_px = None
         if isinstance(frame, StereoFrame):
             disparities, is_valid = self._search_stereo(frame, corners, row_offset_px)
-            is_valid &= self._is_in_range(disparities - offset_px)
+            is_valid &= self._is_in_range(disparities, offset_px)
             row_shift_px = measure_row_shift(
                 (frame.left, frame.right),
                 corners[is_valid],
@@ -110,8 +110,7 @@ class KltFrontend:
 
     def _offsets_px(self) -> tuple[float, float]:
         """Return what is to be taken off disparities, and added to rows of the right image."""
-        offsets = self.rig_offsets
-        return (0.0, 0.0) if offsets is None else (offsets.disparity.value_px, offsets.row.value_px)
+        return self.rig_offsets.disparity.value_px, self.rig_offsets.row.value_px
 
     def register(
         self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
@@ -143,7 +142,7 @@ class KltFrontend:
             if isinstance(rough, Failure):
                 return rough
             result = self._register_from(rough.T_reference_current, reference, current)
-        if isinstance(result, RelativePose) and self.rig_offsets is not None:
+        if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
             row_shift_px = reference.find_corners().row_shift_px
             self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
@@ -203,7 +202,7 @@ class KltFrontend:
             self._config,
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=None if is_wide else T_reference_current,
-            with_offset=self.rig_offsets is not None and not is_wide,
+            with_offset=self.rig_offsets.is_learning and not is_wide,
         )
         if isinstance(result, Failure):
             return result
@@ -231,17 +230,14 @@ class KltFrontend:
         config = self._config
         disparity = config.klt.disparity_sigma_px if is_stereo else config.depth.sigma_px
         pixel = config.klt.pixel_sigma_px
-        n = len(source_uvd)
-        correspondences = Correspondences(
-            source_points=self.camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2]),
-            target_points=self.camera.unproject_stereo(target_uvd[:, :2], target_uvd[:, 2]),
-            source_uvd=source_uvd,
-            target_uvd=target_uvd,
+        offset = np.array([0.0, 0.0, self._offsets_px()[0]])
+        shape = (len(source_uvd), 1)
+        return Correspondences.of_pixels(
+            (source_uvd - offset, target_uvd - offset),
             # A corner is where it was cut out: only the track into the current frame is noisy.
-            source_sigmas=np.tile([0.0, 0.0, disparity], (n, 1)),
-            target_sigmas=np.tile([pixel, pixel, disparity], (n, 1)),
+            (np.tile([0.0, 0.0, disparity], shape), np.tile([pixel, pixel, disparity], shape)),
+            self.camera,
         )
-        return correspondences.without_offset(self._offsets_px()[0], self.camera)
 
     def _search_stereo(
         self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
@@ -290,13 +286,10 @@ class KltFrontend:
                 n_steps=_N_TRACK_STEPS,
                 row_offset_px=row_offset_px,
             )
-        return disparities, is_valid & self._is_in_range(disparities - offset_px)
+        return disparities, is_valid & self._is_in_range(disparities, offset_px)
 
-    def _is_in_range(self, disparities: FloatArray) -> BoolArray:
-        config = self._config.stereo
-        depths = self.camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
-        with np.errstate(invalid="ignore"):
-            return np.asarray((depths >= config.min_depth_m) & (depths <= config.max_depth_m))
+    def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:
+        return is_in_depth_range(disparities - offset_px, self.camera, self._config.stereo)
 
     def _measure_depth(self, frame: RgbdFrame, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         depths, is_valid = sample_depth(frame.depth, pixels, self._config.depth)

@@ -75,10 +75,12 @@ class RigOffsets:
     ----------
     config : StereoConfig
         `estimate_offset`, else all stays at zero; `offset_sigma_px`, how large it may be.
+    is_stereo : bool
+        Of other sensors nothing is learnt, and all stays at zero.
     """
 
-    def __init__(self, config: StereoConfig) -> None:
-        self.is_learning = config.estimate_offset
+    def __init__(self, config: StereoConfig, *, is_stereo: bool = True) -> None:
+        self.is_learning = is_stereo and config.estimate_offset
         self.disparity = OffsetFilter(config.offset_sigma_px)
         self.row = OffsetFilter(_ROW_PRIOR_PX)
         self._pending: tuple[float, float] | None = None

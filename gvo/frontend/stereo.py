@@ -126,6 +126,15 @@ def refine_disparities(
     return disparities, is_valid
 
 
+def is_in_depth_range(
+    disparities: FloatArray, camera: StereoCamera, config: StereoConfig
+) -> BoolArray:
+    """Tell which disparities, shape (n,), mean a depth between the limits."""
+    depths = camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((depths >= config.min_depth_m) & (depths <= config.max_depth_m))
+
+
 def _patch_ssd(
     images: tuple[ImageArray, ImageArray],
     row: IntArray,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,19 +48,33 @@ class Correspondences:
             target_sigmas=target.sigmas[j],
         )
 
+    @classmethod
+    def of_pixels(
+        cls,
+        uvd: tuple[FloatArray, FloatArray],
+        sigmas: tuple[FloatArray, FloatArray],
+        camera: StereoCamera,
+    ) -> Correspondences:
+        """Unproject what source and target measured: (n, 3) each, with standard deviations."""
+        source_points, target_points = (
+            camera.unproject_stereo(each[:, :2], each[:, 2]) for each in uvd
+        )
+        return cls(
+            source_points=source_points,
+            target_points=target_points,
+            source_uvd=uvd[0],
+            target_uvd=uvd[1],
+            source_sigmas=sigmas[0],
+            target_sigmas=sigmas[1],
+        )
+
     def without_offset(self, offset_px: float, camera: StereoCamera) -> Correspondences:
         """Take a constant error off all disparities, and move the points accordingly."""
         if offset_px == 0.0:
             return self
         offset = np.array([0.0, 0.0, offset_px])
-        source_uvd, target_uvd = self.source_uvd - offset, self.target_uvd - offset
-        return replace(
-            self,
-            source_points=camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2]),
-            target_points=camera.unproject_stereo(target_uvd[:, :2], target_uvd[:, 2]),
-            source_uvd=source_uvd,
-            target_uvd=target_uvd,
-        )
+        uvd = self.source_uvd - offset, self.target_uvd - offset
+        return Correspondences.of_pixels(uvd, (self.source_sigmas, self.target_sigmas), camera)
 
     def select(self, chosen: BoolArray | IntArray) -> Correspondences:
         """Return some of the correspondences."""

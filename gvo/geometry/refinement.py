@@ -184,8 +184,9 @@ def _with_covariance(
     if info != 0 or not np.all(inflation < _MAX_INFLATION):
         return Failure(reason=_OPEN)
     scale = _scale(last)
-    sensitivity = _sensitivity(last, H_inverse, residuals.huber)
-    covariance = sensitivity @ _spread(last, scale) @ sensitivity.T
+    scores = last.scores()
+    sensitivity = _sensitivity(last, scores, H_inverse, residuals.huber)
+    covariance = sensitivity @ _spread(last, scores, scale) @ sensitivity.T
     offset = None
     if with_offset:
         offset = estimate_disparity_offset(T, residuals, last)
@@ -198,7 +199,9 @@ def _with_covariance(
     )
 
 
-def _sensitivity(at: Linearization, H_inverse: FloatArray, huber: float) -> FloatArray:
+def _sensitivity(
+    at: Linearization, scores: FloatArray, H_inverse: FloatArray, huber: float
+) -> FloatArray:
     """Return the inverse second derivative of the robust cost: how far a gradient moves the pose.
 
     Beyond its threshold a residual pulls with the same force however long it is, so that along it
@@ -206,7 +209,7 @@ def _sensitivity(at: Linearization, H_inverse: FloatArray, huber: float) -> Floa
     """
     squares = at.r[0] ** 2 + at.r[1] ** 2 + at.r[2] ** 2
     far = np.flatnonzero(squares > huber**2)
-    pulls = np.einsum("kin,in->kn", at.J[:, :, far], at.r[:, far]) / np.sqrt(squares[far])
+    pulls = scores[:, far] / np.sqrt(squares[far])
     _, inverse, info = dposv(at.H - pulls @ pulls.T, _IDENTITY)
     is_sane = info == 0 and np.all(np.diagonal(inverse) < _MAX_LOSS * np.diagonal(H_inverse))
     return np.asarray(inverse) if is_sane else H_inverse
@@ -217,10 +220,9 @@ def _scale(at: Linearization) -> float:
     return max(math.sqrt(mean_square), _MIN_SCALE)
 
 
-def _spread(at: Linearization, scale: float) -> FloatArray:
+def _spread(at: Linearization, scores: FloatArray, scale: float) -> FloatArray:
     """Return the covariance of the gradient, shape (6, 6), as the matches show it."""
     n = at.r.shape[1]
-    scores = at.scores()
     seen = n / max(n - 2, 1) * (scores @ scores.T)
     promised = scale**2 * at.H
     spread = (n * seen + _N_PROMISED * promised) / (n + _N_PROMISED)
