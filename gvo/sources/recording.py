@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
 from gvo.trajectory import Trajectory
+from gvo.types import FloatArray
 
 Sensor = Literal["stereo", "rgbd"]
 
@@ -39,6 +40,22 @@ class StampedImage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthView:
+    """The camera that sees the depth, where that is not the colour camera.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the depth images.
+    T_color_depth : ndarray of float64, shape (4, 4)
+        Maps coordinates of the rectified depth camera to the rectified colour camera, metres.
+    """
+
+    calibration: Calibration
+    T_color_depth: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RecordingInfo:
     """What a source found out before the first image.
 
@@ -53,6 +70,11 @@ class RecordingInfo:
         Announced images of stream 0.
     decisions : list of str
         What was chosen and why, a line each.
+    depth_view : DepthView, optional
+        Of depth that is not registered to colour; None where each pixel of depth belongs to that
+        of the colour image.
+    frame_id : str
+        Name of stream 0's camera frame in `/tf`; empty where the recording names none.
     """
 
     name: str
@@ -60,6 +82,8 @@ class RecordingInfo:
     calibrations: tuple[Calibration, ...]
     n_images: int
     decisions: list[str] = field(default_factory=list)
+    depth_view: DepthView | None = None
+    frame_id: str = ""
 
     @property
     def camera(self) -> StereoCamera | PinholeCamera:
