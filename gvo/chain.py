@@ -27,24 +27,31 @@ class RawStep:
     T_reference_frame : ndarray of float64, shape (4, 4)
     covariance : ndarray of float64, shape (6, 6)
         Of T_reference_frame.
-    is_registered : bool
-        False where the step continues the last velocity.
+    registration : RelativePose or None
+        None where the step continues the last velocity, and for the first frame.
     reason : str
         Why there is no registration; empty where there is one.
     n_matches, n_inliers : int
-    flow_px : float or None
-        Median displacement of the inliers in the image, where it is known.
     """
 
     estimate: Estimate
     reference_ns: int | None
     T_reference_frame: FloatArray
     covariance: FloatArray
-    is_registered: bool
+    registration: RelativePose | None = None
     reason: str = ""
     n_matches: int = 0
     n_inliers: int = 0
-    flow_px: float | None = None
+
+    @property
+    def is_registered(self) -> bool:
+        """False where the step continues the last velocity."""
+        return self.reference_ns is None or self.registration is not None
+
+    @property
+    def flow_px(self) -> float | None:
+        """Median displacement of the inliers in the image, where it is known."""
+        return None if self.registration is None else self.registration.flow_px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,7 +138,6 @@ class RawChain(Generic[ObservationsT]):
             reference_ns=None,
             T_reference_frame=np.eye(4),
             covariance=np.zeros((6, 6)),
-            is_registered=True,
         )
         self._predecessor = self._anchor = _link_of(current, step.estimate)
         return step
@@ -155,10 +161,9 @@ class RawChain(Generic[ObservationsT]):
             reference_ns=link.observations.stamp_ns,
             T_reference_frame=result.T_reference_current,
             covariance=result.covariance,
-            is_registered=True,
+            registration=result,
             n_matches=result.n_matches,
             n_inliers=result.n_inliers,
-            flow_px=result.flow_px,
         )
 
     def _coast(
@@ -183,7 +188,6 @@ class RawChain(Generic[ObservationsT]):
             reference_ns=predecessor.observations.stamp_ns,
             T_reference_frame=T_predecessor_current,
             covariance=covariance,
-            is_registered=False,
             reason=failure.reason,
             n_matches=failure.n_matches,
             n_inliers=failure.n_inliers,

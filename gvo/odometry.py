@@ -27,6 +27,7 @@ from gvo.types import (
     Estimate,
     Failure,
     FloatArray,
+    RelativePose,
     Status,
 )
 
@@ -49,6 +50,8 @@ class FrameResult:
         Keypoints, those measured in 3-D, matches of the chain's registration and those that it
         rests on (0 where a front-end of one's own does not count them), edges that went into
         the window.
+    registration : RelativePose or None
+        Against the frame that the raw chain goes on from; None where there is none.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -63,6 +66,7 @@ class FrameResult:
     n_matches: int
     n_inliers: int
     n_links: int
+    registration: RelativePose | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -158,6 +162,7 @@ class Odometry:
             n_matches=step.n_matches,
             n_inliers=step.n_inliers,
             n_links=len(edges) - len(causal.rejected),
+            registration=step.registration,
             stage_ms=watch.stage_ms,
         )
 

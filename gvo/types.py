@@ -214,6 +214,10 @@ class RelativePose:
         holds none of the point. Empty where the front-end does not tell.
     inliers : ndarray of bool, shape (n,)
         Which matches the pose rests on.
+    pixels_reference, pixels_current : ndarray of float64, shape (n, 2)
+        Where the matches are in either image, (u, v). Empty where the front-end does not tell.
+    points_current : ndarray of float64, shape (n, 3)
+        The matches as measured in the current frame, in its `cam` frame, metres. Likewise.
     flow_px : float or None
         Median displacement of the inliers between the images, where the front-end tells.
     offset_px, offset_sigma_px : float or None
@@ -226,6 +230,9 @@ class RelativePose:
     covariance: FloatArray
     matches: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    pixels_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    pixels_current: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    points_current: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     flow_px: float | None = None
     offset_px: float | None = None
     offset_sigma_px: float | None = None

@@ -483,13 +483,17 @@ def test_a_creeping_camera_is_not_frozen() -> None:
     assert sum(r.n_links for r in results) == sum(r.n_links for r in off)
 
 
+def registration_with(flow_px: float | None) -> RelativePose:
+    return RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6), flow_px=flow_px)
+
+
 @pytest.mark.parametrize(
     ("changes", "is_still"),
     [
         ({}, True),
-        ({"flow_px": 1.5}, False),
-        ({"flow_px": None}, False),
-        ({"is_registered": False}, False),
+        ({"registration": registration_with(flow_px=1.5)}, False),
+        ({"registration": registration_with(flow_px=None)}, False),
+        ({"registration": None}, False),
         ({"covariance": 1e-9 * np.eye(6)}, False),
     ],
 )
@@ -502,8 +506,7 @@ def test_standstill_is_no_flow_and_no_significant_motion(
         reference_ns=3,
         T_reference_frame=se3.exp(np.full(6, 1e-3)),
         covariance=1e-6 * np.eye(6),
-        is_registered=True,
-        flow_px=0.2,
+        registration=registration_with(flow_px=0.2),
     )
     config = WindowConfig(zero_motion=True, zero_motion_sigma_factor=0.5)
     edge = zero_motion_edge(replace(step, **changes), config)

@@ -107,6 +107,11 @@ def test_what_a_registration_rests_on_is_told(sensor: Sensor) -> None:
     flow = frontend(sensor).camera.project(points) - first.keypoints[chosen]
     expected = np.median(np.linalg.norm(flow, axis=1))
     assert result.flow_px == pytest.approx(expected, abs=0.1)
+    np.testing.assert_array_equal(result.pixels_reference, first.keypoints[indices])
+    seen = result.pixels_current[result.inliers]
+    assert np.median(np.linalg.norm(seen - first.keypoints[chosen] - flow, axis=1)) < 0.2
+    off = np.linalg.norm(result.points_current[result.inliers] - points, axis=1)
+    assert np.median(off / points[:, 2]) < 0.01
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -285,10 +285,13 @@ def test_the_offset_of_disparities_is_told_where_asked_for(
     assert abs(result.offset_px) < 4.0 * result.offset_sigma_px
 
 
-def test_the_flow_is_the_median_displacement_of_the_inliers() -> None:
+def test_flow_pixels_and_points_are_those_of_the_matches() -> None:
     T, reference, current, matches = two_frames(9, noise=0.0)
     result = register_matches(reference, current, matches, CAMERA, configure(), start=T)
     assert isinstance(result, RelativePose)
     i, j = matches[result.inliers].T
     displacements = current.keypoints[j] - reference.keypoints[i]
     assert result.flow_px == pytest.approx(np.median(np.linalg.norm(displacements, axis=1)))
+    np.testing.assert_array_equal(result.pixels_reference, reference.keypoints[matches[:, 0]])
+    np.testing.assert_array_equal(result.pixels_current, current.keypoints[matches[:, 1]])
+    np.testing.assert_array_equal(result.points_current, current.points_cam[matches[:, 1]])
