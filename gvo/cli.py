@@ -18,7 +18,8 @@ from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
     from gvo.config import Config
-    from gvo.runs import Progress, RunResult
+    from gvo.run_tally import Progress
+    from gvo.runs import RunResult
     from gvo.trajectory import Trajectory
 
 _EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}

@@ -8,7 +8,8 @@ from pathlib import Path
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.outputs.bag_writer import convert
-from gvo.runs import Progress, RunResult, run_recording
+from gvo.run_tally import Progress
+from gvo.runs import RunResult, run_recording
 from gvo.sources.opening import open_recording
 from gvo.sources.synthetic import SyntheticRecording
 

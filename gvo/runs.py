@@ -5,28 +5,24 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from gvo import __version__
-from gvo.backend.ledger import WindowCounts
-from gvo.backend.polish import Polish
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.evaluation import Evaluation, evaluate
-from gvo.frontend.offset import RigOffsets
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry import Odometry
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
+from gvo.run_tally import Progress, RunTally
 from gvo.sources.frames import frames
 from gvo.sources.opening import BAG_SUFFIXES, open_recording
 from gvo.sources.recording import Sensor, Source
@@ -36,24 +32,6 @@ from gvo.types import FaultyFrame, Frame, Status
 
 EXIT_COMPLETE = 0
 EXIT_PARTLY = 3
-_BIN_WIDTH = 0.01
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
-    """How far a run has come.
-
-    Parameters
-    ----------
-    n_done, n_total : int
-        Frames taken, and images announced by the recording.
-    n_tracked : int
-        Frames tied to earlier ones by a registration.
-    """
-
-    n_done: int
-    n_total: int
-    n_tracked: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,84 +54,6 @@ class RunResult:
     evaluations: tuple[Evaluation, ...]
     exit_code: int
     warnings: tuple[str, ...]
-
-
-class _Durations:
-    """Durations of a stage, counted in bins of one percent: the memory does not grow."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[int] = Counter()
-
-    def add(self, elapsed_ms: float) -> None:
-        self._counts[round(np.log(max(elapsed_ms, 1e-3)) / _BIN_WIDTH)] += 1
-
-    def median(self) -> float:
-        """Return the median in milliseconds, right to half a percent."""
-        bins = sorted(self._counts)
-        cumulated = np.cumsum([self._counts[bin_] for bin_ in bins])
-        middle = bins[int(np.searchsorted(cumulated, 0.5 * cumulated[-1]))]
-        return round(float(np.exp(middle * _BIN_WIDTH)), 3)
-
-
-@dataclass(slots=True, kw_only=True)
-class _Tally:
-    """Counts and times over the frames of a run."""
-
-    statuses: Counter[Status] = field(default_factory=Counter)
-    first_fault: str = ""
-    n_unpaired: int = 0
-    first_unpaired: str = ""
-    first_untied: str = ""
-    broken_off: str = ""
-    window: WindowCounts = field(default_factory=WindowCounts)
-    polish: Polish | None = None
-    rig_offsets: RigOffsets | None = None
-    stages: dict[str, _Durations] = field(default_factory=dict)
-
-    @property
-    def n_frames(self) -> int:
-        return sum(self.statuses.values())
-
-    @property
-    def n_tracked(self) -> int:
-        return self.statuses[Status.OK] + self.statuses[Status.RESUMED]
-
-    @property
-    def n_with_pose(self) -> int:
-        return self.n_frames - self.statuses[Status.SKIPPED]
-
-    @property
-    def n_faulty(self) -> int:
-        return self.statuses[Status.SKIPPED]
-
-    @property
-    def is_partly(self) -> bool:
-        """Tell whether frames are missing, or poses not tied to the others."""
-        is_loose = self.n_with_pose > 1 and self.n_tracked < 2
-        return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
-
-    def progress(self, n_images: int) -> Progress:
-        return Progress(
-            n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
-        )
-
-    def add_result(self, result: FrameResult) -> None:
-        self.statuses[result.status] += 1
-        self.first_untied = self.first_untied or result.reason
-        for stage, elapsed_ms in result.stage_ms.items():
-            self.add_duration(stage, elapsed_ms)
-
-    def add_duration(self, stage: str, elapsed_ms: float) -> None:
-        self.stages.setdefault(stage, _Durations()).add(elapsed_ms)
-
-    def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
-        reason = f"frame at {frame.stamp_ns} ns: {frame.reason}"
-        if is_loss:
-            self.statuses[Status.SKIPPED] += 1
-            self.first_fault = self.first_fault or reason
-        else:
-            self.n_unpaired += 1
-            self.first_unpaired = self.first_unpaired or reason
 
 
 def run_recording(
@@ -192,7 +92,7 @@ def run_recording(
         When no frame is usable, or the folder cannot be written.
     """
     config = config or Config()
-    tally = _Tally()
+    tally = RunTally()
     comparison = SmoothingComparison() if compare_smoothing else None
     odometry = Odometry(
         source.info.camera, config, log=None if comparison is None else comparison.log
@@ -255,7 +155,7 @@ def one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(n_before)
 
 
-def _read_frames(source: Source, config: Config, tally: _Tally) -> Iterator[Frame | FaultyFrame]:
+def _read_frames(source: Source, config: Config, tally: RunTally) -> Iterator[Frame | FaultyFrame]:
     """Yield frames, timing the reading; where the recording breaks off, note it and end."""
     iterator = frames(source, config)
     while True:
@@ -275,7 +175,7 @@ def _take(
     item: Frame | FaultyFrame,
     odometry: Odometry,
     folder: RunFolder,
-    tally: _Tally,
+    tally: RunTally,
     *,
     sensor: Sensor,
 ) -> None:
@@ -295,7 +195,7 @@ def _take(
 def _conclude(
     source: Source,
     folder: RunFolder,
-    tally: _Tally,
+    tally: RunTally,
     *,
     config: Config,
     ground_truth: Trajectory | None,
@@ -307,7 +207,7 @@ def _conclude(
         )
         raise RecordingError(f"{source.info.name}: no usable frame: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    warnings = _warnings(tally)
+    warnings = tally.warnings()
     truth: Trajectory | None = None
     evaluations: tuple[Evaluation, ...] = ()
     try:
@@ -345,47 +245,9 @@ def _evaluate(truth: Trajectory | None, estimates: dict[str, Trajectory]) -> tup
     return tuple(evaluate(truth, estimate, name=name) for name, estimate in estimates.items())
 
 
-def _warnings(tally: _Tally) -> list[str]:
-    warnings = []
-    if tally.broken_off:
-        warnings.append(f"the run broke off after {tally.n_frames} frames: {tally.broken_off}")
-    if tally.n_faulty:
-        warnings.append(
-            f"{tally.n_faulty} of {tally.n_frames} frames are faulty and were skipped; "
-            f"the first: {tally.first_fault}"
-        )
-    if tally.n_unpaired:
-        warnings.append(
-            f"{tally.n_unpaired} images have no partner and make no frame (sync.max_difference_ms)"
-        )
-    n_untied = tally.n_with_pose - tally.n_tracked
-    if n_untied and tally.n_tracked < 2:
-        warnings.append(
-            "no frame could be registered against another (are left and right exchanged, is the "
-            "calibration or depth.scale wrong, are the images dark?); the first: "
-            f"{tally.first_untied}"
-        )
-    elif n_untied:
-        warnings.append(
-            f"{n_untied} of {tally.n_with_pose} poses continue the last velocity, without a "
-            "registration (frames.csv: coasting, lost)"
-        )
-    if tally.window.n_restored:
-        warnings.append(
-            f"{tally.window.n_restored} updates of the window failed and were done again with less"
-        )
-    # Gating is the window's daily work, and counted in the summary; anything else is a fault.
-    n_faulty = tally.window.n_rejected - tally.window.n_gated
-    if n_faulty:
-        warnings.append(
-            f"{n_faulty} edges were refused; the first refusal: {tally.window.first_rejected}"
-        )
-    return warnings
-
-
 def _summary(
     source: Source,
-    tally: _Tally,
+    tally: RunTally,
     *,
     config: Config,
     evaluations: tuple[Evaluation, ...],

@@ -20,7 +20,8 @@ from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
-from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, Progress, RunResult, peak_memory_mb
+from gvo.run_tally import Progress
+from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult, peak_memory_mb
 from gvo.sources.edges import EdgeEvent, EdgeSource, Event, PoseEvent
 from gvo.sources.pose_graphs import PoseGraphSource
 from gvo.trajectory import Trajectory

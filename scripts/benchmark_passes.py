@@ -20,7 +20,8 @@ import numpy as np
 
 import gvo
 from gvo.config import FrontendConfig
-from gvo.runs import Progress, one_opencv_thread, peak_memory_mb
+from gvo.run_tally import Progress
+from gvo.runs import one_opencv_thread, peak_memory_mb
 from gvo.sources.recording import Sensor, Source
 from gvo.types import FaultyFrame, Frame
 

@@ -15,7 +15,8 @@ from gvo.config import Config, WindowConfig
 from gvo.errors import RecordingError
 from gvo.g2o import format_edge, format_vertex
 from gvo.geometry import se3
-from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, Progress, RunResult
+from gvo.run_tally import Progress
+from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.smoothing import configuration_for, smooth_edges
 from gvo.sources.edge_inputs import open_edges
 from gvo.sources.edges import EdgeSource, Event, InputFaults, PoseEvent

@@ -23,38 +23,24 @@ from gvo.outputs.bag_messages import (
     write_image,
     write_truth,
 )
+from gvo.outputs.compressed_messages import write_compressed, write_compressed_depth
+from gvo.outputs.conversion import Conversion, check_new
+from gvo.outputs.depth_counts import MILLIMETRES, is_in_counts
 from gvo.sources.frames import ImagePreparer
-from gvo.sources.recording import Source, StampedImage
+from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.types import FloatArray
 
 _SUFFIXES = (".bag", ".mcap", ".db3", "")
 _Progress: TypeAlias = Callable[[int], None]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Conversion:
-    """What a conversion wrote.
-
-    Parameters
-    ----------
-    path : Path
-        The new bag.
-    n_images : int
-        Images written, of both streams.
-    n_poses : int
-        Poses of the ground truth written.
-    skipped : tuple of str
-        One line for each image that could not be read and was left out.
-    """
-
-    path: Path
-    n_images: int
-    n_poses: int
-    skipped: tuple[str, ...]
-
-
 def convert(
-    source: Source, path: str | Path, *, rectify: bool = False, progress: _Progress | None = None
+    source: Source,
+    path: str | Path,
+    *,
+    rectify: bool = False,
+    compress: bool = False,
+    progress: _Progress | None = None,
 ) -> Conversion:
     """Write a recording as a bag.
 
@@ -73,6 +59,9 @@ def convert(
         `.bag`: ROS 1. `.mcap` or `.db3`: a single file of ROS 2. No suffix: a ROS 2 bag folder.
     rectify : bool
         Write raw images rectified and grey, as the frames hold them.
+    compress : bool
+        Write images as PNG, topics `.../compressed` and, for depth of whole millimetres,
+        `.../compressedDepth`; other depth stays as it is.
     progress : callable, optional
         Called with the number of images written so far.
 
@@ -83,7 +72,7 @@ def convert(
     """
     path = Path(path)
     _check_target(path)
-    plan = _plan(source, rectify=rectify)
+    plan = _plan(source, rectify=rectify, compress=compress)
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder:
             with BagWriter(Path(folder) / path.name) as bag:
@@ -102,52 +91,81 @@ class _Stream:
     frame_id: str
     calibration: Calibration
     prepare: ImagePreparer | None
+    is_compressed: bool
 
     @property
     def info_topic(self) -> str:
         return f"{self.topic.rpartition('/')[0]}/camera_info"
+
+    def write(self, bag: BagWriter, pixels: NDArray[Any], header: Header) -> None:
+        """Write an image, as PNG where that was asked for."""
+        if not self.is_compressed:
+            write_image(bag, self.topic, pixels, header)
+        elif pixels.dtype == np.float32:
+            write_compressed_depth(bag, f"{self.topic}/compressedDepth", pixels, header)
+        else:
+            write_compressed(bag, f"{self.topic}/compressed", pixels, header)
 
 
 _Plan: TypeAlias = tuple[_Stream, _Stream]
 
 
 def _check_target(path: Path) -> None:
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
+    check_new(path)
     if path.suffix not in _SUFFIXES:
         raise RecordingError(
             f"{path}: expected a name ending in .bag, .mcap or .db3, or a folder name without "
             f"a suffix, got {path.suffix}"
         )
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path}: cannot be written: {path.parent} is no folder")
 
 
-def _plan(source: Source, *, rectify: bool) -> _Plan:
+def _plan(source: Source, *, rectify: bool, compress: bool) -> _Plan:
     info = source.info
-    if info.sensor == "rgbd":
-        (color,) = info.calibrations
-        is_rectified = color.is_rectified or rectify
-        name = "image_rect_color" if is_rectified else "image_color"
-        frame_id = "camera_color_optical_frame"
-        return (
-            _stream(f"/camera/rgb/{name}", frame_id, color, rectify=rectify),
-            _stream("/camera/depth/image", frame_id, color, rectify=rectify, is_depth=True),
-        )
-    left, right = info.calibrations
-    name = "image_rect" if left.is_rectified or rectify else "image_raw"
-    return (
-        _stream(f"/stereo/left/{name}", "camera_left_optical", left, rectify=rectify),
-        _stream(f"/stereo/right/{name}", "camera_right_optical", right, rectify=rectify),
+    # Depth that is moved to the colour camera is seen by the rectified one.
+    is_rectifying = info.depth_view is not None or (
+        rectify and not info.calibrations[0].is_rectified
     )
+    prepares = _preparers(info) if is_rectifying else (None, None)
+    is_rectified = is_rectifying or info.calibrations[0].is_rectified
+    if info.sensor == "rgbd":
+        topics = (
+            f"/camera/rgb/{'image_rect_color' if is_rectified else 'image_color'}",
+            "/camera/depth/image",
+        )
+        frame_ids = (info.frame_id or "camera_color_optical_frame",) * 2
+        raws = info.calibrations * 2
+        compressed = (compress, compress and _is_in_millimetres(source))
+    else:
+        name = "image_rect" if is_rectified else "image_raw"
+        topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
+        frame_ids = (info.frame_id or "camera_left_optical", "camera_right_optical")
+        raws = info.calibrations
+        compressed = (compress, compress)
+    calibrations = [_rectified(raw) if is_rectifying else raw for raw in raws]
+    first, second = (
+        _Stream(
+            topic=topic,
+            frame_id=frame_id,
+            calibration=calibration,
+            prepare=prepare,
+            is_compressed=is_compressed,
+        )
+        for topic, frame_id, calibration, prepare, is_compressed in zip(
+            topics, frame_ids, calibrations, prepares, compressed, strict=True
+        )
+    )
+    return first, second
 
 
-def _stream(
-    topic: str, frame_id: str, raw: Calibration, *, rectify: bool, is_depth: bool = False
-) -> _Stream:
-    if raw.is_rectified or not rectify:
-        return _Stream(topic=topic, frame_id=frame_id, calibration=raw, prepare=None)
-    rectified = Calibration(
+def _preparers(info: RecordingInfo) -> tuple[ImagePreparer, ImagePreparer]:
+    first = ImagePreparer(info.calibrations[0])
+    if info.sensor == "stereo":
+        return first, ImagePreparer(info.calibrations[1])
+    return first, ImagePreparer(info.calibrations[0], is_depth=True)
+
+
+def _rectified(raw: Calibration) -> Calibration:
+    return Calibration(
         width=raw.width,
         height=raw.height,
         K=raw.P[:, :3].copy(),
@@ -156,8 +174,17 @@ def _stream(
         P=raw.P,
         is_rectified=True,
     )
-    prepare = ImagePreparer(raw, is_depth=is_depth)
-    return _Stream(topic=topic, frame_id=frame_id, calibration=rectified, prepare=prepare)
+
+
+def _is_in_millimetres(source: Source) -> bool:
+    """Tell whether the first depth image that can be read is of whole millimetres."""
+    for image in source.images():
+        if image.stream == 1:
+            try:
+                return is_in_counts(image.load(), MILLIMETRES)
+            except RecordingError:
+                continue
+    return False
 
 
 def _write(
@@ -175,7 +202,7 @@ def _write(
             continue
         header = Header(image.stamp_ns, stream.frame_id)
         write_camera_info(bag, stream.info_topic, stream.calibration, header)
-        write_image(bag, stream.topic, pixels, header)
+        stream.write(bag, pixels, header)
         n_images += 1
         if progress is not None:
             progress(n_images)

@@ -1,0 +1,159 @@
+"""Counts, times and warnings of a run, frame by frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gvo.backend.ledger import WindowCounts
+from gvo.backend.polish import Polish
+from gvo.frontend.offset import RigOffsets
+from gvo.odometry import FrameResult
+from gvo.types import FaultyFrame, Status
+
+_BIN_WIDTH = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far a run has come.
+
+    Parameters
+    ----------
+    n_done, n_total : int
+        Frames taken, and images announced by the recording.
+    n_tracked : int
+        Frames tied to earlier ones by a registration.
+    """
+
+    n_done: int
+    n_total: int
+    n_tracked: int
+
+
+class _Durations:
+    """Durations of a stage, counted in bins of one percent: the memory does not grow."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[int] = Counter()
+
+    def add(self, elapsed_ms: float) -> None:
+        self._counts[round(np.log(max(elapsed_ms, 1e-3)) / _BIN_WIDTH)] += 1
+
+    def median(self) -> float:
+        """Return the median in milliseconds, right to half a percent."""
+        bins = sorted(self._counts)
+        cumulated = np.cumsum([self._counts[bin_] for bin_ in bins])
+        middle = bins[int(np.searchsorted(cumulated, 0.5 * cumulated[-1]))]
+        return round(float(np.exp(middle * _BIN_WIDTH)), 3)
+
+
+@dataclass(slots=True, kw_only=True)
+class RunTally:
+    """Counts and times over the frames of a run."""
+
+    statuses: Counter[Status] = field(default_factory=Counter)
+    first_fault: str = ""
+    n_unpaired: int = 0
+    first_unpaired: str = ""
+    first_untied: str = ""
+    broken_off: str = ""
+    window: WindowCounts = field(default_factory=WindowCounts)
+    polish: Polish | None = None
+    rig_offsets: RigOffsets | None = None
+    stages: dict[str, _Durations] = field(default_factory=dict)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames, also faulty ones."""
+        return sum(self.statuses.values())
+
+    @property
+    def n_tracked(self) -> int:
+        """Frames tied to earlier ones by a registration."""
+        return self.statuses[Status.OK] + self.statuses[Status.RESUMED]
+
+    @property
+    def n_with_pose(self) -> int:
+        """Frames that have a pose."""
+        return self.n_frames - self.statuses[Status.SKIPPED]
+
+    @property
+    def n_faulty(self) -> int:
+        """Frames that have none."""
+        return self.statuses[Status.SKIPPED]
+
+    @property
+    def is_partly(self) -> bool:
+        """Tell whether frames are missing, or poses not tied to the others."""
+        is_loose = self.n_with_pose > 1 and self.n_tracked < 2
+        return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
+
+    def progress(self, n_images: int) -> Progress:
+        """Return how far the run is, of so many announced images."""
+        return Progress(
+            n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
+        )
+
+    def add_result(self, result: FrameResult) -> None:
+        """Count a frame."""
+        self.statuses[result.status] += 1
+        self.first_untied = self.first_untied or result.reason
+        for stage, elapsed_ms in result.stage_ms.items():
+            self.add_duration(stage, elapsed_ms)
+
+    def add_duration(self, stage: str, elapsed_ms: float) -> None:
+        """Count what one frame took in a stage, milliseconds."""
+        self.stages.setdefault(stage, _Durations()).add(elapsed_ms)
+
+    def add_faulty(self, frame: FaultyFrame, *, is_loss: bool) -> None:
+        """Count a frame without a pose, or, where it is no loss, an image without partner."""
+        reason = f"frame at {frame.stamp_ns} ns: {frame.reason}"
+        if is_loss:
+            self.statuses[Status.SKIPPED] += 1
+            self.first_fault = self.first_fault or reason
+        else:
+            self.n_unpaired += 1
+            self.first_unpaired = self.first_unpaired or reason
+
+    def warnings(self) -> list[str]:
+        """Return what was skipped or broke off, a line each."""
+        warnings = []
+        if self.broken_off:
+            warnings.append(f"the run broke off after {self.n_frames} frames: {self.broken_off}")
+        if self.n_faulty:
+            warnings.append(
+                f"{self.n_faulty} of {self.n_frames} frames are faulty and were skipped; "
+                f"the first: {self.first_fault}"
+            )
+        if self.n_unpaired:
+            warnings.append(
+                f"{self.n_unpaired} images have no partner and make no frame "
+                "(sync.max_difference_ms)"
+            )
+        n_untied = self.n_with_pose - self.n_tracked
+        if n_untied and self.n_tracked < 2:
+            warnings.append(
+                "no frame could be registered against another (are left and right exchanged, is "
+                "the calibration or depth.scale wrong, are the images dark?); the first: "
+                f"{self.first_untied}"
+            )
+        elif n_untied:
+            warnings.append(
+                f"{n_untied} of {self.n_with_pose} poses continue the last velocity, without a "
+                "registration (frames.csv: coasting, lost)"
+            )
+        if self.window.n_restored:
+            warnings.append(
+                f"{self.window.n_restored} updates of the window failed and were done again with "
+                "less"
+            )
+        # Gating is the window's daily work, and counted in the summary; anything else is a fault.
+        n_faulty = self.window.n_rejected - self.window.n_gated
+        if n_faulty:
+            warnings.append(
+                f"{n_faulty} edges were refused; the first refusal: {self.window.first_rejected}"
+            )
+        return warnings
