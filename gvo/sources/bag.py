@@ -91,6 +91,11 @@ class BagSource:
         """What is known before the first image."""
         return self._info
 
+    @property
+    def image_topics(self) -> tuple[str, str]:
+        """Names of the topics of stream 0 and 1."""
+        return self._topics.first.name, self._topics.second.name
+
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both topics in the order of recording.
 
@@ -99,7 +104,7 @@ class BagSource:
         RecordingError
             When the bag cannot be read on, or a topic that announces messages yields none.
         """
-        names = [self._topics.first.name, self._topics.second.name]
+        names = self.image_topics
         counts = [0, 0]
         for message in self._reader.messages(names):
             stream = names.index(message.topic.name)
