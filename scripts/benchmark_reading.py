@@ -89,7 +89,9 @@ def read_bare(bag: Path, source: BagSource, maps: Maps) -> int:
             stream = source.image_topics.index(connection.topic)
             if maps[stream] is not None:
                 is_depth = stream == 1 and source.info.sensor == "rgbd"
-                cv2.remap(image, *maps[stream], cv2.INTER_NEAREST if is_depth else cv2.INTER_LINEAR)
+                map_u, map_v = maps[stream]
+                mode = cv2.INTER_NEAREST if is_depth else cv2.INTER_LINEAR
+                cv2.remap(image, map_u, map_v, mode)
             n_images += 1
     return n_images
 
