@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -15,14 +12,11 @@ import typer
 
 from gvo import __version__
 from gvo.errors import ConfigurationError, GvoError
+from gvo.terminal import both, interruptible, progress, report, report_smoothed, warn
 
 if TYPE_CHECKING:
     from gvo.config import Config
-    from gvo.run_tally import Progress
-    from gvo.runs import RunResult
     from gvo.trajectory import Trajectory
-
-_EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 app = typer.Typer(
     name="gvo",
@@ -85,9 +79,9 @@ def demo(
     from gvo.demo import BAG_NAME, run_demo
 
     typer.echo(f"rendering a drive into {out / BAG_NAME}")
-    with _interruptible() as check, _progress("demo") as show:
-        result = run_demo(out, on_rendered=check, on_progress=_both(show, check))
-    _report(result, out)
+    with interruptible() as check, progress("demo") as show:
+        result = run_demo(out, on_rendered=check, on_progress=both(show, check))
+    report(result, out)
 
 
 @app.command()
@@ -118,16 +112,16 @@ def run(
     for decision in source.info.decisions:
         typer.echo(decision)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
-    with _interruptible() as check, _progress(source.info.name) as show:
+    with interruptible() as check, progress(source.info.name) as show:
         result = run_recording(
             source,
             out,
             config=parameters,
             ground_truth=truth,
             compare_smoothing=compare_smoothing,
-            on_progress=_both(show, check),
+            on_progress=both(show, check),
         )
-    _report(result, out)
+    report(result, out)
 
 
 @app.command()
@@ -173,7 +167,7 @@ def smooth(
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
     for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
         typer.echo(decision)
-    with _interruptible() as check, _progress(source.name, "poses") as show:
+    with interruptible() as check, progress(source.name, "poses") as show:
         result = smooth_edges(
             source,
             out,
@@ -181,9 +175,9 @@ def smooth(
             keyframes=keyframes.value,
             ground_truth=truth,
             compare_smoothing=compare_smoothing,
-            on_progress=_both(show, check),
+            on_progress=both(show, check),
         )
-    _report_smoothed(result, out)
+    report_smoothed(result, out)
 
 
 def _refuse_with_lines(inputs: list[str], **options: object) -> None:
@@ -205,7 +199,7 @@ def _smooth_lines(
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
 
-    with _interruptible() as check:
+    with interruptible() as check:
         result = smooth_lines(
             read_lines(sys.stdin.fileno(), lambda: check(None)),
             answer,
@@ -214,7 +208,7 @@ def _smooth_lines(
             keyframes=keyframes.value,
             ground_truth=ground_truth,
         )
-    _report_smoothed(result, out, is_stdout_taken=True)
+    report_smoothed(result, out, is_stdout_taken=True)
 
 
 @app.command()
@@ -280,10 +274,10 @@ def convert(
 
     options = RecordingOptions(calibration=calibration)
     source = open_recording(folder, config=_load(config, set_), options=options)
-    with _interruptible() as check:
+    with interruptible() as check:
         written = write_bag(source, bag, rectify=rectify, progress=check)
     typer.echo(f"wrote {bag}: {written.n_images} images, {written.n_poses} true poses")
-    _warn(written.skipped)
+    warn(written.skipped)
     raise typer.Exit(EXIT_PARTLY if written.skipped else EXIT_COMPLETE)
 
 
@@ -321,125 +315,6 @@ def _names(paths: list[Path]) -> list[str]:
         for stem, path in zip(stems, paths, strict=True)
     ]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
-
-
-def _report(result: RunResult, out: Path) -> NoReturn:
-    from gvo.outputs.tables import format_evaluations
-
-    if result.evaluations:
-        typer.echo(format_evaluations(result.evaluations), nl=False)
-    _print_smoothings(result)
-    frames, tracked = result.summary["frames"], result.summary["tracked"]
-    offsets = result.summary["rig_offsets"]
-    if offsets is not None:
-        typer.echo(
-            f"learnt of the rig: disparities too large by {offsets['disparity_px']:.3f} px, "
-            f"sigma {offsets['disparity_sigma_px']:.3f}; rows of the right image too large by "
-            f"{offsets['row_px']:.3f} px"
-        )
-    typer.echo(f"{tracked} of {frames} frames tracked; {out / 'trajectories.png'}")
-    _warn(result.warnings)
-    raise typer.Exit(result.exit_code)
-
-
-def _report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
-    from gvo.outputs.tables import format_evaluations
-
-    if result.evaluations:
-        typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
-    summary = result.summary
-    if summary["polish"] is not None:
-        errors = summary["polish"]
-        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} polished"
-        typer.echo(text, err=is_stdout_taken)
-    _print_smoothings(result)
-    counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
-    typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
-    _warn(result.warnings)
-    raise typer.Exit(result.exit_code)
-
-
-def _print_smoothings(result: RunResult) -> None:
-    if "smoothing" in result.summary:
-        from gvo.outputs.smoothings import format_smoothings
-
-        typer.echo(format_smoothings(result.summary["smoothing"]), nl=False)
-
-
-def _warn(warnings: Sequence[str]) -> None:
-    for warning in warnings:
-        typer.echo(f"gvo: warning: {warning}", err=True)
-
-
-@contextmanager
-def _progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], None]]:
-    """Give a callback that draws a bar on a terminal, and nothing in a pipe."""
-    if not sys.stderr.isatty():
-        yield lambda progress: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.1f} " + unit + "/s, {task.fields[tracked]:.0%} tracked,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None, start=False, rate=0.0, tracked=1.0)
-
-        def update(progress: Progress) -> None:
-            bar.start_task(task)
-            bar.update(
-                task,
-                completed=progress.n_done,
-                total=progress.n_total,
-                rate=progress.n_done / (bar.tasks[0].elapsed or 1e-9),
-                tracked=progress.n_tracked / max(progress.n_done, 1),
-            )
-
-        yield update
-
-
-def _both(
-    show: Callable[[Progress], None], check: Callable[[object], None]
-) -> Callable[[Progress], None]:
-    def on_progress(progress: Progress) -> None:
-        show(progress)
-        check(progress)
-
-    return on_progress
-
-
-@contextmanager
-def _interruptible() -> Iterator[Callable[[object], None]]:
-    """Give a function that ends the work where a signal has come; call it between frames.
-
-    So a frame is either in all files or in none. A second signal ends at once.
-    """
-    received: list[int] = []
-
-    def receive(number: int, frame: object) -> None:
-        received.append(number)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-
-    def check(_: object) -> None:
-        if received:
-            raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, receive) for number in _EXIT_CODES}
-    try:
-        yield check
-    except KeyboardInterrupt:
-        raise SystemExit(_EXIT_CODES[received[0]] if received else 130) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def main() -> None:
