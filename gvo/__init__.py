@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from gvo.outputs.bag_writer import convert
     from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import format_evaluations
-    from gvo.runs import RunResult, read_ground_truth, run_recording
+    from gvo.run_inputs import asked_truth, choose_frame, read_ground_truth
+    from gvo.runs import RunResult, run_recording
+    from gvo.sources.excerpt import Excerpt
     from gvo.sources.frames import frames
     from gvo.sources.opening import RecordingOptions, open_recording
     from gvo.sources.synthetic import SyntheticRecording
@@ -53,7 +55,9 @@ _MODULES = {
     "gvo.outputs.bag_writer": ("convert",),
     "gvo.outputs.plots": ("plot_trajectories",),
     "gvo.outputs.tables": ("format_evaluations",),
-    "gvo.runs": ("RunResult", "read_ground_truth", "run_recording"),
+    "gvo.run_inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
+    "gvo.runs": ("RunResult", "run_recording"),
+    "gvo.sources.excerpt": ("Excerpt",),
     "gvo.sources.frames": ("frames",),
     "gvo.sources.opening": ("RecordingOptions", "open_recording"),
     "gvo.sources.synthetic": ("SyntheticRecording",),
@@ -81,6 +85,7 @@ __all__ = [
     "Edge",
     "Estimate",
     "Evaluation",
+    "Excerpt",
     "Failure",
     "FaultyFrame",
     "FrameResult",
@@ -105,6 +110,8 @@ __all__ = [
     "Trajectory",
     "WindowConfig",
     "__version__",
+    "asked_truth",
+    "choose_frame",
     "convert",
     "evaluate",
     "format_evaluations",

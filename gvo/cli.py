@@ -15,7 +15,10 @@ from gvo.errors import ConfigurationError, GvoError
 from gvo.terminal import both, interruptible, progress, report, report_smoothed, warn
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from gvo.config import Config
+    from gvo.sources.recording import Source
     from gvo.trajectory import Trajectory
 
 app = typer.Typer(
@@ -37,15 +40,33 @@ _Compare = Annotated[
     bool,
     typer.Option("--compare", help="Also smooth by full iSAM2 and batch; print the difference."),
 ]
-_CalibrationFile = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Camera, ROS camera_info YAML; replaces the recording's."),
+_Recordings = Annotated[
+    list[Path], typer.Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
 ]
+_CalibrationFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
+    ),
+]
+_Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")]
+_Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")]
+_Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")]
+_Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")]
+_AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+EXIT_FAULTS = 1
 
 
 class _KeyframePolicy(StrEnum):
     DISTANCE = "distance"
     MANUAL = "manual"
+
+
+class _Layout(StrEnum):
+    BAG = "bag"
+    KITTI = "kitti"
+    EUROC = "euroc"
+    TUM = "tum"
 
 
 class _Align(StrEnum):
@@ -75,7 +96,7 @@ def _options(
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
 ) -> None:
-    """Render a drive, write it as a bag, run on it, compare with the exact truth."""
+    """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.demo import BAG_NAME, run_demo
 
     typer.echo(f"rendering a drive into {out / BAG_NAME}")
@@ -86,42 +107,105 @@ def demo(
 
 @app.command()
 def run(
-    recording: Annotated[Path, typer.Argument(help="Bag, MCAP, or data-set folder.")],
+    recordings: _Recordings,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
     config: _ConfigFile = None,
     set_: _Settings = None,
-    ground_truth: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Poses of the camera: TUM, KITTI, EuRoC.")
+    start: Annotated[float, typer.Option(metavar="S", help="Leave out the first seconds.")] = 0.0,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Read no more than so many seconds.")
     ] = None,
-    calibration: _CalibrationFile = None,
-    left: Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")] = None,
-    right: Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")] = None,
-    color: Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")] = None,
-    depth: Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")] = None,
+    every: Annotated[int, typer.Option(metavar="N", help="Take each Nth frame only.")] = 1,
+    frame: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Write poses of this frame of tf, not the camera's."),
+    ] = None,
+    initial_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POSE", help="Of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too."),
+    ] = None,
+    calibration: _CalibrationFiles = None,
+    left: _Left = None,
+    right: _Right = None,
+    color: _Color = None,
+    depth: _Depth = None,
     compare_smoothing: _Compare = False,
 ) -> None:
-    """Estimate the trajectory of a recording; write it with covariances, summary and picture."""
-    from gvo.runs import read_ground_truth, run_recording
-    from gvo.sources.opening import RecordingOptions, open_recording
+    """Estimate the trajectory of a recording, with covariances."""
+    from gvo.output_frame import parse_initial_pose
+    from gvo.run_inputs import asked_truth, choose_frame
+    from gvo.runs import run_recording
+    from gvo.sources.excerpt import make_excerpt
 
     parameters = _load(config, set_)
-    options = RecordingOptions(
-        calibration=calibration, left=left, right=right, color=color, depth=depth
-    )
-    source = open_recording(recording, config=parameters, options=options)
-    for decision in source.info.decisions:
-        typer.echo(decision)
-    truth = None if ground_truth is None else read_ground_truth(ground_truth)
+    excerpt = make_excerpt(start, duration, every)
+    pose = None if initial_pose is None else parse_initial_pose(initial_pose)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = _open(recordings, parameters, calibration, topics)
+    placed = choose_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
+    truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
+    for line in source.info.decisions:
+        typer.echo(line)
     with interruptible() as check, progress(source.info.name) as show:
         result = run_recording(
             source,
             out,
             config=parameters,
             ground_truth=truth,
+            frame=placed,
+            starts_at_truth=pose == "truth",
+            excerpt=excerpt,
+            bag=bag,
             compare_smoothing=compare_smoothing,
             on_progress=both(show, check),
         )
     report(result, out)
+
+
+@app.command("check")
+def check_(
+    recordings: _Recordings,
+    config: _ConfigFile = None,
+    set_: _Settings = None,
+    frame: Annotated[
+        str, typer.Option(metavar="NAME", help="The robot's own frame in tf.")
+    ] = "base_link",
+    calibration: _CalibrationFiles = None,
+    left: _Left = None,
+    right: _Right = None,
+    color: _Color = None,
+    depth: _Depth = None,
+    as_json: _AsJson = False,
+) -> None:
+    """Look for what would make odometry fail, before it runs."""
+    from gvo.checkup import check_recording, format_checkup
+    from gvo.run_inputs import read_transforms
+
+    parameters = _load(config, set_)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = _open(recordings, parameters, calibration, topics)
+    with interruptible():
+        checkup = check_recording(
+            source,
+            parameters,
+            transforms=read_transforms(source, (source.info.frame_id, frame)),
+            base_frame=frame,
+        )
+    if as_json:
+        typer.echo(json.dumps(checkup.as_json(), allow_nan=False))
+    else:
+        typer.echo(format_checkup(checkup), nl=False)
+    raise typer.Exit(0 if checkup.is_healthy else EXIT_FAULTS)
 
 
 @app.command()
@@ -153,8 +237,8 @@ def smooth(
     set_: _Settings = None,
     compare_smoothing: _Compare = False,
 ) -> None:
-    """Smooth the edges or poses of any front-end: g2o, trajectories, odometry topics, stdin."""
-    from gvo.runs import read_ground_truth
+    """Smooth the edges or poses of any front-end."""
+    from gvo.run_inputs import read_ground_truth
     from gvo.smoothing import configuration_for, smooth_edges
     from gvo.sources.edge_inputs import open_edges, parse_sigma
 
@@ -213,8 +297,10 @@ def _smooth_lines(
 
 @app.command()
 def compare(
-    reference: Annotated[Path, typer.Argument(help="TUM, KITTI or EuRoC file, or a recording.")],
-    estimates: Annotated[list[Path], typer.Argument(help="Files of poses.")],
+    reference: Annotated[
+        str, typer.Argument(help="TUM, KITTI or EuRoC file, a recording, or BAG#tf:A:B, BAG#TOPIC.")
+    ],
+    estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
     align: Annotated[_Align, typer.Option(help="What moves each estimate.")] = _Align.SE3,
     segments: Annotated[
         str | None, typer.Option(metavar="L,...", help="Lengths in m; 100,...,800 or 20,50.")
@@ -222,23 +308,20 @@ def compare(
     segment_step: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Every Nth pose a start; 10 or 1.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: _AsJson = False,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")
     ] = None,
 ) -> None:
-    """Measure trajectories against a reference: ATE, RPE, KITTI segment errors."""
+    """Measure trajectories against a reference: ATE, RPE, segments."""
     from gvo.evaluation import evaluate
     from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import evaluations_json, format_evaluations
-    from gvo.runs import read_ground_truth
-    from gvo.trajectory_files import read_trajectory
+    from gvo.run_inputs import read_compared
 
-    truth = read_ground_truth(reference)
+    truth, trajectories, notes = read_compared(reference, estimates)
+    warn(notes)
     lengths = None if segments is None else _parse_lengths(segments)
-    trajectories = {
-        name: read_trajectory(path) for name, path in zip(_names(estimates), estimates, strict=True)
-    }
     evaluations = [
         evaluate(
             truth,
@@ -260,30 +343,44 @@ def compare(
 
 @app.command()
 def convert(
-    folder: Annotated[Path, typer.Argument(help="Data-set folder: KITTI, EuRoC, TUM RGB-D.")],
-    bag: Annotated[Path, typer.Argument(help=".bag, .mcap, or a ROS 2 folder to make.")],
+    recording: Annotated[Path, typer.Argument(help="Data-set folder, or bag.")],
+    target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
+    layout: Annotated[
+        _Layout | None, typer.Option(help="Of the folder; a data set's for a bag, else a bag's.")
+    ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
-    calibration: _CalibrationFile = None,
+    png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
+    calibration: _CalibrationFiles = None,
+    left: _Left = None,
+    right: _Right = None,
+    color: _Color = None,
+    depth: _Depth = None,
     config: _ConfigFile = None,
     set_: _Settings = None,
 ) -> None:
-    """Write a data-set folder as a bag, pixels untouched, with the ground truth as tf."""
-    from gvo.outputs.bag_writer import convert as write_bag
+    """Write a data-set folder as a bag, or a bag as such a folder."""
+    from gvo.outputs.converting import convert_recording
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
-    from gvo.sources.opening import RecordingOptions, open_recording
 
-    options = RecordingOptions(calibration=calibration)
-    source = open_recording(folder, config=_load(config, set_), options=options)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = _open([recording], _load(config, set_), calibration, topics)
     with interruptible() as check:
-        written = write_bag(source, bag, rectify=rectify, progress=check)
-    typer.echo(f"wrote {bag}: {written.n_images} images, {written.n_poses} true poses")
+        written = convert_recording(
+            source,
+            target,
+            layout=None if layout is None else layout.value,
+            rectify=rectify,
+            compress=png,
+            progress=check,
+        )
+    typer.echo(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
     warn(written.skipped)
     raise typer.Exit(EXIT_PARTLY if written.skipped else EXIT_COMPLETE)
 
 
 @app.command("config")
 def config_(config: _ConfigFile = None, set_: _Settings = None) -> None:
-    """Print all parameters as YAML, with units, ranges and meaning."""
+    """Print all parameters with units, ranges and meaning."""
     from gvo.config import describe_configuration
 
     typer.echo(describe_configuration(_load(config, set_)), nl=False)
@@ -307,14 +404,16 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
-def _names(paths: list[Path]) -> list[str]:
-    """Name estimates by their files, with folders where that is ambiguous."""
-    stems = [path.stem for path in paths]
-    names = [
-        stem if stems.count(stem) == 1 else f"{path.parent.name}/{stem}"
-        for stem, path in zip(stems, paths, strict=True)
-    ]
-    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+def _open(
+    recordings: Sequence[Path],
+    config: Config,
+    calibration: Sequence[Path] | None,
+    topics: Mapping[str, str | None],
+) -> Source:
+    from gvo.sources.opening import RecordingOptions, open_recording
+
+    options = RecordingOptions(calibration=tuple(calibration or ()), **topics)
+    return open_recording(recordings, config=config, options=options)
 
 
 def main() -> None:

@@ -49,6 +49,29 @@ class SyncConfig(Section):
     stereo_tolerance_ms: float = _parameter(
         0.0, "largest difference between the stamps of left and right; 0: equal stamps", "ms", ge=0
     )
+    queue_size: int = _parameter(
+        100, "images of a stream that are kept while their partners may come", ge=2, le=10000
+    )
+    age_penalty: float = _parameter(
+        0.1, "how much nearer, as a share, a later partner must be than an earlier one", ge=0
+    )
+
+
+class ImagesConfig(Section):
+    """Grey and colour images of 16 bits, of which 8 are used."""
+
+    black: int = _parameter(
+        0,
+        "largest value that becomes black; more where a thermal camera starts above 0",
+        ge=0,
+        le=65534,
+    )
+    white: int = _parameter(
+        65535,
+        "smallest value that becomes white; 4095 for a camera of 12 bits",
+        ge=1,
+        le=65535,
+    )
 
 
 class DepthConfig(Section):
@@ -266,10 +289,73 @@ class RuntimeConfig(Section):
     )
 
 
+class CheckConfig(Section):
+    """What `gvo check` looks at, and where it warns."""
+
+    n_samples: int = _parameter(12, "frames looked at, each with the next one", ge=2, le=1000)
+    max_lost_share: float = _parameter(
+        0.05, "share of frames lost: dropped, unpaired, undecodable, repeated", ge=0, le=1
+    )
+    fault_lost_share: float = _parameter(0.2, "the same, called a fault", ge=0, le=1)
+    max_jitter: float = _parameter(
+        0.3, "95 % of the periods differ less from the median, relative to it", ge=0
+    )
+    max_gap_s: float = _parameter(
+        0.5, "longest time without a frame; window.lost_after_s is a fault", "s", gt=0
+    )
+    max_stereo_difference_ms: float = _parameter(
+        2.0, "median difference between the stamps of left and right", "ms", ge=0
+    )
+    max_depth_difference_ms: float = _parameter(
+        10.0, "median difference between the stamps of colour and depth", "ms", ge=0
+    )
+    max_clock_drift_ms_per_min: float = _parameter(
+        60.0, "drift of the header clock against the recording clock", "ms/min", ge=0
+    )
+    max_clock_jump_ms: float = _parameter(100.0, "jump of the same", "ms", ge=0)
+    max_row_offset_px: float = _parameter(
+        0.75, "median row difference of left and right; above is a fault", "px", ge=0
+    )
+    max_row_spread_px: float = _parameter(
+        2.0, "95 % of the row differences are below; above is a fault", "px", ge=0
+    )
+    min_stereo_matches: int = _parameter(60, "matches of left and right per frame", ge=0)
+    max_negative_share: float = _parameter(
+        0.1, "share of matches behind infinity; more than half: left and right swapped", ge=0, le=1
+    )
+    min_depth_median_m: float = _parameter(
+        0.2, "smallest median depth that a right scale gives", "m", ge=0
+    )
+    max_depth_median_m: float = _parameter(
+        50.0, "largest median depth that a right scale gives", "m", gt=0
+    )
+    min_depth_in_range: float = _parameter(
+        0.5, "share of known depth within depth.min_depth_m and depth.max_depth_m", ge=0, le=1
+    )
+    max_unknown_depth: float = _parameter(0.5, "share of unknown depth", ge=0, le=1)
+    min_depth_levels: int = _parameter(64, "different values in a depth image", ge=1)
+    max_misregistration_px: float = _parameter(
+        3.0, "offset between the edges of depth and colour; twice as much is a fault", "px", ge=0
+    )
+    min_brightness: float = _parameter(25.0, "smallest mean grey value", "grey", ge=0, le=255)
+    max_brightness: float = _parameter(230.0, "largest mean grey value", "grey", ge=0, le=255)
+    max_clipped_share: float = _parameter(0.3, "share of black and of white pixels", ge=0, le=1)
+    max_exposure_ratio: float = _parameter(
+        1.3, "ratio of the mean grey values of left and right", ge=1
+    )
+    max_blur_px: float = _parameter(1.6, "sigma of the blur of edges", "px", gt=0)
+    min_corners: int = _parameter(80, "corners per image (of klt.n_corners)", ge=0)
+    min_followed_share: float = _parameter(
+        0.3, "share of corners that are found again in the next frame", ge=0, le=1
+    )
+    max_tf_gap_s: float = _parameter(0.5, "longest time without a transform of a chain", "s", gt=0)
+
+
 class Config(Section):
     """The whole configuration."""
 
     sync: SyncConfig = SyncConfig()
+    images: ImagesConfig = ImagesConfig()
     depth: DepthConfig = DepthConfig()
     frontend: FrontendConfig = FrontendConfig()
     klt: KltConfig = KltConfig()
@@ -280,6 +366,7 @@ class Config(Section):
     registration: RegistrationConfig = RegistrationConfig()
     window: WindowConfig = WindowConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+    check: CheckConfig = CheckConfig()
 
 
 def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
@@ -347,6 +434,11 @@ def _validate(values: Mapping[str, object]) -> Config:
                 f"{section}.min_depth_m={limits.min_depth_m} must be below "
                 f"{section}.max_depth_m={limits.max_depth_m}"
             )
+    images = config.images
+    if images.black >= images.white:
+        raise ConfigurationError(
+            f"images.black={images.black} must be below images.white={images.white}"
+        )
     return config
 
 

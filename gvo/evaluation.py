@@ -9,7 +9,7 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, associate
+from gvo.trajectory_alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
 from gvo.types import FloatArray, IntArray
 
 KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -26,6 +26,9 @@ SHORT_STEP = 1
 class Evaluation:
     """The errors of one estimate against a reference, over the associated poses.
 
+    Against positions without rotations (GNSS) only the position errors, the coverage and the path
+    ratio are measured: all others compare motions in the frame of a pose.
+
     Parameters
     ----------
     name : str
@@ -35,9 +38,11 @@ class Evaluation:
     errors_m : ndarray of float64, shape (n,)
         Distance of each aligned position from the reference, metres.
     rpe_m, rpe_deg : float or None
-        Relative pose error: RMSE of translation and rotation; None where no pair fits.
+        Relative pose error: RMSE of translation and rotation; None where no pair fits or
+        there are no rotations.
     t_pct : float or None
-        Mean translation error of KITTI's segments, % of their length; None where none fits.
+        Mean translation error of KITTI's segments, % of their length; None where none fits or
+        there are no rotations.
     r_deg_per_100m : float or None
         Mean rotation error of the same segments, degrees per 100 m.
     n_segments : int
@@ -117,7 +122,7 @@ def evaluate(
     segment_step : int, optional
         Poses between two starts of segments; 10 as in KITTI's, or every pose, likewise.
     max_difference_ns : int
-        Largest difference of associated stamps, nanoseconds.
+        Largest difference of associated stamps, nanoseconds; see `pair`.
     rpe_delta : int
         Poses between the two of a pair of the relative pose error.
 
@@ -128,26 +133,26 @@ def evaluate(
     Raises
     ------
     TrajectoryError
-        Where nothing can be associated, or no scale be found for `sim3`.
+        Where nothing can be associated, no scale be found for `sim3`, or `origin` lacks a
+        rotation.
     ValueError
         Where a segment length, the step or the delta is not positive.
     """
-    indices, others = associate(reference, estimate, max_difference_ns=max_difference_ns, name=name)
-    ref, est = reference.select(indices), estimate.select(others)
+    ref, est = pair(reference, estimate, max_difference_ns=max_difference_ns, name=name)
     aligned = alignment(ref, est, align).apply(est)
     is_long = _path_length(ref) >= KITTI_SEGMENTS_M[-1]
     if segments is None:
         segments = KITTI_SEGMENTS_M if is_long else SHORT_SEGMENTS_M
     if segment_step is None:
         segment_step = KITTI_STEP if is_long else SHORT_STEP
-    pair_t, pair_r = relative_errors(ref, aligned, delta=rpe_delta)
+    step_t, step_r = relative_errors(ref, aligned, delta=rpe_delta)
     shares, turns = segment_errors(ref, aligned, lengths_m=segments, step=segment_step)
     return Evaluation(
         name=name,
         stamps_ns=ref.stamps_ns,
         errors_m=np.linalg.norm(ref.positions - aligned.positions, axis=1),
-        rpe_m=_root(_mean(pair_t**2)),
-        rpe_deg=_root(_mean(np.rad2deg(pair_r) ** 2)),
+        rpe_m=_root(_mean(step_t**2)),
+        rpe_deg=_root(_mean(np.rad2deg(step_r) ** 2)),
         t_pct=_mean(100.0 * shares),
         r_deg_per_100m=_mean(100.0 * np.rad2deg(turns)),
         n_segments=len(shares),
@@ -174,7 +179,7 @@ def relative_errors(
     translations : ndarray of float64, shape (m,)
         Metres.
     rotations : ndarray of float64, shape (m,)
-        Radians.
+        Radians; both are empty where one of the trajectories holds positions alone.
 
     References
     ----------
@@ -183,7 +188,8 @@ def relative_errors(
     """
     if delta < 1:
         raise ValueError(f"delta must be at least 1, got {delta}")
-    first = np.arange(max(len(reference) - delta, 0))
+    n_pairs = max(len(reference) - delta, 0) if _have_rotations(reference, estimate) else 0
+    first = np.arange(n_pairs)
     return _pair_errors(reference, estimate, first, first + delta)
 
 
@@ -209,7 +215,8 @@ def segment_errors(
     translations : ndarray of float64, shape (m,)
         Translation error over the length of the segment.
     rotations : ndarray of float64, shape (m,)
-        Rotation error over the length of the segment, radians per metre.
+        Rotation error over the length of the segment, radians per metre; both are empty where one
+        of the trajectories holds positions alone.
 
     References
     ----------
@@ -222,9 +229,13 @@ def segment_errors(
     starts, lengths = np.meshgrid(np.arange(0, len(reference), step), np.array(lengths_m, float))
     first, length = starts.ravel(), lengths.ravel()
     last = np.searchsorted(distances, distances[first] + length, side="right")
-    fits = last < len(reference)
+    fits = (last < len(reference)) & _have_rotations(reference, estimate)
     translations, rotations = _pair_errors(reference, estimate, first[fits], last[fits])
     return translations / length[fits], rotations / length[fits]
+
+
+def _have_rotations(reference: Trajectory, estimate: Trajectory) -> bool:
+    return reference.has_rotations and estimate.has_rotations
 
 
 def _pair_errors(

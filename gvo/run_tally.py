@@ -60,6 +60,7 @@ class RunTally:
     first_unpaired: str = ""
     first_untied: str = ""
     broken_off: str = ""
+    n_guessed: int = 0
     window: WindowCounts = field(default_factory=WindowCounts)
     polish: Polish | None = None
     rig_offsets: RigOffsets | None = None
@@ -133,6 +134,10 @@ class RunTally:
                 f"{self.n_unpaired} images have no partner and make no frame "
                 "(sync.max_difference_ms)"
             )
+        return [*warnings, *self._warnings_of_poses(), *self._warnings_of_window()]
+
+    def _warnings_of_poses(self) -> list[str]:
+        warnings = []
         n_untied = self.n_with_pose - self.n_tracked
         if n_untied and self.n_tracked < 2:
             warnings.append(
@@ -145,6 +150,15 @@ class RunTally:
                 f"{n_untied} of {self.n_with_pose} poses continue the last velocity, without a "
                 "registration (frames.csv: coasting, lost)"
             )
+        if self.n_guessed:
+            warnings.append(
+                f"tf does not say where the camera is in the frame asked for at {self.n_guessed} "
+                "stamps: what it says at the nearest one was taken"
+            )
+        return warnings
+
+    def _warnings_of_window(self) -> list[str]:
+        warnings = []
         if self.window.n_restored:
             warnings.append(
                 f"{self.window.n_restored} updates of the window failed and were done again with "

@@ -4,31 +4,35 @@ from __future__ import annotations
 
 import resource
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
+import numpy as np
 
 from gvo import __version__
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError, TrajectoryError
-from gvo.evaluation import Evaluation, evaluate
-from gvo.odometry import Odometry
+from gvo.errors import GvoError, RecordingError
+from gvo.evaluation import Evaluation
+from gvo.output_frame import OutputFrame
 from gvo.outputs.plots import plot_trajectories
+from gvo.outputs.run_bag import RunBag
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
-from gvo.run_tally import Progress, RunTally
-from gvo.sources.frames import frames
-from gvo.sources.opening import BAG_SUFFIXES, open_recording
-from gvo.sources.recording import Sensor, Source
+from gvo.run_inputs import initial_pose, own_truth
+from gvo.run_loop import Output, RunLoop, run_frames
+from gvo.run_tally import Progress
+from gvo.sources.excerpt import Excerpt
+from gvo.sources.recording import Source
+from gvo.sources.truth_frames import FramedTruth
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
-from gvo.types import FaultyFrame, Frame, Status
+from gvo.truth_comparison import TruthComparison
+from gvo.types import Failure, Status
 
 EXIT_COMPLETE = 0
 EXIT_PARTLY = 3
@@ -61,7 +65,11 @@ def run_recording(
     out: str | Path,
     *,
     config: Config | None = None,
-    ground_truth: Trajectory | None = None,
+    ground_truth: Trajectory | FramedTruth | None = None,
+    frame: OutputFrame | None = None,
+    starts_at_truth: bool = False,
+    excerpt: Excerpt | None = None,
+    bag: str | Path | None = None,
     compare_smoothing: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
@@ -74,8 +82,17 @@ def run_recording(
     out : str or Path
         Folder for the trajectories, covariances, table of frames, summary and picture.
     config : Config, optional
-    ground_truth : Trajectory, optional
-        Poses of the recording's camera; the recording's own where omitted.
+    ground_truth : Trajectory or FramedTruth, optional
+        Poses of the frame asked for; the recording's own where omitted.
+    frame : OutputFrame, optional
+        Whose poses are written, and where they start; the camera's, from the identity, where
+        omitted.
+    starts_at_truth : bool
+        Take the first true pose for the initial one.
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    bag : str or Path, optional
+        A `.mcap` or `.bag` to write as well: transforms, odometry, paths, points, overlays.
     compare_smoothing : bool
         Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
         all of them in memory.
@@ -89,177 +106,113 @@ def run_recording(
     Raises
     ------
     RecordingError
-        When no frame is usable, or the folder cannot be written.
+        When no frame is usable, or what is to be written cannot be.
     """
     config = config or Config()
-    tally = RunTally()
-    comparison = SmoothingComparison() if compare_smoothing else None
-    odometry = Odometry(
-        source.info.camera, config, log=None if comparison is None else comparison.log
+    frame = frame or OutputFrame(source.info.frame_id)
+    truth, fault = _find_truth(source, ground_truth, frame)
+    loop = RunLoop(
+        source,
+        config,
+        frame,
+        excerpt=excerpt,
+        comparison=SmoothingComparison() if compare_smoothing else None,
+        first_pose=partial(initial_pose, truth) if starts_at_truth else None,
     )
-    with (
-        RunFolder(Path(out), watch=None if comparison is None else comparison.add) as folder,
-        one_opencv_thread(),
-    ):
-        try:
-            for item in _read_frames(source, config, tally):
-                _take(item, odometry, folder, tally, sensor=source.info.sensor)
-                if on_progress is not None:
-                    on_progress(tally.progress(source.info.n_images))
-        finally:
-            # Also where the run is interrupted: what the window holds was computed.
-            folder.add_smoothed(odometry.finish())
-    tally.window, tally.polish = odometry.window.counts, odometry.window.polish
-    tally.rig_offsets = odometry.rig_offsets
-    return _conclude(
-        source, folder, tally, config=config, ground_truth=ground_truth, comparison=comparison
-    )
+    with ExitStack() as stack:
+        outputs: list[Output] = []
+        if bag is not None:
+            names = run_frames(source, frame, is_placed=frame.is_placed or starts_at_truth)
+            outputs.append(stack.enter_context(RunBag(bag, names)))
+        folder = stack.enter_context(RunFolder(Path(out)))
+        loop.run([folder, *outputs], on_progress)
+    return _conclude(loop, folder, truth, fault, is_asked=ground_truth is not None)
 
 
-def read_ground_truth(path: str | Path) -> Trajectory:
-    """Read the true poses of a recording's camera.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file of poses (TUM, KITTI, EuRoC), a recording's folder, or a bag that holds them.
-
-    Raises
-    ------
-    TrajectoryError
-        When the file holds no poses, or the recording no ground truth.
-    """
-    path = Path(path)
-    if (path / "groundtruth.txt").is_file():
-        return read_trajectory(path / "groundtruth.txt")
-    if path.is_file() and path.suffix not in BAG_SUFFIXES:
-        return read_trajectory(path)
-    truth = open_recording(path).ground_truth()
-    if truth is None:
-        raise TrajectoryError(f"{path}: this recording holds no ground truth")
-    return truth
-
-
-@contextmanager
-def one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV, inside the context, from splitting single calls over threads.
-
-    Images are worked on side by side already; splitting the small ones as well costs a tenth more
-    CPU time and gains nothing.
-    """
-    n_before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+def _find_truth(
+    source: Source, given: Trajectory | FramedTruth | None, frame: OutputFrame
+) -> tuple[FramedTruth | Failure, str]:
+    """Return the truth, and what is wrong with that of the recording."""
+    if isinstance(given, Trajectory):
+        return FramedTruth(trajectory=given, T_frame_point=np.eye(4), decision="given"), ""
+    if given is not None:
+        return given, ""
     try:
-        yield
-    finally:
-        cv2.setNumThreads(n_before)
-
-
-def _read_frames(source: Source, config: Config, tally: RunTally) -> Iterator[Frame | FaultyFrame]:
-    """Yield frames, timing the reading; where the recording breaks off, note it and end."""
-    iterator = frames(source, config)
-    while True:
-        start = time.perf_counter()
-        try:
-            item = next(iterator)
-        except StopIteration:
-            return
-        except RecordingError as error:
-            tally.broken_off = str(error)
-            return
-        tally.add_duration("read", 1e3 * (time.perf_counter() - start))
-        yield item
-
-
-def _take(
-    item: Frame | FaultyFrame,
-    odometry: Odometry,
-    folder: RunFolder,
-    tally: RunTally,
-    *,
-    sensor: Sensor,
-) -> None:
-    if isinstance(item, FaultyFrame):
-        # Colour and depth of a free-running sensor need not pair; the images of a stereo
-        # camera are taken together, and one without the other is a loss.
-        is_loss = not item.is_unpaired or sensor == "stereo"
-        tally.add_faulty(item, is_loss=is_loss)
-        if is_loss:
-            folder.add_faulty(item)
-        return
-    result = odometry.track(item)
-    tally.add_result(result)
-    folder.add_frame(result)
+        return own_truth(source, frame=frame), ""
+    except GvoError as error:
+        # What was not asked for must not keep the run from being made.
+        return Failure(reason=str(error)), str(error)
 
 
 def _conclude(
-    source: Source,
-    folder: RunFolder,
-    tally: RunTally,
-    *,
-    config: Config,
-    ground_truth: Trajectory | None,
-    comparison: SmoothingComparison | None,
+    loop: RunLoop, folder: RunFolder, truth: FramedTruth | Failure, fault: str, *, is_asked: bool
 ) -> RunResult:
+    tally = loop.tally
     if tally.n_with_pose == 0:
         reason = (
             tally.broken_off or tally.first_fault or tally.first_unpaired or "it holds no image"
         )
-        raise RecordingError(f"{source.info.name}: no usable frame: {reason}")
+        raise RecordingError(f"{loop.source.info.name}: no usable frame: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     warnings = tally.warnings()
-    truth: Trajectory | None = None
-    evaluations: tuple[Evaluation, ...] = ()
+    compared: TruthComparison | None = None
     try:
-        truth = (
-            source.ground_truth() if ground_truth is None else _with_stamps(ground_truth, folder)
-        )
-        evaluations = _evaluate(truth, estimates)
+        if isinstance(truth, FramedTruth):
+            compared = TruthComparison.of(_with_stamps(truth, folder), estimates)
+            warnings += [f"ground truth: {truth.warning}"] if truth.warning else []
     except GvoError as error:
-        warnings.append(f"not compared with the ground truth: {error}")
-    is_partly = tally.is_partly or (ground_truth is not None and not evaluations)
-    summary = _summary(source, tally, config=config, evaluations=evaluations, warnings=warnings)
-    if comparison is not None:
-        summary["smoothing"] = comparison.conclude(folder.path, truth if evaluations else None)
+        fault = str(error)
+    if fault:
+        warnings.append(f"not compared with the ground truth: {fault}")
+    summary = _summary(loop, compared, warnings)
+    if isinstance(truth, Failure) or compared is None:
+        reason = truth.reason if isinstance(truth, Failure) else fault
+        summary["ground_truth"] = f"none: {reason}"
+    if loop.comparison is not None:
+        summary["smoothing"] = loop.comparison.conclude(
+            folder.path,
+            measure=None if compared is None else compared.measure,
+            place=loop.frame.place,
+        )
     folder.write_summary(summary)
-    plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
+    _plot(folder.path / PICTURE, compared, estimates)
+    is_partly = tally.is_partly or (is_asked and compared is None)
     return RunResult(
         summary=summary,
-        evaluations=evaluations,
+        evaluations=() if compared is None else compared.evaluations,
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
 
 
-def _with_stamps(truth: Trajectory, folder: RunFolder) -> Trajectory:
+def _plot(path: Path, compared: TruthComparison | None, estimates: dict[str, Trajectory]) -> None:
+    if compared is None:
+        plot_trajectories(path, None, estimates)
+    else:
+        plot_trajectories(path, compared.truth.trajectory, compared.estimates)
+
+
+def _with_stamps(truth: FramedTruth, folder: RunFolder) -> FramedTruth:
     """Give poses without stamps, one for each frame, the stamps of the frames."""
     stamps_ns = folder.frame_stamps_ns()
-    if truth.stamps_from != "rows" or len(truth) != len(stamps_ns):
+    if truth.trajectory.stamps_from != "rows" or len(truth.trajectory) != len(stamps_ns):
         return truth
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.T_world_cam)
-
-
-def _evaluate(truth: Trajectory | None, estimates: dict[str, Trajectory]) -> tuple[Evaluation, ...]:
-    if truth is None:
-        return ()
-    return tuple(evaluate(truth, estimate, name=name) for name, estimate in estimates.items())
+    stamped = Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.trajectory.T_world_cam)
+    return replace(truth, trajectory=stamped)
 
 
 def _summary(
-    source: Source,
-    tally: RunTally,
-    *,
-    config: Config,
-    evaluations: tuple[Evaluation, ...],
-    warnings: list[str],
+    loop: RunLoop, compared: TruthComparison | None, warnings: list[str]
 ) -> dict[str, Any]:
-    info = source.info
+    info, tally = loop.source.info, loop.tally
     medians = {stage: durations.median() for stage, durations in tally.stages.items()}
     return {
         "gvo_version": __version__,
         "recording": info.name,
         "sensor": info.sensor,
         "decisions": list(info.decisions),
+        "frame": loop.frame.name or "camera",
+        "ground_truth": "" if compared is None else compared.truth.decision,
         "frames": tally.n_frames,
         "tracked": tally.n_tracked,
         "coverage": tally.n_with_pose / tally.n_frames,
@@ -270,9 +223,9 @@ def _summary(
         "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
-        "errors": evaluations_json(evaluations)["estimates"],
+        "errors": evaluations_json(() if compared is None else compared.evaluations)["estimates"],
         "warnings": warnings,
-        "configuration": config.model_dump(),
+        "configuration": loop.config.model_dump(),
     }
 
 

@@ -288,8 +288,8 @@ def conclude(
             is_partly = True
     summary = _summary(name, smoother, notes)
     if notes.comparison is not None:
-        truth = truth if evaluations else None
-        summary["smoothing"] = notes.comparison.conclude(folder.path, truth)
+        measure = _measure(truth) if truth is not None and evaluations else None
+        summary["smoothing"] = notes.comparison.conclude(folder.path, measure=measure)
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     folder.write_summary(summary | {"configuration": config.model_dump()})
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
@@ -299,6 +299,10 @@ def conclude(
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
+
+
+def _measure(truth: Trajectory) -> Callable[[Trajectory], float]:
+    return lambda estimate: evaluate(truth, estimate, name="").ate_m
 
 
 def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:

@@ -22,6 +22,8 @@ def report(result: RunResult, out: Path) -> NoReturn:
     """Print what a run of odometry gave, and end with its exit code."""
     from gvo.outputs.tables import format_evaluations
 
+    for key in ("frame", "ground_truth"):
+        typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False)
     _print_smoothings(result)

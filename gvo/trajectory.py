@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import Literal, get_args
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray, IntArray
 
-StampsFrom = Literal["file", "times", "rows"]
+StampsFrom = Literal["file", "times", "rows", "topic"]
 
 _ROTATION_TOLERANCE = 1e-3
 
@@ -33,21 +33,26 @@ class Trajectory:
         Map camera coordinates to the world, metres.
     covariances : ndarray of float64, shape (n, 6, 6), optional
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
-    stamps_from : {"file", "times", "rows"}
+    stamps_from : {"file", "times", "rows", "topic"}
         Where the stamps come from: measured with the poses; a list of stamps beside rows of
-        poses; made up of the row numbers, a second each.
+        poses; made up of the row numbers, a second each; headers of messages, whose rate and
+        phase are those of another device.
+    has_rotations : bool
+        False where positions alone were measured, as by GNSS: the rotations are then identities
+        that mean nothing, and there are no covariances.
 
     Raises
     ------
     ValueError
-        Where shapes do not fit, values are not finite, stamps do not increase, or a pose is
-        no rigid transform.
+        Where shapes do not fit, values are not finite, stamps do not increase, a pose is
+        no rigid transform, or positions alone come with rotations or covariances.
     """
 
     stamps_ns: IntArray
     T_world_cam: FloatArray
     covariances: FloatArray | None = None
     stamps_from: StampsFrom = "file"
+    has_rotations: bool = True
 
     def __post_init__(self) -> None:
         """Check once, then keep copies that nobody can write to."""
@@ -62,6 +67,8 @@ class Trajectory:
         if self.covariances is not None:
             covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
             object.__setattr__(self, "covariances", covariances)
+        if not self.has_rotations:
+            _check_positions_only(poses, self.covariances)
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> Trajectory:
@@ -77,6 +84,31 @@ class Trajectory:
             stamps_ns=np.array([estimate.stamp_ns for estimate in ordered], dtype=np.int64),
             T_world_cam=np.array([e.T_world_cam for e in ordered]).reshape(-1, 4, 4),
             covariances=np.array([e.covariance for e in ordered]).reshape(-1, 6, 6),
+        )
+
+    @classmethod
+    def of_positions(
+        cls, stamps_ns: IntArray, positions: FloatArray, *, stamps_from: StampsFrom = "file"
+    ) -> Trajectory:
+        """Return the trajectory of a point of which no rotations are known.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int64, shape (n,)
+            Strictly increasing, nanoseconds.
+        positions : ndarray of float64, shape (n, 3)
+            In the world, metres.
+        stamps_from : {"file", "times", "rows", "topic"}
+            As of the class.
+        """
+        positions = np.asarray(positions, dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
+        return cls(
+            stamps_ns=stamps_ns,
+            T_world_cam=_unrotated(positions),
+            stamps_from=stamps_from,
+            has_rotations=False,
         )
 
     def __len__(self) -> int:
@@ -110,11 +142,11 @@ class Trajectory:
         if not isinstance(chosen, slice) and chosen.size == 0:
             chosen = np.empty(0, dtype=np.int64)  # an empty list would be an array of floats
         covariances = self.covariances
-        return Trajectory(
+        return replace(
+            self,
             stamps_ns=self.stamps_ns[chosen],
             T_world_cam=self.T_world_cam[chosen],
             covariances=None if covariances is None else covariances[chosen],
-            stamps_from=self.stamps_from,
         )
 
     def transformed(self, T_cam_body: FloatArray) -> Trajectory:
@@ -129,19 +161,41 @@ class Trajectory:
         -------
         Trajectory
             T_world_cam @ T_cam_body, the covariances in the new frame.
+
+        Raises
+        ------
+        ValueError
+            Where positions alone are known, and the new frame lies elsewhere.
         """
         T_cam_body = np.asarray(T_cam_body, dtype=np.float64)
+        if not self.has_rotations:
+            if np.any(T_cam_body[:3, 3] != 0.0):
+                raise ValueError("without rotations the positions of another point are not known")
+            return self
         covariances = self.covariances
         if covariances is not None:
             # T exp(xi) B = T B exp(Ad(B^-1) xi)
             Ad = se3.adjoint(se3.invert(T_cam_body))
             covariances = Ad @ covariances @ Ad.T
-        return Trajectory(
-            stamps_ns=self.stamps_ns,
-            T_world_cam=self.T_world_cam @ T_cam_body,
-            covariances=covariances,
-            stamps_from=self.stamps_from,
-        )
+        return replace(self, T_world_cam=self.T_world_cam @ T_cam_body, covariances=covariances)
+
+    def moved(self, T_map_world: FloatArray) -> Trajectory:
+        """Return the same motion in another world.
+
+        Parameters
+        ----------
+        T_map_world : ndarray of float64, shape (4, 4)
+            Maps coordinates of the present world to the new one, metres.
+
+        Returns
+        -------
+        Trajectory
+            T_map_world @ T_world_cam; the covariances, of the camera's own frame, are the same.
+        """
+        T_map_cam = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_cam
+        if not self.has_rotations:
+            T_map_cam = _unrotated(T_map_cam[:, :3, 3])
+        return replace(self, T_world_cam=T_map_cam)
 
     def interpolate(self, stamps_ns: IntArray) -> Trajectory:
         """Return the poses between the neighbours of given stamps.
@@ -161,7 +215,7 @@ class Trajectory:
         """
         wanted = _checked_stamps(stamps_ns)
         if len(self) == 0 or len(wanted) == 0:
-            return Trajectory(stamps_ns=np.empty(0, np.int64), T_world_cam=np.empty((0, 4, 4)))
+            return replace(self.select([]), covariances=None)
         wanted = wanted[(wanted >= self.stamps_ns[0]) & (wanted <= self.stamps_ns[-1])]
         after = np.searchsorted(self.stamps_ns, wanted)
         before = np.maximum(after - 1, 0)
@@ -169,7 +223,7 @@ class Trajectory:
         spans = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
         poses = _between(self.T_world_cam[before], self.T_world_cam[after], shares)
-        return Trajectory(stamps_ns=wanted, T_world_cam=poses, stamps_from=self.stamps_from)
+        return replace(self, stamps_ns=wanted, T_world_cam=poses, covariances=None)
 
 
 def _checked_stamps(stamps_ns: IntArray) -> IntArray:
@@ -205,6 +259,15 @@ def _check_rigid(poses: FloatArray) -> None:
     )
     if not np.all(is_rigid):
         raise ValueError(f"T_world_cam[{np.flatnonzero(~is_rigid)[0]}] is no rigid transform")
+
+
+def _unrotated(positions: FloatArray) -> FloatArray:
+    return se3.make_transform(np.tile(np.eye(3), (len(positions), 1, 1)), positions)
+
+
+def _check_positions_only(poses: FloatArray, covariances: FloatArray | None) -> None:
+    if covariances is not None or not np.all(poses[:, :3, :3] == np.eye(3)):
+        raise ValueError("without rotations the poses hold identities and no covariances")
 
 
 def _between(T_before: FloatArray, T_after: FloatArray, shares: FloatArray) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,6 +18,82 @@ AlignMode = Literal["none", "origin", "se3", "sim3"]
 
 MAX_DIFFERENCE_NS = 10_000_000
 """Largest difference of associated stamps, nanoseconds: the 10 ms of the TUM tools and evo."""
+
+MAX_GAP_NS = 250_000_000
+"""Poses are interpolated between neighbours at most so far apart, nanoseconds.
+
+At an acceleration of 2 m/s^2 the straight line between them is then off by at most 16 mm.
+"""
+
+
+def pair(
+    reference: Trajectory,
+    estimate: Trajectory,
+    *,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+    name: str = "estimate",
+) -> tuple[Trajectory, Trajectory]:
+    """Return the reference and the estimate at common stamps.
+
+    Files of a data set are associated pose by pose, as the field's tools do; see `associate`.
+    Where the stamps of either come from a topic (`stamps_from="topic"`), rates and phases differ
+    by nature: then the trajectory of the shorter steps is interpolated at the stamps of the
+    other, between neighbours at most `MAX_GAP_NS` apart; stamps in longer gaps are left out.
+
+    Parameters
+    ----------
+    reference, estimate : Trajectory
+        With at least one pose each.
+    max_difference_ns : int
+        Largest difference of associated stamps, nanoseconds; of no account in interpolation.
+    name : str
+        Of the estimate, for messages.
+
+    Returns
+    -------
+    tuple of two Trajectory
+        Of n poses each, n >= 1. An interpolated one holds no covariances.
+
+    Raises
+    ------
+    TrajectoryError
+        Where nothing can be associated.
+    """
+    origins = {reference.stamps_from, estimate.stamps_from}
+    if "topic" not in origins or "rows" in origins or 0 in (len(reference), len(estimate)):
+        indices, others = associate(
+            reference, estimate, max_difference_ns=max_difference_ns, name=name
+        )
+        return reference.select(indices), estimate.select(others)
+    if _step(estimate) < _step(reference):
+        inner, outer = _interpolated(estimate, reference)
+        pairs = outer, inner
+    else:
+        pairs = _interpolated(reference, estimate)
+    if len(pairs[0]) == 0:
+        raise TrajectoryError(
+            f"{name} and the reference share no stamps, none lies between two poses at most "
+            f"{MAX_GAP_NS / 1e6:g} ms apart: {name} {_range(estimate)}, reference "
+            f"{_range(reference)}; give files of one recording and one clock"
+        )
+    return pairs
+
+
+def _step(trajectory: Trajectory) -> float:
+    """Return the usual step between stamps, nanoseconds; infinite where there is none."""
+    return float(np.median(np.diff(trajectory.stamps_ns))) if len(trajectory) > 1 else np.inf
+
+
+def _interpolated(dense: Trajectory, sparse: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """Return both at those stamps of the sparse one that the dense one has close neighbours of."""
+    stamps_ns = sparse.stamps_ns
+    after = np.clip(np.searchsorted(dense.stamps_ns, stamps_ns), 0, len(dense) - 1)
+    before = np.maximum(after - 1, 0)
+    is_inside = (stamps_ns >= dense.stamps_ns[0]) & (stamps_ns <= dense.stamps_ns[-1])
+    is_hit = dense.stamps_ns[after] == stamps_ns
+    is_near = dense.stamps_ns[after] - dense.stamps_ns[before] <= MAX_GAP_NS
+    chosen = sparse.select(is_inside & (is_hit | is_near))
+    return dense.interpolate(chosen.stamps_ns), chosen
 
 
 def associate(
@@ -76,7 +152,7 @@ def _is_associated_by_row(reference: Trajectory, estimate: Trajectory, name: str
     origins = (reference.stamps_from, estimate.stamps_from)
     if "rows" not in origins:
         return False
-    if "file" not in origins and len(reference) == len(estimate):
+    if {*origins} <= {"rows", "times"} and len(reference) == len(estimate):
         return True  # one row per frame in both, whether or not stamps lie beside one of them
     if origins == ("rows", "rows"):
         raise TrajectoryError(
@@ -139,18 +215,13 @@ class Similarity:
         Trajectory
             In world a, with scaled covariances where it has some.
         """
-        scaled = trajectory.T_world_cam.copy()
+        scaled = np.array(trajectory.T_world_cam)
         scaled[:, :3, 3] *= self.scale
         covariances = trajectory.covariances
         if covariances is not None:
             factors = np.array([1.0] * 3 + [self.scale] * 3)
             covariances = covariances * np.outer(factors, factors)
-        return Trajectory(
-            stamps_ns=trajectory.stamps_ns,
-            T_world_cam=self.T_a_b @ scaled,
-            covariances=covariances,
-            stamps_from=trajectory.stamps_from,
-        )
+        return replace(trajectory, T_world_cam=scaled, covariances=covariances).moved(self.T_a_b)
 
 
 def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> Similarity:
@@ -162,7 +233,7 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
         Associated: of one length, at least one pose.
     mode : {"none", "origin", "se3", "sim3"}
         Nothing; the first pose onto the first; least squares over the positions by a rigid
-        motion; the same with a scale.
+        motion; the same with a scale. The last two need no rotations.
 
     Returns
     -------
@@ -174,7 +245,8 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
     ValueError
         Where the lengths differ or the mode is unknown.
     TrajectoryError
-        Where a scale is asked for and the estimate does not move.
+        Where a scale is asked for and the estimate does not move, or the first poses are to be
+        laid onto each other and one of them is a position alone.
 
     References
     ----------
@@ -186,10 +258,20 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
     if mode == "none":
         return Similarity(T_a_b=np.eye(4))
     if mode == "origin":
+        _refuse_without_rotations(reference, estimate)
         return Similarity(T_a_b=reference.T_world_cam[0] @ se3.invert(estimate.T_world_cam[0]))
     if mode not in ("se3", "sim3"):
         raise ValueError(f"mode must be one of {get_args(AlignMode)}, got {mode!r}")
     return _fit(reference.positions, estimate.positions, is_scaled=mode == "sim3")
+
+
+def _refuse_without_rotations(reference: Trajectory, estimate: Trajectory) -> None:
+    for name, trajectory in {"reference": reference, "estimate": estimate}.items():
+        if not trajectory.has_rotations:
+            raise TrajectoryError(
+                f"the {name} holds positions without rotations, its first pose cannot be aligned "
+                "with; align by se3"
+            )
 
 
 def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Similarity:

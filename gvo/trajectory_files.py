@@ -32,6 +32,11 @@ _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # text files round: four decimals in TUM's ground truths, seven digits in KITTI's
 _ROUNDING = 1e-2
 
+_EUROC_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+    "q_RS_z []"
+)
+
 COVARIANCE_HEADER = "stamp_ns," + ",".join(
     f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)
 )
@@ -153,9 +158,12 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 
     Raises
     ------
+    ValueError
+        Where it holds positions without rotations.
     TrajectoryError
         Where the file cannot be written.
     """
+    _check_rotations(trajectory)
     poses = zip(trajectory.stamps_ns, trajectory.T_world_cam, strict=True)
     _write_lines(path, (format_tum_line(int(stamp_ns), T) for stamp_ns, T in poses))
 
@@ -172,11 +180,41 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
     Raises
     ------
+    ValueError
+        Where it holds positions without rotations.
     TrajectoryError
         Where the file cannot be written.
     """
+    _check_rotations(trajectory)
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12)
     _write_lines(path, (" ".join(f"{value:.12e}" for value in row) for row in rows))
+
+
+def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
+    """Write stamps and poses as the ground truth of an EuRoC folder, without loss.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    trajectory : Trajectory
+        Of the body.
+
+    Raises
+    ------
+    ValueError
+        Where it holds positions without rotations.
+    TrajectoryError
+        Where the file cannot be written.
+    """
+    _check_rotations(trajectory)
+    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat()
+    rows = zip(trajectory.stamps_ns, trajectory.positions, quaternions_xyzw, strict=True)
+    lines = (
+        ",".join([str(int(stamp_ns)), *(repr(float(x)) for x in (*t, w, *xyz))])
+        for stamp_ns, t, (*xyz, w) in rows
+    )
+    _write_lines(path, [_EUROC_HEADER, *lines])
 
 
 def write_covariances(path: str | Path, trajectory: Trajectory) -> None:
@@ -201,6 +239,11 @@ def write_covariances(path: str | Path, trajectory: Trajectory) -> None:
     values = zip(trajectory.stamps_ns, trajectory.covariances, strict=True)
     lines = (format_covariance_line(int(stamp_ns), C) for stamp_ns, C in values)
     _write_lines(path, [COVARIANCE_HEADER, *lines])
+
+
+def _check_rotations(trajectory: Trajectory) -> None:
+    if not trajectory.has_rotations:
+        raise ValueError("a file of poses cannot hold positions without rotations")
 
 
 def _write_lines(path: str | Path, lines: Iterable[str]) -> None:

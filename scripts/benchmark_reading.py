@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 
 import gvo
 from gvo.geometry.camera import rectification_maps
-from gvo.runs import one_opencv_thread
+from gvo.run_loop import one_opencv_thread
 from gvo.sources.bag import BagSource
 from gvo.sources.recording import Source
 

@@ -312,3 +312,27 @@ def test_published_figures_are_met(
     assert evaluation.r_deg_per_100m == (
         None if r_deg_per_100m is None else pytest.approx(r_deg_per_100m, abs=5e-4)
     )
+
+
+def test_against_positions_the_place_is_measured_and_no_rotation() -> None:
+    reference = drive(900)
+    estimate = disturbed(reference)
+    points = Trajectory.of_positions(reference.stamps_ns, reference.positions)
+    unturned = Trajectory.of_positions(estimate.stamps_ns, estimate.positions)
+    full = evaluate(reference, estimate, name="full")
+    for bare in (evaluate(points, estimate, name="e"), evaluate(reference, unturned, name="e")):
+        np.testing.assert_allclose(bare.errors_m, full.errors_m, atol=1e-9)
+        assert measures(bare) == [pytest.approx(full.ate_m), None, None, None, None]
+        assert (bare.n_segments, bare.coverage, bare.path_ratio) == (0, 1.0, full.path_ratio)
+
+
+def test_a_truth_of_one_fix_a_second_measures_the_drive() -> None:
+    """No stamp of a fix is that of a frame; association within 10 ms would find none."""
+    reference = drive(600, 0.5)
+    fixes = reference.interpolate(reference.stamps_ns[0] + 10**9 * np.arange(60) + 47_000_000)
+    points = Trajectory.of_positions(fixes.stamps_ns, fixes.positions, stamps_from="topic")
+    estimate = disturbed(reference)
+    found = evaluate(points, estimate, name="e")
+    assert found.n == 60
+    assert found.ate_m == pytest.approx(evaluate(reference, estimate, name="e").ate_m, rel=0.05)
+    np.testing.assert_array_equal(found.stamps_ns, fixes.stamps_ns)

@@ -186,3 +186,60 @@ def test_estimates_in_any_order_become_a_trajectory_with_covariances() -> None:
     assert collected.covariances is not None
     np.testing.assert_array_equal(collected.covariances[1], 20.0 * np.eye(6))
     assert len(Trajectory.of([])) == 0
+
+
+def positions_only(seed: int = 0, n: int = 5) -> Trajectory:
+    points = np.random.default_rng(seed).normal(size=(n, 3))
+    return Trajectory.of_positions(np.arange(n) * 10, points, stamps_from="topic")
+
+
+@given(seeds)
+def test_positions_without_rotations_stay_so_wherever_they_go(seed: int) -> None:
+    found = positions_only(seed)
+    T = se3.exp(np.random.default_rng(seed).normal(size=6))
+    moved = found.moved(T)
+    np.testing.assert_allclose(moved.positions, se3.transform_points(T, found.positions))
+    middles = found.interpolate(np.arange(5, 40, 10))
+    expected = 0.5 * (found.positions[1:] + found.positions[:-1])
+    np.testing.assert_allclose(middles.positions, expected)
+    for other in (found, moved, middles, found.select([1, 3]), found.interpolate(np.array([99]))):
+        assert not other.has_rotations
+        assert other.stamps_from == "topic"
+        unturned = np.tile(np.eye(3), (len(other), 1, 1))
+        np.testing.assert_array_equal(other.T_world_cam[:, :3, :3], unturned)
+
+
+def test_without_rotations_only_the_point_itself_is_known() -> None:
+    found = positions_only()
+    turned = found.transformed(se3.exp(np.array([0.3, 0.2, 0.1, 0.0, 0.0, 0.0])))
+    np.testing.assert_array_equal(turned.T_world_cam, found.T_world_cam)
+    with pytest.raises(ValueError, match="positions of another point are not known"):
+        found.transformed(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])))
+
+
+def test_positions_come_without_rotations_and_covariances() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    turned = se3.exp(np.full((2, 6), 0.1))
+    stamps_ns = np.arange(2)
+    with pytest.raises(ValueError, match="identities and no covariances"):
+        Trajectory(stamps_ns=stamps_ns, T_world_cam=turned, has_rotations=False)
+    with pytest.raises(ValueError, match="identities and no covariances"):
+        Trajectory(
+            stamps_ns=stamps_ns,
+            T_world_cam=poses,
+            covariances=np.tile(np.eye(6), (2, 1, 1)),
+            has_rotations=False,
+        )
+    with pytest.raises(ValueError, match=r"shape \(n, 3\)"):
+        Trajectory.of_positions(stamps_ns, np.zeros((2, 2)))
+
+
+@given(seeds)
+def test_another_world_changes_neither_steps_nor_covariances(seed: int) -> None:
+    trajectory = random_trajectory(seed, with_covariances=True)
+    moved = trajectory.moved(se3.exp(np.random.default_rng(seed).normal(size=6)))
+    steps = [se3.invert(T[:-1]) @ T[1:] for T in (trajectory.T_world_cam, moved.T_world_cam)]
+    np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)
+    assert moved.covariances is not None
+    assert trajectory.covariances is not None
+    np.testing.assert_array_equal(moved.covariances, trajectory.covariances)

@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory import StampsFrom, Trajectory
-from gvo.trajectory_alignment import AlignMode, Similarity, alignment, associate
+from gvo.trajectory_alignment import (
+    MAX_GAP_NS,
+    AlignMode,
+    Similarity,
+    alignment,
+    associate,
+    pair,
+)
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 stamp_lists = st.lists(st.integers(0, 200), min_size=1, max_size=30, unique=True).map(sorted)
@@ -216,3 +223,90 @@ def test_covariances_scale_with_the_positions() -> None:
     assert scaled is not None
     assert np.diag(scaled[0]).tolist() == [1.0, 1.0, 1.0, 18.0, 18.0, 18.0]
     assert scaled[0, 0, 3] == scaled[0, 3, 0] == 1.5
+
+
+def circle(stamps_ns: np.ndarray, stamps_from: StampsFrom = "topic") -> Trajectory:
+    """Return the poses of a turn of 20 s and a radius of 10 m at any stamps."""
+    angles = 2.0 * np.pi * stamps_ns / 20e9
+    R = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
+    t = 10.0 * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    return Trajectory(
+        stamps_ns=stamps_ns, T_world_cam=se3.make_transform(R, t), stamps_from=stamps_from
+    )
+
+
+@given(
+    st.integers(20_000_000, 120_000_000),
+    st.integers(200_000_000, 2_000_000_000),
+    st.integers(0, 10**9),
+    st.booleans(),
+)
+def test_trajectories_of_topics_meet_at_the_stamps_of_the_sparser_one(
+    step_ns: int, sparse_step_ns: int, phase_ns: int, is_estimate_dense: bool
+) -> None:
+    """Both show one motion at other stamps: interpolated they agree to the sagitta of a step."""
+    dense = circle(np.arange(0, 10**10, step_ns))
+    sparse = circle(np.arange(phase_ns, 9 * 10**9, sparse_step_ns), "file")
+    if is_estimate_dense:
+        stamped, interpolated = pair(sparse, dense)
+    else:
+        interpolated, stamped = pair(dense, sparse)
+    np.testing.assert_array_equal(stamped.stamps_ns, sparse.stamps_ns)
+    np.testing.assert_array_equal(interpolated.stamps_ns, sparse.stamps_ns)
+    sagitta = 10.0 * (1.0 - np.cos(np.pi * step_ns / 20e9))
+    apart = np.linalg.norm(interpolated.positions - stamped.positions, axis=1)
+    assert apart.max() <= sagitta + 1e-9
+    np.testing.assert_allclose(
+        interpolated.T_world_cam[:, :3, :3], stamped.T_world_cam[:, :3, :3], atol=1e-9
+    )
+
+
+def test_nothing_is_interpolated_over_a_gap_or_outside() -> None:
+    step = MAX_GAP_NS
+    dense = circle(np.array([0, step, 2 * step + 1, *range(3 * step, 3 * step + 9)]))
+    stamps_ns = np.array([-step, 0, step // 2, step + 5, 2 * step + 1, 3 * step - 9, 9 * step])
+    found, _ = pair(dense, circle(stamps_ns))
+    assert found.stamps_ns.tolist() == [0, step // 2, 2 * step + 1, 3 * step - 9]
+
+
+def test_equal_stamps_give_the_very_poses() -> None:
+    trajectory = circle(np.array([0, 7, 11, 3 * MAX_GAP_NS]))
+    first, second = pair(trajectory, circle(trajectory.stamps_ns, "file"))
+    np.testing.assert_allclose(first.T_world_cam, second.T_world_cam, rtol=0.0, atol=1e-12)
+    assert len(first) == 4
+
+
+def test_files_are_associated_as_ever_and_single_poses_as_well() -> None:
+    reference = circle(np.arange(0, 10**9, 50_000_000), "file")
+    estimate = circle(np.arange(3_000_000, 10**9, 100_000_000), "times")
+    indices, others = associate(reference, estimate)
+    first, second = pair(reference, estimate)
+    np.testing.assert_array_equal(first.stamps_ns, reference.stamps_ns[indices])
+    np.testing.assert_array_equal(second.stamps_ns, estimate.stamps_ns[others])
+    one = circle(np.array([5]))
+    assert [len(found) for found in pair(one, one)] == [1, 1]
+    first, second = pair(reference, circle(np.array([75_000_000])))
+    assert first.stamps_ns.tolist() == second.stamps_ns.tolist() == [75_000_000]
+
+
+def test_topics_of_other_clocks_are_refused() -> None:
+    with pytest.raises(TrajectoryError, match=r"^raw and the reference .* 250 ms apart"):
+        pair(circle(np.arange(5)), circle(np.arange(5) + 10**12), name="raw")
+    nothing = circle(np.empty(0, dtype=np.int64))
+    with pytest.raises(TrajectoryError, match="holds no poses"):
+        pair(nothing, circle(np.arange(5)))
+    with pytest.raises(TrajectoryError, match="without stamps"):
+        pair(circle(np.arange(5)), circle(np.arange(5), "rows"))
+
+
+def test_positions_without_rotations_are_aligned_but_not_by_their_first_pose() -> None:
+    poses = random_trajectory(1)
+    points = Trajectory.of_positions(poses.stamps_ns, poses.positions)
+    moved = random_similarity(3)
+    moved = Similarity(T_a_b=moved.T_a_b)
+    for reference, estimate in ((moved.apply(points), poses), (moved.apply(poses), points)):
+        aligned = alignment(reference, estimate, "se3").apply(estimate)
+        np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-9)
+        assert aligned.has_rotations == estimate.has_rotations
+        with pytest.raises(TrajectoryError, match=r"positions without rotations.*align by se3"):
+            alignment(reference, estimate, "origin")

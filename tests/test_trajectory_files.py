@@ -273,3 +273,11 @@ def test_published_files_are_read_whole(
 ) -> None:
     trajectory = read_trajectory(gvo_data / name)
     assert (len(trajectory), trajectory.stamps_from) == (n, stamps_from)
+
+
+def test_positions_without_rotations_are_no_file_of_poses(tmp_path: Path) -> None:
+    points = Trajectory.of_positions(np.arange(2), np.zeros((2, 3)))
+    for write in (write_tum, write_kitti):
+        with pytest.raises(ValueError, match="positions without rotations"):
+            write(tmp_path / "poses.txt", points)
+    assert not (tmp_path / "poses.txt").exists()

@@ -5,13 +5,19 @@ Pixel (0, 0) is the centre of the first pixel; x right, y down, z forward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo.errors import CalibrationError
+from gvo.geometry.lens import (
+    DistortionModel,
+    Lens,
+    RectificationMaps,
+    bouguet,
+    bouguet_wide,
+)
 from gvo.types import FloatArray
 
 
@@ -168,22 +174,25 @@ class StereoCamera(PinholeCamera):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """One camera as `sensor_msgs/CameraInfo` describes it.
+    """One camera as `sensor_msgs/CameraInfo` describes it, of the image as recorded.
 
     Parameters
     ----------
     width, height : int
-        Image size, pixels.
+        Size of the recorded image, pixels: binning and region of interest are applied.
     K : ndarray of float64, shape (3, 3)
         Intrinsics of the raw image, pixels.
-    D : ndarray of float64, shape (5,)
-        Distortion k1, k2, p1, p2, k3 (`plumb_bob`).
+    D : ndarray of float64
+        Distortion: k1, k2, p1, p2, k3 of `plumb_bob`; 8, 12 or 14 coefficients of
+        `rational_polynomial`; k1 to k4 of `equidistant`.
     R : ndarray of float64, shape (3, 3)
         Rotation from the raw camera to the rectified one.
     P : ndarray of float64, shape (3, 4)
         Projection of the rectified image; P[0, 3] = -fx * baseline for a right camera.
     is_rectified : bool
         The images are rectified already: only P counts.
+    model : {"plumb_bob", "rational_polynomial", "equidistant"}
+        What D means.
     """
 
     width: int
@@ -193,6 +202,7 @@ class Calibration:
     R: FloatArray
     P: FloatArray
     is_rectified: bool
+    model: DistortionModel = "plumb_bob"
 
     @classmethod
     def from_camera(cls, camera: PinholeCamera, *, baseline: float = 0.0) -> Calibration:
@@ -207,6 +217,11 @@ class Calibration:
             P=P,
             is_rectified=True,
         )
+
+    @property
+    def lens(self) -> Lens:
+        """The raw camera."""
+        return Lens(width=self.width, height=self.height, K=self.K, D=self.D, model=self.model)
 
     def pinhole(self) -> PinholeCamera:
         """Return the camera of the rectified image."""
@@ -229,11 +244,7 @@ def stereo_camera(left: Calibration, right: Calibration) -> StereoCamera:
     CalibrationError
         When sizes differ, the rectified intrinsics differ, or there is no baseline.
     """
-    if (left.width, left.height) != (right.width, right.height):
-        raise CalibrationError(
-            f"left and right images must be of one size, got {left.width}x{left.height} "
-            f"and {right.width}x{right.height}"
-        )
+    _check_sizes(left, right)
     if not np.allclose(left.P[:, :3], right.P[:, :3], rtol=1e-6, atol=1e-6):
         raise CalibrationError(
             "left and right are not rectified to one camera: their P differ in the first three "
@@ -243,16 +254,13 @@ def stereo_camera(left: Calibration, right: Calibration) -> StereoCamera:
     return StereoCamera.from_pinhole(pinhole, float(left.P[0, 3] - right.P[0, 3]) / pinhole.fx)
 
 
-RectificationMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
-
-
 def rectification_maps(calibration: Calibration) -> RectificationMaps | None:
     """Return the maps for `cv2.remap` from the raw to the rectified image.
 
     Parameters
     ----------
     calibration : Calibration
-        With `plumb_bob` distortion.
+        Of one camera.
 
     Returns
     -------
@@ -260,21 +268,14 @@ def rectification_maps(calibration: Calibration) -> RectificationMaps | None:
         u and v in the raw image for each rectified pixel; None where nothing is to be done.
     """
     is_identity = (
-        not np.any(calibration.D)
+        calibration.model != "equidistant"  # without coefficients it is no pinhole either
+        and not np.any(calibration.D)
         and np.array_equal(calibration.R, np.eye(3))
         and np.array_equal(calibration.K, calibration.P[:, :3])
     )
     if calibration.is_rectified or is_identity:
         return None
-    map_u, map_v = cv2.initUndistortRectifyMap(
-        calibration.K,
-        calibration.D,
-        calibration.R,
-        calibration.P[:, :3],
-        (calibration.width, calibration.height),
-        cv2.CV_32FC1,
-    )
-    return np.asarray(map_u, dtype=np.float32), np.asarray(map_v, dtype=np.float32)
+    return calibration.lens.maps(calibration.R, calibration.P[:, :3])
 
 
 def rectify_stereo(
@@ -292,27 +293,43 @@ def rectify_stereo(
     Returns
     -------
     tuple of two Calibration
-        The same K and D with R and P set (Bouguet's algorithm, `cv2.stereoRectify`, alpha 0).
+        The same K and D with R and P set (Bouguet's algorithm). The rectified images have no
+        empty borders; where a lens is `equidistant`, they keep the resolution of the centre and
+        lose what a plane image of that size does not hold.
+
+    Raises
+    ------
+    CalibrationError
+        When sizes differ, or the cameras do not stand side by side.
     """
-    T_right_left = np.linalg.inv(T_left_right)
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        left.K,
-        left.D,
-        right.K,
-        right.D,
-        (left.width, left.height),
-        T_right_left[:3, :3],
-        T_right_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=0,
-    )
+    _check_pair(left, right, T_left_right)
+    choose = bouguet_wide if "equidistant" in (left.model, right.model) else bouguet
+    try:
+        chosen = choose(left.lens, right.lens, np.asarray(np.linalg.inv(T_left_right)))
+    except cv2.error as error:
+        raise CalibrationError(
+            "left and right cannot be rectified: OpenCV finds no projection that fits K and D; "
+            "calibrate the pair again"
+        ) from error
     return (
-        _with_rectification(left, np.asarray(R_left), np.asarray(P_left)),
-        _with_rectification(right, np.asarray(R_right), np.asarray(P_right)),
+        replace(left, R=chosen.R_left, P=chosen.P_left, is_rectified=False),
+        replace(right, R=chosen.R_right, P=chosen.P_right, is_rectified=False),
     )
 
 
-def _with_rectification(raw: Calibration, R: FloatArray, P: FloatArray) -> Calibration:
-    return Calibration(
-        width=raw.width, height=raw.height, K=raw.K, D=raw.D, R=R, P=P, is_rectified=False
-    )
+def _check_sizes(left: Calibration, right: Calibration) -> None:
+    if (left.width, left.height) != (right.width, right.height):
+        raise CalibrationError(
+            f"left and right images must be of one size, got {left.width}x{left.height} "
+            f"and {right.width}x{right.height}"
+        )
+
+
+def _check_pair(left: Calibration, right: Calibration, T_left_right: FloatArray) -> None:
+    _check_sizes(left, right)
+    x, y, z = (float(value) for value in T_left_right[:3, 3])
+    if not np.hypot(y, z) < abs(x):
+        raise CalibrationError(
+            f"left and right must stand side by side, got the right camera at x={x:.4g} "
+            f"y={y:.4g} z={z:.4g} m of the left one; mend the transform between them"
+        )

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -17,8 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.sources.bag import TRUTH_FRAMES
 from gvo.sources.bag_reader import TF_TYPE, typestore
+from gvo.sources.ground_truth import TRUTH_FRAMES
 from gvo.sources.topics import CAMERA_INFO_TYPE, IMAGE_TYPE
 from gvo.types import FloatArray
 
@@ -26,6 +34,18 @@ from gvo.types import FloatArray
 _ROS2_VERSION: Final = 8
 _MAX_SECONDS_ROS1 = 2**32 - 1
 _MAX_SECONDS_ROS2 = 2**31 - 1
+# What tf2's static broadcaster offers: who comes late is given the last message all the same.
+_LATCHED_QOS: Final = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=QosTime(0, 0),
+    lifespan=QosTime(0, 0),
+    liveliness=QosLiveliness.SYSTEM_DEFAULT,
+    liveliness_lease_duration=QosTime(0, 0),
+    avoid_ros_namespace_conventions=False,
+)
 
 
 class Header(NamedTuple):
@@ -33,6 +53,15 @@ class Header(NamedTuple):
 
     stamp_ns: int
     frame_id: str
+
+
+class FramePose(NamedTuple):
+    """A pose of a child frame in its parent: stamp in nanoseconds, T_parent_child (4, 4)."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    T_parent_child: FloatArray
 
 
 class BagWriter:
@@ -116,7 +145,9 @@ class BagWriter:
         sequence = {"seq": 0} if self.is_ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
 
-    def write(self, topic: str, type_: str, message: object, stamp_ns: int) -> None:
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
         """Write a message; its log time is the stamp, but never goes back.
 
         Parameters
@@ -127,15 +158,28 @@ class BagWriter:
             Made by `make`.
         stamp_ns : int
             Not negative, nanoseconds.
+        is_latched : bool
+            Of the topic, told with its first message: the last message is kept for those who
+            subscribe later.
         """
         # Readers sort by log time: a frame whose stamp goes back must stay where it was.
         self._log_time_ns = max(self._log_time_ns, stamp_ns)
         if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, type_, typestore=self._store
-            )
+            self._connections[topic] = self._connect(topic, type_, is_latched=is_latched)
         serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
         self._writer.write(self._connections[topic], self._log_time_ns, serialize(message, type_))
+
+    def _connect(self, topic: str, type_: str, *, is_latched: bool) -> Connection:
+        if isinstance(self._writer, Writer1):
+            return self._writer.add_connection(
+                topic, type_, typestore=self._store, latching=1 if is_latched else None
+            )
+        return self._writer.add_connection(
+            topic,
+            type_,
+            typestore=self._store,
+            offered_qos_profiles=[_LATCHED_QOS] if is_latched else [],
+        )
 
 
 def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
@@ -192,7 +236,7 @@ def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, head
         header=bag.header(header),
         height=calibration.height,
         width=calibration.width,
-        distortion_model="plumb_bob",
+        distortion_model=calibration.model,
         binning_x=0,
         binning_y=0,
         roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
@@ -213,18 +257,48 @@ def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
     T_world_cam : ndarray of float64, shape (4, 4)
         Of the rectified camera, metres.
     """
-    parent, child = TRUTH_FRAMES
-    t = [float(value) for value in T_world_cam[:3, 3]]
-    q = [float(value) for value in Rotation.from_matrix(T_world_cam[:3, :3]).as_quat()]
+    parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
+    write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])
+
+
+def write_transforms(
+    bag: BagWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
+) -> None:
+    """Write poses of frames as one `tf2_msgs/TFMessage`; of none: nothing.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        `/tf`, or `/tf_static` for what never moves, with `is_latched`.
+    poses : iterable of FramePose
+    is_latched : bool
+        As for `BagWriter.write`.
+    """
+    poses = tuple(poses)
+    if poses:
+        message = bag.make(TF_TYPE, transforms=[_transform(bag, pose) for pose in poses])
+        stamp_ns = max(pose.stamp_ns for pose in poses)
+        bag.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
+
+
+def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
+    """Return position and quaternion (x, y, z, qx, qy, qz, qw), shape (7,), of a pose (4, 4)."""
+    quaternion_xyzw = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat()
+    return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
+
+
+def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
+    x, y, z, *q = pose_numbers(pose.T_parent_child).tolist()
     transform = bag.make(
         "geometry_msgs/msg/Transform",
-        translation=bag.make("geometry_msgs/msg/Vector3", x=t[0], y=t[1], z=t[2]),
+        translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
         rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
     )
-    stamped = bag.make(
+    return bag.make(
         "geometry_msgs/msg/TransformStamped",
-        header=bag.header(Header(stamp_ns, parent)),
-        child_frame_id=child,
+        header=bag.header(Header(pose.stamp_ns, pose.parent)),
+        child_frame_id=pose.child,
         transform=transform,
     )
-    bag.write("/tf", TF_TYPE, bag.make(TF_TYPE, transforms=[stamped]), stamp_ns)

@@ -26,8 +26,8 @@ from gvo.outputs.bag_messages import (
 from gvo.outputs.compressed_messages import write_compressed, write_compressed_depth
 from gvo.outputs.conversion import Conversion, check_new
 from gvo.outputs.depth_counts import MILLIMETRES, is_in_counts
-from gvo.sources.frames import ImagePreparer
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.sources.frames import ImagePreparer, make_preparers
+from gvo.sources.recording import Source, StampedImage
 from gvo.types import FloatArray
 
 _SUFFIXES = (".bag", ".mcap", ".db3", "")
@@ -125,7 +125,7 @@ def _plan(source: Source, *, rectify: bool, compress: bool) -> _Plan:
     is_rectifying = info.depth_view is not None or (
         rectify and not info.calibrations[0].is_rectified
     )
-    prepares = _preparers(info) if is_rectifying else (None, None)
+    prepares = make_preparers(info) if is_rectifying else (None, None)
     is_rectified = is_rectifying or info.calibrations[0].is_rectified
     if info.sensor == "rgbd":
         topics = (
@@ -155,13 +155,6 @@ def _plan(source: Source, *, rectify: bool, compress: bool) -> _Plan:
         )
     )
     return first, second
-
-
-def _preparers(info: RecordingInfo) -> tuple[ImagePreparer, ImagePreparer]:
-    first = ImagePreparer(info.calibrations[0])
-    if info.sensor == "stereo":
-        return first, ImagePreparer(info.calibrations[1])
-    return first, ImagePreparer(info.calibrations[0], is_depth=True)
 
 
 def _rectified(raw: Calibration) -> Calibration:

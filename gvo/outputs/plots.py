@@ -14,7 +14,7 @@ import numpy as np
 
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import AlignMode, alignment, associate
+from gvo.trajectory_alignment import AlignMode, alignment, pair
 from gvo.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class _Curve:
 
     label: str
     trajectory: Trajectory
-    indices: IntArray
+    stamps_ns: IntArray
     errors_m: FloatArray
 
 
@@ -128,17 +128,16 @@ def _figure_of_errors(
     align: AlignMode,
 ) -> Figure:
     curves = [_aligned(reference, name, estimate, align) for name, estimate in estimates.items()]
-    first = min(int(curve.indices[0]) for curve in curves)
-    last = max(int(curve.indices[-1]) for curve in curves)
-    shown = reference.select(slice(first, last + 1))
+    first_ns = min(int(curve.stamps_ns[0]) for curve in curves)
+    last_ns = max(int(curve.stamps_ns[-1]) for curve in curves)
+    shown = _around(reference, first_ns, last_ns)
     figure = _new_figure()
     view, errors = figure.subplots(1, 2)
     plane = _plane(reference)
     _draw_path(view, shown, plane, _REFERENCE_STYLE, "reference")
     for curve, style in zip(curves, styles, strict=True):
         _draw_path(view, curve.trajectory, plane, style, curve.label)
-        stamps_ns = reference.stamps_ns[curve.indices]
-        _draw(errors, _elapsed(stamps_ns, shown), curve.errors_m, style)
+        _draw(errors, _elapsed(curve.stamps_ns, shown), curve.errors_m, style)
     _finish_view(view, shown, plane)
     errors.set(xlabel=_stamp_label(shown), ylabel=f"position error [m], alignment: {align}")
     errors.set_ylim(bottom=0.0)
@@ -169,23 +168,32 @@ def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[_
 
 
 def _aligned(reference: Trajectory, name: str, estimate: Trajectory, align: AlignMode) -> _Curve:
-    indices, others = associate(reference, estimate, name=name)
-    ref, est = reference.select(indices), estimate.select(others)
-    moved = alignment(ref, est, align).apply(estimate)
-    errors_m = np.linalg.norm(ref.positions - moved.positions[others], axis=1)
+    ref, est = pair(reference, estimate, name=name)
+    similarity = alignment(ref, est, align)
+    moved = similarity.apply(estimate)
+    errors_m = np.linalg.norm(ref.positions - similarity.apply(est).positions, axis=1)
     rmse = np.sqrt(np.mean(errors_m**2))
     label = f"{_plain(name)} (ATE {rmse:.3g} m)"
-    return _Curve(label=label, trajectory=moved, indices=indices, errors_m=errors_m)
+    return _Curve(label=label, trajectory=moved, stamps_ns=ref.stamps_ns, errors_m=errors_m)
+
+
+def _around(reference: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
+    """Return the part of the reference from the pose at or before the first stamp to the last."""
+    start = int(np.searchsorted(reference.stamps_ns, first_ns, side="right")) - 1
+    end = int(np.searchsorted(reference.stamps_ns, last_ns))
+    return reference.select(slice(max(start, 0), end + 1))
 
 
 def _plane(reference: Trajectory) -> tuple[int, int]:
     """Return the axes to look at: x and z of a camera's world, else the two of most motion.
 
     A world that begins with the identity is a camera's, unless it is as flat along z as that of a
-    robot with z upwards.
+    robot with z upwards. Positions without rotations begin no world of a camera.
     """
     extents = np.ptp(reference.positions, axis=0)
-    is_camera = np.allclose(reference.T_world_cam[0], np.eye(4), atol=1e-3)
+    is_camera = reference.has_rotations and np.allclose(
+        reference.T_world_cam[0], np.eye(4), atol=1e-3
+    )
     if is_camera and extents[2] >= _FLAT * extents[1]:
         return 0, 2
     least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds

@@ -89,8 +89,8 @@ class RunFolder:
         with self._refused_on_error():
             self._files[name].write(line)
 
-    def add_frame(self, result: FrameResult) -> None:
-        """Write what one frame gave."""
+    def add_frame(self, frame: object, result: FrameResult) -> None:
+        """Write what one frame gave; its images are not needed."""
         row = (
             result.stamp_ns,
             result.status,

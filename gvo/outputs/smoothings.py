@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gvo.backend.comparison import MeasurementLog, Smoothing
-from gvo.evaluation import evaluate
 from gvo.geometry import se3
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import write_tum
@@ -32,15 +31,23 @@ class SmoothingComparison:
         """Take smoothed poses that are final."""
         self._smoothed += estimates
 
-    def conclude(self, folder: Path, truth: Trajectory | None) -> list[dict[str, Any]]:
+    def conclude(
+        self,
+        folder: Path,
+        *,
+        measure: Callable[[Trajectory], float] | None = None,
+        place: Callable[[Trajectory], Trajectory] | None = None,
+    ) -> list[dict[str, Any]]:
         """Compare the ways, and write the trajectories of the two that the run did not take.
 
         Parameters
         ----------
         folder : Path
             Gets `FILES`.
-        truth : Trajectory, optional
-            Poses of the same frame.
+        measure : callable, optional
+            Returns the ATE of a trajectory, metres.
+        place : callable, optional
+            Brings a trajectory of the frame that was smoothed to the one that is written.
 
         Returns
         -------
@@ -54,6 +61,8 @@ class SmoothingComparison:
         trajectories = {
             smoothing.name: _trajectory(smoothing, stamps_ns) for smoothing in smoothings
         }
+        if place is not None:
+            trajectories = {name: place(trajectory) for name, trajectory in trajectories.items()}
         for name, file in FILES.items():
             write_tum(folder / file, trajectories[name])
         least = smoothings[-1]
@@ -63,7 +72,7 @@ class SmoothingComparison:
                 "error": smoothing.error,
                 "above_least_pct": _percent_above(smoothing.error, least.error),
                 "off_least_m": _distance(trajectories[smoothing.name], trajectories[least.name]),
-                "ate_m": _ate(truth, trajectories[smoothing.name]),
+                "ate_m": None if measure is None else measure(trajectories[smoothing.name]),
                 "ms_per_pose": 1e3 * smoothing.elapsed_s / len(stamps_ns),
             }
             for smoothing in smoothings
@@ -101,10 +110,6 @@ def _trajectory(smoothing: Smoothing, stamps_ns: dict[Any, int]) -> Trajectory:
 
 def _distance(first: Trajectory, second: Trajectory) -> float:
     return float(np.sqrt(np.mean(np.sum((first.positions - second.positions) ** 2, axis=1))))
-
-
-def _ate(truth: Trajectory | None, estimate: Trajectory) -> float | None:
-    return None if truth is None else evaluate(truth, estimate, name="").ate_m
 
 
 def _percent_above(error: float, least: float) -> float:

@@ -31,7 +31,8 @@ def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
     Returns
     -------
     str
-        Lines ended by line feeds; "-" where there is no value.
+        Lines ended by line feeds; "-" where there is no value, as for rotations against
+        positions alone.
     """
     rows = [_HEADER, *(_cells(evaluation) for evaluation in evaluations)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -56,7 +57,7 @@ def evaluations_json(
     -------
     dict
         `{"estimates": [{"name", "n", "ate_m", "rpe_m", "rpe_deg", "t_pct",
-        "r_deg_per_100m"}]}`; None where no pair or no segment fits.
+        "r_deg_per_100m"}]}`; None where no pair or no segment fits, or there are no rotations.
     """
     return {
         "estimates": [

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.geometry import se3
 from gvo.sources.bag_calibration import calibrations_of_file, calibrations_of_messages
-from gvo.sources.bag_reader import TF_TYPE, BagMessage, BagReader
+from gvo.sources.bag_reader import BagMessage, BagReader
+from gvo.sources.calibration_files import CalibrationPaths, paths_of
 from gvo.sources.messages import (
     decode_compressed,
     decode_compressed_depth,
@@ -22,34 +21,32 @@ from gvo.sources.messages import (
     decode_grey_or_color,
     stamp_of,
 )
+from gvo.sources.pixels import GreyRange
 from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.sources.topics import COMPRESSED_TYPE, Topic, TopicChoice, choose_topics
+from gvo.sources.tf import TfBuffer, read_tf
+from gvo.sources.topics import COMPRESSED_TYPE, CameraTopics, Topic, TopicChoice, choose_topics
+from gvo.sources.truth_frames import FramedTruth, find_framed_truth
+from gvo.sources.truth_specs import BagTruthSpec
 from gvo.trajectory import Trajectory
-from gvo.types import FloatArray
+from gvo.types import Failure, FloatArray
 
 DEFAULT_SCALE = 1000.0
 """Counts per metre of integer depth in messages: millimetres, by REP 118."""
 
-TRUTH_FRAMES = ("world", "ground_truth")
-"""Parent and child frame of the ground truth in `/tf`: T_world_cam of the rectified camera."""
-
-
-_NORM_TOLERANCE = 1e-2
-
 
 class BagSource:
-    """A stereo or RGB-D camera in a bag.
+    """A stereo or RGB-D camera in a bag, or in several that are one recording.
 
     Parameters
     ----------
-    path : Path
-        `.bag`, `.mcap` or `.db3` file, or a ROS 2 bag folder.
+    paths : Path or sequence of Path
+        `.bag`, `.mcap` or `.db3` files, or ROS 2 bag folders.
     topics : TopicChoice, optional
         What the names of the topics do not decide.
-    calibration : Path, optional
-        YAML that replaces the `CameraInfo` messages; `left` and `right` for stereo.
-    depth_scale : float, optional
-        Counts per metre of integer depth; otherwise that of the calibration file, or 1000.
+    calibration : Path or sequence of Path, optional
+        Files that replace the `CameraInfo` messages, see `read_cameras`.
+    config : Config, optional
+        Of which `depth.scale` (otherwise that of the calibration, or 1000) and `images` matter.
 
     Raises
     ------
@@ -59,31 +56,37 @@ class BagSource:
 
     def __init__(
         self,
-        path: Path,
+        paths: Path | Sequence[Path],
         *,
         topics: TopicChoice | None = None,
-        calibration: Path | None = None,
-        depth_scale: float | None = None,
+        calibration: CalibrationPaths = None,
+        config: Config | None = None,
     ) -> None:
-        self._path = path
-        self._reader = BagReader(path)
-        self._topics = choose_topics(self._reader.topics, topics or TopicChoice(), str(path))
-        if calibration is None:
-            found = calibrations_of_messages(self._reader, self._topics, str(path))
+        config = config or Config()
+        paths = [paths] if isinstance(paths, Path) else list(paths)
+        self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        self._reader = BagReader(paths)
+        self._topics = self._choose_topics(topics or TopicChoice())
+        if paths_of(calibration):
+            found = calibrations_of_file(calibration, self._topics, self._reader)
         else:
-            found = calibrations_of_file(calibration, self._topics)
-        self._scale = depth_scale or found.depth_scale or DEFAULT_SCALE
+            found = calibrations_of_messages(self._reader, self._topics, self._where)
+        self._scale = config.depth.scale or found.depth_scale or DEFAULT_SCALE
+        self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
         decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
         if self._topics.sensor == "rgbd":
             decisions.append(
                 f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
             )
         self._info = RecordingInfo(
-            name=path.resolve().stem if path.is_file() else path.resolve().name,
+            name=paths[0].resolve().stem if paths[0].is_file() else paths[0].resolve().name,
             sensor=self._topics.sensor,
             calibrations=found.calibrations,
             n_images=self._topics.first.n_messages,
             decisions=decisions,
+            depth_view=found.depth_view,
+            frame_id=found.frame_id,
+            T_body_cam=found.T_body_cam,
         )
 
     @property
@@ -102,55 +105,105 @@ class BagSource:
         Raises
         ------
         RecordingError
-            When the bag cannot be read on, or a topic that announces messages yields none.
+            At the end, where a part of the bag could not be read, or a topic that announces
+            messages yields none.
         """
-        names = self.image_topics
         counts = [0, 0]
-        for message in self._reader.messages(names):
-            stream = names.index(message.topic.name)
+        for message in self._reader.messages(self.image_topics):
+            stream = self.image_topics.index(message.topic.name)
             counts[stream] += 1
             yield self._image(message, stream)
+        if self._reader.damage:
+            raise RecordingError(self._reader.damage)
         for topic, count in zip((self._topics.first, self._topics.second), counts, strict=True):
             if count == 0:
                 raise RecordingError(
-                    f"{self._path}: {topic.name} announces {topic.n_messages} messages but "
+                    f"{self._where}: {topic.name} announces {topic.n_messages} messages but "
                     "yields none; record or convert the bag anew"
                 )
 
-    def ground_truth(self) -> Trajectory | None:
-        """Return T_world_cam of the rectified camera: `world` to `ground_truth` in `/tf`.
+    def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
+        """Read `/tf` and `/tf_static`.
+
+        Parameters
+        ----------
+        frames : collection of str, optional
+            What will be looked up; of a long bag the rest is not kept.
 
         Raises
         ------
         RecordingError
             When the bag cannot be read.
         """
-        if not any(topic.name == "/tf" and topic.type == TF_TYPE for topic in self._reader.topics):
-            return None
-        poses: dict[int, FloatArray] = {}
-        for message in self._reader.messages(["/tf"]):
-            transforms = message.decode().transforms if message.topic.type == TF_TYPE else []
-            for transform in transforms:
-                frames = (transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/"))
-                if frames == TRUTH_FRAMES:
-                    poses[stamp_of(transform.header)] = _pose(transform.transform, self._path)
-        if not poses:
-            return None
-        stamps_ns = np.array(sorted(poses), dtype=np.int64)
-        T_world_cam = np.stack([poses[int(stamp_ns)] for stamp_ns in stamps_ns])
-        return Trajectory(stamps_ns=stamps_ns, T_world_cam=T_world_cam)
+        return read_tf(self._reader, frames=frames)
+
+    def truth(
+        self,
+        spec: BagTruthSpec | None = None,
+        *,
+        frame: str = "",
+        T_frame_cam: FloatArray | None = None,
+    ) -> FramedTruth | Failure:
+        """Return true poses of a frame.
+
+        Parameters
+        ----------
+        spec : TfTruth or TopicTruth, optional
+            What to read; omitted: what names itself ground truth.
+        frame : str
+            In tf; empty: the rectified left or colour camera.
+        T_frame_cam : ndarray of float64, shape (4, 4), optional
+            How the camera sits in the frame, where tf does not say so.
+
+        Returns
+        -------
+        FramedTruth or Failure
+            The failure says why there is none, or why it cannot be compared.
+
+        Raises
+        ------
+        RecordingError
+            When the bag does not hold what was asked for.
+        """
+        return find_framed_truth(
+            self._reader,
+            spec,
+            where=self._where,
+            frame=frame,
+            camera_frame=self._info.frame_id,
+            T_frame_cam=T_frame_cam,
+        )
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of the rectified camera, where the bag names it ground truth.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read.
+        """
+        found = self.truth()
+        return found.trajectory if isinstance(found, FramedTruth) else None
+
+    def _choose_topics(self, choice: TopicChoice) -> CameraTopics:
+        try:
+            return choose_topics(self._reader.topics, choice, self._where)
+        except RecordingError as error:
+            if not self._reader.damage:
+                raise
+            raise RecordingError(f"{error}; {self._reader.damage}") from error
 
     def _image(self, message: BagMessage, stream: int) -> StampedImage:
         try:
             content = message.decode()
         except RecordingError as error:
             # Without a header there is no other stamp than that of the recording.
-            return StampedImage(
-                stream=stream, stamp_ns=message.log_time_ns, load=partial(_fail, str(error))
-            )
-        decode = self._decoder(message.topic, is_depth=self._is_depth(stream))
+            stamp_ns, load = message.log_time_ns, partial(_fail, str(error))
+        else:
+            decode = self._decoder(message.topic, is_depth=self._is_depth(stream))
+            stamp_ns, load = stamp_of(content.header), partial(decode, content)
         return StampedImage(
-            stream=stream, stamp_ns=stamp_of(content.header), load=partial(decode, content)
+            stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=message.log_time_ns
         )
 
     def _is_depth(self, stream: int) -> bool:
@@ -162,17 +215,8 @@ class BagSource:
             decode = decode_compressed_depth if is_compressed else decode_depth
             return partial(decode, scale=self._scale, where=topic.name)
         if is_compressed:
-            return partial(decode_compressed, where=topic.name)
-        return partial(decode_grey_or_color, where=topic.name)
-
-
-def _pose(transform: Any, path: Path) -> FloatArray:  # noqa: ANN401 - geometry_msgs/Transform
-    t = np.array([getattr(transform.translation, axis) for axis in "xyz"], dtype=np.float64)
-    quaternion_xyzw = np.array([getattr(transform.rotation, axis) for axis in "xyzw"])
-    norm = np.linalg.norm(quaternion_xyzw)
-    if not np.all(np.isfinite(t)) or not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        raise RecordingError(f"{path}: /tf holds a pose of {TRUTH_FRAMES[1]} that is no transform")
-    return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
+            return partial(decode_compressed, where=topic.name, grey_range=self._grey_range)
+        return partial(decode_grey_or_color, where=topic.name, grey_range=self._grey_range)
 
 
 def _fail(reason: str) -> NDArray[Any]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gvo.errors import CalibrationError
-from gvo.geometry.camera import Calibration, stereo_camera
+from gvo.geometry.camera import Calibration
+from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
+from gvo.sources.camera_fields import CameraFields, read_numbers, shortened
 from gvo.types import FloatArray
 
 MAX_SIDE_PX = 32767
@@ -19,35 +19,25 @@ MAX_AREA_PX = 100_000_000
 
 _ROTATION_TOLERANCE = 1e-3
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CameraFields:
-    """What a `CameraInfo` says, as it stands there.
-
-    Parameters
-    ----------
-    where : str
-        File or topic, for messages.
-    width, height : int
-        Image size, pixels.
-    model : str
-        Distortion model.
-    K, D, R, P : array_like of float
-        9, 0 to 14, 9 and 12 numbers; R and P of zeros mean "not set".
-    """
-
-    where: str
-    width: int
-    height: int
-    model: str
-    K: ArrayLike
-    D: ArrayLike
-    R: ArrayLike
-    P: ArrayLike
+# As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
+_MODELS: dict[str, DistortionModel] = {
+    "plumb_bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "brown_conrady": "plumb_bob",
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant",
+}
 
 
 def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
-    """Check the fields of a `CameraInfo` and return the calibration.
+    """Check the fields of a `CameraInfo` and return the calibration of the recorded image.
+
+    Binning and region move K and P alike, by the raw region, as ROS's `PinholeCameraModel` does
+    it; `do_rectify` does not matter there either.
 
     Parameters
     ----------
@@ -59,8 +49,8 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     Raises
     ------
     CalibrationError
-        When the camera is not calibrated, its distortion is not `plumb_bob`, or a matrix is
-        malformed.
+        When the camera is not calibrated, its distortion model is not known, a matrix is
+        malformed, or the region lies outside the image.
     """
     where = fields.where
     K = _matrix(fields.K, (3, 3), f"{where}: K")
@@ -74,19 +64,32 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
         P = np.hstack([K, np.zeros((3, 1))])
     if not np.any(R):
         R = np.eye(3)
-    if not is_rotation(R):
-        raise CalibrationError(f"{where}: R is no rotation")
+    _check_matrices(K, R, P, where)
+    model, D = _distortion(fields, is_rectified=is_rectified)
+    width, height = fields.recorded_size()
+    recorded = _from_full_image(fields)
     calibration = Calibration(
-        width=fields.width,
-        height=fields.height,
-        K=K,
-        D=_distortion(fields, is_rectified=is_rectified),
+        width=width,
+        height=height,
+        K=K if recorded is None else recorded @ K,
+        D=D,
         R=R,
-        P=P,
+        P=P if recorded is None else recorded @ P,
         is_rectified=is_rectified,
+        model=model,
     )
     check_camera(calibration, where)
     return calibration
+
+
+def _from_full_image(fields: CameraFields) -> FloatArray | None:
+    """Return what maps pixels of the full image to the recorded one; None where it is whole."""
+    binning, roi = fields.binning_factors, fields.roi
+    if binning == (1, 1) and (roi.x_offset, roi.y_offset) == (0, 0):
+        return None
+    scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
+    shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
+    return np.asarray(scale @ shift)
 
 
 def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
@@ -154,29 +157,8 @@ def check_camera(calibration: Calibration, where: str) -> None:
         raise CalibrationError(f"{where}: {error}") from error
 
 
-def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -> float:
-    """Return the baseline of a rectified pair in metres.
-
-    Parameters
-    ----------
-    calibrations : tuple of two Calibration
-        Left and right.
-    where : str
-        File or topics, for the message.
-
-    Raises
-    ------
-    CalibrationError
-        When they are no rectified pair, naming where they come from.
-    """
-    try:
-        return stereo_camera(*calibrations).baseline
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from error
-
-
 def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
-    numbers = _numbers(values, what)
+    numbers = read_numbers(values, what)
     if numbers.size != shape[0] * shape[1]:
         raise CalibrationError(
             f"{what} must hold {shape[0] * shape[1]} numbers, got {numbers.size}"
@@ -184,27 +166,46 @@ def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
     return numbers.reshape(shape)
 
 
-def _numbers(values: ArrayLike, what: str) -> FloatArray:
-    try:
-        numbers = np.array(values, dtype=np.float64).ravel()
-    except (TypeError, ValueError) as error:
-        raise CalibrationError(f"{what} must hold numbers, got {values!r}") from error
-    if not np.all(np.isfinite(numbers)):
-        raise CalibrationError(f"{what} holds a value that is not finite")
-    return numbers
-
-
-def _distortion(fields: CameraFields, *, is_rectified: bool) -> FloatArray:
-    D = _numbers(fields.D, f"{fields.where}: D")
-    if not np.any(D):
-        return np.zeros(5)
-    if fields.model.lower() not in ("plumb_bob", "radial-tangential", "radtan"):
-        if is_rectified:
-            return np.zeros(5)
+def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> None:
+    if not is_rotation(R):
+        raise CalibrationError(f"{where}: R is no rotation")
+    for name, matrix in (("K", K), ("P", P)):
+        if not np.allclose(matrix[2, :3], [0.0, 0.0, 1.0], atol=1e-6):
+            raise CalibrationError(
+                f"{where}: the third row of {name} must begin with 0 0 1, got "
+                f"{' '.join(f'{value:g}' for value in matrix[2, :3])}"
+            )
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise CalibrationError(
-            f"{fields.where}: distortion model {fields.model!r} is not supported, expected "
-            "plumb_bob; rectify the images first"
+            f"{where}: focal lengths must be positive, got K with fx={K[0, 0]:g} fy={K[1, 1]:g}"
         )
-    if D.size not in (4, 5):
-        raise CalibrationError(f"{fields.where}: D must hold 4 or 5 numbers, got {D.size}")
-    return np.concatenate([D, np.zeros(5 - D.size)])
+
+
+def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[DistortionModel, FloatArray]:
+    D = read_numbers(fields.D, f"{fields.where}: D")
+    model = _MODELS.get("_".join(fields.model.lower().replace("-", " ").split()))
+    is_meant = fields.is_distorted_by_zeros and model == "equidistant"
+    if is_rectified or not (np.any(D) or is_meant):
+        return "plumb_bob", np.zeros(5)
+    if model is None:
+        raise CalibrationError(
+            f"{fields.where}: distortion model {shortened(fields.model)} is not supported, "
+            "expected plumb_bob, rational_polynomial or equidistant; rectify the images first"
+        )
+    if model == "plumb_bob" and D.size > 5:
+        model = "rational_polynomial"  # OpenCV goes by the count alone, and ROS with it
+    counts = {4, 5, *N_COEFFICIENTS[model]} if model != "equidistant" else {4}
+    if model == "equidistant" and not np.any(D[4:]):
+        D = D[:4]
+    if D.size not in counts:
+        raise CalibrationError(
+            f"{fields.where}: D of {' '.join(fields.model.split())} must hold "
+            f"{_alternatives(counts)} numbers, got {D.size}"
+        )
+    n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)
+    return model, np.concatenate([D, np.zeros(n_missing)])
+
+
+def _alternatives(counts: set[int]) -> str:
+    *most, last = (str(count) for count in sorted(counts))
+    return f"{', '.join(most)} or {last}" if most else last

@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
-from gvo.sources.pixels import read_image
+from gvo.sources.pixels import FULL_RANGE, GreyRange, read_image
 from gvo.sources.recording import RecordingInfo, StampedImage
 
 StampedPath = tuple[int, Path]
@@ -28,6 +28,8 @@ class FolderSource:
         Stamps in nanoseconds and files; first are colour or grey images.
     load_second : callable, optional
         Reads a file of the second stream; as a colour or grey image when left out.
+    grey_range : GreyRange
+        Of images with 16 bits.
     """
 
     def __init__(
@@ -35,12 +37,15 @@ class FolderSource:
         info: RecordingInfo,
         first: Sequence[StampedPath],
         second: Sequence[StampedPath],
-        load_second: Callable[[Path], NDArray[Any]] = read_image,
+        *,
+        load_second: Callable[[Path], NDArray[Any]] | None = None,
+        grey_range: GreyRange = FULL_RANGE,
     ) -> None:
         self._info = info
         self._first = first
         self._second = second
-        self._load_second = load_second
+        self._load = partial(read_image, grey_range=grey_range)
+        self._load_second = load_second or self._load
 
     @property
     def info(self) -> RecordingInfo:
@@ -50,13 +55,15 @@ class FolderSource:
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both streams in the order of their stamps, not decoded yet."""
         yield from heapq.merge(
-            _stream(0, self._first, read_image),
+            _stream(0, self._first, self._load),
             _stream(1, self._second, self._load_second),
             key=lambda image: image.stamp_ns,
         )
 
 
-def first_image_size(paths: Sequence[Path], folder: Path) -> tuple[int, int]:
+def first_image_size(
+    paths: Sequence[Path], folder: Path, grey_range: GreyRange = FULL_RANGE
+) -> tuple[int, int]:
     """Return width and height of the first image that can be read.
 
     Parameters
@@ -65,6 +72,8 @@ def first_image_size(paths: Sequence[Path], folder: Path) -> tuple[int, int]:
         Image files.
     folder : Path
         Where they lie, for the message.
+    grey_range : GreyRange
+        Of images with 16 bits.
 
     Returns
     -------
@@ -76,13 +85,17 @@ def first_image_size(paths: Sequence[Path], folder: Path) -> tuple[int, int]:
     RecordingError
         When there is none.
     """
+    first_fault = ""
     for path in paths:
         try:
-            height, width = read_image(path).shape[:2]
-        except RecordingError:
+            height, width = read_image(path, grey_range).shape[:2]
+        except RecordingError as error:
+            first_fault = first_fault or str(error)
             continue  # it becomes a faulty frame later
         return width, height
-    raise RecordingError(f"{folder}: none of its {len(paths)} images can be read")
+    raise RecordingError(
+        f"{folder}: none of its {len(paths)} images can be read; the first: {first_fault}"
+    )
 
 
 def _stream(

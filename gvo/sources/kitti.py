@@ -9,10 +9,12 @@ import numpy as np
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.sources.calibration import check_camera, stereo_baseline
-from gvo.sources.calibration_files import read_stereo_file
+from gvo.sources.calibration import check_camera
+from gvo.sources.calibration_files import CalibrationPaths, paths_of, read_cameras
 from gvo.sources.folders import FolderSource, StampedPath, first_image_size
+from gvo.sources.pixels import FULL_RANGE, GreyRange
 from gvo.sources.recording import RecordingInfo
+from gvo.sources.stereo_pairs import stereo_baseline
 from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
@@ -33,8 +35,10 @@ class KittiSource(FolderSource):
     ----------
     folder : Path
         Such a folder.
-    calibration : Path, optional
-        YAML of `left` and `right` that replaces `calib.txt`.
+    calibration : Path or sequence of Path, optional
+        Files of the pair that replace `calib.txt`, see `read_cameras`.
+    grey_range : GreyRange
+        Of images with 16 bits.
 
     Raises
     ------
@@ -42,7 +46,13 @@ class KittiSource(FolderSource):
         When files are missing or malformed.
     """
 
-    def __init__(self, folder: Path, *, calibration: Path | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        calibration: CalibrationPaths = None,
+        grey_range: GreyRange = FULL_RANGE,
+    ) -> None:
         self._folder = folder
         rows = read_rows(folder / "times.txt", n_fields=1)
         self._stamps_ns = [
@@ -51,17 +61,22 @@ class KittiSource(FolderSource):
         ]
         names = _find_pair(folder)
         left, right = (self._list_images(name) for name in names)
-        if calibration is not None:
-            calibrations = read_stereo_file(calibration, is_rectified=True)
+        explicit = paths_of(calibration)
+        files = explicit or (folder / "calib.txt",)
+        origin, T_body_cam = " + ".join(str(file) for file in files), None
+        if explicit:
+            cameras = read_cameras(files, sensor="stereo", is_rectified=True)
+            calibrations, T_body_cam = cameras.pair, cameras.T_body_cam
         else:
-            size = first_image_size([path for _, path in left], folder / names[0])
-            calibrations = _read_calibrations(folder / "calib.txt", names, size)
+            paths = [path for _, path in left]
+            size = first_image_size(paths, folder / names[0], grey_range)
+            calibrations = _read_calibrations(files[0], names, size)
         self._t_cam0_cam = _camera_offset(calibrations[0])
-        file = calibration or folder / "calib.txt"
+        state = "rectified" if calibrations[0].is_rectified else "raw"
         decisions = [
             f"stereo: {names[0]} + {names[1]} ({len(left)} + {len(right)} images)",
-            f"calibration: {file.name}, rectified",
-            f"baseline: {stereo_baseline(calibrations, str(file)):.4f} m",
+            f"calibration: {' + '.join(file.name for file in files)}, {state}",
+            f"baseline: {stereo_baseline(calibrations, origin):.4f} m",
         ]
         n_missing = len(self._stamps_ns) - len(left)
         if n_missing:
@@ -72,8 +87,9 @@ class KittiSource(FolderSource):
             calibrations=calibrations,
             n_images=len(left),
             decisions=decisions,
+            T_body_cam=T_body_cam,
         )
-        super().__init__(info, left, right)
+        super().__init__(info, left, right, grey_range=grey_range)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the left camera; the world is the first grey left camera.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gvo.config import Config
@@ -10,6 +11,7 @@ from gvo.errors import RecordingError
 from gvo.sources.bag import BagSource
 from gvo.sources.euroc import EurocSource
 from gvo.sources.kitti import KittiSource
+from gvo.sources.pixels import GreyRange
 from gvo.sources.recording import Source
 from gvo.sources.topics import TopicChoice
 from gvo.sources.tum import TumSource
@@ -19,6 +21,7 @@ _KINDS = (
     "a recording is a .bag, .mcap or .db3 file, a ROS 2 bag folder (metadata.yaml), or a folder "
     "of KITTI odometry (calib.txt), EuRoC (mav0 or cam0) or TUM RGB-D (rgb.txt)"
 )
+_TOPICS = ("left", "right", "color", "depth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,15 +30,15 @@ class RecordingOptions:
 
     Parameters
     ----------
-    calibration : Path, optional
-        YAML file that replaces the recording's own calibration.
+    calibration : sequence of Path
+        Files that replace the recording's own calibration: one or two, or a folder.
     left, right : str, optional
         Topics of a stereo pair in a bag.
     color, depth : str, optional
         Topics of an RGB-D camera in a bag.
     """
 
-    calibration: Path | None = None
+    calibration: Sequence[Path] = ()
     left: str | None = None
     right: str | None = None
     color: str | None = None
@@ -43,48 +46,48 @@ class RecordingOptions:
 
 
 def open_recording(
-    path: str | Path, *, config: Config | None = None, options: RecordingOptions | None = None
+    path: str | Path | Sequence[str | Path],
+    *,
+    config: Config | None = None,
+    options: RecordingOptions | None = None,
 ) -> Source:
     """Open a recording of any kind.
 
     Parameters
     ----------
-    path : str or Path
-        File or folder.
+    path : str or Path, or a sequence of them
+        File or folder; several bags are one recording.
     config : Config, optional
-        Of which `depth.scale` matters here.
+        Of which `depth.scale` and `images` matter here.
     options : RecordingOptions, optional
         What to choose, and the calibration.
 
     Raises
     ------
     RecordingError
-        When the path is missing or holds no recording, or does not hold what is needed.
+        When a path is missing or holds no recording, or does not hold what is needed.
     CalibrationError
         When the camera is not calibrated.
     """
-    path = Path(path)
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(one) for one in path]
     config = config or Config()
     options = options or RecordingOptions()
-    if not path.exists():
-        raise RecordingError(f"{path}: does not exist; {_KINDS}")
-    scale = config.depth.scale
-    if _is_bag(path):
+    for one in paths:
+        if not one.exists():
+            raise RecordingError(f"{one}: does not exist; {_KINDS}")
+    if all(is_bag(one) for one in paths):
         topics = TopicChoice(
             left=options.left, right=options.right, color=options.color, depth=options.depth
         )
-        return BagSource(path, topics=topics, calibration=options.calibration, depth_scale=scale)
-    _refuse_topics(path, options)
-    if _is_kitti(path):
-        return KittiSource(path, calibration=options.calibration)
-    if (path / "mav0").is_dir() or (path / "cam0").is_dir():
-        return EurocSource(path, calibration=options.calibration)
-    if (path / "rgb.txt").is_file():
-        return TumSource(path, calibration=options.calibration, depth_scale=scale)
-    raise RecordingError(f"{path}: is no recording; {_KINDS}")
+        return BagSource(paths, topics=topics, calibration=options.calibration, config=config)
+    if len(paths) > 1:
+        other = next(one for one in paths if not is_bag(one))
+        raise RecordingError(f"{other}: is no bag; only several bags can be one recording")
+    return _open_folder(paths[0], config, options)
 
 
-def _is_bag(path: Path) -> bool:
+def is_bag(path: Path) -> bool:
+    """Tell whether a path that exists is a bag of ROS, by its name or by what it holds."""
     if path.is_file():
         return path.suffix in BAG_SUFFIXES
     return (path / "metadata.yaml").is_file() or any(
@@ -92,13 +95,22 @@ def _is_bag(path: Path) -> bool:
     )
 
 
+def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
+    for name in _TOPICS:
+        if getattr(options, name) is not None:
+            raise RecordingError(f"{path}: --{name} names a topic of a bag, this is no bag")
+    calibration = options.calibration
+    grey_range = GreyRange(black=config.images.black, white=config.images.white)
+    if _is_kitti(path):
+        return KittiSource(path, calibration=calibration, grey_range=grey_range)
+    if (path / "mav0").is_dir() or (path / "cam0").is_dir():
+        return EurocSource(path, calibration=calibration, grey_range=grey_range)
+    if (path / "rgb.txt").is_file():
+        scale = config.depth.scale
+        return TumSource(path, calibration=calibration, depth_scale=scale, grey_range=grey_range)
+    raise RecordingError(f"{path}: is no recording; {_KINDS}")
+
+
 def _is_kitti(path: Path) -> bool:
     has_images = any((path / name).is_dir() for name in ("image_0", "image_2"))
     return (path / "calib.txt").is_file() or (has_images and (path / "times.txt").is_file())
-
-
-def _refuse_topics(path: Path, options: RecordingOptions) -> None:
-    names = [field.name for field in fields(options) if field.name != "calibration"]
-    given = [name for name in names if getattr(options, name) is not None]
-    if given:
-        raise RecordingError(f"{path}: --{given[0]} names a topic of a bag, this is no bag")

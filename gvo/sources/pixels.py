@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,33 +11,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
+from gvo.sources.image_headers import check_size, is_jpeg_complete, read_header
 from gvo.types import DepthArray, ImageArray
 
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_JPEG_MAGIC = b"\xff\xd8\xff"
-_MAX_PIXELS = 100_000_000
-_JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_TOO_DARK = 1 << 12
 
 
-def read_image(path: Path) -> ImageArray:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GreyRange:
+    """Which values of 16-bit images become black and white.
+
+    Cameras of 10, 12 or 14 bits fill the lower bits of 16, thermal ones a part in the middle, and
+    no encoding tells. The range is one for the whole recording: a gain chosen for each frame
+    would change the brightness of what is tracked.
+
+    Parameters
+    ----------
+    black : int
+        This value and all below become 0.
+    white : int
+        This value and all above become 255.
+
+    Examples
+    --------
+    >>> GreyRange(white=4095).narrow(np.array([0, 15, 16, 4095, 9000], np.uint16)).tolist()
+    [0, 0, 1, 255, 255]
+    """
+
+    black: int = 0
+    white: int = 65535
+
+    def __post_init__(self) -> None:
+        """Refuse what is no range."""
+        if not 0 <= self.black < self.white <= 65535:
+            raise ValueError(
+                f"expected 0 <= black < white <= 65535, got black={self.black} white={self.white}"
+            )
+
+    def narrow(self, values: NDArray[np.uint16]) -> ImageArray:
+        """Return values of 8 bits: for the full range the upper eight."""
+        if self == FULL_RANGE:
+            return (values >> 8).astype(np.uint8)
+        above = np.clip(values, self.black, self.white).astype(np.uint32) - np.uint32(self.black)
+        return (above * 256 // (self.white + 1 - self.black)).astype(np.uint8)
+
+
+FULL_RANGE = GreyRange()
+
+
+def read_image(path: Path, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
     """Read an image file.
 
     Parameters
     ----------
     path : Path
-        PNG, JPEG or whatever else OpenCV decodes.
+        PNG, JPEG, TIFF, BMP or PNM.
+    grey_range : GreyRange
+        Of 16-bit images.
 
     Returns
     -------
     ndarray of uint8, shape (height, width) or (height, width, 3)
-        Grey, or colour in BGR order; 16 bits are shifted to 8.
+        Grey, or colour in BGR order.
 
     Raises
     ------
     RecordingError
-        When the file is missing, empty, truncated or no image.
+        When the file is missing, empty, truncated or no image, or nearly black.
     """
-    return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path))
+    return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path), grey_range)
 
 
 def read_depth(path: Path, scale: float) -> DepthArray:
@@ -77,13 +120,16 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     RecordingError
         When it is empty, truncated, of an absurd size or no image.
     """
-    head = data[:32].tobytes()
-    if not head:
+    if len(data) == 0:
         raise RecordingError(f"{where}: the image is empty")
-    width, height = _announced_size(data, head)
-    if width * height > _MAX_PIXELS:
-        raise RecordingError(f"{where}: the image claims {width}x{height} pixels, it is damaged")
-    if head.startswith(_JPEG_MAGIC) and b"\xff\xd9" not in data[-1024:].tobytes():
+    header = read_header(data)
+    if header is None:
+        raise RecordingError(
+            f"{where}: the image cannot be decoded: expected PNG, JPEG, TIFF, BMP or PNM, but it "
+            f"begins with {data[:8].tobytes()!r}"
+        )
+    check_size(header.width, header.height, where)
+    if header.format == "JPEG" and not is_jpeg_complete(data):
         raise RecordingError(f"{where}: the JPEG image is truncated")
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -94,33 +140,46 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def to_8_bit(pixels: NDArray[Any], where: str) -> ImageArray:
+def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
     """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped.
 
     Parameters
     ----------
     pixels : ndarray of uint8 or uint16, shape (h, w), (h, w, 3) or (h, w, 4)
-        Values of 16 bits lose their lower eight.
+        Colour in BGR order.
     where : str
         File or topic, for the message.
+    grey_range : GreyRange
+        Of 16-bit images.
 
     Raises
     ------
     RecordingError
-        When the values are of another type.
+        When the values are of another type, or those of 16 bits would become nearly black.
     """
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    if pixels.dtype not in (np.uint8, np.uint16) or channels not in (1, 3, 4):
         raise RecordingError(
             f"{where}: expected grey or colour of 8 or 16 bits, got {pixels.dtype} of shape "
             f"{pixels.shape}"
         )
-    if pixels.ndim == 3 and pixels.shape[2] == 1:
+    if pixels.dtype == np.uint16:
+        _check_brightness(int(pixels.max(initial=0)), grey_range, where)
+        pixels = grey_range.narrow(pixels)
+    if pixels.ndim == 3 and channels == 1:
         pixels = pixels[:, :, 0]
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        pixels = pixels[:, :, :3]
+    if channels == 4:
+        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2BGR))
     return np.ascontiguousarray(pixels)
+
+
+def _check_brightness(largest: int, grey_range: GreyRange, where: str) -> None:
+    if grey_range == FULL_RANGE and largest < _TOO_DARK:
+        n_bits = max(8, largest.bit_length())
+        raise RecordingError(
+            f"{where}: the 16-bit image is nearly black, its largest value is {largest} of 65535; "
+            f"where the camera has {n_bits} bits, set images.white={(1 << n_bits) - 1}"
+        )
 
 
 def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthArray:
@@ -144,9 +203,10 @@ def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthAr
         raise RecordingError(
             f"{where}: expected depth as 16-bit grey, got {counts.dtype} of shape {counts.shape}"
         )
-    depth: DepthArray = np.divide(counts, np.float32(scale), dtype=np.float32)
+    depth: DepthArray = counts.astype(np.float32)
+    depth /= np.float32(scale)
     # One look at each pixel for both: with one added, 65535 becomes 0 and 0 becomes 1.
-    depth[counts + np.uint16(1) <= 1] = np.nan
+    np.copyto(depth, np.nan, where=counts + np.uint16(1) <= 1)
     return depth
 
 
@@ -164,7 +224,7 @@ def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
         A copy, metres, NaN = unknown.
     """
     depth = np.array(metres, dtype=np.float32)
-    depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+    np.copyto(depth, np.nan, where=~((depth > 0) & (depth < np.inf)))
     return depth
 
 
@@ -175,22 +235,3 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
         raise RecordingError(f"{path}: the file is missing") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _announced_size(data: NDArray[np.uint8], head: bytes) -> tuple[int, int]:
-    # Checked before decoding: a damaged header must not make the decoder allocate gigabytes.
-    if head.startswith(_PNG_MAGIC):
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    if head.startswith(_JPEG_MAGIC):
-        return _jpeg_size(data)
-    return 0, 0
-
-
-def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        segment = data[position : position + 9].tobytes()
-        if segment[1] in _JPEG_FRAME_MARKERS:
-            return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
-        position += 2 + int.from_bytes(segment[2:4], "big")
-    return 0, 0

@@ -1,4 +1,4 @@
-"""Topics of a bag that hold poses: odometry, stamped poses with and without covariance."""
+"""Topics of a bag that hold poses: odometry, stamped poses and transforms."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from gvo.sources.topics import Topic
 from gvo.trajectory import StampsFrom
 from gvo.types import FloatArray
 
-POSE_TYPES = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/PoseStamped",
-)
-"""Message types that hold a pose of a stamp; the last one without a covariance."""
+_TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
+_COVARIANCE_TYPES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+POSE_TYPES = (*_COVARIANCE_TYPES, "geometry_msgs/msg/PoseStamped", _TRANSFORM_TYPE)
+"""Message types that hold a pose of a stamp; the last two without a covariance."""
 
 _NORM_TOLERANCE = 1e-2
 
@@ -37,6 +36,12 @@ class TopicStream:
     reader : BagReader
     topic : Topic
         Of one of `POSE_TYPES`.
+
+    Attributes
+    ----------
+    parent_frame, child_frame : str
+        As the first pose names them, without leading slashes: T_parent_child is the pose. Empty
+        before it is read; the child also where the type names none.
     """
 
     def __init__(self, reader: BagReader, topic: Topic) -> None:
@@ -46,6 +51,9 @@ class TopicStream:
         self.decisions = [f"{topic.name}: {topic.type}, {topic.n_messages} messages"]
         self.n_poses = topic.n_messages
         self.stamps_from: StampsFrom = "file"
+        self.parent_frame = ""
+        self.child_frame = ""
+        self._has_frames = False
 
     def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
         """Yield the poses in the order of recording; skip and count what holds none.
@@ -61,17 +69,35 @@ class TopicStream:
                 continue
             n_messages += 1
             try:
-                yield _sample(message.decode(), self._topic)
+                content = message.decode()
+                sample = _sample(content, self._topic)
             except RecordingError as error:
                 faults.add("messages hold no pose and were skipped", str(error))
+                continue
+            if self._is_of_the_frames(content, faults):
+                yield sample
         if n_messages == 0:
             raise RecordingError(
                 f"{self._topic.name} announces {self._topic.n_messages} messages but yields "
                 "none; record or convert the bag anew"
             )
 
+    def _is_of_the_frames(self, message: Any, faults: InputFaults) -> bool:  # noqa: ANN401
+        """Tell whether a message is of the frames that the first one is of."""
+        names = (message.header.frame_id, getattr(message, "child_frame_id", ""))
+        parent, child = (name.strip("/") for name in names)
+        if not self._has_frames:
+            self.parent_frame, self.child_frame, self._has_frames = parent, child, True
+        is_same = (parent, child) == (self.parent_frame, self.child_frame)
+        if not is_same:
+            reason = f"{child} in {parent} in place of {self.child_frame} in {self.parent_frame}"
+            faults.add("messages are of other frames and were skipped", reason)
+        return is_same
 
-def find_topics(reader: BagReader, names: Sequence[str], where: str) -> list[Topic]:
+
+def find_topics(
+    reader: BagReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
+) -> list[Topic]:
     """Find the topics of poses that were asked for, or the only one there is.
 
     Parameters
@@ -81,6 +107,8 @@ def find_topics(reader: BagReader, names: Sequence[str], where: str) -> list[Top
         With or without the leading slash; empty: the only topic of poses is taken.
     where : str
         The bag, for messages.
+    types : sequence of str
+        Of the messages.
 
     Returns
     -------
@@ -92,15 +120,13 @@ def find_topics(reader: BagReader, names: Sequence[str], where: str) -> list[Top
     RecordingError
         When a name is unknown, or none is given and there is not exactly one topic of poses.
     """
-    found = [topic for topic in reader.topics if topic.type in POSE_TYPES and topic.n_messages]
+    found = [topic for topic in reader.topics if topic.type in types and topic.n_messages]
     if names:
         return [_find(name, found, where) for name in names]
     if len(found) == 1:
         return found
     if not found:
-        raise RecordingError(
-            f"{where}: holds no poses; expected a topic of {', '.join(POSE_TYPES)}"
-        )
+        raise RecordingError(f"{where}: holds no poses; expected a topic of {', '.join(types)}")
     raise RecordingError(
         f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
         f"several: {_list(found)}"
@@ -121,10 +147,10 @@ def _list(topics: Sequence[Topic]) -> str:
 
 def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at run time
     stamp_ns = stamp_of(message.header)
-    has_covariance = topic.type != POSE_TYPES[-1]
-    pose = message.pose.pose if has_covariance else message.pose
-    t = np.array([getattr(pose.position, axis) for axis in "xyz"], dtype=np.float64)
-    quaternion_xyzw = np.array([getattr(pose.orientation, axis) for axis in "xyzw"])
+    has_covariance = topic.type in _COVARIANCE_TYPES
+    position, orientation = _parts(message, topic.type)
+    t = np.array([getattr(position, axis) for axis in "xyz"], dtype=np.float64)
+    quaternion_xyzw = np.array([getattr(orientation, axis) for axis in "xyzw"])
     norm = np.linalg.norm(quaternion_xyzw)
     if not np.isfinite(t).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise RecordingError(f"{topic.name} at {stamp_ns} ns: the pose is no transform")
@@ -134,6 +160,13 @@ def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at
         T_world_frame=se3.make_transform(R, t),
         covariance=_covariance(message.pose.covariance, R) if has_covariance else None,
     )
+
+
+def _parts(message: Any, type_: str) -> tuple[Any, Any]:  # noqa: ANN401 - made at run time
+    if type_ == _TRANSFORM_TYPE:
+        return message.transform.translation, message.transform.rotation
+    pose = message.pose.pose if type_ in _COVARIANCE_TYPES else message.pose
+    return pose.position, pose.orientation
 
 
 def _covariance(numbers: FloatArray, R: FloatArray) -> FloatArray | None:

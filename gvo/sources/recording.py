@@ -32,11 +32,14 @@ class StampedImage:
     load : callable
         Returns the raw pixels: uint8 (h, w) grey or (h, w, 3) in BGR order; depth as float32
         metres (h, w), NaN = unknown. Raises `RecordingError` where the image is faulty.
+    log_time_ns : int, optional
+        When it was recorded, by the recording's own clock; None where there is no such clock.
     """
 
     stream: int
     stamp_ns: int
     load: Callable[[], NDArray[Any]]
+    log_time_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,6 +78,8 @@ class RecordingInfo:
         of the colour image.
     frame_id : str
         Name of stream 0's camera frame in `/tf`; empty where the recording names none.
+    T_body_cam : ndarray of float64, shape (4, 4), optional
+        Maps the rectified camera to the body the calibration names, metres.
     """
 
     name: str
@@ -84,6 +89,7 @@ class RecordingInfo:
     decisions: list[str] = field(default_factory=list)
     depth_view: DepthView | None = None
     frame_id: str = ""
+    T_body_cam: FloatArray | None = None
 
     @property
     def camera(self) -> StereoCamera | PinholeCamera:

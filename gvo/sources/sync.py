@@ -1,218 +1,315 @@
-"""Pairs of images by stamp, streaming.
+"""Pairs of images by stamp, streaming, as message_filters of ROS pairs messages.
 
-The result depends on the order and stamps within each stream, not on how the two streams are
-interleaved, as long as neither runs more than `MAX_PENDING` images ahead of the other.
+Which pairs come out depends on the stamps within each stream, not on how the two streams are
+interleaved, as long as no queue overflows; for equal stamps (`limit_ns` 0), as long as the
+stamps of each stream increase.
 """
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import TypeAlias
 
 from gvo.errors import GvoError
 from gvo.sources.recording import StampedImage
 from gvo.types import FaultyFrame
 
-MAX_PENDING = 100
-"""Images of one stream that are kept while the other one lags behind, or while they compete."""
-
 Pair: TypeAlias = tuple[StampedImage, StampedImage]
 
 
 def pair_images(
-    images: Iterable[StampedImage], *, limit_ns: int, partner: str
+    images: Iterable[StampedImage],
+    *,
+    limit_ns: int,
+    partner: str,
+    queue_size: int = 100,
+    age_penalty: float = 0.1,
 ) -> Iterator[Pair | FaultyFrame]:
     """Pair the images of stream 0 with those of stream 1.
 
-    Of all ways to pair within the limit, each image at most once, that with the least sum of
-    differences is taken, where an image of stream 0 without partner counts as much as the limit.
-    So none is left without while its partner's stamp is nearer to it than to the image that got
-    it, and a missing image does not shift those after it.
+    Without a tolerance images of equal stamps are paired, by the policy ExactTime of
+    message_filters; else by its ApproximateTime [1]_: the later one of the two images at the
+    front becomes the pivot, and gets either the last image of the other stream before it or,
+    where that is nearer by more than the age penalty, the first one after it.
 
     Parameters
     ----------
     images : iterable of StampedImage
         Both streams, interleaved in any way.
     limit_ns : int
-        Largest difference of the stamps of a pair, nanoseconds.
+        Largest difference of the stamps of a pair, nanoseconds; 0: equal stamps.
     partner : str
         What stream 1 is called in messages, with the parameter that sets the limit.
+    queue_size : int
+        Images of each stream that are kept (ExactTime: stamps of both together) while their
+        partners may still come; then the oldest is given up.
+    age_penalty : float
+        How much nearer, as a share, a later partner must be to be preferred to an earlier one.
 
-    Yields
-    ------
-    pair of StampedImage, or FaultyFrame
-        One for each image of stream 0, in its order: faulty where the stamp repeats or goes
-        back, or where there is no partner. Images of stream 1 whose stamp repeats or goes back
-        are left out.
+    Returns
+    -------
+    iterator of pair of StampedImage, or FaultyFrame
+        One for each image of stream 0, as soon as it is certain, in the order of the stream
+        (ExactTime: of the stamps waiting). Faulty with `is_unpaired` where there is no partner;
+        faulty where the stamp repeats or goes behind that of the last pair given, even if
+        message_filters pairs it: frames have increasing stamps. Images of stream 1 that nobody
+        gets are left out.
 
     Raises
     ------
+    ValueError
+        Where a parameter is out of its range.
     GvoError
         What reading the images raises, after the pairs of those read before.
 
     Notes
     -----
-    The sum is minimized by dynamic programming over the images of stream 0. A pair is given out
-    when all plans that may still turn out best agree on it, which is mostly an image later; when
-    `MAX_PENDING` images wait for that, the best plan so far decides about the first.
+    message_filters holds a pair back until the next image shows that it is the best. At the end
+    of the images, pairs held back are given out, as if one more image of each stream followed
+    long after.
+
+    The interval of a pair never exceeds the limit, the limits on message rates are 0 (as by
+    default in message_filters), and only two streams exist. So its search for a virtual
+    candidate never decides anything, and is not needed here.
+
+    References
+    ----------
+    .. [1] http://wiki.ros.org/message_filters/ApproximateTime
     """
-    pairing = _Pairing(limit_ns, partner)
+    if limit_ns < 0 or queue_size < 1 or age_penalty < 0:
+        raise ValueError(
+            "expected limit_ns >= 0, queue_size >= 1 and age_penalty >= 0, "
+            f"got {limit_ns}, {queue_size} and {age_penalty}"
+        )
+    answers = _Answers(limit_ns, partner, queue_size)
+    policy: _ExactTime | _ApproximateTime = _ExactTime(queue_size, answers)
+    if limit_ns > 0:
+        policy = _ApproximateTime(limit_ns, queue_size, age_penalty, answers)
+    return _paired(images, policy, answers)
+
+
+def _paired(
+    images: Iterable[StampedImage], policy: _ExactTime | _ApproximateTime, answers: _Answers
+) -> Iterator[Pair | FaultyFrame]:
     try:
         for image in images:
-            pairing.push(image)
-            yield from pairing.decided()
+            policy.push(image)
+            yield from answers.take()
     except GvoError:
-        yield from pairing.rest()  # what was read before it counts
+        policy.end()  # what was read before it counts
+        yield from answers.take()
         raise
-    yield from pairing.rest()
+    policy.end()
+    yield from answers.take()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Plan:
-    """One way to pair the images that are planned but not given out.
+class _Answers:
+    """What becomes of the images of stream 0."""
 
-    `last_ns` is the stamp of the last partner taken, `cost_ns` the sum of differences so far.
-    """
-
-    last_ns: int
-    cost_ns: int
-    partners: tuple[StampedImage | None, ...]
-
-
-class _Pairing:
-    def __init__(self, limit_ns: int, partner: str) -> None:
-        self._is_ended = False
+    def __init__(self, limit_ns: int, partner: str, queue_size: int) -> None:
         self._limit_ns = limit_ns
         self._partner = partner
-        self._waiting: deque[StampedImage | FaultyFrame] = deque()
-        self._partners: deque[StampedImage] = deque()
-        self._last_stamps: list[int | None] = [None, None]
-        self._stamp_passed: int | None = None
-        # planned images, each with what it becomes where the plan has no partner for it
-        self._planned: deque[tuple[StampedImage | None, FaultyFrame]] = deque()
-        self._plans = [_Plan(last_ns=-(2**64), cost_ns=0, partners=())]
+        self._queue_size = queue_size
+        self._ready: list[Pair | FaultyFrame] = []
+        self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
+        self.last_ns: int | None = None  # of the last pair
+
+    def take(self) -> list[Pair | FaultyFrame]:
+        """Return the answers since the last call."""
+        ready, self._ready = self._ready, []
+        return ready
+
+    def add_pair(self, image: StampedImage, partner: StampedImage) -> None:
+        self.pass_partner(partner)
+        if self.is_late(image):
+            self.add_late(image)
+        else:
+            self.last_ns = image.stamp_ns
+            self._ready.append((image, partner))
+
+    def is_late(self, image: StampedImage) -> bool:
+        return self.last_ns is not None and image.stamp_ns <= self.last_ns
+
+    def add_late(self, image: StampedImage) -> None:
+        if self.last_ns is not None and image.stamp_ns < self.last_ns:
+            reason = f"the stamp goes back from {self.last_ns} to {image.stamp_ns} ns"
+        else:
+            reason = f"the stamp {image.stamp_ns} ns repeats"
+        self._ready.append(FaultyFrame(stamp_ns=image.stamp_ns, reason=reason))
+
+    def add_alone(
+        self, image: StampedImage, next_ns: int | None, *, is_crowded: bool = False
+    ) -> None:
+        """Answer for an image without partner; `next_ns`: the next stamp of stream 1."""
+        if self.is_late(image):
+            self.add_late(image)
+            return
+        around = [stamp_ns for stamp_ns in (self._passed_ns, next_ns) if stamp_ns is not None]
+        gaps = [abs(stamp_ns - image.stamp_ns) for stamp_ns in around]
+        nearest = f"the nearest is {min(gaps) / 1e6:g} ms away" if gaps else "there is none"
+        if is_crowded:
+            nearest += f", and sync.queue_size={self._queue_size} is reached"
+        elif gaps and min(gaps) <= self._limit_ns:
+            nearest += " and belongs to another image"
+        reason = f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}"
+        self._ready.append(FaultyFrame(stamp_ns=image.stamp_ns, reason=reason, is_unpaired=True))
+
+    def pass_partner(self, partner: StampedImage) -> None:
+        self._passed_ns = partner.stamp_ns
+
+
+class _ExactTime:
+    """Images wait by their stamp; a pair ends the wait of all older ones."""
+
+    def __init__(self, queue_size: int, answers: _Answers) -> None:
+        self._queue_size = queue_size
+        self._answers = answers
+        self._stamps: list[int] = []  # a heap of the keys of `_waiting`
+        self._waiting: dict[int, list[StampedImage | None]] = {}
 
     def push(self, image: StampedImage) -> None:
         """Take the next image of either stream."""
-        last_ns = self._last_stamps[image.stream]
-        is_late = last_ns is not None and image.stamp_ns <= last_ns
-        if not is_late:
-            self._last_stamps[image.stream] = image.stamp_ns
-        if image.stream == 0:
-            self._waiting.append(_late_frame(image, last_ns) if is_late else image)
-        elif not is_late:
-            self._partners.append(image)
-            if len(self._partners) > MAX_PENDING and not self._waiting:
-                self._pass_partner()
+        if self._answers.is_late(image):
+            # message_filters would pair it with another late one; no frame could come of it
+            if image.stream == 0:
+                self._answers.add_late(image)
+            return
+        if image.stamp_ns not in self._waiting:
+            self._waiting[image.stamp_ns] = [None, None]
+            heapq.heappush(self._stamps, image.stamp_ns)
+        self._store(image)
+        if len(self._waiting) > self._queue_size:
+            self._leave_oldest(is_crowded=True)
 
-    def decided(self) -> Iterator[Pair | FaultyFrame]:
-        """Yield what no later image can change."""
-        while self._waiting and self._is_plannable(self._waiting[0]):
-            image = self._waiting.popleft()
-            if isinstance(image, FaultyFrame):
-                self._planned.append((None, image))
-                self._plans = [_extended(plan, None) for plan in self._plans]
-            else:
-                self._plan(image)
-            yield from self._agreed()
+    def end(self) -> None:
+        """Give up what waits."""
+        while self._stamps:
+            self._leave_oldest()
 
-    def rest(self) -> Iterator[Pair | FaultyFrame]:
-        """Yield what is left when no image will come any more."""
-        self._is_ended = True
-        yield from self.decided()
-        self._plans = [self._best_plan()]
-        yield from self._agreed()
+    def _store(self, image: StampedImage) -> None:
+        """Put an image beside its partner, instead of an earlier one of the same stamp."""
+        images = self._waiting[image.stamp_ns]
+        replaced, images[image.stream] = images[image.stream], image
+        if replaced is not None and replaced.stream == 0:
+            self._answers.add_late(replaced)
+        first, second = images
+        if first is not None and second is not None:
+            while self._stamps[0] < image.stamp_ns:
+                self._leave_oldest()
+            del self._waiting[heapq.heappop(self._stamps)]
+            self._answers.add_pair(first, second)
 
-    def _is_plannable(self, image: StampedImage | FaultyFrame) -> bool:
-        """Tell whether all images that may become its partner are known."""
-        last_ns = self._last_stamps[1]
-        return (
-            self._is_ended
-            or isinstance(image, FaultyFrame)
-            or (last_ns is not None and last_ns >= image.stamp_ns + self._limit_ns)
-            or max(len(self._waiting), len(self._partners)) > MAX_PENDING
-        )
-
-    def _plan(self, image: StampedImage) -> None:
-        """Continue all plans by all choices for one image, and keep those that may be best."""
-        earliest_ns = image.stamp_ns - self._limit_ns
-        while self._partners and self._partners[0].stamp_ns < earliest_ns:
-            self._pass_partner()
-        self._planned.append((image, self._partnerless_frame(image)))
-        near = [p for p in self._partners if p.stamp_ns <= image.stamp_ns + self._limit_ns]
-        plans = []
-        for plan in self._plans:
-            # one more than the limit: a pair with just that difference is better than none
-            plans.append(_extended(plan, None, cost_ns=self._limit_ns + 1))
-            plans += [
-                _extended(plan, partner, cost_ns=abs(partner.stamp_ns - image.stamp_ns))
-                for partner in near
-                if partner.stamp_ns > plan.last_ns
-            ]
-        self._plans = _not_dominated(plans, earliest_ns)
-
-    def _agreed(self) -> Iterator[Pair | FaultyFrame]:
-        """Yield the answers that all plans share; the best plan's where too many wait."""
-        while self._planned:
-            if len(self._planned) > MAX_PENDING:
-                first = self._best_plan().partners[0]
-            else:
-                first = self._plans[0].partners[0]
-                if any(plan.partners[0] is not first for plan in self._plans):
-                    return
-            self._plans = [
-                _Plan(last_ns=plan.last_ns, cost_ns=plan.cost_ns, partners=plan.partners[1:])
-                for plan in self._plans
-                if plan.partners[0] is first
-            ]
-            image, alone = self._planned.popleft()
-            yield alone if image is None or first is None else (image, first)
-
-    def _best_plan(self) -> _Plan:
-        return min(self._plans, key=lambda plan: plan.cost_ns)
-
-    def _pass_partner(self) -> None:
-        self._stamp_passed = self._partners.popleft().stamp_ns
-
-    def _partnerless_frame(self, image: StampedImage) -> FaultyFrame:
-        around = [self._stamp_passed] + [partner.stamp_ns for partner in self._partners]
-        gaps = [abs(stamp - image.stamp_ns) for stamp in around if stamp is not None]
-        nearest = f"the nearest is {min(gaps) / 1e6:g} ms away" if gaps else "there is none"
-        if gaps and min(gaps) <= self._limit_ns:
-            nearest += " and belongs to another image"
-        return FaultyFrame(
-            stamp_ns=image.stamp_ns,
-            reason=f"no {self._partner}={self._limit_ns / 1e6:g}: {nearest}",
-            is_unpaired=True,
-        )
+    def _leave_oldest(self, *, is_crowded: bool = False) -> None:
+        image, partner = self._waiting.pop(heapq.heappop(self._stamps))
+        if partner is not None:
+            self._answers.pass_partner(partner)
+        if image is not None:
+            partners = (stamp for stamp, images in self._waiting.items() if images[1] is not None)
+            self._answers.add_alone(image, min(partners, default=None), is_crowded=is_crowded)
 
 
-def _extended(plan: _Plan, partner: StampedImage | None, *, cost_ns: int = 0) -> _Plan:
-    return _Plan(
-        last_ns=plan.last_ns if partner is None else partner.stamp_ns,
-        cost_ns=plan.cost_ns + cost_ns,
-        partners=(*plan.partners, partner),
-    )
+class _ApproximateTime:
+    """Two queues; the fronts make the candidate where there is a pivot.
 
-
-def _not_dominated(plans: list[_Plan], earliest_ns: int) -> list[_Plan]:
-    """Leave out each plan that another one cannot do worse than, whatever comes.
-
-    Of two plans, that whose last partner is earlier has all choices of the other; partners
-    before `earliest_ns` are no choice any more.
+    `_pivot` is the stream whose front is the pivot: the later front of the first interval within
+    the limit. The front of the other queue is its best partner so far; `_n_seen` images of
+    that queue have been looked at, the best one included. Each pivot looks at the images of the
+    other stream up to the first one after it.
     """
-    kept: list[_Plan] = []
-    for plan in sorted(plans, key=lambda plan: (max(plan.last_ns, earliest_ns), plan.cost_ns)):
-        if not kept or plan.cost_ns < kept[-1].cost_ns:
-            kept.append(plan)
-    return kept
+
+    def __init__(
+        self, limit_ns: int, queue_size: int, age_penalty: float, answers: _Answers
+    ) -> None:
+        self._limit_ns = limit_ns
+        self._queue_size = queue_size
+        self._factor = 1 + age_penalty
+        self._answers = answers
+        self._queues: tuple[deque[StampedImage], deque[StampedImage]] = (deque(), deque())
+        # Where images were given up, one of them might have suited a pivot better than what is
+        # left: no image of that stream is a pivot until the other stream has caught up.
+        self._has_gap = [False, False]
+        self._pivot: int | None = None
+        self._n_seen = 0
+
+    def push(self, image: StampedImage) -> None:
+        """Take the next image of either stream."""
+        queue = self._queues[image.stream]
+        queue.append(image)
+        self._advance()
+        if len(queue) > self._queue_size:
+            self._pivot = None
+            self._leave(image.stream, is_crowded=True)
+            self._has_gap[image.stream] = True
+            self._advance()
+
+    def end(self) -> None:
+        """Give out the pairs held back, and give up the rest."""
+        while self._pivot is not None:
+            self._give_candidate()
+            self._advance()
+        while self._queues[0]:
+            self._leave(0)
+
+    def _advance(self) -> None:
+        """Do all that the images known so far allow."""
+        while self._find_pivot() if self._pivot is None else self._look_on(self._pivot):
+            pass
+
+    def _find_pivot(self) -> bool:
+        """Look at the fronts; tell whether there were both."""
+        if not (self._queues[0] and self._queues[1]):
+            return False
+        gap_ns = self._queues[1][0].stamp_ns - self._queues[0][0].stamp_ns
+        earlier, later = (0, 1) if gap_ns >= 0 else (1, 0)
+        self._has_gap[earlier] = False
+        if abs(gap_ns) > self._limit_ns:
+            self._leave(earlier)
+        elif self._has_gap[later]:
+            self._leave(earlier, is_crowded=True)
+        else:
+            self._pivot, self._n_seen = later, 1
+            if gap_ns == 0:
+                self._give_candidate()
+        return True
+
+    def _look_on(self, pivot: int) -> bool:
+        """Look at one more image of the other stream; tell whether there was one."""
+        others = self._queues[1 - pivot]
+        if self._n_seen == len(others):
+            return False
+        pivot_ns = self._queues[pivot][0].stamp_ns
+        best_ns, next_ns = others[0].stamp_ns, others[self._n_seen].stamp_ns
+        if next_ns > pivot_ns:
+            is_better = _scaled_ns(next_ns - pivot_ns, self._factor) < pivot_ns - best_ns
+        else:
+            is_better = next_ns > best_ns  # it is not where stamps repeat or go back
+        if is_better:
+            for _ in range(self._n_seen):
+                self._leave(1 - pivot)
+            self._n_seen = 0
+        self._n_seen += 1
+        if next_ns >= pivot_ns:
+            self._give_candidate()
+        return True
+
+    def _give_candidate(self) -> None:
+        self._pivot = None
+        self._answers.add_pair(self._queues[0].popleft(), self._queues[1].popleft())
+
+    def _leave(self, stream: int, *, is_crowded: bool = False) -> None:
+        image = self._queues[stream].popleft()
+        if stream == 1:
+            self._answers.pass_partner(image)
+        else:
+            next_ns = self._queues[1][0].stamp_ns if self._queues[1] else None
+            self._answers.add_alone(image, next_ns, is_crowded=is_crowded)
 
 
-def _late_frame(image: StampedImage, last_ns: int | None) -> FaultyFrame:
-    if image.stamp_ns == last_ns:
-        reason = f"the stamp {image.stamp_ns} ns repeats"
-    else:
-        reason = f"the stamp goes back from {last_ns} to {image.stamp_ns} ns"
-    return FaultyFrame(stamp_ns=image.stamp_ns, reason=reason)
+def _scaled_ns(duration_ns: int, factor: float) -> int:
+    """Scale a duration as ROS does: by way of seconds, so that ties fall alike."""
+    seconds = (duration_ns // 10**9 + 1e-9 * (duration_ns % 10**9)) * factor
+    whole = math.floor(seconds)
+    return whole * 10**9 + math.floor((seconds - whole) * 1e9 + 0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,10 +12,16 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.sources.calibration import CameraFields, make_calibration, make_rgbd_calibration
-from gvo.sources.calibration_files import read_mono_file
+from gvo.sources.calibration import make_calibration
+from gvo.sources.calibration_files import (
+    CalibrationPaths,
+    CameraSet,
+    paths_of,
+    read_cameras,
+)
+from gvo.sources.camera_fields import CameraFields
 from gvo.sources.folders import FolderSource, StampedPath
-from gvo.sources.pixels import read_depth
+from gvo.sources.pixels import FULL_RANGE, GreyRange, read_depth
 from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
@@ -54,11 +61,13 @@ class TumSource(FolderSource):
     ----------
     folder : Path
         Such a folder.
-    calibration : Path, optional
-        YAML of the colour camera.
+    calibration : Path or sequence of Path, optional
+        File of the colour camera, see `read_cameras`.
     depth_scale : float, optional
         Counts per metre; otherwise that of the calibration file; otherwise 5000 as TUM has it,
         or 1000 where the first depth image only makes sense in millimetres.
+    grey_range : GreyRange
+        Of images with 16 bits.
 
     Raises
     ------
@@ -67,30 +76,37 @@ class TumSource(FolderSource):
     """
 
     def __init__(
-        self, folder: Path, *, calibration: Path | None = None, depth_scale: float | None = None
+        self,
+        folder: Path,
+        *,
+        calibration: CalibrationPaths = None,
+        depth_scale: float | None = None,
+        grey_range: GreyRange = FULL_RANGE,
     ) -> None:
         self._folder = folder
         color, depth = (_list_images(folder / name) for name in ("rgb.txt", "depth.txt"))
-        camera, from_file, origin = _find_calibration(folder, calibration)
+        cameras = _find_calibration(folder, paths_of(calibration))
         if depth_scale is not None:
             scale, reason = depth_scale, "by depth.scale"
-        elif from_file is not None:
-            scale, reason = from_file, "by the calibration"
+        elif cameras.depth_scale is not None:
+            scale, reason = cameras.depth_scale, "by the calibration"
         else:
             scale, reason = _assume_scale([path for _, path in depth])
         decisions = [
             f"rgbd: rgb + depth ({len(color)} + {len(depth)} images)",
-            f"calibration: {origin}",
+            f"calibration: {cameras.origin}",
             f"depth: {scale:g} counts per metre, {reason}",
         ]
         info = RecordingInfo(
             name=folder.resolve().name,
             sensor="rgbd",
-            calibrations=(camera,),
+            calibrations=cameras.calibrations,
             n_images=len(color),
             decisions=decisions,
+            T_body_cam=cameras.T_body_cam,
         )
-        super().__init__(info, color, depth, partial(read_depth, scale=scale))
+        load_second = partial(read_depth, scale=scale)
+        super().__init__(info, color, depth, load_second=load_second, grey_range=grey_range)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the colour camera.
@@ -114,23 +130,23 @@ def _list_images(table: Path) -> list[StampedPath]:
     ]
 
 
-def _find_calibration(folder: Path, explicit: Path | None) -> tuple[Calibration, float | None, str]:
-    """Return the camera, the depth scale of its file, and where it comes from."""
+def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
     beside = folder / "calibration.yaml"
     named = _CAMERA_NAME.search(folder.resolve().name.lower())
-    if explicit is None and named is not None:
+    if not explicit and named is not None:
         origin = f"published for freiburg{named[1]}, by the name of the folder"
         if beside.is_file():
             origin += f"; {beside.name} there is not used, give it by --calibration to use it"
-        return _published_camera(*_CAMERAS[named[1]]), DEFAULT_SCALE, origin
-    path = explicit or beside
-    if explicit is None and not beside.is_file():
+        camera = _published_camera(*_CAMERAS[named[1]])
+        return CameraSet(calibrations=(camera,), origin=origin, depth_scale=DEFAULT_SCALE)
+    if not explicit and not beside.is_file():
         raise CalibrationError(
             f"{folder}: no calibration is known: the name holds none of freiburg1, freiburg2, "
             "freiburg3; add calibration.yaml or give --calibration FILE"
         )
-    fields, scale = read_mono_file(path)
-    return make_rgbd_calibration(fields, is_rectified=False), scale, path.name
+    paths = explicit or (beside,)
+    cameras = read_cameras(paths, sensor="rgbd", is_rectified=False)
+    return replace(cameras, origin=" + ".join(path.name for path in paths))
 
 
 def _published_camera(

@@ -1,5 +1,7 @@
 """Camera models against OpenCV, and the rectification of raw pairs."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -207,7 +209,7 @@ def test_nothing_is_to_be_done_for_rectified_images() -> None:
 
 @pytest.mark.parametrize("what", ["D", "R", "P"])
 def test_each_difference_between_raw_and_rectified_is_mapped(what: str) -> None:
-    values: dict[str, FloatArray] = {
+    values: dict[str, Any] = {
         "K": CAMERA.K,
         "D": np.zeros(5),
         "R": np.eye(3),

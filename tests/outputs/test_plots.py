@@ -155,3 +155,28 @@ def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
         "assert matplotlib.rcParams['svg.hashsalt'] is None"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
+
+
+def test_positions_without_rotations_are_drawn_with_their_errors(tmp_path: Path) -> None:
+    reference = curve(0)
+    points = Trajectory.of_positions(
+        reference.stamps_ns[::7] + 33_000_000, reference.positions[::7], stamps_from="topic"
+    )
+    text = svg_text(tmp_path, points, {"raw": curve(1)})
+    assert "position error [m]" in text
+    assert "raw (ATE" in text
+
+
+def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
+    """They begin with an identity that means nothing: it makes no world of a camera."""
+    path = curve(0, extents=(3.0, 5.0, 0.5))
+    path = path.moved(se3.invert(path.T_world_cam[0]))
+    points = Trajectory.of_positions(path.stamps_ns, path.positions)
+    axes = {
+        name: [letter for letter in "xyz" if f"<!-- {letter} [m] -->" in text]
+        for name, text in (
+            ("camera", svg_text(tmp_path, path, {"raw": path})),
+            ("points", svg_text(tmp_path, points, {"raw": path})),
+        )
+    }
+    assert axes == {"camera": ["x", "z"], "points": ["x", "y"]}

@@ -1,16 +1,16 @@
-"""Calibrations from fields and files."""
+"""Calibrations from fields."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
-from gvo.sources.calibration import CameraFields, make_calibration, make_rgbd_calibration
-from gvo.sources.calibration_files import read_calibration_file, read_mono_file, read_stereo_file
+from gvo.sources.calibration import make_calibration, make_rgbd_calibration
+from gvo.sources.camera_fields import CameraFields, RegionOfInterest
 
 _K = [50.0, 0, 23.5, 0, 51.0, 15.5, 0, 0, 1]
 _P = [40.0, 0, 20.5, -20.0, 0, 41.0, 10.5, 0, 0, 0, 1, 0]
@@ -60,9 +60,17 @@ def test_missing_distortion_coefficients_are_zero(D: list[float]) -> None:
         ({"K": ["a"] * 9}, "K must hold numbers"),
         ({"P": [-40.0, *_P[1:]]}, "focal lengths must be positive"),
         ({"R": 2 * np.eye(3)}, "R is no rotation"),
-        ({"D": [0.1, 0.2]}, "D must hold 4 or 5 numbers, got 2"),
-        ({"model": "equidistant"}, "distortion model 'equidistant'"),
-        ({"model": "rational_polynomial", "D": [0.1] * 8}, "'rational_polynomial'"),
+        ({"K": [1e300, *_K[1:]]}, "K holds 1e.300"),
+        ({"K": [10**400, *_K[1:]]}, "K must hold numbers"),
+        ({"K": [0.0, *_K[1:]]}, "focal lengths must be positive, got K with fx=0 fy=51"),
+        ({"K": [*_K[:8], 0.0]}, "third row of K must begin with 0 0 1, got 0 0 0"),
+        ({"P": [*_P[:8], 1, 0, 1, 0]}, "third row of P must begin with 0 0 1, got 1 0 1"),
+        ({"D": [0.1, 0.2]}, "D of plumb_bob must hold 4 or 5 numbers, got 2"),
+        ({"D": [0.1] * 7}, "D of plumb_bob must hold 4, 5, 8, 12 or 14 numbers, got 7"),
+        ({"model": "equidistant"}, "D of equidistant must hold 4 numbers, got 5"),
+        ({"model": "rational_polynomial", "D": [0.1] * 15}, "4, 5, 8, 12 or 14 numbers, got 15"),
+        ({"model": "thin_prism"}, "distortion model 'thin_prism' .* expected plumb_bob"),
+        ({"model": "Inverse Brown Conrady"}, "distortion model 'Inverse Brown Conrady'"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "R is no rotation"),
         ({"width": 0}, "image size must be positive"),
         ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
@@ -96,72 +104,104 @@ def test_a_model_without_distortion_does_not_matter_either() -> None:
     assert not np.any(make_calibration(fields, is_rectified=False).D)
 
 
-def _write(path: Path, content: object) -> Path:
-    path.write_text(yaml.safe_dump(content))
-    return path
+@pytest.mark.parametrize(
+    ("name", "n", "model", "n_kept"),
+    [
+        ("plumb_bob", 4, "plumb_bob", 5),
+        ("radtan", 4, "plumb_bob", 5),
+        ("radial-tangential", 4, "plumb_bob", 5),
+        ("Brown Conrady", 5, "plumb_bob", 5),
+        ("plumb_bob", 8, "rational_polynomial", 8),
+        ("rational_polynomial", 5, "rational_polynomial", 8),
+        ("rational_polynomial", 8, "rational_polynomial", 8),
+        ("rational_polynomial", 12, "rational_polynomial", 12),
+        ("rational_polynomial", 14, "rational_polynomial", 14),
+        ("equidistant", 4, "equidistant", 4),
+        ("fisheye", 4, "equidistant", 4),
+        ("kannala_brandt", 4, "equidistant", 4),
+    ],
+)
+def test_the_model_goes_by_name_and_count(name: str, n: int, model: str, n_kept: int) -> None:
+    D = np.linspace(0.01, 0.02, n)
+    calibration = make_calibration(_fields(model=name, D=D), is_rectified=False)
+    assert calibration.model == model
+    np.testing.assert_array_equal(calibration.D, [*D, *[0.0] * (n_kept - n)])
 
 
-@pytest.mark.parametrize("names", ["kdrp", "KDRP"])
-def test_both_spellings_of_a_file_say_the_same(tmp_path: Path, tiny: Any, names: str) -> None:
-    long = tiny.ros_camera(
-        rectification_matrix={"data": np.eye(3).ravel().tolist()},
-        projection_matrix={"data": _P},
+def test_zeros_after_the_coefficients_of_a_fisheye_are_filling() -> None:
+    fields = _fields(model="Kannala Brandt4", D=[0.1, 0.2, 0.3, 0.4, 0.0])
+    np.testing.assert_array_equal(
+        make_calibration(fields, is_rectified=False).D, [0.1, 0.2, 0.3, 0.4]
     )
-    k, d, r, p = list(names)
-    short = {
-        "width": 48,
-        "height": 32,
-        "distortion_model": "plumb_bob",
-        k: tiny.camera.K.ravel().tolist(),
-        d: [0.0] * 5,
-        r: np.eye(3).ravel().tolist(),
-        p: _P,
+
+
+def test_zeros_of_a_fisheye_mean_no_distortion_unless_they_are_meant() -> None:
+    unset = make_calibration(_fields(model="equidistant", D=[0.0] * 4), is_rectified=False)
+    assert unset.model == "plumb_bob"
+    fields = _fields(model="equidistant", D=[0.0] * 4, is_distorted_by_zeros=True)
+    assert make_calibration(fields, is_rectified=False).model == "equidistant"
+
+
+def test_binning_and_region_give_the_camera_of_the_recorded_image() -> None:
+    # by hand, as image_geometry has it: the region first, then both axes by their binning
+    fields = _fields(
+        width=1280,
+        height=960,
+        K=[800.0, 0, 640, 0, 810, 480, 0, 0, 1],
+        P=[700.0, 0, 630, -70, 0, 700, 470, 0, 0, 0, 1, 0],
+        binning=(2, 4),
+        roi=RegionOfInterest(x_offset=100, y_offset=60, width=800, height=600),
+    )
+    calibration = make_calibration(fields, is_rectified=False)
+    assert (calibration.width, calibration.height) == (400, 150)
+    np.testing.assert_allclose(calibration.K.ravel(), [400, 0, 270, 0, 202.5, 105, 0, 0, 1])
+    expected = [350, 0, 265, -35, 0, 175, 102.5, 0, 0, 0, 1, 0]
+    np.testing.assert_allclose(calibration.P.ravel(), expected)
+    np.testing.assert_array_equal(calibration.D, fields.D)
+
+
+@given(
+    binning=st.sampled_from([0, 1, 2, 4]),
+    offset=st.integers(0, 200),
+    point=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+)
+def test_a_binned_region_sees_a_point_where_the_full_image_has_it(
+    binning: int, offset: int, point: tuple[float, float]
+) -> None:
+    wide: dict[str, Any] = {
+        "width": 1280,
+        "height": 960,
+        "K": [800.0, 0, 640, 0, 800, 480, 0, 0, 1],
     }
-    made = [
-        make_calibration(read_mono_file(_write(tmp_path / "c.yaml", c))[0], is_rectified=False)
-        for c in (long, short)
-    ]
-    for name in "KDRP":
-        np.testing.assert_array_equal(getattr(made[0], name), getattr(made[1], name))
+    roi = RegionOfInterest(x_offset=offset, y_offset=offset // 2, width=1000, height=800)
+    fields = _fields(**wide, P=np.zeros(12), binning=(binning, binning), roi=roi)
+    full = make_calibration(_fields(**wide, P=np.zeros(12)), is_rectified=False)
+    part = make_calibration(fields, is_rectified=False)
+    scale = max(binning, 1)
+    points = np.array([[*point, 1.0]])
+    np.testing.assert_allclose(
+        part.lens.project(points) * scale + [offset, offset // 2],
+        full.lens.project(points),
+        atol=1e-9,
+    )
+    assert (part.width, part.height) == (1000 // scale, 800 // scale)
 
 
-def test_a_file_may_carry_the_scale_of_depth(tmp_path: Path, tiny: Any) -> None:
-    path = _write(tmp_path / "c.yaml", tiny.ros_camera(depth_scale=1000))
-    assert read_calibration_file(path).depth_scale == 1000.0
-    path = _write(tmp_path / "c.yaml", tiny.ros_camera(depth_scale="many"))
-    with pytest.raises(CalibrationError, match="depth_scale must be a positive number"):
-        read_calibration_file(path)
-
-
-def test_a_stereo_pair_is_two_cameras(tmp_path: Path, tiny: Any) -> None:
-    pair = {
-        "left": tiny.ros_camera(),
-        "right": tiny.ros_camera(projection_matrix={"data": _P}),
-    }
-    path = _write(tmp_path / "pair.yaml", pair)
-    left, right = read_stereo_file(path, is_rectified=True)
-    assert left.P[0, 3] == 0
-    assert right.P[0, 3] == -20.0
-    with pytest.raises(CalibrationError, match="expected one camera"):
-        read_mono_file(path)
-    with pytest.raises(CalibrationError, match="left and right"):
-        read_stereo_file(_write(tmp_path / "mono.yaml", tiny.ros_camera()), is_rectified=True)
-
-
-@pytest.mark.parametrize("key", ["image_width", "image_height", "camera_matrix"])
-def test_a_missing_key_is_named(tmp_path: Path, tiny: Any, key: str) -> None:
-    path = _write(tmp_path / "c.yaml", tiny.ros_camera(**{key: None}))
-    with pytest.raises(CalibrationError, match=f"lacks {key}"):
-        read_mono_file(path)
+def test_a_region_of_size_zero_is_the_rest_of_the_image() -> None:
+    assert make_calibration(_fields(), is_rectified=False).width == 48
+    rest = _fields(roi=RegionOfInterest(x_offset=8, y_offset=2))
+    calibration = make_calibration(rest, is_rectified=False)
+    assert (calibration.width, calibration.height) == (40, 30)
 
 
 @pytest.mark.parametrize(
-    "text", ["a: [", "", "- 1", "\x00", "a: 2024-99-99", "a: 0b2", "a: " + "[" * 1000]
+    "roi",
+    [
+        RegionOfInterest(x_offset=1, width=48, height=32),
+        RegionOfInterest(y_offset=33),
+        RegionOfInterest(width=48, height=33),
+    ],
 )
-def test_a_file_that_holds_no_keys_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "c.yaml"
-    path.write_text(text)
-    with pytest.raises(CalibrationError, match=r"c\.yaml"):
-        read_calibration_file(path)
-    with pytest.raises(CalibrationError, match="cannot be read"):
-        read_calibration_file(tmp_path / "none.yaml")
+def test_a_region_outside_the_image_is_refused(roi: RegionOfInterest) -> None:
+    with pytest.raises(CalibrationError, match=r"/info: the region .* full image of 48x32 px"):
+        make_calibration(_fields(roi=roi), is_rectified=False)

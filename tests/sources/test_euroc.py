@@ -103,7 +103,7 @@ def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: An
     ("changes", "text"),
     [
         ({"camera_model": "omni"}, "camera model 'omni'"),
-        ({"distortion_model": "equidistant", "distortion_coefficients": [0.1] * 4}, "equidistant"),
+        ({"distortion_model": "fov", "distortion_coefficients": [0.1]}, "distortion model 'fov'"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4"),
         ({"resolution": None}, "resolution must hold"),
         ({"T_BS": {"data": [1.0] * 16}}, "T_BS is no rigid transform"),
@@ -145,6 +145,48 @@ def test_a_calibration_file_replaces_the_rectification(tmp_path: Path, tiny: Any
     info = EurocSource(_write(tmp_path / "m", tiny), calibration=path).info
     assert getattr(info.camera, "baseline", None) == 1.0
     assert not info.calibrations[0].is_rectified
+
+
+def test_a_fisheye_pair_is_rectified(tmp_path: Path, tiny: Any) -> None:
+    changes = {"distortion_model": "equidistant", "distortion_coefficients": [0.01, 0.0, 0.0, 0.0]}
+    source = EurocSource(_write(tmp_path / "m", tiny, **changes))
+    assert [c.model for c in source.info.calibrations] == ["equidistant"] * 2
+    assert getattr(source.info.camera, "baseline", 0) == pytest.approx(0.5)
+    assert all(isinstance(frame, StereoFrame) for frame in frames(source, Config()))
+
+
+def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    T_body_left, _ = _poses()
+    sensors = [folder / "mav0" / f"cam{n}" / "sensor.yaml" for n in range(2)]
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
+    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(pair))
+    for calibration in (None, sensors, folder, folder / "mav0", tmp_path / "pair.yaml"):
+        info = EurocSource(folder, calibration=calibration).info
+        assert info.T_body_cam is not None
+        R = info.calibrations[0].R
+        np.testing.assert_allclose(info.T_body_cam[:3, :3], T_body_left[:3, :3] @ R.T, atol=1e-12)
+        np.testing.assert_allclose(info.T_body_cam[:3, 3], T_body_left[:3, 3], atol=1e-12)
+    # the file's own pose on its body counts
+    moved = yaml.safe_load(sensors[0].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "0.yaml").write_text(yaml.safe_dump(moved))
+    moved = yaml.safe_load(sensors[1].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "1.yaml").write_text(yaml.safe_dump(moved))
+    info = EurocSource(folder, calibration=[tmp_path / "0.yaml", tmp_path / "1.yaml"]).info
+    assert info.T_body_cam is not None
+    assert info.T_body_cam[0, 3] == pytest.approx(T_body_left[0, 3] + 1.0)
+    assert "rectification: the poses of both on the body of 0.yaml + 1.yaml" in info.decisions
+
+
+def test_a_folder_without_poses_on_the_body_needs_none_of_the_pair(
+    tmp_path: Path, tiny: Any
+) -> None:
+    folder = _write(tmp_path / "m", tiny, T_BS=None)
+    with pytest.raises(CalibrationError, match=r"sensor\.yaml: the baseline must be positive"):
+        EurocSource(folder)
 
 
 @pytest.mark.recorded

@@ -12,10 +12,11 @@ import pytest
 
 from gvo.config import Config, RuntimeConfig, SyncConfig
 from gvo.errors import RecordingError
-from gvo.geometry.camera import Calibration
+from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.sources.depth_registration import DepthRegistration
 from gvo.sources.frames import frames
 from gvo.sources.kitti import KittiSource
-from gvo.sources.recording import StampedImage
+from gvo.sources.recording import DepthView, StampedImage
 from gvo.sources.sync import pair_images
 from gvo.sources.tum import TumSource
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
@@ -80,6 +81,9 @@ def test_depth_of_which_nothing_is_known_is_faulty(tiny: Any) -> None:
     (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
     assert isinstance(frame, FaultyFrame)
     assert frame.reason == "depth image: no pixel of the depth image is known"
+    unknown[21, 7] = 1.5
+    (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
+    assert isinstance(frame, RgbdFrame)
 
 
 def test_the_tolerances_are_those_of_the_configuration(tiny: Any) -> None:
@@ -104,6 +108,35 @@ def test_raw_images_are_rectified(tiny: Any) -> None:
     assert np.abs(frame.left - expected).max() <= 1.0
     np.testing.assert_array_equal(frame.left, frame.right)
     assert not np.array_equal(frame.left, ramp)
+
+
+def _seen_from_beside() -> DepthView:
+    """Return a depth camera of half the size, two centimetres left of the colour camera."""
+    camera = PinholeCamera(fx=25.0, fy=25.0, cx=11.5, cy=7.5, width=24, height=16)
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = -0.02
+    return DepthView(calibration=Calibration.from_camera(camera), T_color_depth=T_color_depth)
+
+
+@_THREADS
+def test_depth_of_a_camera_of_its_own_is_registered(tiny: Any, threads: int) -> None:
+    view = _seen_from_beside()
+    depth = np.random.default_rng(0).uniform(1.0, 1.1, (16, 24)).astype(np.float32)
+    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, depth)])
+    source.info = replace(source.info, depth_view=view)
+    (frame,) = _read(source, threads)
+    expected = DepthRegistration(source.info.calibrations[0], view)(depth)
+    assert np.isfinite(expected).mean() > 0.8
+    np.testing.assert_array_equal(frame.depth, expected)
+    np.testing.assert_array_equal(frame.image, tiny.texture(1))
+
+
+def test_the_size_of_depth_is_checked_against_its_own_camera(tiny: Any) -> None:
+    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, tiny.depth(1))])
+    source.info = replace(source.info, depth_view=_seen_from_beside())
+    (faulty,) = _read(source)
+    assert isinstance(faulty, FaultyFrame)
+    assert faulty.reason == ("depth image: expected 24x16 pixels by the calibration, got 48x32")
 
 
 @_THREADS

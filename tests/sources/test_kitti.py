@@ -88,6 +88,24 @@ def test_a_calibration_file_wins(tmp_path: Path, tiny: Any) -> None:
     assert any("pair.yaml" in decision for decision in info.decisions)
 
 
+def test_two_files_may_replace_the_calibration(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    (folder / "calib.txt").unlink()
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    (tmp_path / "l.yaml").write_text(yaml.safe_dump(tiny.ros_camera()))
+    right = tiny.ros_camera(projection_matrix={"data": P})
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump(right))
+    info = KittiSource(folder, calibration=[tmp_path / "l.yaml", tmp_path / "r.yaml"]).info
+    assert getattr(info.camera, "baseline", None) == 1.0
+    assert "calibration: l.yaml + r.yaml, rectified" in info.decisions
+    assert info.T_body_cam is None
+
+
+def test_an_empty_list_of_files_is_none(tmp_path: Path, tiny: Any) -> None:
+    info = KittiSource(tiny.write_kitti(tmp_path / "00"), calibration=()).info
+    assert "calibration: calib.txt, rectified" in info.decisions
+
+
 def _without(name: str) -> Any:
     return lambda folder: (folder / name).unlink()
 

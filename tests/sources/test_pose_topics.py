@@ -20,8 +20,9 @@ from gvo.sources.edges import InputFaults
 from gvo.sources.pose_streams import PoseSample
 from gvo.sources.pose_topics import POSE_TYPES, find_topics, open_streams
 from gvo.types import FloatArray
+from tests.sources.pose_bags import PoseBag
 
-ODOMETRY, WITH_COVARIANCE, STAMPED = POSE_TYPES
+ODOMETRY, WITH_COVARIANCE, STAMPED, TRANSFORM = POSE_TYPES
 N = 4
 
 
@@ -58,6 +59,16 @@ class Maker:
     def message(self, type_: str, n: int, scale: float = 1.0) -> Any:
         if type_ == STAMPED:
             return self._types[type_](header=self.header(n), pose=self.pose(n, scale))
+        if type_ == TRANSFORM:
+            pose = self.pose(n, scale)
+            return self._types[type_](
+                header=self.header(n),
+                child_frame_id="base",
+                transform=self._types["geometry_msgs/msg/Transform"](
+                    translation=self._types["geometry_msgs/msg/Vector3"](**vars(pose.position)),
+                    rotation=pose.orientation,
+                ),
+            )
         with_covariance = self._types["geometry_msgs/msg/PoseWithCovariance"](
             pose=self.pose(n, scale), covariance=covariance_ros(n).ravel()
         )
@@ -103,7 +114,7 @@ def test_poses_and_stamps_are_read_of_all_types(tmp_path: Path, name: str, type_
     assert [sample.stamp_ns for sample in samples] == [(10 + n) * 10**9 + 7 for n in range(N)]
     for n, sample in enumerate(samples):
         np.testing.assert_allclose(sample.T_world_frame, pose(n), atol=1e-12)
-        assert (sample.covariance is None) == (type_ == STAMPED)
+        assert (sample.covariance is None) == (type_ in (STAMPED, TRANSFORM))
     assert not faults
 
 
@@ -169,3 +180,14 @@ def test_recorded_wheel_odometry_has_covariances(gvo_data: Path) -> None:
     samples = list(stream.samples(InputFaults()))
     assert len(samples) == 2639
     assert all(sample.covariance is not None for sample in samples)
+
+
+def test_a_topic_tells_its_frames_and_keeps_to_them(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    for n, child in enumerate(["drone", "/drone", "wand", "drone"]):
+        bag.pose("/vicon", TRANSFORM, n, pose(n), parent="/room", child=child)
+    (stream,) = open_streams(bag.write(), [])
+    faults = InputFaults()
+    assert [sample.stamp_ns for sample in stream.samples(faults)] == [0, 1, 3]
+    assert (stream.parent_frame, stream.child_frame) == ("room", "drone")
+    assert "wand in room in place of drone in room" in faults.warnings()[0]

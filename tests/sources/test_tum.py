@@ -96,6 +96,27 @@ def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: A
     assert largest(depth_scale=10000.0) == pytest.approx(0.5 * at_5000)
 
 
+def test_a_camera_on_a_body_says_where(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    T_cam_imu = np.eye(4)
+    T_cam_imu[:3, 3] = 0.1, 0.2, 0.3
+    camera = {
+        "camera_model": "pinhole",
+        "intrinsics": [50.0, 50.0, 23.5, 15.5],
+        "resolution": [48, 32],
+        "distortion_model": "equidistant",
+        "distortion_coeffs": [0.1, 0.0, 0.0, 0.0],
+        "T_cam_imu": T_cam_imu.tolist(),
+    }
+    path = tmp_path / "camchain-imucam.yaml"
+    path.write_text(yaml.safe_dump({"cam0": camera}))
+    info = TumSource(folder, calibration=path).info
+    assert info.calibrations[0].model == "equidistant"
+    assert info.T_body_cam is not None
+    np.testing.assert_allclose(info.T_body_cam[:3, 3], [-0.1, -0.2, -0.3])
+    assert "calibration: camchain-imucam.yaml" in info.decisions
+
+
 def _depth_decision(source: TumSource) -> str:
     (line,) = [line for line in source.info.decisions if line.startswith("depth: ")]
     return line

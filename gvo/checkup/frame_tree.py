@@ -1,0 +1,134 @@
+"""The tree of frames: is the camera in it, is it one tree, does it hold all the time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+import numpy as np
+
+from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.config import CheckConfig
+from gvo.sources.tf import TfBuffer
+from gvo.types import Failure, IntArray
+
+_N_NAMED = 5
+# A single transform, such as the ground truth of a data set, is no robot that misses a camera.
+_MIN_FRAMES = 3
+
+
+def check_frame_tree(
+    buffer: TfBuffer,
+    camera_frame: str,
+    stamps_ns: IntArray,
+    *,
+    base_frame: str,
+    check: CheckConfig,
+) -> Iterator[Finding]:
+    """Yield what is missing between the camera, the robot's base and the root of its tree.
+
+    Odometry needs none of it; the trajectory of another frame, and ground truth from `/tf`, do.
+
+    Parameters
+    ----------
+    buffer : TfBuffer
+        The transforms of the recording.
+    camera_frame : str
+        Of the images' headers; empty where they name none.
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the images.
+    base_frame : str
+        The robot's own frame.
+    check : CheckConfig
+    """
+    if len(buffer.frames) < _MIN_FRAMES:
+        yield Finding(name="tf: frames", value=", ".join(sorted(buffer.frames)) or "none")
+        return
+    roots = _roots(buffer.edges)
+    yield _check_trees(buffer, roots)
+    camera = camera_frame.strip("/")
+    if not camera:
+        yield unknown("tf: camera", "the images name no frame")
+        return
+    if camera not in buffer.frames:
+        yield Finding(
+            name="tf: camera",
+            value=f"{camera} is in no transform",
+            threshold="in the tree",
+            verdict="warning",
+            fix=f"record /tf_static, or publish where {camera} is on the robot",
+        )
+        return
+    yield _check_base(buffer, camera, base_frame)
+    root = next((root for root in sorted(roots) if buffer.chain(root, camera)), None)
+    if root is not None and root != camera:
+        yield from _check_gaps(buffer.edge_stamps_ns(root, camera), root, camera, stamps_ns, check)
+
+
+def _roots(edges: Collection[tuple[str, str]]) -> set[str]:
+    """Return the frames that are nobody's child."""
+    return {parent for parent, _ in edges} - {child for _, child in edges}
+
+
+def _check_trees(buffer: TfBuffer, roots: Collection[str]) -> Finding:
+    names = sorted(roots)
+    is_split = len(names) > 1
+    more = ", ..." if len(names) > _N_NAMED else ""
+    return Finding(
+        name="tf: frames",
+        value=f"{len(buffer.frames)} in {len(names)} tree{'s' if len(names) != 1 else ''}"
+        f" (root {', '.join(names[:_N_NAMED])}{more})",
+        threshold="1 tree",
+        verdict="warning" if is_split else "ok",
+        fix="a transform between the trees is missing: record /tf_static as well"
+        if is_split
+        else "",
+    )
+
+
+def _check_base(buffer: TfBuffer, camera: str, base_frame: str) -> Finding:
+    name = "tf: camera"
+    if base_frame not in buffer.frames:
+        return Finding(name=name, value=f"{camera} is in the tree, there is no {base_frame}")
+    chain = buffer.chain(base_frame, camera)
+    if not isinstance(chain, Failure):
+        return Finding(
+            name=name,
+            value=" - ".join(chain),
+            threshold=f"connected to {base_frame}",
+            verdict="ok",
+        )
+    return Finding(
+        name=name,
+        value=f"{camera} is not connected to {base_frame}",
+        threshold=f"connected to {base_frame}",
+        verdict="warning",
+        fix="record /tf_static, or give the camera's pose on the robot in a file",
+    )
+
+
+def _check_gaps(
+    edge_stamps_ns: IntArray, root: str, camera: str, stamps_ns: IntArray, check: CheckConfig
+) -> Iterator[Finding]:
+    name = f"tf: {root} to {camera}"
+    if len(edge_stamps_ns) == 0:
+        yield Finding(name=name, value="static", verdict="ok")
+        return
+    first_ns, last_ns = edge_stamps_ns[0], edge_stamps_ns[-1]
+    if len(stamps_ns):
+        share = float(np.mean((stamps_ns < first_ns) | (stamps_ns > last_ns)))
+        yield measured(
+            f"{name}: images outside",
+            share,
+            Limits(high=check.max_lost_share + check.fault_lost_share),
+            unit="%",
+            text=f"{share:.1%} of the images",
+            fix="transforms start late or end early, or are stamped by another clock",
+        )
+    longest_s = float(np.diff(edge_stamps_ns).max(initial=0)) / 1e9
+    yield measured(
+        f"{name}: gaps",
+        longest_s,
+        Limits(high=check.max_tf_gap_s),
+        unit="s",
+        fix="transforms were lost: poses are interpolated over the gap",
+    )

@@ -1,0 +1,278 @@
+"""Images: exposure, blur, texture, and what cannot be used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.sampling import Sample
+from gvo.config import CheckConfig, Config
+from gvo.frontend.corners import detect_corners
+from gvo.types import BoolArray, FaultyFrame, FloatArray, Frame, ImageArray, RgbdFrame, StereoFrame
+
+_BLACK, _WHITE = 2, 253
+# Scales that the gradients are compared at, pixels, and the weakest edge that counts, grey per
+# pixel times eight (Sobel's sum).
+_FINE_PX, _COARSE_PX = 1.0, 2.0
+_MIN_GRADIENT = 8.0
+_MIN_EDGES = 20
+# Of the local maxima of the gradient this share is strong enough to be edges of things.
+_STRONG_SHARE = 0.3
+_MAX_RETURN_PX = 0.5
+_TRACK_WINDOW = (15, 15)
+_N_TRACK_LEVELS = 4
+# A transfer that broke off leaves the last rows alike; so large a share of them is no scene.
+_MIN_TORN_SHARE = 0.05
+_MIN_TORN_ROWS = 4
+
+
+def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Finding]:
+    """Yield how many of the sampled frames odometry cannot use, and why."""
+    looked_at = [frame for sample in samples for frame in _frames_of(sample)]
+    faulty = [frame for frame in looked_at if isinstance(frame, FaultyFrame)]
+    if not looked_at:
+        yield unknown("frames that cannot be used", "no frame to look at")
+        return
+    yield measured(
+        "frames that cannot be used",
+        len(faulty) / len(looked_at),
+        _lost_limits(check),
+        unit="%",
+        text=f"{len(faulty)} of {len(looked_at)}",
+        fix=" ".join(faulty[0].reason.split()) if faulty else "",
+    )
+
+
+def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
+    """Yield what the grey images of the samples say, both of a stereo camera."""
+    usable = [sample for sample in samples if not isinstance(sample.first, FaultyFrame)]
+    if not usable:
+        return
+    is_stereo = isinstance(usable[0].first, StereoFrame)
+    for index, name in enumerate(("left", "right") if is_stereo else ("colour",)):
+        images = [_grey_images(sample.first)[index] for sample in usable]
+        pairs = [
+            (_grey_images(sample.first)[index], _grey_images(sample.second)[index])
+            for sample in usable
+            if sample.second is not None and not isinstance(sample.second, FaultyFrame)
+        ]
+        yield from _check_exposure(name, images, config.check)
+        yield from _check_sharpness(name, images, config.check)
+        yield from _check_texture(name, images, pairs, config)
+        yield from _check_transfer(name, images, pairs, config.check)
+    if is_stereo:
+        yield _compare_exposures([_grey_images(sample.first) for sample in usable], config.check)
+
+
+def blur_sigma_px(image: ImageArray) -> float:
+    """Return how blurred the edges of an image are: sigma of a Gaussian, pixels.
+
+    At a step edge the gradient of an image smoothed by sigma s falls with
+    1 / sqrt(s^2 + blur^2), whatever the contrast. So the ratio of the gradients at two scales
+    tells the blur, here as the median over the strong local maxima of the gradient.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width)
+
+    Returns
+    -------
+    float
+        0.3 to 1.3 for sharp cameras; NaN where the image has no edges. Of much blurred edges with
+        little contrast the noise takes some away.
+
+    References
+    ----------
+    S. Zhuo, T. Sim, "Defocus map estimation from a single image", Pattern Recognition 44(9),
+    2011, doi:10.1016/j.patcog.2011.03.009.
+    """
+    fine, coarse = _gradients(image, _FINE_PX), _gradients(image, _COARSE_PX)
+    is_maximum = coarse == np.asarray(cv2.dilate(coarse, np.ones((5, 5), np.uint8)))
+    is_maximum &= coarse > _MIN_GRADIENT
+    if np.count_nonzero(is_maximum) < _MIN_EDGES:
+        return math.nan
+    strong = np.quantile(coarse[is_maximum], 1.0 - _STRONG_SHARE)
+    is_edge = is_maximum & (coarse >= strong)
+    ratio = float(np.median((fine[is_edge] / coarse[is_edge]) ** 2))
+    # ratio = (coarse^2 + blur^2) / (fine^2 + blur^2)
+    numerator = max(_COARSE_PX**2 - ratio * _FINE_PX**2, 0.0)
+    return math.sqrt(numerator / max(ratio - 1.0, 1e-3))
+
+
+def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -> float:
+    """Return the share of corners that Lucas-Kanade finds in the next image and back again.
+
+    Parameters
+    ----------
+    first, second : ndarray of uint8, shape (height, width)
+        An image and the next one.
+    corners : ndarray of float64, shape (n, 2)
+        In the first image; noise gives corners too, but none that are found again.
+    """
+    if len(corners) == 0:
+        return 0.0
+    start = corners.astype(np.float32)
+    there, is_there = _follow(first, second, start)
+    back, is_back = _follow(second, first, there)
+    is_followed = is_there & is_back & (np.linalg.norm(back - start, axis=1) <= _MAX_RETURN_PX)
+    return float(np.mean(is_followed))
+
+
+def n_torn_rows(image: ImageArray) -> int:
+    """Count the rows at the bottom that hold one grey value throughout, as a torn transfer does."""
+    is_varied = np.flatnonzero(np.any(image != image[-1, -1], axis=1))
+    n_rows: int = image.shape[0]
+    return n_rows - 1 - int(is_varied[-1]) if len(is_varied) else n_rows
+
+
+def _check_exposure(
+    name: str, images: Sequence[ImageArray], check: CheckConfig
+) -> Iterator[Finding]:
+    yield measured(
+        f"{name}: brightness",
+        float(np.median([image.mean() for image in images])),
+        Limits(low=check.min_brightness, high=check.max_brightness),
+        unit="grey",
+        fix="set exposure and gain of the camera, or light the scene",
+    )
+    black = float(np.median([np.mean(image <= _BLACK) for image in images]))
+    white = float(np.median([np.mean(image >= _WHITE) for image in images]))
+    yield measured(
+        f"{name}: clipped pixels",
+        max(black, white),
+        Limits(high=check.max_clipped_share),
+        unit="%",
+        text=f"{black:.1%} black, {white:.1%} white",
+        fix=f"{'longer' if black > white else 'shorter'} exposure: clipped pixels hold no corners",
+    )
+
+
+def _check_sharpness(
+    name: str, images: Sequence[ImageArray], check: CheckConfig
+) -> Iterator[Finding]:
+    blurs = np.array([blur_sigma_px(image) for image in images])
+    known = blurs[np.isfinite(blurs)]
+    if len(known) == 0:
+        yield unknown(f"{name}: blur", "no edges")
+        return
+    share = float(np.mean(known > check.max_blur_px))
+    yield measured(
+        f"{name}: blur",
+        float(np.median(known)),
+        Limits(high=check.max_blur_px),
+        unit="px",
+        text=f"{np.median(known):.2f} px median, {share:.0%} of the frames above the threshold",
+        fix="focus the lens; shorter exposure where the camera moves fast",
+    )
+
+
+def _check_texture(
+    name: str,
+    images: Sequence[ImageArray],
+    pairs: Sequence[tuple[ImageArray, ImageArray]],
+    config: Config,
+) -> Iterator[Finding]:
+    check = config.check
+    counts = [len(detect_corners(image, config.klt)) for image in images]
+    yield measured(
+        f"{name}: corners",
+        float(np.median(counts)),
+        Limits(low=check.min_corners, fault_low=config.ransac.min_inliers),
+        text=f"{np.median(counts):.0f} median, {min(counts)} least of {config.klt.n_corners}",
+        fix="more light, texture or contrast in view; klt.min_eigenvalue takes weaker corners",
+    )
+    if not pairs:
+        yield unknown(f"{name}: corners found again", "no two consecutive frames")
+        return
+    shares = [
+        followed_share(first, second, detect_corners(first, config.klt)) for first, second in pairs
+    ]
+    yield measured(
+        f"{name}: corners found again",
+        float(np.median(shares)),
+        Limits(low=check.min_followed_share),
+        unit="%",
+        text=f"{np.median(shares):.0%} in the next frame (median)",
+        fix="higher frame rate or slower motion; check that frames are in order",
+    )
+
+
+def _check_transfer(
+    name: str,
+    images: Sequence[ImageArray],
+    pairs: Sequence[tuple[ImageArray, ImageArray]],
+    check: CheckConfig,
+) -> Iterator[Finding]:
+    n_frozen = sum(np.array_equal(first, second) for first, second in pairs)
+    if pairs:
+        yield measured(
+            f"{name}: frozen images",
+            n_frozen / len(pairs),
+            _lost_limits(check),
+            unit="%",
+            text=f"{n_frozen} of {len(pairs)} are the same as the one before",
+            fix="the driver repeats images: record at the camera's own rate",
+        )
+    torn = np.array([n_torn_rows(image) for image in images])
+    # Rectification leaves a border without pixels, the same in each image.
+    limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
+    n_torn = int(np.count_nonzero(torn - torn.min() > limit))
+    yield measured(
+        f"{name}: torn images",
+        n_torn / len(images),
+        _lost_limits(check),
+        unit="%",
+        text=f"{n_torn} of {len(images)} end in rows of one value",
+        fix="transfers break off: lower rate or size, another cable or port",
+    )
+
+
+def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]], check: CheckConfig) -> Finding:
+    ratios = [(left.mean() + 1.0) / (right.mean() + 1.0) for left, right in pairs]
+    ratio = float(np.median(ratios))
+    return measured(
+        "left/right: brightness ratio",
+        ratio,
+        Limits(low=1.0 / check.max_exposure_ratio, high=check.max_exposure_ratio),
+        fix="let both cameras share exposure and gain",
+    )
+
+
+def _follow(
+    first: ImageArray, second: ImageArray, start: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], BoolArray]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        start,
+        np.zeros_like(start),
+        winSize=_TRACK_WINDOW,
+        maxLevel=_N_TRACK_LEVELS,
+    )
+    return np.asarray(found), np.asarray(status)[:, 0] > 0
+
+
+def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
+    along_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3)
+    along_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)
+    return np.asarray(cv2.magnitude(along_u, along_v))
+
+
+def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
+    if isinstance(frame, StereoFrame):
+        return (frame.left, frame.right)
+    return (frame.image,) if isinstance(frame, RgbdFrame) else ()
+
+
+def _frames_of(sample: Sample) -> list[Frame | FaultyFrame]:
+    return [frame for frame in (sample.first, sample.second) if frame is not None]
+
+
+def _lost_limits(check: CheckConfig) -> Limits:
+    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)

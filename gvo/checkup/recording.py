@@ -1,0 +1,123 @@
+"""`check_recording`: all checks on one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gvo.checkup.depth import check_depth
+from gvo.checkup.frame_tree import check_frame_tree
+from gvo.checkup.images import check_images, check_usable
+from gvo.checkup.report import Checkup, Finding, Limits, measured
+from gvo.checkup.sampling import Survey, survey
+from gvo.checkup.stereo import check_stereo
+from gvo.checkup.timing import check_timing
+from gvo.config import Config
+from gvo.geometry.camera import StereoCamera
+from gvo.sources.recording import RecordingInfo, Source
+from gvo.sources.tf import TfBuffer
+
+# Cameras with eyes closer or wider than that exist, but are mostly a unit gone wrong.
+_BASELINES_M = (0.01, 3.0)
+
+
+def check_recording(
+    source: Source,
+    config: Config,
+    *,
+    n_samples: int | None = None,
+    transforms: TfBuffer | None = None,
+    base_frame: str = "base_link",
+) -> Checkup:
+    """Look for what makes odometry fail or err, before it runs.
+
+    All stamps are read, and a few frames are decoded as odometry gets them. No more than these
+    frames and two numbers per image are held.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    config : Config
+        `check` holds the thresholds; the rest says what odometry would use.
+    n_samples : int, optional
+        Frames looked at, each with the next one; default: `check.n_samples`.
+    transforms : TfBuffer, optional
+        Of the same bag; where None, the tree of frames is not checked.
+    base_frame : str
+        The robot's own frame in that tree.
+
+    Returns
+    -------
+    Checkup
+        What is damaged or missing is a finding, no exception.
+
+    Examples
+    --------
+    >>> import gvo
+    >>> recording = gvo.SyntheticRecording("handheld", "stereo", n_frames=8, scale=0.5)
+    >>> check_recording(recording, gvo.Config(), n_samples=4).is_healthy
+    True
+    """
+    found = survey(source, config, n_samples=n_samples or config.check.n_samples)
+    info = source.info
+    findings = [
+        *_describe(info, found),
+        *check_timing(found, info, config),
+        *check_usable(found.samples, config.check),
+        *check_images(found.samples, config),
+    ]
+    if info.sensor == "stereo":
+        findings += check_stereo(found.samples, config)
+    else:
+        findings += check_depth(found.samples, config)
+    if transforms is not None:
+        findings += check_frame_tree(
+            transforms,
+            info.frame_id,
+            found.streams[0].stamps_ns,
+            base_frame=base_frame,
+            check=config.check,
+        )
+    return Checkup(recording=info.name, findings=tuple(findings))
+
+
+def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
+    """Yield what is in the recording and what odometry will use."""
+    camera = info.camera
+    stamps_ns = found.streams[0].stamps_ns
+    duration_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
+    yield Finding(
+        name="recording",
+        value=f"{info.sensor}, {' + '.join(str(len(s.stamps_ns)) for s in found.streams)} images "
+        f"of {camera.width}x{camera.height}, {duration_s:.1f} s",
+    )
+    for number, decision in enumerate(info.decisions, start=1):
+        yield Finding(name=f"source {number}", value=decision)
+    yield Finding(
+        name="reading",
+        value=" ".join(found.damage.split()) or "complete",
+        threshold="complete",
+        verdict="fault" if found.damage else "ok",
+        fix="what was read is usable; repair a copy of the file or record anew"
+        if found.damage
+        else "",
+    )
+    yield Finding(
+        name="focal length",
+        value=f"{camera.fx:.1f} px, view of {_view_deg(camera.fx, camera.width):.0f} deg",
+    )
+    if isinstance(camera, StereoCamera):
+        low, high = _BASELINES_M
+        yield measured(
+            "baseline",
+            camera.baseline,
+            Limits(low=low, high=high),
+            unit="m",
+            fix="P[3] of the right CameraInfo is -fx * baseline in metres",
+        )
+
+
+def _view_deg(focal_px: float, size_px: int) -> float:
+    return float(np.degrees(2.0 * np.arctan(0.5 * size_px / focal_px)))

@@ -1,0 +1,227 @@
+"""What a check found: values with their limits, verdicts and fixes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Literal, TypeAlias
+
+Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
+
+_HEADER = ("check", "value", "threshold", "verdict", "fix")
+_N_DIGITS = 3
+_MAX_PLAIN = 1e7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that was looked at.
+
+    Parameters
+    ----------
+    name : str
+        What was looked at; no two findings of a checkup share it.
+    value : float or str
+        A number in `unit`, or text. Shares are in percent.
+    unit : str
+        Of the number; empty for none.
+    text : str
+        What a table shows in place of the number, where that tells more.
+    threshold : str
+        What the value is held against; empty where nothing is.
+    verdict : {"ok", "warning", "fault", "info", "unknown"}
+        A warning costs accuracy or frames, a fault most of them; unknown: the recording does not
+        hold what the check needs.
+    fix : str
+        What to do, one line; empty where nothing is.
+    """
+
+    name: str
+    value: float | str
+    unit: str = ""
+    text: str = ""
+    threshold: str = ""
+    verdict: Verdict = "info"
+    fix: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what breaks a table."""
+        if not self.name or any("\n" in line for line in self._lines):
+            raise ValueError(f"a finding needs a name and one line of text each, got {self!r}")
+        if self.verdict in ("warning", "fault") and not self.fix:
+            raise ValueError(f"{self.name}: a {self.verdict} needs a fix")
+
+    @property
+    def _lines(self) -> tuple[str, ...]:
+        return (self.name, str(self.value), self.text, self.threshold, self.fix)
+
+    @property
+    def value_text(self) -> str:
+        """The value with its unit."""
+        if self.text or isinstance(self.value, str):
+            return self.text or str(self.value)
+        return f"{_number_text(self.value)} {self.unit}".strip()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Checkup:
+    """All findings on a recording.
+
+    Parameters
+    ----------
+    recording : str
+        Its name.
+    findings : tuple of Finding
+        In the order of the checks.
+    """
+
+    recording: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def is_healthy(self) -> bool:
+        """Whether there is no fault; warnings do not count."""
+        return not any(finding.verdict == "fault" for finding in self.findings)
+
+    def with_verdict(self, *verdicts: Verdict) -> tuple[Finding, ...]:
+        """Return the findings of these verdicts."""
+        return tuple(finding for finding in self.findings if finding.verdict in verdicts)
+
+    def as_json(self) -> dict[str, object]:
+        """Return the content as JSON holds it: no NaN, no infinity."""
+        findings = [asdict(finding) for finding in self.findings]
+        for finding in findings:
+            if isinstance(finding["value"], float) and not math.isfinite(finding["value"]):
+                finding["value"] = None
+        return {
+            "recording": self.recording,
+            "is_healthy": self.is_healthy,
+            "n_warnings": len(self.with_verdict("warning")),
+            "n_faults": len(self.with_verdict("fault")),
+            "findings": findings,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """The range of a value without warning, and that without fault.
+
+    Parameters
+    ----------
+    low, high : float
+        Outside is a warning.
+    fault_low, fault_high : float
+        Outside is a fault.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    fault_low: float = -math.inf
+    fault_high: float = math.inf
+
+    def judge(self, value: float) -> Verdict:
+        """Return the verdict on a number; NaN is unknown."""
+        if math.isnan(value):
+            return "unknown"
+        if not self.fault_low <= value <= self.fault_high:
+            return "fault"
+        return "ok" if self.low <= value <= self.high else "warning"
+
+    def describe(self, unit: str = "") -> str:
+        """Return the range that is held against, the tighter limit on each side."""
+        factor = 100.0 if unit == "%" else 1.0
+        low = factor * max(self.low, self.fault_low)
+        high = factor * min(self.high, self.fault_high)
+        if math.isinf(low) and math.isinf(high):
+            return ""
+        if math.isinf(low):
+            text = f"<= {_number_text(high)}"
+        elif math.isinf(high):
+            text = f">= {_number_text(low)}"
+        else:
+            text = f"{_number_text(low)} .. {_number_text(high)}"
+        return f"{text} {unit}".strip()
+
+
+def measured(
+    name: str, value: float, limits: Limits, *, unit: str = "", fix: str = "", text: str = ""
+) -> Finding:
+    """Hold a number against limits.
+
+    Parameters
+    ----------
+    name : str
+    value : float
+        NaN: the recording does not tell.
+    limits : Limits
+    unit : str
+        Of value and limits; "%": both are shares in [0, 1], shown in percent.
+    fix : str
+        What to do where the value is outside.
+    text : str
+        Shown instead of the number, where it tells more.
+
+    Returns
+    -------
+    Finding
+    """
+    verdict = limits.judge(value)
+    return Finding(
+        name=name,
+        value=float(value) * (100.0 if unit == "%" else 1.0),
+        unit=unit,
+        text=text,
+        threshold=limits.describe(unit),
+        verdict=verdict,
+        fix=fix if verdict in ("warning", "fault") else "",
+    )
+
+
+def unknown(name: str, reason: str) -> Finding:
+    """Return a finding that the recording does not allow."""
+    return Finding(name=name, value=reason, verdict="unknown")
+
+
+def format_checkup(checkup: Checkup) -> str:
+    """Return an aligned table, one line per finding, and a line that sums it up.
+
+    Examples
+    --------
+    >>> finding = Finding(name="rows", value=0.1234, unit="px", threshold="<= 1 px", verdict="ok")
+    >>> print(format_checkup(Checkup(recording="drive", findings=(finding,))))
+    check  value     threshold  verdict  fix
+    rows   0.123 px  <= 1 px    ok
+    drive: healthy
+    """
+    rows = [_HEADER, *map(_row, checkup.findings)]
+    # What is only told, however long, does not push the verdicts aside.
+    told = [_row(finding) for finding in checkup.findings if finding.verdict == "info"]
+    judged = [row for row in rows if row not in told]
+    widths = [max(len(row[column]) for row in judged) for column in range(len(_HEADER))]
+    widths[0] = max(len(row[0]) for row in rows)
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    return "\n".join([*lines, _sum_up(checkup)])
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    return (finding.name, finding.value_text, finding.threshold, finding.verdict, finding.fix)
+
+
+def _sum_up(checkup: Checkup) -> str:
+    counts = {
+        "fault": len(checkup.with_verdict("fault")),
+        "warning": len(checkup.with_verdict("warning")),
+    }
+    parts = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    return f"{checkup.recording}: {', '.join(parts) or 'healthy'}"
+
+
+def _number_text(value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    if value == 0 or 10 ** (_N_DIGITS - 1) <= abs(value) < _MAX_PLAIN:
+        return f"{value:.0f}"
+    return f"{value:.{_N_DIGITS}g}"

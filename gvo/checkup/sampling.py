@@ -1,0 +1,196 @@
+"""One pass over a recording: all stamps, and frames here and there with their successors."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gvo.config import Config, SyncConfig
+from gvo.errors import GvoError
+from gvo.sources.frames import frames
+from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.sources.sync import Pair, pair_images
+from gvo.trajectory import Trajectory
+from gvo.types import FaultyFrame, Frame, IntArray
+
+# Pairs that are formed only to look at them, where none is near enough for odometry.
+_WIDE_LIMIT_NS = 200_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StreamStamps:
+    """The stamps of one stream, in the order of the recording.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the headers.
+    log_stamps_ns : ndarray of int64, shape (m,)
+        Of the recording, for the images that have both; empty where there is no such clock.
+    headers_ns : ndarray of int64, shape (m,)
+        Stamps of the headers of those images.
+    """
+
+    stamps_ns: IntArray
+    log_stamps_ns: IntArray
+    headers_ns: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sample:
+    """A frame and the one after it.
+
+    Parameters
+    ----------
+    first, second : StereoFrame, RgbdFrame or FaultyFrame
+        `second` is None where the recording ends.
+    """
+
+    first: Frame | FaultyFrame
+    second: Frame | FaultyFrame | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """What a pass over a recording gave.
+
+    Parameters
+    ----------
+    streams : tuple of two StreamStamps
+    n_pairs : int
+        Frames that odometry gets.
+    samples : tuple of Sample
+        Spread over the recording.
+    damage : str
+        Why the recording could not be read to its end; empty where it could.
+    """
+
+    streams: tuple[StreamStamps, StreamStamps]
+    n_pairs: int
+    samples: tuple[Sample, ...]
+    damage: str
+
+
+def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
+    """Read all stamps of a recording, and decode some of its frames as odometry does.
+
+    No image is decoded but those of the samples, and no more of them are held.
+
+    Parameters
+    ----------
+    source : Source
+    config : Config
+    n_samples : int
+        Frames looked at, each with its successor.
+
+    Returns
+    -------
+    Survey
+    """
+    pass_ = _Pass(source, config.sync, n_samples)
+    pass_.run(_limit_ns(source.info, config))
+    n_pairs = pass_.n_pairs
+    if n_pairs == 0 and all(len(stamps) for stamps in pass_.stamps):
+        pass_ = _Pass(source, config.sync, n_samples)
+        pass_.run(_WIDE_LIMIT_NS)
+    return Survey(
+        streams=(pass_.stream(0), pass_.stream(1)),
+        n_pairs=n_pairs,
+        samples=_load(source.info, config, pass_.chosen),
+        damage=pass_.damage,
+    )
+
+
+class _Pass:
+    """Goes once over the images of a recording."""
+
+    def __init__(self, source: Source, sync: SyncConfig, n_samples: int) -> None:
+        self._source = source
+        self._sync = sync
+        last = max(source.info.n_images - 2, 0)
+        self._due = sorted({round(index) for index in np.linspace(0, last, n_samples).tolist()})
+        self.stamps = (array("q"), array("q"))
+        self._logs = (array("q"), array("q"))
+        self._headers = (array("q"), array("q"))
+        self.n_pairs = 0
+        self.damage = ""
+        self.chosen: list[list[Pair]] = []
+
+    def run(self, limit_ns: int) -> None:
+        due = iter(self._due)
+        next_due = next(due, None)
+        is_successor = False
+        pairs = pair_images(
+            self._noted(),
+            limit_ns=limit_ns,
+            partner="partner",
+            queue_size=self._sync.queue_size,
+            age_penalty=self._sync.age_penalty,
+        )
+        for index, item in enumerate(self._until_damage(pairs)):
+            if isinstance(item, FaultyFrame):
+                is_successor = False
+                continue
+            self.n_pairs += 1
+            if is_successor:
+                self.chosen[-1].append(item)
+            is_successor = next_due is not None and index >= next_due
+            if is_successor:
+                self.chosen.append([item])
+                while next_due is not None and index >= next_due:
+                    next_due = next(due, None)
+
+    def stream(self, number: int) -> StreamStamps:
+        """Return the stamps of one stream."""
+        return StreamStamps(
+            stamps_ns=np.array(self.stamps[number], dtype=np.int64),
+            log_stamps_ns=np.array(self._logs[number], dtype=np.int64),
+            headers_ns=np.array(self._headers[number], dtype=np.int64),
+        )
+
+    def _noted(self) -> Iterator[StampedImage]:
+        for image in self._source.images():
+            self.stamps[image.stream].append(image.stamp_ns)
+            if image.log_time_ns is not None:
+                self._logs[image.stream].append(image.log_time_ns)
+                self._headers[image.stream].append(image.stamp_ns)
+            yield image
+
+    def _until_damage(self, pairs: Iterable[Pair | FaultyFrame]) -> Iterator[Pair | FaultyFrame]:
+        try:
+            yield from pairs
+        except GvoError as error:
+            self.damage = str(error)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Chosen:
+    """The chosen pairs as a recording, so that they become frames as all others do."""
+
+    info: RecordingInfo
+    pairs: list[Pair]
+
+    def images(self) -> Iterator[StampedImage]:
+        for index, (first, second) in enumerate(self.pairs):
+            # Paired already: with stamps a second apart nothing is paired anew.
+            yield replace(first, stamp_ns=index * 1_000_000_000)
+            yield replace(second, stamp_ns=index * 1_000_000_000)
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tuple[Sample, ...]:
+    loaded = frames(_Chosen(info=info, pairs=[pair for run in chosen for pair in run]), config)
+    return tuple(
+        Sample(first=next(loaded), second=next(loaded) if len(run) > 1 else None) for run in chosen
+    )
+
+
+def _limit_ns(info: RecordingInfo, config: Config) -> int:
+    sync = config.sync
+    limit_ms = sync.stereo_tolerance_ms if info.sensor == "stereo" else sync.max_difference_ms
+    return round(limit_ms * 1e6)

@@ -1,0 +1,232 @@
+"""Stamps: their order, rate and gaps, how streams fit one another, and the two clocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.sampling import StreamStamps, Survey
+from gvo.config import CheckConfig, Config
+from gvo.sources.recording import RecordingInfo
+from gvo.types import FloatArray, IntArray
+
+# An interval this many periods long is a gap, not jitter.
+_GAP_PERIODS = 2.5
+# Medians of so many stretches of the recording tell how the two clocks run.
+_N_STRETCHES = 40
+_MIN_PER_STRETCH = 3
+_MIN_STRETCHES = 4
+# A drift counts where it is that many times what the scatter of the offsets explains.
+_DRIFT_SIGMAS = 4.0
+
+
+def stream_names(info: RecordingInfo) -> tuple[str, str]:
+    """Return what the two streams are called."""
+    return ("left", "right") if info.sensor == "stereo" else ("colour", "depth")
+
+
+def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
+    """Yield what all stamps of the recording say; no image is looked at."""
+    names = stream_names(info)
+    for name, stream in zip(names, survey.streams, strict=True):
+        yield from _check_stream(name, stream.stamps_ns, config)
+    yield from _check_pairs(survey, info, config)
+    for name, stream in zip(names, survey.streams, strict=True):
+        yield from _check_clock(name, stream, config.check)
+
+
+def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Finding]:
+    if len(stamps_ns) == 0:
+        yield Finding(
+            name=f"{name}: images",
+            value="none",
+            threshold=">= 1",
+            verdict="fault",
+            fix=f"record or choose a {name} stream",
+        )
+        return
+    steps_ns = np.diff(stamps_ns)
+    n_bad = int(np.count_nonzero(steps_ns <= 0))
+    yield measured(
+        f"{name}: stamps",
+        n_bad / len(stamps_ns),
+        _lost_limits(config.check),
+        unit="%",
+        text=f"{n_bad} of {len(stamps_ns)} repeat or go back",
+        fix="record anew, or sort by header stamp; such frames are skipped",
+    )
+    forward = steps_ns[steps_ns > 0]
+    if len(forward) < 2:
+        yield unknown(f"{name}: period", f"{len(stamps_ns)} images")
+        return
+    yield from _check_rate(name, forward.astype(np.float64) / 1e9, len(stamps_ns), config)
+
+
+def _check_rate(name: str, steps_s: FloatArray, n: int, config: Config) -> Iterator[Finding]:
+    period_s = float(np.median(steps_s))
+    yield Finding(name=f"{name}: period", value=f"{1e3 * period_s:.2f} ms ({1 / period_s:.2f} Hz)")
+    regular = steps_s[steps_s < 1.5 * period_s]
+    jitter_s = float(np.percentile(np.abs(regular - period_s), 95))
+    yield measured(
+        f"{name}: jitter",
+        jitter_s / period_s,
+        Limits(high=config.check.max_jitter),
+        unit="%",
+        text=f"{1e3 * jitter_s:.3g} ms, {jitter_s / period_s:.1%} of the period",
+        fix="stamp at the exposure in the driver, not where messages arrive",
+    )
+    yield from _check_gaps(name, steps_s, n, config)
+
+
+def _check_gaps(name: str, steps_s: FloatArray, n: int, config: Config) -> Iterator[Finding]:
+    period_s = float(np.median(steps_s))
+    gaps_s = steps_s[steps_s > _GAP_PERIODS * period_s]
+    longest_s = float(gaps_s.max(initial=0.0))
+    yield measured(
+        f"{name}: gaps",
+        longest_s,
+        Limits(high=config.check.max_gap_s, fault_high=config.window.lost_after_s),
+        unit="s",
+        text=f"{len(gaps_s)}, longest {longest_s:.3g} s" if len(gaps_s) else "",
+        fix="find what stalled the recording (disk, bandwidth); odometry coasts over it",
+    )
+    n_dropped = int(np.sum(np.maximum(np.rint(steps_s / period_s) - 1, 0)))
+    yield measured(
+        f"{name}: dropped frames",
+        n_dropped / (n + n_dropped),
+        _lost_limits(config.check),
+        unit="%",
+        text=f"{n_dropped} of {n + n_dropped}",
+        fix="record with more bandwidth or a smaller rate; every dropped frame widens the motion",
+    )
+
+
+def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
+    first, second = (stream.stamps_ns for stream in survey.streams)
+    if len(first) == 0 or len(second) == 0:
+        return
+    check = config.check
+    name = "/".join(stream_names(info))
+    is_stereo = info.sensor == "stereo"
+    most_ms = check.max_stereo_difference_ms if is_stereo else check.max_depth_difference_ms
+    signed_ms = _nearest_differences(first, second) / 1e6
+    sizes_ms = np.abs(signed_ms)
+    typical_ms, largest_ms = float(np.median(sizes_ms)), float(sizes_ms.max())
+    yield measured(
+        f"{name}: stamp difference",
+        typical_ms,
+        Limits(high=most_ms),
+        unit="ms",
+        text=f"{typical_ms:.3g} ms median ({np.median(signed_ms):+.3g} signed), "
+        f"{largest_ms:.3g} ms largest",
+        fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
+    )
+    yield _check_partners(name, first, survey.n_pairs, sizes_ms, is_stereo=is_stereo, config=config)
+
+
+def _check_partners(
+    name: str,
+    first: IntArray,
+    n_pairs: int,
+    sizes_ms: FloatArray,
+    *,
+    is_stereo: bool,
+    config: Config,
+) -> Finding:
+    n_alone = len(first) - n_pairs
+    key = "stereo_tolerance_ms" if is_stereo else "max_difference_ms"
+    limit_ms, enough_ms = getattr(config.sync, key), math.ceil(float(np.percentile(sizes_ms, 95)))
+    return measured(
+        f"{name}: frames without partner",
+        n_alone / len(first),
+        _lost_limits(config.check),
+        unit="%",
+        text=f"{n_alone} of {len(first)} at sync.{key}={limit_ms:g}",
+        # More than half a period only pairs images with the partners of others.
+        fix=f"--set sync.{key}={enough_ms} pairs 95 % of them"
+        if limit_ms < enough_ms <= _half_period_ms(first) + 1.0
+        else f"images of one stream are missing: see dropped frames and gaps of {name}",
+    )
+
+
+def _half_period_ms(stamps_ns: IntArray) -> float:
+    return 0.5 * float(np.median(np.diff(stamps_ns))) / 1e6 if len(stamps_ns) > 1 else math.inf
+
+
+def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
+    """Return second minus first for the nearest stamp of the second stream, nanoseconds, (n,)."""
+    ordered = np.unique(second_ns)
+    after = np.searchsorted(ordered, first_ns).clip(max=len(ordered) - 1)
+    before = (after - 1).clip(min=0)
+    to_after, to_before = ordered[after] - first_ns, ordered[before] - first_ns
+    is_before = np.abs(to_before) < np.abs(to_after)
+    return np.asarray(np.where(is_before, to_before, to_after), dtype=np.float64)
+
+
+def _check_clock(name: str, stream: StreamStamps, check: CheckConfig) -> Iterator[Finding]:
+    """Compare the header stamps with when the messages were recorded.
+
+    Messages are late by chance, never early, and now and then very late, so that medians of
+    stretches of the recording are compared: their slope is the drift of one clock against the
+    other, their largest step a jump. Where the clocks differ by a constant, nothing is wrong.
+    """
+    if len(stream.log_stamps_ns) == 0:
+        return
+    elapsed_s = (stream.headers_ns - stream.headers_ns[0]) / 1e9
+    offsets_ms = (stream.log_stamps_ns - stream.headers_ns) / 1e6
+    yield Finding(
+        name=f"{name}: recording clock",
+        value=f"{_duration_text(float(np.median(offsets_ms)))} after the header",
+    )
+    n_stretches = min(_N_STRETCHES, len(offsets_ms) // _MIN_PER_STRETCH)
+    if n_stretches < _MIN_STRETCHES:
+        yield unknown(f"{name}: clock drift", f"{len(offsets_ms)} images are too few")
+        return
+    middles_s = _medians(elapsed_s, n_stretches)
+    levels_ms = _medians(offsets_ms, n_stretches)
+    steps_ms = np.diff(levels_ms)
+    jump_ms = float(np.abs(steps_ms - np.median(steps_ms)).max())
+    yield measured(
+        f"{name}: clock jump",
+        jump_ms,
+        Limits(high=check.max_clock_jump_ms),
+        unit="ms",
+        fix="a clock was set, or recording stalled: keep time synchronisation from stepping it",
+    )
+    drift = 0.0 if jump_ms > check.max_clock_jump_ms else _drift(middles_s, levels_ms)
+    yield measured(
+        f"{name}: clock drift",
+        drift,
+        Limits(low=-check.max_clock_drift_ms_per_min, high=check.max_clock_drift_ms_per_min),
+        unit="ms/min",
+        fix="synchronise the camera's clock with the computer's (PTP, NTP)",
+    )
+
+
+def _medians(values: FloatArray, n_stretches: int) -> FloatArray:
+    return np.array([np.median(part) for part in np.array_split(values, n_stretches)])
+
+
+def _drift(middles_s: FloatArray, levels_ms: FloatArray) -> float:
+    """Return the slope in ms/min; zero where the scatter explains it."""
+    if np.ptp(middles_s) <= 0:
+        return 0.0
+    slope, level = np.polyfit(middles_s, levels_ms, 1)
+    scatter = np.std(levels_ms - (slope * middles_s + level))
+    sigma = scatter / (np.std(middles_s) * math.sqrt(len(middles_s)))
+    return 60.0 * float(slope) if abs(slope) > _DRIFT_SIGMAS * sigma else 0.0
+
+
+def _duration_text(milliseconds: float) -> str:
+    if abs(milliseconds) < 1e3:
+        return f"{milliseconds:.3g} ms"
+    if abs(milliseconds) < 1e8:
+        return f"{milliseconds / 1e3:.3g} s"
+    return f"{milliseconds / 86_400_000:.1f} days"
+
+
+def _lost_limits(check: CheckConfig) -> Limits:
+    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)

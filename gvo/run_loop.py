@@ -1,0 +1,184 @@
+"""The loop of a run: frames in, poses out to all that writes them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Protocol
+
+import cv2
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.odometry import FrameResult, Odometry
+from gvo.output_frame import OutputFrame
+from gvo.outputs.run_frames import RunFrames
+from gvo.outputs.smoothings import SmoothingComparison
+from gvo.run_tally import Progress, RunTally
+from gvo.sources.excerpt import Excerpt
+from gvo.sources.frames import frames
+from gvo.sources.recording import Source
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame
+
+
+class Output(Protocol):
+    """What writes a run as it goes; all poses are of the frame that was asked for."""
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Write what one frame gave, and the smoothed poses that are final with it."""
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write that a frame has no pose."""
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses that are final."""
+
+
+class RunLoop:
+    """Odometry over a recording, or a part of it.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    config : Config
+    frame : OutputFrame
+        Whose poses are written.
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    comparison : SmoothingComparison, optional
+        Is given all that is measured and smoothed, of the camera.
+    first_pose : callable, optional
+        Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
+
+    Attributes
+    ----------
+    tally : RunTally
+        What was counted.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        frame: OutputFrame,
+        *,
+        excerpt: Excerpt | None = None,
+        comparison: SmoothingComparison | None = None,
+        first_pose: Callable[[int], FloatArray] | None = None,
+    ) -> None:
+        self.source = source
+        self.config = config
+        self.frame = frame
+        self.comparison = comparison
+        self.tally = RunTally()
+        self._excerpt = excerpt or Excerpt()
+        self._first_pose = first_pose
+        log = None if comparison is None else comparison.log
+        self._odometry = Odometry(source.info.camera, config, log=log)
+
+    def run(
+        self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
+    ) -> None:
+        """Take all frames; where the recording breaks off, note it and end.
+
+        Parameters
+        ----------
+        outputs : iterable of Output
+            Are given the poses, also those that the window still holds where it is interrupted.
+        on_progress : callable, optional
+            Called after each frame.
+        """
+        outputs = tuple(outputs)
+        n_images = self._excerpt.n_expected(self.source.info.n_images)
+        with one_opencv_thread():
+            try:
+                for item in self._read():
+                    self._take(item, outputs)
+                    if on_progress is not None:
+                        on_progress(self.tally.progress(n_images))
+            finally:
+                finished = self._placed(self._odometry.finish())
+                for output in outputs:
+                    output.add_smoothed(finished)
+        window = self._odometry.window
+        self.tally.window, self.tally.polish = window.counts, window.polish
+        self.tally.rig_offsets = self._odometry.rig_offsets
+        self.tally.n_guessed = self.frame.n_guessed
+
+    def _read(self) -> Iterator[Frame | FaultyFrame]:
+        iterator = frames(self.source, self.config, self._excerpt)
+        while True:
+            start = time.perf_counter()
+            try:
+                item = next(iterator)
+            except StopIteration:
+                return
+            except RecordingError as error:
+                self.tally.broken_off = str(error)
+                return
+            self.tally.add_duration("read", 1e3 * (time.perf_counter() - start))
+            yield item
+
+    def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
+        if isinstance(item, FaultyFrame):
+            # Colour and depth of a free-running sensor need not pair; the images of a stereo
+            # camera are taken together, and one without the other is a loss.
+            is_loss = not item.is_unpaired or self.source.info.sensor == "stereo"
+            self.tally.add_faulty(item, is_loss=is_loss)
+            for output in outputs if is_loss else ():
+                output.add_faulty(item)
+            return
+        if self._first_pose is not None and self.frame.first_stamp_ns is None:
+            self.frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
+        result = self._odometry.track(item)
+        self.tally.add_result(result)
+        placed = replace(
+            result,
+            raw=self.frame.apply(result.raw),
+            causal=self.frame.apply(result.causal),
+            finished=self._placed(result.finished),
+        )
+        for output in outputs:
+            output.add_frame(item, placed)
+
+    def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+        if self.comparison is not None:
+            self.comparison.add(estimates)
+        return tuple(self.frame.apply(estimate) for estimate in estimates)
+
+
+def run_frames(source: Source, frame: OutputFrame, *, is_placed: bool) -> RunFrames:
+    """Name the frames of a run for a bag.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    frame : OutputFrame
+        Whose poses are written.
+    is_placed : bool
+        The first pose was asked for: the world is not that of the first frame.
+    """
+    camera = source.info.frame_id
+    if frame.is_camera:
+        return RunFrames(camera=camera, is_world_optical=not is_placed)
+    mount = frame.T_frame_cam if frame.fixed_mount is None else frame.fixed_mount
+    return RunFrames(camera=camera, tracked=frame.name, T_tracked_cam=mount)
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV, inside the context, from splitting single calls over threads.
+
+    Images are worked on side by side already; splitting the small ones as well costs a tenth more
+    CPU time and gains nothing.
+    """
+    n_before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(n_before)

@@ -1,0 +1,285 @@
+"""One bag file, read by rosbags or, where that refuses, by walking over its records.
+
+rosbags' readers are used without its `AnyReader`, which parses the definitions of all message
+types: one foreign type that it cannot parse would block the camera's topics.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import TypeAlias
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import ReaderError as ReaderError2
+from rosbags.serde import SerdeError
+
+from gvo.errors import RecordingError
+from gvo.sources.salvage import mcap, ros1
+from gvo.sources.salvage.inflate import inflate_message
+from gvo.sources.salvage.mcap import McapScan
+from gvo.sources.salvage.ros1 import Ros1Scan
+from gvo.sources.salvage.scan import Channel, FoundMessage, Salvage, standard_type
+from gvo.sources.salvage.sqlite import SqliteScan, announced_size
+from gvo.sources.salvage.window import DamageError
+
+_Reader: TypeAlias = Reader1 | Reader2
+
+
+def _storage_faults() -> Iterator[type[Exception]]:
+    """Yield the errors of the libraries that rosbags reads SQLite and Zstandard with.
+
+    It lets them through. The libraries are its own affair, another release may bring others.
+    """
+    for module, name in (
+        ("apsw", "Error"),
+        ("compression.zstd", "ZstdError"),
+        ("backports.zstd", "ZstdError"),
+    ):
+        with suppress(ImportError):
+            yield getattr(import_module(module), name)
+
+
+# The readers check the structure of a file by assertions and by what happens to fail.
+FAULTS: tuple[type[Exception], ...] = (
+    ReaderError1,
+    ReaderError2,
+    SerdeError,
+    AssertionError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    MemoryError,  # a damaged size
+    struct.error,
+    *_storage_faults(),
+)
+"""What rosbags raises where a file or a message is not what it should be."""
+
+
+DAMAGE: tuple[type[Exception], ...] = (DamageError, *FAULTS)
+"""What is raised where a file is damaged."""
+
+
+class BagFile:
+    """A `.bag`, `.mcap` or `.db3` file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    RecordingError
+        When no message of it can be read, with what to do.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.note = ""
+        self._salvage: Salvage | None = None
+        self._fault = _unread_log(path)
+        try:
+            with self._opened() as reader:
+                self.counts = _counts(reader)
+                self.start_time_ns = reader.start_time
+        except DAMAGE as error:
+            self._salvage = _salvage(path, error)
+            self.counts = self._salvage.counts
+            self.start_time_ns = self._salvage.start_time_ns
+            if not self._salvage.damage:
+                self.note = _describe_order(path, error, self._salvage)
+
+    @property
+    def damage(self) -> str:
+        """What cannot be read, in one line; complete when all messages were read."""
+        salvaged = "" if self._salvage is None else self._salvage.damage
+        return "; ".join(text for text in (self._fault, salvaged) if text)
+
+    def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
+        """Yield the messages of some topics, nearly in the order of recording.
+
+        Where rosbags cannot go on, the rest is found by walking over the records.
+        """
+        seen = _Seen()
+        try:
+            if self._salvage is None:
+                for message in self._indexed(names):
+                    seen.add(message)
+                    yield message
+                self._check_number(seen.n_messages, names)
+                return
+        except DAMAGE as error:
+            self._salvage = self._rescue(error)
+        try:
+            for message in self._salvage.messages(names) if self._salvage else ():
+                if message.channel not in self.counts:
+                    self._fault = f"{self.path}: messages of a damaged topic are left out"
+                elif not seen.takes(message):
+                    yield message
+        except DAMAGE as error:  # as of a file that is shortened meanwhile
+            self._fault = f"{self.path}: cannot be read on ({_one_line(error)})"
+
+    def _check_number(self, n_messages: int, names: Collection[str]) -> None:
+        """Look after rosbags, which steps over some damage without a word."""
+        n_announced = sum(n for channel, n in self.counts.items() if channel.name in names)
+        if n_messages < n_announced:
+            raise DamageError(f"{n_messages} of {n_announced} messages were found")
+
+    def _rescue(self, error: Exception) -> Salvage | None:
+        try:
+            return _salvage(self.path, error)
+        except RecordingError as refusal:
+            self._fault = str(refusal)
+            return None
+
+    def _indexed(self, names: Collection[str]) -> Iterator[FoundMessage]:
+        with self._opened() as reader:
+            connections = [c for c in reader.connections if c.topic in names]
+            channels = {c.id: _channel(c, reader) for c in connections}
+            is_ros1 = isinstance(reader, Reader1)
+            # Without any, rosbags would yield all.
+            messages = reader.messages(connections=connections) if connections else ()
+            for connection, log_time_ns, data in messages:
+                if not isinstance(log_time_ns, int) or not isinstance(data, bytes):
+                    raise TypeError("a row of the database holds no message")
+                content = data if is_ros1 else inflate_message(data)
+                yield FoundMessage(channels[connection.id], log_time_ns, content)
+
+    def _opened(self) -> _Reader:
+        if self.path.suffix == ".db3" and announced_size(self.path) > self.path.stat().st_size:
+            # SQLite fills the last page with zeros, of which rosbags makes messages.
+            raise DamageError("the file is shorter than it says")
+        return Reader1(self.path) if self.path.suffix == ".bag" else Reader2(self.path)
+
+
+class _Seen:
+    """Tells the messages that came from the index from those that follow.
+
+    Of the messages of one topic and time only their number matters: they come in one order.
+    """
+
+    def __init__(self) -> None:
+        self._log_times: dict[Channel, array[int]] = {}
+        self._counts: dict[Channel, Counter[int]] = {}
+
+    def add(self, message: FoundMessage) -> None:
+        log_times = self._log_times.setdefault(message.channel, array("Q"))
+        log_times.append(message.log_time_ns % 2**64)
+
+    @property
+    def n_messages(self) -> int:
+        """The number of messages that came."""
+        return sum(map(len, self._log_times.values()))
+
+    def takes(self, message: FoundMessage) -> bool:
+        """Tell whether a message came already, once for each time that it did."""
+        channel, log_time = message.channel, message.log_time_ns % 2**64
+        if channel not in self._counts:
+            self._counts[channel] = Counter(self._log_times.get(channel, ()))
+        self._counts[channel][log_time] -= 1
+        return self._counts[channel][log_time] >= 0
+
+
+def _counts(reader: _Reader) -> dict[Channel, int]:
+    counts: dict[Channel, int] = {}
+    for connection in reader.connections:
+        channel = _channel(connection, reader)
+        counts[channel] = counts.get(channel, 0) + connection.msgcount
+    return counts
+
+
+def _channel(connection: Connection, reader: _Reader) -> Channel:
+    is_ros1 = isinstance(reader, Reader1)
+    return Channel(connection.topic, standard_type(connection.msgtype), is_ros1)
+
+
+def _salvage(path: Path, error: Exception) -> Salvage:
+    """Read a file without its index.
+
+    Raises
+    ------
+    RecordingError
+        When no message is found.
+    """
+    refusal = _refusal(path)
+    if refusal or "encryption" in str(error):
+        raise RecordingError(refusal or f"{path}: cannot be read ({_one_line(error)})") from error
+    try:
+        salvage = _scan(path)
+    except (OSError, DamageError) as fault:
+        raise RecordingError(_explain(path, fault)) from error
+    if not any(salvage.counts.values()):
+        raise RecordingError(salvage.damage or _explain(path, error)) from error
+    return salvage
+
+
+def _scan(path: Path) -> Salvage:
+    if path.suffix == ".bag":
+        return Ros1Scan(path)
+    return McapScan(path) if path.suffix == ".mcap" else SqliteScan(path)
+
+
+def _describe_order(path: Path, error: Exception, salvage: Salvage) -> str:
+    reason = str(error).strip(" .") or "it is damaged"
+    return (
+        f"bag: {path.name} is read without its index ({' '.join(reason.split())}); "
+        f"`{salvage.tool}` on a copy writes one"
+    )
+
+
+def _unread_log(path: Path) -> str:
+    """Return what is to be said where a recorder did not come to write all into a database."""
+    log = path.with_name(f"{path.name}-wal")
+    if path.suffix != ".db3" or not log.is_file() or not log.stat().st_size:
+        return ""
+    return (
+        f"{path}: the {log.stat().st_size} bytes of {log.name} are not read; "
+        f"`sqlite3 FILE 'PRAGMA wal_checkpoint'` on a copy of both writes them into the file"
+    )
+
+
+def _refusal(path: Path) -> str:
+    """Return why a file is no bag at all; nothing where it is one."""
+    if not path.is_file():
+        return f"{path}: is no file"
+    if path.stat().st_size == 0:
+        return f"{path}: the file is empty"
+    if path.suffix == ".bag" and not _has_magic(path, ros1.MAGIC):
+        if _has_magic(path, b"#ROS"):
+            return f"{path}: the bag is of an older format than 2.0; run `rosbag fix` on a copy"
+        return f"{path}: is no ROS 1 bag"
+    if path.suffix == ".mcap" and not _has_magic(path, mcap.MAGIC):
+        return f"{path}: is no MCAP file"
+    if path.suffix == ".db3" and not _has_magic(path, b"SQLite format 3\0"):
+        return f"{path}: is no SQLite database"
+    return ""
+
+
+def _explain(path: Path, error: Exception) -> str:
+    tools = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "sqlite3 FILE .recover"}
+    return (
+        f"{path}: holds no message that can be read ({_one_line(error)}); where it is truncated "
+        f"or damaged, try `{tools.get(path.suffix, 'ros2 bag reindex')}` on a copy"
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _has_magic(path: Path, magic: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic

@@ -1,0 +1,133 @@
+"""Decompression of what may be cut or damaged, into bounded memory."""
+
+from __future__ import annotations
+
+import bz2
+import sys
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+
+from gvo.sources.salvage.window import DamageError, Window
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""What a Zstandard frame begins with, and no message in CDR does."""
+
+MAX_INFLATED = 1 << 30
+"""Bytes; recorders write chunks of about one megabyte."""
+
+_BLOCK = 1 << 16
+_MAX_STEP = 1 << 24
+_DECOMPRESSORS: dict[str, Any] = {
+    "bz2": bz2.BZ2Decompressor,
+    "lz4": LZ4FrameDecompressor,
+    "zstd": zstd.ZstdDecompressor,
+}
+_FAULTS = (OSError, RuntimeError, EOFError, ValueError, zstd.ZstdError)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inflated:
+    """What came out of a compressed part of a file.
+
+    Parameters
+    ----------
+    data : bytes
+        All of it, or the start of it.
+    is_cut : bool
+        The compressed part ends before the end of the data.
+    """
+
+    data: bytes
+    is_cut: bool
+
+
+def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> Inflated:
+    """Decompress what is left of a window; step over what was used.
+
+    Parameters
+    ----------
+    window : Window
+    compression : str
+        "bz2", "lz4" or "zstd".
+    limit : int
+        Bytes that may come out.
+
+    Raises
+    ------
+    DamageError
+        When it is no such data, or more comes out than may.
+    """
+    if compression not in _DECOMPRESSORS:
+        raise DamageError(f"a chunk of unknown compression {compression!r}")
+    if limit > MAX_INFLATED:
+        raise DamageError(f"a chunk that claims {limit} bytes")
+    parts: list[bytes] = []
+    n_bytes = 0
+    decompressor = _DECOMPRESSORS[compression]()
+    while window.rest:
+        piece = window.take(min(_BLOCK, window.rest))
+        while piece or not decompressor.needs_input:
+            parts.append(_feed(decompressor, compression, piece, limit + 1 - n_bytes))
+            n_bytes += len(parts[-1])
+            if n_bytes > limit:
+                raise DamageError(f"a chunk inflates to more than the {limit} bytes it claims")
+            piece = b""
+            if decompressor.eof:
+                window.position -= len(decompressor.unused_data or b"")
+                return Inflated(data=b"".join(parts), is_cut=False)
+    return Inflated(data=b"".join(parts), is_cut=True)
+
+
+def inflate_message(data: bytes) -> bytes:
+    """Decompress a message that was compressed on its own; return any other as it is."""
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    try:
+        inflated = inflate(Window(BytesIO(data), 0, len(data)), "zstd")
+    except DamageError:
+        return data  # who decodes it says that it is no message
+    return data if inflated.is_cut else inflated.data
+
+
+def inflate_file(source: Path, target: Path) -> str:
+    """Decompress a file of Zstandard frames as far as it goes.
+
+    Parameters
+    ----------
+    source, target : Path
+
+    Returns
+    -------
+    str
+        What is wrong; nothing where all is there.
+    """
+    decompressor = zstd.ZstdDecompressor()
+    is_whole = False
+    with source.open("rb") as packed, target.open("wb") as unpacked:
+        while piece := packed.read(_BLOCK):
+            while piece or not decompressor.needs_input:
+                try:
+                    unpacked.write(_feed(decompressor, "zstd", piece, _MAX_STEP))
+                except DamageError:
+                    return f"it does not inflate after {packed.tell()} bytes"
+                is_whole = decompressor.eof
+                piece = decompressor.unused_data if is_whole else b""
+                if is_whole:
+                    decompressor = zstd.ZstdDecompressor()
+    return "" if is_whole else "its end is missing"
+
+
+def _feed(decompressor: Any, compression: str, piece: bytes, limit: int) -> bytes:  # noqa: ANN401
+    try:
+        return bytes(decompressor.decompress(piece, max_length=limit))
+    except _FAULTS as error:
+        raise DamageError(f"a chunk of {compression} that does not inflate") from error

@@ -1,0 +1,113 @@
+"""Rendered recordings held in memory, and faults to plant in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import pytest
+from numpy.typing import NDArray
+
+from gvo.checkup import Checkup, Finding, check_recording
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
+from gvo.sources.synthetic import SyntheticRecording, WorldName
+from gvo.trajectory import Trajectory
+
+N_FRAMES = 40
+Change = Callable[[NDArray[Any]], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Held:
+    """A recording as a list of images, each loaded once at most."""
+
+    info: RecordingInfo
+    items: Sequence[StampedImage]
+    damage: str = ""
+    loaded: list[int] = field(default_factory=list)
+
+    def images(self) -> Iterator[StampedImage]:
+        yield from self.items
+        if self.damage:
+            raise RecordingError(self.damage)
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+    def stream(self, number: int) -> list[StampedImage]:
+        return [image for image in self.items if image.stream == number]
+
+    def mapped(self, change: Callable[[StampedImage, int], StampedImage | None]) -> Held:
+        """Return the recording with each image changed; the number counts within its stream."""
+        numbers = [0, 0]
+        items = []
+        for image in self.items:
+            changed = change(image, numbers[image.stream])
+            numbers[image.stream] += 1
+            if changed is not None:
+                items.append(changed)
+        return replace(self, items=items)
+
+    def with_pixels(self, change: Change, *, stream: int | None = None) -> Held:
+        """Return the recording with the pixels of one stream (or both) changed."""
+
+        def alter(image: StampedImage, _: int) -> StampedImage:
+            if stream not in (None, image.stream):
+                return image
+            return replace(image, load=lambda: change(image.load()))
+
+        return self.mapped(alter)
+
+    def with_stamps(self, change: Callable[[int, int], int], *, stream: int | None = None) -> Held:
+        """Return the recording with the stamps changed, given stamp and number."""
+
+        def alter(image: StampedImage, number: int) -> StampedImage:
+            if stream not in (None, image.stream):
+                return image
+            return replace(image, stamp_ns=change(image.stamp_ns, number))
+
+        return self.mapped(alter)
+
+
+@cache
+def render(world: WorldName, sensor: Sensor, seed: int = 0) -> Held:
+    """Return a rendered recording of half the size that keeps what it rendered."""
+    source = SyntheticRecording(world, sensor, n_frames=N_FRAMES, seed=seed, scale=0.5)
+    items = [replace(image, load=cache(image.load)) for image in source.images()]
+    return Held(info=source.info, items=items)
+
+
+def check(recording: Held, *, n_samples: int = 4, **options: Any) -> Checkup:
+    return check_recording(recording, Config(), n_samples=n_samples, **options)
+
+
+def complaints(checkup: Checkup) -> set[str]:
+    """Return the names of all warnings and faults."""
+    return {finding.name for finding in checkup.with_verdict("warning", "fault")}
+
+
+def find(checkup: Checkup, name: str) -> Finding:
+    """Return the finding of this name."""
+    (found,) = [finding for finding in checkup.findings if finding.name == name]
+    return found
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the tests of the checks share."""
+
+    render: Callable[..., Held] = render
+    check: Callable[..., Checkup] = check
+    complaints: Callable[[Checkup], set[str]] = complaints
+    find: Callable[[Checkup, str], Finding] = find
+    n_frames: int = N_FRAMES
+
+
+@pytest.fixture(scope="session")
+def bench() -> Bench:
+    """Return rendered recordings and the way to check them."""
+    return Bench()

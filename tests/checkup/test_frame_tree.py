@@ -1,0 +1,92 @@
+"""The tree of frames: planted holes are found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gvo.checkup.frame_tree import check_frame_tree
+from gvo.checkup.report import Finding
+from gvo.config import CheckConfig
+from gvo.sources.tf import TfBuffer
+
+S = 1_000_000_000
+STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)
+
+
+def tree(*, leave_out: str = "", moving_ns: Any = STAMPS_NS) -> TfBuffer:
+    buffer = TfBuffer()
+    for stamp_ns in moving_ns:
+        buffer.add("odom", "base_link", int(stamp_ns), np.eye(4))
+    for parent, child in (
+        ("base_link", "camera_link"),
+        ("camera_link", "camera_optical"),
+        ("camera_optical", "eye"),
+    ):
+        if child != leave_out:
+            buffer.add(parent, child, 0, np.eye(4), is_static=True)
+    return buffer
+
+
+def look(buffer: TfBuffer, camera: str = "camera_optical") -> dict[str, Finding]:
+    found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame="base_link", check=CheckConfig())
+    return {finding.name: finding for finding in found}
+
+
+def complaints(findings: dict[str, Finding]) -> set[str]:
+    return {name for name, finding in findings.items() if finding.verdict in ("warning", "fault")}
+
+
+@pytest.mark.parametrize("camera", ["camera_optical", "/camera_optical"])
+def test_a_whole_tree_is_fine(camera: str) -> None:
+    findings = look(tree(), camera)
+    assert complaints(findings) == set()
+    assert findings["tf: camera"].value == "base_link - camera_link - camera_optical"
+    assert findings["tf: frames"].value == "5 in 1 tree (root odom)"
+
+
+def test_a_camera_that_no_transform_names_is_found() -> None:
+    findings = look(tree(), "zed_left")
+    assert complaints(findings) == {"tf: camera"}
+    assert "zed_left" in findings["tf: camera"].fix
+
+
+def test_a_missing_link_to_the_base_is_found() -> None:
+    findings = look(tree(leave_out="camera_link"))
+    assert complaints(findings) == {"tf: frames", "tf: camera"}
+    assert findings["tf: camera"].value == "camera_optical is not connected to base_link"
+
+
+def test_gaps_of_the_transforms_are_found() -> None:
+    sparse = STAMPS_NS[(STAMPS_NS < 4 * S) | (STAMPS_NS > 6 * S)]
+    findings = look(tree(moving_ns=sparse))
+    assert complaints(findings) == {"tf: odom to camera_optical: gaps"}
+    assert findings["tf: odom to camera_optical: gaps"].value == pytest.approx(2.2)
+
+
+def test_transforms_that_end_early_are_found() -> None:
+    findings = look(tree(moving_ns=STAMPS_NS[:50]))
+    assert complaints(findings) == {"tf: odom to camera_optical: images outside"}
+    assert findings["tf: odom to camera_optical: images outside"].value == pytest.approx(50.0)
+
+
+def test_a_recording_without_transforms_or_names_is_no_fault() -> None:
+    assert complaints(look(TfBuffer())) == set()
+    assert look(tree(), "")["tf: camera"].verdict == "unknown"
+
+
+def test_a_single_transform_is_no_robot_that_misses_its_camera() -> None:
+    buffer = TfBuffer()
+    buffer.add("world", "ground_truth", 0, np.eye(4))
+    findings = look(buffer)
+    assert complaints(findings) == set()
+    assert findings["tf: frames"].value == "ground_truth, world"
+
+
+def test_the_tree_is_part_of_a_checkup(bench: Any) -> None:
+    recording = bench.render("handheld", "rgbd")
+    names = {finding.name for finding in bench.check(recording, transforms=tree()).findings}
+    assert {"tf: frames", "tf: camera"} <= names
+    assert not any(f.name.startswith("tf") for f in bench.check(recording).findings)

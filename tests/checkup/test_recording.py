@@ -1,0 +1,352 @@
+"""Whole recordings: clean ones are healthy, each planted fault is found by its own finding."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gvo.checkup import check_recording
+from gvo.config import Config
+from gvo.errors import RecordingError
+
+Fault = Callable[[Any], Any]
+_RNG = np.random.default_rng(5)
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor", "seed"),
+    [
+        ("driving", "stereo", 0),
+        ("handheld", "stereo", 0),
+        ("handheld", "rgbd", 0),
+        ("handheld", "rgbd", 1),
+        pytest.param("driving", "stereo", 1, marks=pytest.mark.slow),
+        pytest.param("handheld", "stereo", 1, marks=pytest.mark.slow),
+        pytest.param("handheld", "rgbd", 2, marks=pytest.mark.slow),
+    ],
+)
+def test_clean_recordings_have_nothing_to_complain_about(
+    bench: Any, world: str, sensor: str, seed: int
+) -> None:
+    checkup = bench.check(bench.render(world, sensor, seed))
+    assert bench.complaints(checkup) == set()
+    assert not checkup.with_verdict("unknown")
+    assert checkup.is_healthy
+
+
+def shifted_rows(recording: Any) -> Any:
+    return recording.with_pixels(lambda image: moved(image, 0.0, 1.5), stream=1)
+
+
+def rotated(recording: Any) -> Any:
+    def turn(image: NDArray[Any]) -> NDArray[Any]:
+        height, width = image.shape
+        M = cv2.getRotationMatrix2D((width / 2, height / 2), 1.5, 1.0)
+        return np.asarray(cv2.warpAffine(image, M, (width, height)))
+
+    return recording.with_pixels(turn, stream=1)
+
+
+def swapped(recording: Any) -> Any:
+    return recording.mapped(lambda image, _: replace(image, stream=1 - image.stream))
+
+
+def out_of_step(n_frames: int) -> Fault:
+    """Return the fault that right images show what left ones showed so many frames before."""
+
+    def delay(recording: Any) -> Any:
+        right = recording.stream(1)
+
+        def take(image: Any, number: int) -> Any:
+            if not 0 <= number - n_frames < len(right):
+                return None
+            return replace(image, load=right[number - n_frames].load) if image.stream else image
+
+        return recording.mapped(take)
+
+    return delay
+
+
+def of_another_place(recording: Any) -> Any:
+    return recording.with_pixels(lambda image: image[::-1, ::-1].copy(), stream=1)
+
+
+def darker_right(recording: Any) -> Any:
+    return recording.with_pixels(lambda image: (0.6 * image).astype(np.uint8), stream=1)
+
+
+def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
+    M = np.array([[1.0, 0.0, du], [0.0, 1.0, dv]])
+    return np.asarray(cv2.warpAffine(image, M, image.shape[::-1], borderMode=cv2.BORDER_REFLECT))
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (shifted_rows, {"left/right: row offset"}),
+        (rotated, {"left/right: row spread"}),
+        (swapped, {"left/right: order"}),
+        (of_another_place, {"left/right: matches"}),
+        (darker_right, {"left/right: brightness ratio"}),
+    ],
+)
+@pytest.mark.parametrize("world", ["driving", "handheld"])
+def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
+    bench: Any, world: str, fault: Fault, expected: set[str]
+) -> None:
+    found = bench.complaints(bench.check(fault(bench.render(world, "stereo"))))
+    # A turn of the image moves its rows at the middle hardly, but not by exactly nothing.
+    assert expected <= found <= expected | {"left/right: row offset"}
+
+
+@pytest.mark.parametrize("world", ["driving", "handheld"])
+@pytest.mark.parametrize(("n_frames", "word"), [(1, "late"), (-1, "early")])
+def test_a_stream_that_lags_by_a_frame_is_found_although_its_stamps_are_right(
+    bench: Any, world: str, n_frames: int, word: str
+) -> None:
+    checkup = bench.check(out_of_step(n_frames)(bench.render(world, "stereo")))
+    finding = bench.find(checkup, "left/right: same moment")
+    assert finding.verdict == "fault"
+    assert f"a frame {word}" in finding.fix
+    # Images that were not taken at once have no disparities to speak of.
+    others = {"left/right: row spread", "left/right: order"}
+    assert bench.complaints(checkup) <= {finding.name} | others
+
+
+def test_swapped_topics_are_to_be_exchanged(bench: Any) -> None:
+    checkup = bench.check(swapped(bench.render("handheld", "stereo")))
+    assert bench.find(checkup, "left/right: order").fix == "exchange --left and --right"
+    assert not checkup.is_healthy
+
+
+def nothing_known(share: float) -> Fault:
+    def lose(depth: NDArray[Any]) -> NDArray[Any]:
+        field = np.random.default_rng(1).random((depth.shape[0] // 8 + 1, depth.shape[1] // 8 + 1))
+        is_lost = np.kron(field, np.ones((8, 8)))[: depth.shape[0], : depth.shape[1]] < share
+        return np.where(is_lost, np.float32(np.nan), depth)
+
+    return lambda recording: recording.with_pixels(lose, stream=1)
+
+
+def scaled_depth(factor: float) -> Fault:
+    return lambda recording: recording.with_pixels(
+        lambda depth: (depth * np.float32(factor)).astype(np.float32), stream=1
+    )
+
+
+def shifted_depth(du: int, dv: int) -> Fault:
+    def shift(depth: NDArray[Any]) -> NDArray[Any]:
+        return np.roll(depth, (dv, du), axis=(0, 1))
+
+    return lambda recording: recording.with_pixels(shift, stream=1)
+
+
+def zoomed_depth(recording: Any) -> Any:
+    def zoom(depth: NDArray[Any]) -> NDArray[Any]:
+        height, width = depth.shape
+        M = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), 0.0, 1.1)
+        return np.asarray(cv2.warpAffine(depth, M, (width, height), flags=cv2.INTER_NEAREST))
+
+    return recording.with_pixels(zoom, stream=1)
+
+
+def coarse_depth(recording: Any) -> Any:
+    return recording.with_pixels(
+        lambda depth: (np.rint(4.0 * depth) / np.float32(4.0)).astype(np.float32), stream=1
+    )
+
+
+_SCALE = {"depth: scale", "depth: within limits"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (scaled_depth(1000.0), _SCALE),
+        (scaled_depth(0.001), _SCALE),
+        (nothing_known(0.7), {"depth: unknown"}),
+        (shifted_depth(5, 0), {"depth: misregistration"}),
+        (shifted_depth(-4, 0), {"depth: misregistration"}),
+        (shifted_depth(0, 4), {"depth: misregistration"}),
+        (shifted_depth(4, -5), {"depth: misregistration"}),
+        (zoomed_depth, {"depth: misregistration"}),
+    ],
+)
+def test_faults_of_depth_are_found_and_nothing_else(
+    bench: Any, fault: Fault, expected: set[str]
+) -> None:
+    assert bench.complaints(bench.check(fault(bench.render("handheld", "rgbd")))) == expected
+
+
+def test_depth_of_a_few_values_is_found(bench: Any) -> None:
+    found = bench.complaints(bench.check(coarse_depth(bench.render("handheld", "rgbd"))))
+    # Its own steps are edges that colour does not have.
+    assert {"depth: levels"} <= found <= {"depth: levels", "depth: misregistration"}
+
+
+def darkness(image: NDArray[Any]) -> NDArray[Any]:
+    return (0.05 * image).astype(np.uint8)
+
+
+def glare(image: NDArray[Any]) -> NDArray[Any]:
+    return np.clip(image.astype(np.float64) * 3.0, 0, 255).astype(np.uint8)
+
+
+def out_of_focus(image: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 2.5))
+
+
+def noise_alone(image: NDArray[Any]) -> NDArray[Any]:
+    noise = np.random.default_rng(int(image.astype(np.int64).sum())).normal(110, 2, image.shape)
+    return np.asarray(np.rint(noise), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected", "tolerated"),
+    [
+        (darkness, {"colour: brightness"}, {"colour: corners"}),
+        (glare, {"colour: clipped pixels"}, {"colour: brightness", "colour: corners"}),
+        (out_of_focus, {"colour: blur"}, set()),
+        (noise_alone, {"colour: corners"}, {"colour: corners found again"}),
+    ],
+)
+def test_faults_of_images_are_found_and_nothing_else(
+    bench: Any, fault: Callable[..., Any], expected: set[str], tolerated: set[str]
+) -> None:
+    recording = bench.render("handheld", "rgbd").with_pixels(fault, stream=0)
+    found = bench.complaints(bench.check(recording))
+    assert expected <= found <= expected | tolerated
+
+
+def test_images_in_another_order_are_not_found_again(bench: Any) -> None:
+    recording = bench.render("driving", "stereo")
+    colour = recording.stream(0)
+    order = np.random.default_rng(3).permutation(len(colour))
+
+    def shuffle(image: Any, number: int) -> Any:
+        return replace(image, load=recording.stream(image.stream)[order[number]].load)
+
+    found = bench.complaints(bench.check(recording.mapped(shuffle)))
+    assert {"left: corners found again", "right: corners found again"} <= found
+
+
+def test_frozen_images_are_found(bench: Any) -> None:
+    recording = bench.render("handheld", "rgbd")
+    firsts = {stream: recording.stream(stream)[0].load for stream in (0, 1)}
+    frozen = recording.mapped(lambda image, _: replace(image, load=firsts[image.stream]))
+    found = bench.complaints(bench.check(frozen))
+    assert {"colour: frozen images", "depth: frozen images"} == found
+
+
+def test_torn_images_are_found(bench: Any) -> None:
+    def tear(image: Any, number: int) -> Any:
+        def load() -> NDArray[Any]:
+            pixels: NDArray[Any] = image.load().copy()
+            pixels[2 * len(pixels) // 3 :] = 128
+            return pixels
+
+        return replace(image, load=load) if image.stream == 0 and number < 12 else image
+
+    checkup = bench.check(bench.render("handheld", "rgbd").mapped(tear))
+    assert "colour: torn images" in bench.complaints(checkup)
+
+
+def test_images_that_do_not_decode_are_counted_and_quoted(bench: Any) -> None:
+    def fail() -> NDArray[Any]:
+        raise RecordingError("/camera: the JPEG image is truncated")
+
+    def break_some(image: Any, number: int) -> Any:
+        return replace(image, load=fail) if image.stream == 1 and number < 12 else image
+
+    checkup = bench.check(bench.render("handheld", "rgbd").mapped(break_some))
+    assert bench.complaints(checkup) == {"frames that cannot be used"}
+    fix = bench.find(checkup, "frames that cannot be used").fix
+    assert fix == "depth image: /camera: the JPEG image is truncated"
+
+
+def test_damage_ends_the_reading_but_not_the_check(bench: Any) -> None:
+    recording = bench.render("handheld", "rgbd")
+    damaged = replace(recording, items=recording.items[:50], damage="a.bag: truncated at 61 %")
+    checkup = bench.check(damaged)
+    assert bench.complaints(checkup) == {"reading"}
+    assert bench.find(checkup, "reading").value == "a.bag: truncated at 61 %"
+    assert bench.find(checkup, "depth: scale").verdict == "ok"
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize("n_items", [0, 1, 2, 3, 4])
+def test_hardly_any_images_are_reported_and_nothing_breaks(
+    bench: Any, sensor: str, n_items: int
+) -> None:
+    recording = bench.render("handheld", sensor)
+    checkup = bench.check(replace(recording, items=recording.items[:n_items]))
+    assert checkup.is_healthy == (n_items in (2, 4))
+    assert json.loads(json.dumps(checkup.as_json(), allow_nan=False))
+
+
+def test_a_recording_without_a_single_usable_image_is_no_crash(bench: Any) -> None:
+    def fail() -> NDArray[Any]:
+        raise RecordingError("no image")
+
+    for sensor in ("stereo", "rgbd"):
+        broken = bench.render("handheld", sensor).mapped(lambda image, _: replace(image, load=fail))
+        assert bench.complaints(bench.check(broken)) == {"frames that cannot be used"}
+
+
+def test_only_the_samples_are_decoded(bench: Any) -> None:
+    loaded = []
+
+    def count(image: Any, number: int) -> Any:
+        def load() -> NDArray[Any]:
+            loaded.append((image.stream, number))
+            return np.asarray(image.load())
+
+        return replace(image, load=load)
+
+    bench.check(bench.render("handheld", "rgbd").mapped(count), n_samples=3)
+    assert sorted(loaded) == [(s, n) for s in (0, 1) for n in (0, 1, 19, 20, 38, 39)]
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize("name", ["kitti_06_start", "euroc_mh01_start"])
+def test_recorded_stereo_is_healthy(gvo_data: Path, bench: Any, name: str) -> None:
+    from gvo.sources.opening import open_recording
+
+    checkup = check_recording(open_recording(gvo_data / name), Config(), n_samples=6)
+    assert bench.complaints(checkup) == set()
+
+
+@pytest.mark.recorded
+def test_a_free_running_kinect_is_usable_with_its_known_flaws(gvo_data: Path, bench: Any) -> None:
+    from gvo.sources.opening import open_recording
+
+    source = open_recording(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    checkup = check_recording(source, Config())
+    assert checkup.is_healthy
+    # Colour and depth are half a period apart; its driver registers to about three pixels.
+    known = {"colour/depth: stamp difference", "depth: misregistration"}
+    assert "colour/depth: stamp difference" in bench.complaints(checkup) <= known
+
+
+@pytest.mark.recorded
+def test_depth_that_is_not_registered_is_found_in_a_recorded_sequence(
+    gvo_data: Path, bench: Any
+) -> None:
+    from gvo.sources.opening import open_recording
+
+    checkup = check_recording(open_recording(gvo_data / "sevenscenes_start"), Config())
+    finding = bench.find(checkup, "depth: misregistration")
+    assert finding.verdict == "fault"
+    # Focal lengths of a Kinect: 525 px of colour, 585 px of depth.
+    assert "zoom 0.90" in finding.text
+    # Some of its images are the same as the one before, byte by byte.
+    frozen = {"colour: frozen images", "depth: frozen images"}
+    assert bench.complaints(checkup) <= {finding.name} | frozen

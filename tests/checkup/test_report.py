@@ -1,0 +1,110 @@
+"""Findings, limits, tables and JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvo.checkup import Checkup, Finding, format_checkup
+from gvo.checkup.report import Limits, measured
+
+WORDS = st.text(st.characters(codec="ascii", categories=["L", "N"]), min_size=1, max_size=12)
+VERDICTS = st.sampled_from(["ok", "warning", "fault", "info", "unknown"])
+FINDINGS = st.builds(
+    Finding,
+    name=WORDS,
+    value=st.one_of(st.floats(), WORDS),
+    unit=st.sampled_from(["", "px", "%"]),
+    threshold=st.sampled_from(["", "<= 2 px"]),
+    verdict=VERDICTS,
+    fix=WORDS,
+)
+CHECKUPS = st.builds(Checkup, recording=WORDS, findings=st.lists(FINDINGS).map(tuple))
+
+
+@given(CHECKUPS)
+def test_json_holds_every_finding_and_no_nan(checkup: Checkup) -> None:
+    content = json.loads(json.dumps(checkup.as_json(), allow_nan=False))
+    assert [row["name"] for row in content["findings"]] == [f.name for f in checkup.findings]
+    assert content["is_healthy"] == (content["n_faults"] == 0)
+    for row, finding in zip(content["findings"], checkup.findings, strict=True):
+        is_number = isinstance(finding.value, float)
+        if is_number and not math.isfinite(float(finding.value)):
+            assert row["value"] is None
+        else:
+            assert row["value"] == finding.value
+
+
+@given(CHECKUPS)
+def test_the_table_has_a_line_per_finding_and_aligned_columns(checkup: Checkup) -> None:
+    header, *rows, last = format_checkup(checkup).split("\n")
+    assert len(rows) == len(checkup.findings)
+    assert last.startswith(checkup.recording)
+    column = header.index("verdict")
+    for row, finding in zip(rows, checkup.findings, strict=True):
+        assert row.startswith(finding.name)
+        if finding.verdict != "info":
+            assert row[column:].startswith(finding.verdict)
+        assert row.endswith(finding.fix)
+
+
+@given(st.floats(-10, 10), st.floats(-1, 1), st.floats(2, 3))
+def test_farther_out_is_never_judged_milder(value: float, limit: float, fault: float) -> None:
+    limits = Limits(low=-limit, high=limit + 1, fault_low=-fault, fault_high=fault)
+    ranks = {"ok": 0, "warning": 1, "fault": 2}
+    outward = 1.5 * value if abs(value) > fault else math.copysign(fault + 1, value)
+    assert ranks[limits.judge(outward)] >= ranks[limits.judge(value)]
+    assert ranks[limits.judge(outward)] == 2
+
+
+def test_the_limits_themselves_are_still_within() -> None:
+    limits = Limits(low=1.0, high=2.0, fault_high=3.0)
+    assert [limits.judge(value) for value in (1.0, 2.0, 2.1, 3.0, 3.1, 0.9)] == [
+        "ok",
+        "ok",
+        "warning",
+        "warning",
+        "fault",
+        "warning",
+    ]
+    assert limits.judge(math.nan) == "unknown"
+    assert limits.describe("m") == "1 .. 2 m"
+
+
+def test_only_what_is_wrong_has_a_fix() -> None:
+    fine = measured("rows", 0.1, Limits(high=0.5), unit="px", fix="calibrate")
+    wrong = measured("rows", 0.7, Limits(high=0.5), unit="px", fix="calibrate")
+    assert (fine.fix, wrong.fix) == ("", "calibrate")
+
+
+def test_shares_are_shown_in_percent() -> None:
+    finding = measured("lost", 0.25, Limits(high=0.05), unit="%", fix="record anew")
+    assert (finding.value_text, finding.threshold) == ("25 %", "<= 5 %")
+
+
+def test_warnings_alone_do_not_make_a_recording_unusable() -> None:
+    warning = Finding(name="a", value=1.0, verdict="warning", fix="do")
+    fault = Finding(name="b", value=1.0, verdict="fault", fix="do")
+    assert Checkup(recording="r", findings=(warning,)).is_healthy
+    checkup = Checkup(recording="r", findings=(warning, fault, warning))
+    assert not checkup.is_healthy
+    assert format_checkup(checkup).endswith("r: 1 fault, 2 warnings")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"name": ""},
+        {"name": "two\nlines"},
+        {"value": "two\nlines"},
+        {"fix": "two\nlines"},
+        {"verdict": "fault"},
+    ],
+)
+def test_what_would_break_a_table_is_refused(content: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"finding|needs a fix"):
+        Finding(**({"name": "rows", "value": 1.0} | content))  # type: ignore[arg-type]

@@ -1,0 +1,221 @@
+"""Lenses against OpenCV's projections of the same points, and the rectification of pairs."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import CalibrationError
+from gvo.geometry import se3
+from gvo.geometry.camera import Calibration, rectification_maps, rectify_stereo, stereo_camera
+from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
+from gvo.types import FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+
+# As calibrated for real cameras: a wide lens, one with eight coefficients, a fisheye.
+_RADTAN = [-0.283, 0.0740, 1.9e-4, 1.8e-5, 0.0]
+_RATIONAL = [0.62, -2.71, 4e-4, -2e-4, 1.55, 0.49, -2.53, 1.47]
+_FISHEYE = [0.0034, 0.0007, -0.0020, 0.0002]
+_LENSES: list[tuple[DistortionModel, list[float]]] = [
+    ("plumb_bob", _RADTAN),
+    ("rational_polynomial", _RATIONAL),
+    ("rational_polynomial", [*_RATIONAL, 1e-3, -2e-3, 5e-4, 1e-3]),
+    ("rational_polynomial", [*_RATIONAL, 1e-3, -2e-3, 5e-4, 1e-3, 0.02, -0.01]),
+    ("equidistant", _FISHEYE),
+]
+_IDS = ["5", "8", "12", "14", "fisheye"]
+
+
+def raw(
+    model: DistortionModel, D: list[float], *, focal: float = 250.0, shift: float = 0.0
+) -> Calibration:
+    """Return a raw camera whose R and P are of no use."""
+    K = np.array([[focal, 0, 260.0 + shift], [0, focal * 1.01, 250.0 - shift], [0, 0, 1]])
+    return Calibration(
+        width=512,
+        height=480,
+        K=K,
+        D=np.array(D),
+        R=np.full((3, 3), np.nan),
+        P=np.full((3, 4), np.nan),
+        is_rectified=False,
+        model=model,
+    )
+
+
+def see(
+    points: FloatArray, camera: Calibration, T_cam_points: FloatArray | None = None
+) -> FloatArray:
+    """Return the raw pixels (n, 2) of points (n, 3) by OpenCV's projection."""
+    T = np.eye(4) if T_cam_points is None else T_cam_points
+    rotation, _ = cv2.Rodrigues(T[:3, :3])
+    project: Any = cv2.fisheye.projectPoints if len(camera.D) == 4 else cv2.projectPoints
+    pixels, _ = project(points[:, None], rotation, T[:3, 3].copy(), camera.K, camera.D)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+def read_maps(calibration: Calibration, pixels: FloatArray) -> FloatArray:
+    """Return where the maps say that rectified pixels (n, 2) come from."""
+    maps = rectification_maps(calibration)
+    assert maps is not None
+    at = pixels[:, ::-1].T
+    return np.stack([map_coordinates(m.astype(float), at, order=3) for m in maps], axis=1)
+
+
+def visible(calibration: Calibration, rng: np.random.Generator, n: int = 60) -> FloatArray:
+    """Return points (n, 3) of the rectified camera that lie in its image, 1 to 20 m away."""
+    pixels = rng.uniform([5, 5], [calibration.width - 6, calibration.height - 6], (n, 2))
+    return calibration.pinhole().unproject(pixels) * rng.uniform(1, 20, (n, 1))
+
+
+@pytest.mark.parametrize(("model", "D"), _LENSES, ids=_IDS)
+def test_the_maps_send_the_pixel_of_a_point_to_its_raw_pixel(
+    model: DistortionModel, D: list[float]
+) -> None:
+    rng = np.random.default_rng(0)
+    camera = raw(model, D)
+    R = np.asarray(Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix())
+    P = np.array([[240.0, 0, 255, 0], [0, 245.0, 238, 0], [0, 0, 1, 0]])
+    calibration = Calibration(
+        width=512, height=480, K=camera.K, D=camera.D, R=R, P=P, is_rectified=False, model=model
+    )
+    points_cam = visible(calibration, rng)
+    found = read_maps(calibration, calibration.pinhole().project(points_cam))
+    np.testing.assert_allclose(found, see(points_cam @ R, camera), atol=1e-3)
+    np.testing.assert_allclose(camera.lens.project(points_cam), see(points_cam, camera))
+
+
+def test_each_model_says_how_many_numbers_it_has() -> None:
+    assert {(model, len(D)) for model, D in _LENSES} == {
+        (model, n) for model, counts in N_COEFFICIENTS.items() for n in counts
+    }
+
+
+def mount(seed: int) -> FloatArray:
+    """Return T_left_right of cameras mounted with a few degrees of error."""
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.03 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = np.array([0.11, 0.0, 0.0]) + 0.004 * rng.normal(size=3)
+    return T
+
+
+_PAIRS = [
+    *[(lens, lens) for lens in _LENSES],
+    (_LENSES[0], _LENSES[1]),
+    (_LENSES[4], _LENSES[0]),
+    (_LENSES[0], _LENSES[4]),
+]
+
+
+@settings(deadline=None, max_examples=5)
+@given(seed=seeds)
+@pytest.mark.parametrize(("first", "second"), _PAIRS, ids=lambda lens: f"{lens[0]}{len(lens[1])}")
+def test_a_point_lies_on_one_row_of_the_pair_at_the_disparity_of_its_depth(
+    first: tuple[DistortionModel, list[float]],
+    second: tuple[DistortionModel, list[float]],
+    seed: int,
+) -> None:
+    T_left_right = mount(seed)
+    raw_left, raw_right = raw(*first), raw(*second, focal=255.0, shift=8.0)
+    left, right = rectify_stereo(raw_left, raw_right, T_left_right)
+    camera = stereo_camera(left, right)
+    assert camera.baseline == pytest.approx(np.linalg.norm(T_left_right[:3, 3]))
+    points_cam = visible(left, np.random.default_rng(seed))
+    points_left = points_cam @ left.R
+    uvd = camera.project_stereo(points_cam)
+    np.testing.assert_allclose(read_maps(left, uvd[:, :2]), see(points_left, raw_left), atol=1e-3)
+    pixels_right = uvd[:, :2] - np.stack([uvd[:, 2], np.zeros(len(uvd))], axis=1)
+    is_seen = np.all((pixels_right > 4) & (pixels_right < [507, 475]), axis=1)
+    assert is_seen.sum() > 20
+    seen_right = see(points_left, raw_right, se3.invert(T_left_right))
+    found = read_maps(right, pixels_right[is_seen])
+    np.testing.assert_allclose(found, seen_right[is_seen], atol=1e-3)
+
+
+def test_the_rotations_of_wide_pairs_are_those_that_opencv_chooses() -> None:
+    # Without distortion a fisheye's rotations and those of a pinhole are one.
+    for seed in range(5):
+        T_left_right = mount(seed)
+        pinhole = raw("plumb_bob", [0.0] * 5)
+        wide = rectify_stereo(raw("equidistant", _FISHEYE), pinhole, T_left_right)
+        expected = rectify_stereo(pinhole, pinhole, T_left_right)
+        for found, of_opencv in zip(wide, expected, strict=True):
+            np.testing.assert_allclose(found.R, of_opencv.R, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fisheye_pair_keeps_the_resolution_of_its_centre_and_has_no_empty_border(
+    seed: int,
+) -> None:
+    lenses = raw("equidistant", _FISHEYE, focal=190.0), raw("equidistant", _FISHEYE, focal=192.0)
+    pair = rectify_stereo(*lenses, mount(seed))
+    for rectified in pair:
+        assert rectified.P[0, 0] == rectified.P[1, 1]
+        assert 190.0 <= rectified.P[0, 0] < 1.1 * 192.0
+        maps = rectification_maps(rectified)
+        assert maps is not None
+        for values, size in zip(maps, (512, 480), strict=True):
+            assert values.min() >= -0.01
+            assert values.max() <= size - 1 + 0.01
+
+
+def test_a_lens_narrower_than_a_plane_is_enlarged_until_no_border_is_empty() -> None:
+    # pincushion: the rim of the raw image is nearer to the axis than that of a pinhole
+    lens = raw("equidistant", [0.75, 0.1, 0.0, 0.0])
+    left, _ = rectify_stereo(lens, lens, mount(1))
+    maps = rectification_maps(left)
+    assert maps is not None
+    assert left.P[0, 0] > 1.02 * lens.K[0, 0]
+    assert maps[0].min() >= -0.01
+    assert maps[1].max() <= 479.01
+
+
+def test_a_fisheye_without_coefficients_is_still_no_pinhole() -> None:
+    camera = raw("equidistant", [0.0] * 4)
+    as_raw = Calibration(
+        width=512,
+        height=480,
+        K=camera.K,
+        D=camera.D,
+        R=np.eye(3),
+        P=np.hstack([camera.K, np.zeros((3, 1))]),
+        is_rectified=False,
+        model="equidistant",
+    )
+    # 45 degrees off the axis: f * theta in the raw image, f * tan(theta) in the rectified one
+    found = read_maps(as_raw, np.array([[260.0 + 200.0, 250.0]]))
+    np.testing.assert_allclose(found, [[260.0 + 250.0 * np.arctan(0.8), 250.0]], atol=1e-3)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_exchanged_cameras_give_no_positive_baseline(model: DistortionModel) -> None:
+    lens = raw(model, _RADTAN if model == "plumb_bob" else _FISHEYE)
+    pair = rectify_stereo(lens, lens, se3.invert(mount(2)))
+    with pytest.raises(CalibrationError, match="exchanged"):
+        stereo_camera(*pair)
+
+
+@pytest.mark.parametrize("t", [[0.0, 0.1, 0.0], [0.05, 0.1, 0.0], [0.0, 0.0, 0.0], [0, 0, 0.2]])
+def test_cameras_that_do_not_stand_side_by_side_are_refused(t: list[float]) -> None:
+    T_left_right = np.eye(4)
+    T_left_right[:3, 3] = t
+    lens = raw("plumb_bob", _RADTAN)
+    with pytest.raises(CalibrationError, match=f"side by side, .* x={t[0]:g} y={t[1]:g}"):
+        rectify_stereo(lens, lens, T_left_right)
+
+
+def test_cameras_of_two_sizes_are_refused_with_both() -> None:
+    lens = raw("plumb_bob", _RADTAN)
+    small = Calibration(
+        width=256, height=240, K=lens.K, D=lens.D, R=lens.R, P=lens.P, is_rectified=False
+    )
+    with pytest.raises(CalibrationError, match=r"512x480 and 256x240") as caught:
+        rectify_stereo(lens, small, mount(0))
+    assert "\n" not in str(caught.value)

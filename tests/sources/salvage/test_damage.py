@@ -1,0 +1,407 @@
+"""Whatever is cut from a bag or changed in it: the rest is read, and what is lost is said."""
+
+import struct
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.errors import RecordingError
+from gvo.sources.bag_file import BagFile
+from gvo.sources.salvage.mcap import McapScan
+from gvo.sources.salvage.ros1 import Ros1Scan
+from gvo.sources.salvage.scan import Salvage
+from gvo.sources.salvage.sqlite import SqliteScan
+from tests.sources.salvage.bags import (
+    TOPICS,
+    Message,
+    contents,
+    damaged,
+    open_mcap,
+    write_ros1,
+    write_ros2,
+)
+
+_MESSAGES = contents(20)
+_ALL = list(range(len(_MESSAGES)))
+_CLOSED = ("none.bag", "bz2.bag", "lz4.bag", "plain.mcap", "storage.mcap", "plain.db3")
+_OPEN_AS = {"flat.mcap": None, "none.mcap": "", "lz4.mcap": "lz4", "zstd.mcap": "zstd"}
+_OPEN = tuple(_OPEN_AS)
+_KINDS = (*_CLOSED, *_OPEN)
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return a whole bag of each kind."""
+    folder = tmp_path_factory.mktemp("bags")
+    found = {name: write_ros1(folder / name, _MESSAGES, name[:-4]) for name in _CLOSED[:3]}
+    for name in _CLOSED[3:]:
+        compression = "storage" if name.startswith("storage") else ""
+        found[name] = write_ros2(folder / name[-3:] / name, _MESSAGES, compression)
+    for name, packed in _OPEN_AS.items():
+        found[name] = folder / name
+        found[name].write_bytes(open_mcap(_MESSAGES, packed))
+    return found
+
+
+def _scan(path: Path) -> Salvage:
+    if path.suffix == ".bag":
+        return Ros1Scan(path)
+    return McapScan(path) if path.suffix == ".mcap" else SqliteScan(path)
+
+
+_FOREIGN = -1
+
+
+def _read(bag: BagFile | Salvage, written: Sequence[Message] = _MESSAGES) -> list[int]:
+    """Return which of the messages come, by number."""
+    numbers = {message: n for n, message in enumerate(written)}
+    found = [(m.channel.name, m.log_time_ns, m.data) for m in bag.messages(TOPICS)]
+    return [numbers.get(message, _FOREIGN) for message in found]
+
+
+def _try(path: Path, written: Sequence[Message] = _MESSAGES) -> tuple[list[int], str] | None:
+    """Return the messages and what is lost; nothing where the file is refused in one line."""
+    try:
+        bag = BagFile(path)
+    except RecordingError as error:
+        refusal = str(error)
+    else:
+        refusal = ""
+    if refusal:
+        assert refusal.startswith(str(path))
+        assert "\n" not in refusal
+        return None
+    messages = _read(bag, written)
+    assert "\n" not in bag.damage
+    return messages, bag.damage
+
+
+def _records_of_mcap(data: bytes) -> Iterator[int]:
+    position = 8
+    while position + 9 <= len(data):
+        yield position
+        position += 9 + struct.unpack_from("<Q", data, position + 1)[0]
+
+
+def _records_of_ros1(data: bytes) -> Iterator[int]:
+    position = 13
+    while position + 4 <= len(data):
+        yield position
+        position += 4 + struct.unpack_from("<I", data, position)[0]
+        position += 4 + struct.unpack_from("<I", data, position)[0]
+
+
+@pytest.mark.parametrize("name", _KINDS)
+def test_the_walk_finds_all_messages_in_their_order(bags: dict[str, Path], name: str) -> None:
+    scan = _scan(bags[name])
+    assert _read(scan) == _ALL
+    assert scan.damage == ""
+    assert {channel.name: n for channel, n in scan.counts.items()} == {"/a": 10, "/b": 10}
+    assert scan.start_time_ns == 0
+
+
+@pytest.mark.parametrize("name", _KINDS)
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_of_a_bag_cut_anywhere_the_start_is_read(
+    bags: dict[str, Path], name: str, data: st.DataObject
+) -> None:
+    whole = bags[name].read_bytes()
+    _check_cut(bags[name], data.draw(st.integers(0, len(whole) - 1)))
+
+
+@pytest.mark.parametrize("name", _KINDS[:3] + _KINDS[3:5] + _OPEN)
+def test_of_a_bag_cut_at_a_record_the_start_is_read(bags: dict[str, Path], name: str) -> None:
+    data = bags[name].read_bytes()
+    walk = _records_of_ros1 if name.endswith(".bag") else _records_of_mcap
+    for position in walk(data):
+        for n_bytes in range(max(position - 2, 0), min(position + 12, len(data))):
+            _check_cut(bags[name], n_bytes)
+
+
+def _check_cut(path: Path, n_bytes: int) -> None:
+    found = _try(damaged(path, lambda data: data[:n_bytes]))
+    if found is None:
+        return
+    messages, damage = found
+    if path.suffix == ".db3":  # its pages are in another order
+        assert messages == sorted(set(messages) & set(_ALL))
+    else:
+        assert messages == _ALL[: len(messages)]
+    ends_with_a_record = path.suffix == ".mcap" and n_bytes in {
+        *_records_of_mcap(path.read_bytes())
+    }
+    if len(messages) < len(_MESSAGES) and not ends_with_a_record:
+        # Where no record is cut, nothing tells an MCAP file from one that was never longer.
+        assert damage
+
+
+@pytest.mark.parametrize("name", _KINDS)
+@settings(max_examples=80, deadline=None)
+@given(data=st.data())
+def test_changed_bytes_are_refused_or_read_around(
+    bags: dict[str, Path], name: str, data: st.DataObject
+) -> None:
+    size = bags[name].stat().st_size
+    _try(damaged(bags[name], _flipper(data.draw(_changes(st.integers(0, size - 1))))))
+
+
+@pytest.mark.parametrize("name", ["bz2.bag", "none.mcap", "lz4.mcap", "zstd.mcap"])
+@settings(max_examples=80, deadline=None)
+@given(data=st.data())
+def test_of_chunks_with_a_checksum_none_that_was_changed_is_read(
+    bags: dict[str, Path], name: str, data: st.DataObject
+) -> None:
+    # Not in the first, without which the topics of a recording without an end are unknown.
+    places = st.sampled_from(
+        [*_contents_of_chunks(bags[name].read_bytes(), is_bag=name[-1] == "g")]
+    )
+    changes = data.draw(_changes(places))
+    found = _try(damaged(bags[name], _flipper(changes)))
+    assert found is not None
+    messages, damage = found
+    assert messages == sorted(set(messages) & set(_ALL))
+    assert 1 <= len(_ALL) - len(messages) <= 4 * len(changes)
+    assert "cannot be read" in damage
+
+
+def _changes(places: st.SearchStrategy[int]) -> st.SearchStrategy[dict[int, int]]:
+    return st.dictionaries(places, st.integers(1, 255), min_size=1, max_size=6)
+
+
+def _contents_of_chunks(data: bytes, *, is_bag: bool) -> Iterator[int]:
+    """Yield the bytes that a checksum covers, without those of the first chunk."""
+    starts = [*(_records_of_ros1(data) if is_bag else _records_of_mcap(data)), len(data)]
+    is_chunk = [
+        b"op=\x05" in data[p : p + 40] if is_bag else data[p : p + 1] == b"\x06" for p in starts
+    ]
+    chunks = [k for k, found in enumerate(is_chunk) if found]
+    for k in chunks[1:]:
+        n_head = 8 + data[starts[k]] if is_bag else 9 + 28 + 4 + data[starts[k] + 37] + 8
+        yield from range(starts[k] + n_head, starts[k + 1])
+
+
+def _flipper(changes: dict[int, int]) -> Callable[[bytes], bytes]:
+    def change(data: bytes) -> bytes:
+        return bytes(value ^ changes.get(n, 0) for n, value in enumerate(data))
+
+    return change
+
+
+@pytest.mark.parametrize("name", ["none.bag", "bz2.bag", "lz4.bag", "plain.mcap", "storage.mcap"])
+def test_a_chunk_that_is_lost_costs_no_other(bags: dict[str, Path], name: str) -> None:
+    whole = bags[name].read_bytes()
+    walk = _records_of_ros1 if name.endswith(".bag") else _records_of_mcap
+    mark = b"op=\x05" if name.endswith(".bag") else b"\x06"
+    chunks = [p for p in walk(whole) if mark in whole[p : p + 40 if mark[0] == 111 else p + 1]]
+    all_lost: list[int] = []
+    for start in chunks[1:-1]:
+        # the start of it, with all that is said of it, and of what is in it
+        found = _try(damaged(bags[name], partial(_zeros, start=start, n_bytes=90)))
+        assert found is not None
+        messages, damage = found
+        lost = sorted(set(_ALL) - set(messages))
+        assert lost == list(range(lost[0], lost[0] + len(lost)))
+        assert 1 <= len(lost) <= 4
+        assert messages == sorted(set(messages) & set(_ALL))
+        assert "cannot be read" in damage
+        all_lost += lost
+    assert sorted(set(all_lost)) == sorted(all_lost)
+
+
+def _zeros(data: bytes, start: int, n_bytes: int) -> bytes:
+    return data[:start] + bytes(n_bytes) + data[start + n_bytes :]
+
+
+def test_an_index_without_use_costs_no_message(bags: dict[str, Path]) -> None:
+    for name in ("none.bag", "bz2.bag", "plain.mcap"):
+        whole = bags[name].read_bytes()
+        start = (
+            struct.unpack_from("<Q", whole, whole.index(b"index_pos=") + 10)[0]
+            if (name.endswith(".bag"))
+            else len(whole) - 300
+        )
+        bag = BagFile(damaged(bags[name], partial(_zeros, start=start, n_bytes=200)))
+        assert _read(bag) == _ALL
+        assert bag.damage == ""
+        assert "is read without its index" in bag.note
+
+
+def _without_index(data: bytes, tail: bytes = b"") -> bytes:
+    """Return a ROS 1 bag as a recorder leaves it that was killed."""
+    place = data.index(b"index_pos=") + len("index_pos=")
+    end = struct.unpack_from("<Q", data, place)[0]
+    head = data[:4096]
+    for name in (b"conn_count=", b"chunk_count="):
+        at = head.index(name) + len(name)
+        head = head[:at] + bytes(4) + head[at + 4 :]
+    head = head[:place] + bytes(8) + head[place + 8 :]
+    return head + data[len(head) : end] + tail
+
+
+@pytest.mark.parametrize("name", _CLOSED[:3])
+def test_a_bag_without_an_index_misses_nothing(bags: dict[str, Path], name: str) -> None:
+    bag = BagFile(damaged(bags[name], _without_index))
+    assert _read(bag) == _ALL
+    assert bag.damage == ""
+    assert "rosbag reindex" in bag.note
+
+
+@pytest.mark.parametrize("name", _CLOSED[:3])
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_a_bag_without_an_index_is_read_up_to_its_last_chunk(
+    bags: dict[str, Path], name: str, data: st.DataObject
+) -> None:
+    whole = _without_index(bags[name].read_bytes())
+    n_bytes = data.draw(st.integers(0, len(whole) - 1))
+    found = _try(damaged(bags[name], lambda _: whole[:n_bytes]))
+    if found is not None:
+        messages, damage = found
+        assert messages == _ALL[: len(messages)]
+        assert damage or n_bytes in {*_records_of_ros1(whole)}
+
+
+@pytest.mark.parametrize("name", _CLOSED[:3])
+def test_a_chunk_that_was_never_closed_is_read(bags: dict[str, Path], name: str) -> None:
+    whole = _without_index(bags[name].read_bytes())
+    start = [p for p in _records_of_ros1(whole) if b"op=\x05" in whole[p : p + 40]][-1]
+    n_header = struct.unpack_from("<I", whole, start)[0]
+    n_data = struct.unpack_from("<I", whole, start + 4 + n_header)[0]
+    at = start + 4 + n_header
+    size = whole.index(b"size=", start) + 5
+    file = (
+        whole[:size] + bytes(4) + whole[size + 4 : at] + bytes(4) + whole[at + 4 : at + 4 + n_data]
+    )
+    bag = BagFile(damaged(bags[name], lambda _: file))
+    assert _read(bag) == _ALL
+
+
+def test_messages_out_of_order_are_sorted_within_a_chunk(tmp_path: Path) -> None:
+    shuffled = [_MESSAGES[k] for k in (1, 0, 2, 5, 4, 3, 8, 6, 7)]
+    for compression in ("", "zstd"):
+        path = tmp_path / f"{compression}.mcap"
+        path.write_bytes(open_mcap(shuffled, compression))
+        assert _read(McapScan(path)) == _ALL[:9]
+
+
+def test_messages_that_the_index_gave_are_not_given_again(tmp_path: Path) -> None:
+    # The reader stops at the fourth: it sees that they are not sorted.
+    shuffled = [n for n in (0, 1, 5, 3, 2, 6, 4) for _ in range(2)]
+    twice = [_MESSAGES[n] for n in shuffled]
+    path = tmp_path / "flat.mcap"
+    path.write_bytes(open_mcap(twice, None) + b"\x0f" + struct.pack("<QI", 4, 0))
+    path.write_bytes(path.read_bytes() + b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0))
+    path.write_bytes(path.read_bytes() + b"\x89MCAP0\r\n")
+    bag = BagFile(path)
+    assert bag.note == ""
+    assert _read(bag) == shuffled
+    assert bag.damage == ""
+
+
+def test_mcap_holds_messages_of_ros1_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(open_mcap(_MESSAGES, "lz4", encoding="ros1"))
+    assert all(message.channel.is_ros1 for message in BagFile(path).messages(TOPICS))
+
+
+def test_a_log_that_is_not_part_of_a_database_is_told(bags: dict[str, Path]) -> None:
+    path = damaged(bags["plain.db3"], bytes)
+    path.with_name(f"{path.name}-wal").write_bytes(b"0123456789")
+    bag = BagFile(path)
+    assert _read(bag) == _ALL
+    assert "the 10 bytes of" in bag.damage
+    path.with_name(f"{path.name}-wal").unlink()
+
+
+@pytest.mark.parametrize("n_bytes", [0, 20_000])
+def test_pages_of_a_database_that_are_lost_cost_only_their_messages(
+    tmp_path: Path, n_bytes: int
+) -> None:
+    written = contents(200, 300) if n_bytes == 0 else contents(20, n_bytes)
+    path = write_ros2(tmp_path / "a.db3", written)
+    n_pages = path.stat().st_size // 4096
+    for page in range(n_pages // 3, n_pages - 12, max(n_pages // 7, 1)):
+        spoilt = damaged(path, partial(_fill_page, start=4096 * page))
+        found = _try(spoilt, written)
+        assert found is not None
+        messages, damage = found
+        good = [n for n in messages if n != _FOREIGN]
+        assert good == sorted(set(good))
+        # of long messages the pages are a chain: what is in them is not told from numbers
+        assert len(messages) - len(good) <= (1 if n_bytes else 0)
+        n_lost = len(written) - len(good)
+        assert n_lost <= 1 if n_bytes else 1 <= n_lost <= 14
+        assert n_bytes or f"{n_lost} messages cannot be read" in damage
+
+
+def _fill_page(data: bytes, start: int) -> bytes:
+    return data[:start] + b"\xff" * 4096 + data[start + 4096 :]
+
+
+_HUGE = [2**31, 2**32 - 1, 2**63, 2**64 - 1]
+
+
+@pytest.mark.parametrize("size", _HUGE)
+@pytest.mark.parametrize("op", range(1, 16))
+def test_a_claimed_size_is_not_allocated_in_mcap(tmp_path: Path, op: int, size: int) -> None:
+    path = tmp_path / "a.mcap"
+    good = open_mcap(_MESSAGES, "lz4")
+    path.write_bytes(good + struct.pack("<BQ", op, size) + bytes(200))
+    _check_memory(path)
+    # a string, a list, the data of a chunk, all longer than their record
+    for n_bytes in range(0, 60, 4):
+        content = bytes(n_bytes) + struct.pack("<Q", size) + b"\xff" * 100
+        path.write_bytes(good + struct.pack("<BQ", op, len(content)) + content)
+        _check_memory(path)
+
+
+@pytest.mark.parametrize("size", _HUGE[:2])
+@pytest.mark.parametrize("op", range(2, 8))
+@pytest.mark.parametrize("compression", [b"none", b"bz2", b"lz4"])
+def test_a_claimed_size_is_not_allocated_in_ros1(
+    bags: dict[str, Path], op: int, size: int, compression: bytes
+) -> None:
+    number = struct.pack("<I", size)
+    fields = (b"op=" + bytes([op]), b"conn=" + number, b"count=" + number, b"size=" + number,
+              b"compression=" + compression, b"index_pos=" + number, b"time=" + 2 * number,
+              b"chunk_count=" + number)  # fmt: skip
+    header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    for record in (
+        struct.pack("<I", len(header)) + header + number,
+        struct.pack("<I", len(header)) + header + struct.pack("<I", 100),
+        number + header,
+        struct.pack("<I", 8) + number + b"op=\x05" + number,
+    ):
+        for tail in (bytes(200), b"\xff" * 200):
+            path = damaged(bags["lz4.bag"], partial(_without_index, tail=record + tail))
+            _check_memory(path)
+
+
+def _check_memory(path: Path) -> None:
+    tracemalloc.start()
+    scan = _scan(path)
+    messages = _read(scan)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert messages[: len(_ALL)] == _ALL
+    assert peak < 4_000_000
+
+
+def test_a_chunk_that_inflates_without_end_is_stopped(tmp_path: Path) -> None:
+    bomb = [("/a", n, bytes(1_000_000)) for n in range(3)]
+    good = open_mcap(_MESSAGES, "zstd", has_crc=False)
+    file = open_mcap(bomb, "zstd", has_crc=False)
+    chunk = next(p for p in _records_of_mcap(file) if file[p] == 6)
+    end = chunk + 9 + struct.unpack_from("<Q", file, chunk + 1)[0]
+    record = bytearray(file[chunk:end])
+    record[9 + 16 : 9 + 24] = struct.pack("<Q", 5000)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(good + bytes(record))
+    _check_memory(path)
+    assert "more than the 5000 bytes" in McapScan(path).damage
