@@ -134,6 +134,9 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too."),
     ] = None,
+    world: Annotated[
+        str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
+    ] = "world",
     calibration: _CalibrationFiles = None,
     left: _Left = None,
     right: _Right = None,
@@ -163,9 +166,10 @@ def run(
             config=parameters,
             ground_truth=truth,
             frame=placed,
-            starts_at_truth=pose == "truth",
+            starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
             bag=bag,
+            world=world,
             compare_smoothing=compare_smoothing,
             on_progress=both(show, check),
         )
@@ -189,7 +193,7 @@ def check_(
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.checkup import check_recording, format_checkup
-    from gvo.run_inputs import read_transforms
+    from gvo.run_inputs import count_calibration_changes, read_transforms
 
     parameters = _load(config, set_)
     topics = {"left": left, "right": right, "color": color, "depth": depth}
@@ -200,6 +204,7 @@ def check_(
             parameters,
             transforms=read_transforms(source, (source.info.frame_id, frame)),
             base_frame=frame,
+            calibration_changes=count_calibration_changes(source),
         )
     if as_json:
         typer.echo(json.dumps(checkup.as_json(), allow_nan=False))
@@ -298,7 +303,10 @@ def _smooth_lines(
 @app.command()
 def compare(
     reference: Annotated[
-        str, typer.Argument(help="TUM, KITTI or EuRoC file, a recording, or BAG#tf:A:B, BAG#TOPIC.")
+        str,
+        typer.Argument(
+            help="File (TUM, KITTI, EuRoC), recording, or BAG#tf:PARENT:CHILD, BAG#TOPIC."
+        ),
     ],
     estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
     align: Annotated[_Align, typer.Option(help="What moves each estimate.")] = _Align.SE3,
@@ -343,7 +351,7 @@ def compare(
 
 @app.command()
 def convert(
-    recording: Annotated[Path, typer.Argument(help="Data-set folder, or bag.")],
+    recordings: _Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
         _Layout | None, typer.Option(help="Of the folder; a data set's for a bag, else a bag's.")
@@ -363,7 +371,8 @@ def convert(
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = _open([recording], _load(config, set_), calibration, topics)
+    settings = _load(config, set_)
+    source = _open(recordings, settings, calibration, topics)
     with interruptible() as check:
         written = convert_recording(
             source,
@@ -371,6 +380,7 @@ def convert(
             layout=None if layout is None else layout.value,
             rectify=rectify,
             compress=png,
+            config=settings,
             progress=check,
         )
     typer.echo(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.sources.tf import TfBuffer
-from gvo.sources.tf_paths import list_names
+from gvo.sources.tf_paths import bare, list_names
 from gvo.trajectory import Trajectory
 from gvo.types import Estimate, Failure, FloatArray, IntArray
 
@@ -46,6 +46,8 @@ class OutputFrame:
     Attributes
     ----------
     name : str
+    origin : str
+        What says where the camera is in it, in words; empty for tf and the camera itself.
     first_stamp_ns : int or None
         Stamp of the first frame, once it is known.
 
@@ -63,6 +65,7 @@ class OutputFrame:
         T_initial: FloatArray | None = None,
     ) -> None:
         self.name = name
+        self.origin = ""
         self.first_stamp_ns: int | None = None
         self._is_camera = T_frame_cam is None
         self._T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
@@ -106,7 +109,7 @@ class OutputFrame:
         RecordingError
             When `/tf` does not connect the frames.
         """
-        frame, camera_frame = frame.removeprefix("/"), camera_frame.removeprefix("/")
+        frame, camera_frame = bare(frame), bare(camera_frame)
         if frame == camera_frame:
             return cls(frame, T_initial=T_initial)
         if not camera_frame:

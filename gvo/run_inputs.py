@@ -56,7 +56,9 @@ def choose_frame(
             f"{info.name}: --frame {name}: the recording does not say where the camera is on it; "
             "give a calibration with the camera's pose on the body by --calibration FILE"
         )
-    return OutputFrame(name, info.T_body_cam, T_initial=T_initial)
+    placed = OutputFrame(name, info.T_body_cam, T_initial=T_initial)
+    placed.origin = "the body on which the calibration places the camera"
+    return placed
 
 
 def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) -> FramedTruth:
@@ -126,6 +128,11 @@ def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
         return None
     buffer = source.transforms([name for name in frames if name])
     return buffer if buffer.frames else None
+
+
+def count_calibration_changes(source: Source) -> dict[str, int] | None:
+    """Count the `CameraInfo` of a bag that differ from the first, by topic; None for no bag."""
+    return source.camera_info_changes() if isinstance(source, BagSource) else None
 
 
 def read_compared(
@@ -217,12 +224,14 @@ def initial_pose(truth: FramedTruth | Failure, stamp_ns: int) -> FloatArray:
     Raises
     ------
     TrajectoryError
-        When there is no truth, or it has no rotations.
+        When there is no truth, it has no rotations, or ends before the first frame.
     """
     if isinstance(truth, Failure):
         raise TrajectoryError(f"--initial-pose truth: there is no ground truth: {truth.reason}")
     if not truth.trajectory.has_rotations:
         raise TrajectoryError("--initial-pose truth: the ground truth has no rotations")
+    if len(truth.trajectory) == 0 or truth.trajectory.stamps_ns[-1] < stamp_ns:
+        raise TrajectoryError("--initial-pose truth: the ground truth ends before the first frame")
     at_first = truth.trajectory.interpolate(np.array([stamp_ns], dtype=np.int64))
     poses = at_first if len(at_first) else truth.trajectory
     first: FloatArray = poses.T_world_cam[0]

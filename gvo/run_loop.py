@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 
 from gvo.config import Config
-from gvo.errors import RecordingError
+from gvo.errors import ConfigurationError, RecordingError
 from gvo.odometry import FrameResult, Odometry
 from gvo.output_frame import OutputFrame
 from gvo.outputs.run_frames import RunFrames
@@ -78,6 +78,11 @@ class RunLoop:
         self._first_pose = first_pose
         log = None if comparison is None else comparison.log
         self._odometry = Odometry(source.info.camera, config, log=log)
+
+    @property
+    def is_excerpt(self) -> bool:
+        """Tell whether a part of the recording is read."""
+        return not self._excerpt.is_everything
 
     def run(
         self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
@@ -150,7 +155,7 @@ class RunLoop:
         return tuple(self.frame.apply(estimate) for estimate in estimates)
 
 
-def run_frames(source: Source, frame: OutputFrame, *, is_placed: bool) -> RunFrames:
+def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
     """Name the frames of a run for a bag.
 
     Parameters
@@ -161,12 +166,26 @@ def run_frames(source: Source, frame: OutputFrame, *, is_placed: bool) -> RunFra
         Whose poses are written.
     is_placed : bool
         The first pose was asked for: the world is not that of the first frame.
+    world : str
+        The fixed frame.
+
+    Raises
+    ------
+    ConfigurationError
+        When a name cannot be one.
     """
+    try:
+        return _named(source, frame, is_placed=is_placed, world=world)
+    except ValueError as error:
+        raise ConfigurationError(f"--world {world}: {error}") from error
+
+
+def _named(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
     camera = source.info.frame_id
     if frame.is_camera:
-        return RunFrames(camera=camera, is_world_optical=not is_placed)
+        return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
     mount = frame.T_frame_cam if frame.fixed_mount is None else frame.fixed_mount
-    return RunFrames(camera=camera, tracked=frame.name, T_tracked_cam=mount)
+    return RunFrames(world=world, camera=camera, tracked=frame.name, T_tracked_cam=mount)
 
 
 @contextmanager

@@ -24,12 +24,13 @@ from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
 from gvo.run_inputs import initial_pose, own_truth
-from gvo.run_loop import Output, RunLoop, run_frames
+from gvo.run_loop import Output, RunLoop, name_frames
 from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
 from gvo.sources.truth_frames import FramedTruth
 from gvo.trajectory import Trajectory
+from gvo.trajectory_alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory_files import read_trajectory
 from gvo.truth_comparison import TruthComparison
 from gvo.types import Failure, Status
@@ -70,6 +71,7 @@ def run_recording(
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
     bag: str | Path | None = None,
+    world: str = "world",
     compare_smoothing: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
@@ -93,6 +95,8 @@ def run_recording(
         Which frames are read; all where omitted.
     bag : str or Path, optional
         A `.mcap` or `.bag` to write as well: transforms, odometry, paths, points, overlays.
+    world : str
+        The fixed frame in that bag.
     compare_smoothing : bool
         Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
         all of them in memory.
@@ -122,7 +126,8 @@ def run_recording(
     with ExitStack() as stack:
         outputs: list[Output] = []
         if bag is not None:
-            names = run_frames(source, frame, is_placed=frame.is_placed or starts_at_truth)
+            is_placed = frame.is_placed or starts_at_truth
+            names = name_frames(source, frame, is_placed=is_placed, world=world)
             outputs.append(stack.enter_context(RunBag(bag, names)))
         folder = stack.enter_context(RunFolder(Path(out)))
         loop.run([folder, *outputs], on_progress)
@@ -158,7 +163,7 @@ def _conclude(
     compared: TruthComparison | None = None
     try:
         if isinstance(truth, FramedTruth):
-            compared = TruthComparison.of(_with_stamps(truth, folder), estimates)
+            compared = TruthComparison.of(_within(truth, folder, loop), estimates)
             warnings += [f"ground truth: {truth.warning}"] if truth.warning else []
     except GvoError as error:
         fault = str(error)
@@ -192,13 +197,21 @@ def _plot(path: Path, compared: TruthComparison | None, estimates: dict[str, Tra
         plot_trajectories(path, compared.truth.trajectory, compared.estimates)
 
 
-def _with_stamps(truth: FramedTruth, folder: RunFolder) -> FramedTruth:
-    """Give poses without stamps, one for each frame, the stamps of the frames."""
+def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth:
+    """Give poses without stamps, one for each frame, their stamps; cut the truth to an excerpt."""
     stamps_ns = folder.frame_stamps_ns()
-    if truth.trajectory.stamps_from != "rows" or len(truth.trajectory) != len(stamps_ns):
-        return truth
-    stamped = Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.trajectory.T_world_cam)
-    return replace(truth, trajectory=stamped)
+    trajectory = truth.trajectory
+    if trajectory.stamps_from == "rows" and len(trajectory) == len(stamps_ns):
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_cam=trajectory.T_world_cam)
+    if loop.is_excerpt and trajectory.stamps_from != "rows":
+        first, last = stamps_ns.min() - MAX_DIFFERENCE_NS, stamps_ns.max() + MAX_DIFFERENCE_NS
+        start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
+        trajectory = trajectory.select(slice(int(start), int(end)))
+    return replace(truth, trajectory=trajectory)
+
+
+def _frame_text(frame: OutputFrame) -> str:
+    return ", ".join(text for text in (frame.name or "camera", frame.origin) if text)
 
 
 def _summary(
@@ -211,7 +224,7 @@ def _summary(
         "recording": info.name,
         "sensor": info.sensor,
         "decisions": list(info.decisions),
-        "frame": loop.frame.name or "camera",
+        "frame": _frame_text(loop.frame),
         "ground_truth": "" if compared is None else compared.truth.decision,
         "frames": tally.n_frames,
         "tracked": tally.n_tracked,

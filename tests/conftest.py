@@ -10,6 +10,7 @@ import pytest
 import gvo
 from gvo.cli import main
 from gvo.sources.synthetic import SyntheticRecording
+from tests.rendered_walk import Walk
 
 
 class Answer(NamedTuple):
@@ -64,3 +65,19 @@ def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "room.bag"
     gvo.convert(SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5), path)
     return path
+
+
+@pytest.fixture(scope="session")
+def walk_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bag of `tests.rendered_walk`: nothing of the robot, no truth."""
+    path = tmp_path_factory.mktemp("walk") / "walk.mcap"
+    gvo.convert(Walk(), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def walk_run(walk_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run over `walk_bag`: poses of the camera from the identity."""
+    out = tmp_path_factory.mktemp("walk_run")
+    assert gvo.run_recording(gvo.open_recording(walk_bag), out).exit_code == 0
+    return out

@@ -10,10 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import gvo
-from gvo.config import Config, describe_configuration
+from gvo.config import CheckConfig, Config, describe_configuration
+from gvo.geometry.lens import N_COEFFICIENTS
+from gvo.sources.bag_reader import BagReader
+from gvo.sources.encodings import DEPTHS, IMAGES
+from tests.sources.pose_bags import PoseBag
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -36,8 +41,35 @@ def workplace(
     """Return a working folder with the recordings that the documentation names."""
     shutil.copy(drive_bag, tmp_path / "drive.mcap")
     shutil.copy(room_bag, tmp_path / "room.bag")
+    write_robot(tmp_path / "robot.mcap", drive_bag)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def write_robot(path: Path, drive: Path) -> None:
+    """Write the tf of the robot that carries the camera of the drive: base_link goes forward."""
+    truth = gvo.open_recording(drive).ground_truth()
+    assert truth is not None
+    T_base_cam = np.array(
+        [[0.0, 0.0, 1.0, 0.5], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]]
+    )
+    bag = PoseBag(path)
+    stamps_ns = truth.stamps_ns.tolist()
+    bag.tf(stamps_ns[0], "base_link", "camera_left_optical", T_base_cam, is_static=True)
+    for stamp_ns, T_world_cam in zip(stamps_ns, truth.T_world_cam, strict=True):
+        T_map_base = T_base_cam @ T_world_cam @ np.linalg.inv(T_base_cam)
+        bag.tf(stamp_ns, "map", "base_link", T_map_base)
+    shutil.move(bag.write(), path)
+
+
+def shown_after(page: str, command_line: str) -> str:
+    """Return the output that a page shows of a command."""
+    text = (ROOT / "docs" / page).read_text()
+    found = re.search(
+        rf"```sh\n{re.escape(command_line)}\n```\n\n```text\n(.*?)```", text, re.DOTALL
+    )
+    assert found is not None, f"{page} shows no output of {command_line}"
+    return found[1]
 
 
 def test_the_list_of_parameters_is_up_to_date() -> None:
@@ -66,6 +98,49 @@ def test_commands_in_the_documentation_run(
             continue  # a placeholder for a file of the reader's own
         answer = command(*arguments)
         assert answer.code == 0, f"{page}: {line}: {answer.err}"
+
+
+def test_the_shown_check_has_the_lines_of_a_real_one(
+    workplace: Path, command: Callable[..., Any]
+) -> None:
+    def names(text: str) -> list[str]:
+        return [re.split(r"  +", line)[0] for line in text.splitlines()]
+
+    answer = command("check", "drive.mcap")
+    assert names(shown_after("check.md", "gvo check drive.mcap")) == names(answer.out)
+
+
+def test_the_shown_run_has_the_decisions_of_a_real_one(
+    workplace: Path, command: Callable[..., Any]
+) -> None:
+    shown = shown_after("recordings.md", "gvo run drive.mcap --out out")
+    assert command("run", "drive.mcap", "--out", "out").out.startswith(shown)
+
+
+def test_all_encodings_and_lenses_are_listed() -> None:
+    page = (ROOT / "docs/recordings.md").read_text()
+    missing = [name for name in (*IMAGES, *DEPTHS, *N_COEFFICIENTS) if f"`{name}`" not in page]
+    assert missing == []
+
+
+def test_all_thresholds_of_a_check_are_listed() -> None:
+    page = (ROOT / "docs/check.md").read_text()
+    names = [*CheckConfig.model_fields]
+    assert [name for name in names if not re.search(rf"`(check\.)?{name}`", page)] == []
+
+
+def test_all_topics_of_the_bag_of_a_run_are_listed(
+    workplace: Path, command: Callable[..., Any]
+) -> None:
+    assert command("run", "drive.mcap", "--out", "out", "--bag", "run.mcap").code == 0
+    page = (ROOT / "docs/bags.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| `/")]
+    shown = {
+        (name, kind.replace("/", "/msg/"))
+        for _, names, kind, *_ in (row.replace("`", "").split("|") for row in rows)
+        for name, kind in [(name.strip(), kind.strip()) for name in names.split(",")]
+    }
+    assert shown == {(topic.name, topic.type) for topic in BagReader(workplace / "run.mcap").topics}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

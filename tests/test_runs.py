@@ -8,16 +8,33 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
+from gvo.run_inputs import asked_truth, choose_frame
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_covariances, write_kitti
-
-TRAJECTORIES = ("raw", "causal", "smoothed")
+from tests.rendered_walk import (
+    CAMERA,
+    N_FRAMES,
+    STAMPS_NS,
+    START_NS,
+    T_BASE_CAM,
+    TRAJECTORIES,
+    ate_by_hand,
+    geodetic,
+    moved_by_hand,
+    on_a_robot,
+    read_bag,
+    true_poses,
+    truth_stamps,
+)
+from tests.sources.pose_bags import PoseBag
 
 
 class FaultySource:
@@ -272,3 +289,163 @@ def test_a_run_in_which_nothing_could_be_registered_says_so(tmp_path: Path) -> N
     assert result.exit_code == 3
     assert "no frame could be registered" in result.warnings[0]
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 4
+
+
+def _poses(folder: Path, name: str) -> np.ndarray:
+    return gvo.read_trajectory(folder / f"{name}.txt").T_world_cam
+
+
+def _covariance_by_hand(covariance: np.ndarray, T_frame_cam: np.ndarray) -> np.ndarray:
+    """Move each axis of the camera a little and see how the frame moves with it."""
+    J = np.zeros((6, 6))
+    for k in range(6):
+        small = np.zeros(6)
+        small[k] = 1e-6
+        hat = np.zeros((4, 4))
+        hat[[2, 0, 1], [1, 2, 0]], hat[[1, 2, 0], [2, 0, 1]] = small[:3], -small[:3]
+        hat[:3, 3] = small[3:]
+        step = T_frame_cam @ expm(hat) @ np.linalg.inv(T_frame_cam)
+        J[:, k] = [*Rotation.from_matrix(step[:3, :3]).as_rotvec(), *step[:3, 3]]
+    return np.asarray(1e12 * J @ covariance @ J.T)
+
+
+def _assert_moved(
+    base: Path, camera: Path, T_frame_cam: np.ndarray, T_initial: np.ndarray | None = None
+) -> None:
+    """Compare a run of a frame with the camera's run, pose by pose and covariance by covariance."""
+    mounts = np.broadcast_to(T_frame_cam, (N_FRAMES, 4, 4))
+    for name in TRAJECTORIES:
+        expected = moved_by_hand(_poses(camera, name), mounts, T_initial)
+        np.testing.assert_allclose(_poses(base, name), expected, atol=1e-8)
+        stamps_ns, covariances = read_covariances(camera / f"{name}_covariance.csv")
+        found_ns, found = read_covariances(base / f"{name}_covariance.csv")
+        np.testing.assert_array_equal(found_ns, stamps_ns)
+        for mine, theirs, mount in zip(found, covariances, mounts, strict=True):
+            wanted = _covariance_by_hand(theirs, mount)
+            np.testing.assert_allclose(mine, wanted, atol=1e-5 * np.abs(wanted).max(initial=0.0))
+
+
+def test_poses_and_covariances_of_the_base_follow_from_those_of_the_camera(
+    walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    source = gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
+    result = gvo.run_recording(source, tmp_path / "out", frame=choose_frame(source, "base_link"))
+    assert result.summary["frame"] == "base_link"
+    assert result.exit_code == 0
+    _assert_moved(tmp_path / "out", walk_run, T_BASE_CAM)
+
+
+def _panned(stamps_ns: np.ndarray) -> np.ndarray:
+    """Return T_base_cam of a head that turns to the left, 0.4 rad/s."""
+    angles = 0.4e-9 * (stamps_ns - START_NS)
+    R = Rotation.from_euler("z", angles[:, np.newaxis]).as_matrix()
+    return np.asarray(se3.make_transform(R, np.array([0.1, 0.0, 0.3])) @ T_BASE_CAM)
+
+
+def _on_a_head(path: Path, stamps_ns: np.ndarray) -> PoseBag:
+    bag = PoseBag(path)
+    bag.tf(START_NS, "head", CAMERA, T_BASE_CAM, is_static=True)
+    heads = _panned(stamps_ns) @ np.linalg.inv(T_BASE_CAM)
+    for stamp_ns, T_base_head in zip(stamps_ns.tolist(), heads, strict=True):
+        bag.tf(stamp_ns, "base_link", "head", T_base_head)
+    return bag
+
+
+def test_a_camera_on_a_head_that_turns_is_placed_at_each_stamp(
+    walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    bag = _on_a_head(tmp_path / "tf.mcap", truth_stamps(rate_hz=20))
+    source = gvo.open_recording([walk_bag, bag.write()])
+    out = tmp_path / "out"
+    result = gvo.run_recording(source, out, frame=choose_frame(source, "base_link"))
+    assert result.warnings == ()
+    _assert_moved(out, walk_run, _panned(STAMPS_NS))
+
+
+def test_a_head_of_which_tf_tells_too_late_is_guessed_with_a_warning(
+    walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    bag = _on_a_head(tmp_path / "tf.mcap", STAMPS_NS[3:])
+    source = gvo.open_recording([walk_bag, bag.write()])
+    out = tmp_path / "out"
+    result = gvo.run_recording(source, out, frame=choose_frame(source, "base_link"))
+    assert result.warnings[0].startswith("tf does not say where the camera is")
+    assert "at 3 stamps" in result.warnings[0]
+    _assert_moved(out, walk_run, _panned(np.maximum(STAMPS_NS, STAMPS_NS[3])))
+
+
+def test_a_run_that_starts_at_the_truth_lies_on_it_without_alignment(
+    walk_bag: Path, tmp_path: Path
+) -> None:
+    bag = on_a_robot(tmp_path / "truth.mcap")
+    stamps_ns = truth_stamps()
+    T_map_world = se3.exp(np.array([0.1, 0.2, 2.0, 30.0, -20.0, 1.0]))
+    T_map_base = T_map_world @ true_poses(stamps_ns) @ np.linalg.inv(T_BASE_CAM)
+    for stamp_ns, T in zip(stamps_ns.tolist(), T_map_base, strict=True):
+        bag.tf(stamp_ns, "map", "base_link", T)
+    source = gvo.open_recording([walk_bag, bag.write()])
+    frame = choose_frame(source, "base_link")
+    truth = asked_truth(source, "tf:map:base_link", frame=frame)
+    result = gvo.run_recording(
+        source, tmp_path / "out", ground_truth=truth, frame=frame, starts_at_truth=True
+    )
+    exact = T_map_world @ true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
+    for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):
+        poses = _poses(tmp_path / "out", name)
+        np.testing.assert_allclose(poses[0], exact[0], atol=1e-4)
+        np.testing.assert_allclose(poses[:, :3, 3], exact[:, :3, 3], atol=0.02)
+        expected = ate_by_hand(poses[:, :3, 3], exact[:, :3, 3])
+        assert evaluation.ate_m == pytest.approx(expected, abs=5e-5)
+        assert expected > 1e-4
+
+
+def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
+    walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    bag, lever = on_a_robot(tmp_path / "fix.mcap"), np.array([-0.6, 0.2, 0.9])
+    bag.tf(0, "base_link", "gps", se3.make_transform(np.eye(3), lever), is_static=True)
+    p_cam = (np.linalg.inv(T_BASE_CAM) @ [*lever, 1.0])[:3]
+    stamps_ns = truth_stamps(rate_hz=50)
+    T_map_cam = T_BASE_CAM @ true_poses(stamps_ns)  # z up
+    antenna = T_map_cam[:, :3, :3] @ p_cam + T_map_cam[:, :3, 3]
+    for stamp_ns, place in zip(stamps_ns.tolist(), geodetic(antenna), strict=True):
+        bag.fix(stamp_ns, place)
+    source = gvo.open_recording([walk_bag, bag.write()])
+    truth = asked_truth(source, "/fix")
+    result = gvo.run_recording(source, tmp_path / "out", ground_truth=truth)
+    assert result.warnings == ()
+    exact = true_poses(STAMPS_NS)
+    points = exact[:, :3, :3] @ p_cam + exact[:, :3, 3]
+    for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):
+        poses = _poses(walk_run, name)
+        found = poses[:, :3, :3] @ p_cam + poses[:, :3, 3]
+        # interpolation over 20 ms leaves a tenth of a millimetre
+        assert evaluation.ate_m == pytest.approx(ate_by_hand(found, points), abs=2e-4)
+        assert evaluation.rpe_deg is None
+        at_camera = ate_by_hand(poses[:, :3, 3], exact[:, :3, 3])
+        assert evaluation.ate_m < 4 * at_camera < 0.02
+
+
+def test_a_bag_of_an_interrupted_run_holds_what_the_folder_holds(
+    walk_bag: Path, tmp_path: Path
+) -> None:
+    def interrupt(progress: object) -> None:
+        if progress.n_done == 7:  # type: ignore[attr-defined]
+            raise KeyboardInterrupt
+
+    path = tmp_path / "run.mcap"
+    with pytest.raises(KeyboardInterrupt):
+        gvo.run_recording(gvo.open_recording(walk_bag), tmp_path, bag=path, on_progress=interrupt)
+    messages = read_bag(path)
+    for name in TRAJECTORIES:
+        assert len(messages[f"/gvo/{name}/odometry"]) == 7
+        assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 7
+
+
+def test_a_bag_that_cannot_be_written_leaves_no_folder(
+    room: SyntheticRecording, tmp_path: Path
+) -> None:
+    (tmp_path / "run.mcap").write_text("mine")
+    with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
+        gvo.run_recording(room, tmp_path / "out", bag=tmp_path / "run.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

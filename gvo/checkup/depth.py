@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from gvo.checkup.misregistration import estimate_misregistration
-from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
 from gvo.types import DepthArray, Failure, RgbdFrame
@@ -115,7 +115,7 @@ def _check_frozen(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Fin
     yield measured(
         "depth: frozen images",
         n_frozen / len(pairs),
-        Limits(high=check.max_lost_share, fault_high=check.fault_lost_share),
+        lost_limits(check),
         unit="%",
         text=f"{n_frozen} of {len(pairs)} are the same as the one before",
         fix="the driver repeats depth images: record at the camera's own rate",

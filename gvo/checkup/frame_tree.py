@@ -6,13 +6,16 @@ from collections.abc import Collection, Iterator
 
 import numpy as np
 
-from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.report import Finding, Limits, judged, measured, unknown
 from gvo.config import CheckConfig
+from gvo.sources.ground_truth import TRUTH_FRAMES
 from gvo.sources.tf import TfBuffer
+from gvo.sources.tf_paths import bare
 from gvo.types import Failure, IntArray
 
 _N_NAMED = 5
-# A single transform, such as the ground truth of a data set, is no robot that misses a camera.
+# A single transform, such as that between two cameras, is no robot that misses a camera. Nor is
+# the ground truth of a data set, which has a tree of its own.
 _MIN_FRAMES = 3
 
 
@@ -40,16 +43,18 @@ def check_frame_tree(
         The robot's own frame.
     check : CheckConfig
     """
-    if len(buffer.frames) < _MIN_FRAMES:
+    edges = buffer.edges - {(TRUTH_FRAMES.parent, TRUTH_FRAMES.child)}
+    frames = {name for edge in edges for name in edge}
+    if len(frames) < _MIN_FRAMES:
         yield Finding(name="tf: frames", value=", ".join(sorted(buffer.frames)) or "none")
         return
-    roots = _roots(buffer.edges)
-    yield _check_trees(buffer, roots)
-    camera = camera_frame.strip("/")
+    roots = _roots(edges)
+    yield _check_trees(len(frames), roots)
+    camera, base_frame = bare(camera_frame), bare(base_frame)
     if not camera:
         yield unknown("tf: camera", "the images name no frame")
         return
-    if camera not in buffer.frames:
+    if camera not in frames:
         yield Finding(
             name="tf: camera",
             value=f"{camera} is in no transform",
@@ -69,19 +74,17 @@ def _roots(edges: Collection[tuple[str, str]]) -> set[str]:
     return {parent for parent, _ in edges} - {child for _, child in edges}
 
 
-def _check_trees(buffer: TfBuffer, roots: Collection[str]) -> Finding:
+def _check_trees(n_frames: int, roots: Collection[str]) -> Finding:
     names = sorted(roots)
-    is_split = len(names) > 1
     more = ", ..." if len(names) > _N_NAMED else ""
-    return Finding(
-        name="tf: frames",
-        value=f"{len(buffer.frames)} in {len(names)} tree{'s' if len(names) != 1 else ''}"
+    return judged(
+        "tf: frames",
+        f"{n_frames} in {len(names)} tree{'s' if len(names) != 1 else ''}"
         f" (root {', '.join(names[:_N_NAMED])}{more})",
+        is_ok=len(names) <= 1,
         threshold="1 tree",
-        verdict="warning" if is_split else "ok",
-        fix="a transform between the trees is missing: record /tf_static as well"
-        if is_split
-        else "",
+        otherwise="warning",
+        fix="a transform between the trees is missing: record /tf_static as well",
     )
 
 
@@ -90,18 +93,14 @@ def _check_base(buffer: TfBuffer, camera: str, base_frame: str) -> Finding:
     if base_frame not in buffer.frames:
         return Finding(name=name, value=f"{camera} is in the tree, there is no {base_frame}")
     chain = buffer.chain(base_frame, camera)
-    if not isinstance(chain, Failure):
-        return Finding(
-            name=name,
-            value=" - ".join(chain),
-            threshold=f"connected to {base_frame}",
-            verdict="ok",
-        )
-    return Finding(
-        name=name,
-        value=f"{camera} is not connected to {base_frame}",
+    return judged(
+        name,
+        f"{camera} is not connected to {base_frame}"
+        if isinstance(chain, Failure)
+        else " - ".join(chain),
+        is_ok=not isinstance(chain, Failure),
         threshold=f"connected to {base_frame}",
-        verdict="warning",
+        otherwise="warning",
         fix="record /tf_static, or give the camera's pose on the robot in a file",
     )
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
 from gvo.frontend.corners import detect_corners
@@ -41,10 +41,10 @@ def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Find
     yield measured(
         "frames that cannot be used",
         len(faulty) / len(looked_at),
-        _lost_limits(check),
+        lost_limits(check),
         unit="%",
         text=f"{len(faulty)} of {len(looked_at)}",
-        fix=" ".join(faulty[0].reason.split()) if faulty else "",
+        fix=faulty[0].reason if faulty else "",
     )
 
 
@@ -166,7 +166,7 @@ def _check_sharpness(
         float(np.median(known)),
         Limits(high=check.max_blur_px),
         unit="px",
-        text=f"{np.median(known):.2f} px median, {share:.0%} of the frames above the threshold",
+        text=f"{np.median(known):.2f} px, {share:.0%} of frames above",
         fix="focus the lens; shorter exposure where the camera moves fast",
     )
 
@@ -197,7 +197,7 @@ def _check_texture(
         float(np.median(shares)),
         Limits(low=check.min_followed_share),
         unit="%",
-        text=f"{np.median(shares):.0%} in the next frame (median)",
+        text=f"{np.median(shares):.0%} in the next frame",
         fix="higher frame rate or slower motion; check that frames are in order",
     )
 
@@ -213,7 +213,7 @@ def _check_transfer(
         yield measured(
             f"{name}: frozen images",
             n_frozen / len(pairs),
-            _lost_limits(check),
+            lost_limits(check),
             unit="%",
             text=f"{n_frozen} of {len(pairs)} are the same as the one before",
             fix="the driver repeats images: record at the camera's own rate",
@@ -225,7 +225,7 @@ def _check_transfer(
     yield measured(
         f"{name}: torn images",
         n_torn / len(images),
-        _lost_limits(check),
+        lost_limits(check),
         unit="%",
         text=f"{n_torn} of {len(images)} end in rows of one value",
         fix="transfers break off: lower rate or size, another cable or port",
@@ -272,7 +272,3 @@ def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
 
 def _frames_of(sample: Sample) -> list[Frame | FaultyFrame]:
     return [frame for frame in (sample.first, sample.second) if frame is not None]
-
-
-def _lost_limits(check: CheckConfig) -> Limits:
-    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)

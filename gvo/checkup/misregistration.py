@@ -27,8 +27,6 @@ _MIN_POINTS = 300
 # How much stronger colour edges must be at the best shift than at the typical one.
 _MIN_CONTRAST = 0.25
 
-_Profiles = tuple[FloatArray, FloatArray]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misregistration:
@@ -204,8 +202,14 @@ def _profile(strips: _Strips, zoom: float) -> FloatArray:
     middle = strips.values.shape[1] // 2
     moved = middle + np.rint(zoom * strips.offsets).astype(np.int64)
     positions = moved[:, np.newaxis] + np.arange(-_REACH_PX, _REACH_PX + 1)
-    means = np.nanmean(np.take_along_axis(strips.values, positions, axis=1), axis=0)
-    padded = np.pad(means.astype(np.float64), 1, mode="edge")
+    values = np.take_along_axis(strips.values, positions, axis=1)
+    is_seen = np.isfinite(values).any(axis=0)
+    if not np.any(is_seen):
+        return np.ones(values.shape[1])  # all moved out of the image: no shift stands out
+    seen = np.nanmean(values[:, is_seen], axis=0).astype(np.float64)
+    means = np.full(values.shape[1], np.median(seen))  # outside of the image nothing stands out
+    means[is_seen] = seen
+    padded = np.pad(means, 1, mode="edge")
     smooth = np.convolve(padded, [0.25, 0.5, 0.25], mode="valid")
     return np.asarray(smooth / max(float(np.median(smooth)), 1e-6))
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from gvo.checkup.depth import check_depth
 from gvo.checkup.frame_tree import check_frame_tree
 from gvo.checkup.images import check_images, check_usable
-from gvo.checkup.report import Checkup, Finding, Limits, measured
+from gvo.checkup.report import Checkup, Finding, Limits, judged, measured
 from gvo.checkup.sampling import Survey, survey
 from gvo.checkup.stereo import check_stereo
 from gvo.checkup.timing import check_timing
@@ -29,6 +29,7 @@ def check_recording(
     n_samples: int | None = None,
     transforms: TfBuffer | None = None,
     base_frame: str = "base_link",
+    calibration_changes: Mapping[str, int] | None = None,
 ) -> Checkup:
     """Look for what makes odometry fail or err, before it runs.
 
@@ -47,6 +48,8 @@ def check_recording(
         Of the same bag; where None, the tree of frames is not checked.
     base_frame : str
         The robot's own frame in that tree.
+    calibration_changes : mapping of str to int, optional
+        Of a bag: how many messages of a `CameraInfo` topic differ from its first.
 
     Returns
     -------
@@ -72,6 +75,8 @@ def check_recording(
         findings += check_stereo(found.samples, config)
     else:
         findings += check_depth(found.samples, config)
+    if calibration_changes is not None:
+        findings.append(_check_changes(calibration_changes))
     if transforms is not None:
         findings += check_frame_tree(
             transforms,
@@ -81,6 +86,18 @@ def check_recording(
             check=config.check,
         )
     return Checkup(recording=info.name, findings=tuple(findings))
+
+
+def _check_changes(changes: Mapping[str, int]) -> Finding:
+    changed = [f"{n} of {name}" for name, n in changes.items() if n]
+    return judged(
+        "changed CameraInfo",
+        ", ".join(changed) or "0 messages differ from the first",
+        is_ok=not changed,
+        threshold="0",
+        otherwise="warning",
+        fix="the first one is used; give the right one by --calibration FILE, or cut the bag there",
+    )
 
 
 def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
@@ -95,14 +112,13 @@ def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
     )
     for number, decision in enumerate(info.decisions, start=1):
         yield Finding(name=f"source {number}", value=decision)
-    yield Finding(
-        name="reading",
-        value=" ".join(found.damage.split()) or "complete",
+    yield judged(
+        "reading",
+        found.damage or "complete",
+        is_ok=not found.damage,
         threshold="complete",
-        verdict="fault" if found.damage else "ok",
-        fix="what was read is usable; repair a copy of the file or record anew"
-        if found.damage
-        else "",
+        otherwise="fault",
+        fix="what was read is usable; repair a copy of the file or record anew",
     )
     yield Finding(
         name="focal length",

@@ -6,16 +6,17 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Literal, TypeAlias
 
+from gvo.config import CheckConfig
+
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
 
-_HEADER = ("check", "value", "threshold", "verdict", "fix")
 _N_DIGITS = 3
 _MAX_PLAIN = 1e7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that was looked at.
+    """One thing that was looked at; line ends in its texts become blanks.
 
     Parameters
     ----------
@@ -34,6 +35,11 @@ class Finding:
         hold what the check needs.
     fix : str
         What to do, one line; empty where nothing is.
+
+    Raises
+    ------
+    ValueError
+        For a finding without a name, or a warning or fault without a fix.
     """
 
     name: str
@@ -45,15 +51,15 @@ class Finding:
     fix: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what breaks a table."""
-        if not self.name or any("\n" in line for line in self._lines):
-            raise ValueError(f"a finding needs a name and one line of text each, got {self!r}")
+        """Make a line of each text: names and reasons may come out of damaged files."""
+        for key in ("name", "value", "text", "threshold", "fix"):
+            value = getattr(self, key)
+            if isinstance(value, str):
+                object.__setattr__(self, key, " ".join(value.split()))
+        if not self.name:
+            raise ValueError(f"a finding needs a name, got {self!r}")
         if self.verdict in ("warning", "fault") and not self.fix:
             raise ValueError(f"{self.name}: a {self.verdict} needs a fix")
-
-    @property
-    def _lines(self) -> tuple[str, ...]:
-        return (self.name, str(self.value), self.text, self.threshold, self.fix)
 
     @property
     def value_text(self) -> str:
@@ -177,46 +183,39 @@ def measured(
     )
 
 
+def judged(
+    name: str, value: str, *, is_ok: bool, threshold: str, otherwise: Verdict, fix: str
+) -> Finding:
+    """Return a finding whose verdict is known already.
+
+    Parameters
+    ----------
+    name, value, threshold : str
+        As of `Finding`.
+    is_ok : bool
+        Whether all is well.
+    otherwise : {"warning", "fault"}
+        The verdict where it is not.
+    fix : str
+        What to do then.
+    """
+    return Finding(
+        name=name,
+        value=value,
+        threshold=threshold,
+        verdict="ok" if is_ok else otherwise,
+        fix="" if is_ok else fix,
+    )
+
+
+def lost_limits(check: CheckConfig) -> Limits:
+    """Return the limits of the share of frames that are lost in one way or another."""
+    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)
+
+
 def unknown(name: str, reason: str) -> Finding:
     """Return a finding that the recording does not allow."""
     return Finding(name=name, value=reason, verdict="unknown")
-
-
-def format_checkup(checkup: Checkup) -> str:
-    """Return an aligned table, one line per finding, and a line that sums it up.
-
-    Examples
-    --------
-    >>> finding = Finding(name="rows", value=0.1234, unit="px", threshold="<= 1 px", verdict="ok")
-    >>> print(format_checkup(Checkup(recording="drive", findings=(finding,))))
-    check  value     threshold  verdict  fix
-    rows   0.123 px  <= 1 px    ok
-    drive: healthy
-    """
-    rows = [_HEADER, *map(_row, checkup.findings)]
-    # What is only told, however long, does not push the verdicts aside.
-    told = [_row(finding) for finding in checkup.findings if finding.verdict == "info"]
-    judged = [row for row in rows if row not in told]
-    widths = [max(len(row[column]) for row in judged) for column in range(len(_HEADER))]
-    widths[0] = max(len(row[0]) for row in rows)
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
-    return "\n".join([*lines, _sum_up(checkup)])
-
-
-def _row(finding: Finding) -> tuple[str, ...]:
-    return (finding.name, finding.value_text, finding.threshold, finding.verdict, finding.fix)
-
-
-def _sum_up(checkup: Checkup) -> str:
-    counts = {
-        "fault": len(checkup.with_verdict("fault")),
-        "warning": len(checkup.with_verdict("warning")),
-    }
-    parts = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
-    return f"{checkup.recording}: {', '.join(parts) or 'healthy'}"
 
 
 def _number_text(value: float) -> str:

@@ -10,14 +10,14 @@ import numpy as np
 
 from gvo.config import Config, SyncConfig
 from gvo.errors import GvoError
-from gvo.sources.frames import frames
+from gvo.sources.frames import frames, paired
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.sources.sync import Pair, pair_images
+from gvo.sources.sync import Pair
 from gvo.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, IntArray
 
 # Pairs that are formed only to look at them, where none is near enough for odometry.
-_WIDE_LIMIT_NS = 200_000_000
+_WIDE_LIMIT_MS = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,14 +28,14 @@ class StreamStamps:
     ----------
     stamps_ns : ndarray of int64, shape (n,)
         Of the headers.
-    log_stamps_ns : ndarray of int64, shape (m,)
+    log_times_ns : ndarray of int64, shape (m,)
         Of the recording, for the images that have both; empty where there is no such clock.
     headers_ns : ndarray of int64, shape (m,)
         Stamps of the headers of those images.
     """
 
     stamps_ns: IntArray
-    log_stamps_ns: IntArray
+    log_times_ns: IntArray
     headers_ns: IntArray
 
 
@@ -91,11 +91,11 @@ def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
     Survey
     """
     pass_ = _Pass(source, config.sync, n_samples)
-    pass_.run(_limit_ns(source.info, config))
+    pass_.run()
     n_pairs = pass_.n_pairs
     if n_pairs == 0 and all(len(stamps) for stamps in pass_.stamps):
         pass_ = _Pass(source, config.sync, n_samples)
-        pass_.run(_WIDE_LIMIT_NS)
+        pass_.run(_WIDE_LIMIT_MS)
     return Survey(
         streams=(pass_.stream(0), pass_.stream(1)),
         n_pairs=n_pairs,
@@ -119,17 +119,11 @@ class _Pass:
         self.damage = ""
         self.chosen: list[list[Pair]] = []
 
-    def run(self, limit_ns: int) -> None:
+    def run(self, limit_ms: float | None = None) -> None:
         due = iter(self._due)
         next_due = next(due, None)
         is_successor = False
-        pairs = pair_images(
-            self._noted(),
-            limit_ns=limit_ns,
-            partner="partner",
-            queue_size=self._sync.queue_size,
-            age_penalty=self._sync.age_penalty,
-        )
+        pairs = paired(self._noted(), self._source.info.sensor, self._sync, limit_ms=limit_ms)
         for index, item in enumerate(self._until_damage(pairs)):
             if isinstance(item, FaultyFrame):
                 is_successor = False
@@ -147,7 +141,7 @@ class _Pass:
         """Return the stamps of one stream."""
         return StreamStamps(
             stamps_ns=np.array(self.stamps[number], dtype=np.int64),
-            log_stamps_ns=np.array(self._logs[number], dtype=np.int64),
+            log_times_ns=np.array(self._logs[number], dtype=np.int64),
             headers_ns=np.array(self._headers[number], dtype=np.int64),
         )
 
@@ -188,9 +182,3 @@ def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tupl
     return tuple(
         Sample(first=next(loaded), second=next(loaded) if len(run) > 1 else None) for run in chosen
     )
-
-
-def _limit_ns(info: RecordingInfo, config: Config) -> int:
-    sync = config.sync
-    limit_ms = sync.stereo_tolerance_ms if info.sensor == "stereo" else sync.max_difference_ms
-    return round(limit_ms * 1e6)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.report import Finding, Limits, judged, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.checkup.stereo_matches import FreeMatcher, FreeMatches
 from gvo.config import CheckConfig, Config
@@ -148,16 +148,14 @@ def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:
         return unknown(name, "too few consecutive frames")
     same, later, earlier = np.median(known, axis=0)
     is_off = same > _MIN_STEP_SPREAD_PX and min(later, earlier) < _STEP_RATIO * same
-    return Finding(
-        name=name,
-        value=f"rows spread {same:.2f} px; {later:.2f} with the next right image, {earlier:.2f} "
-        "with the last",
+    return judged(
+        name,
+        f"rows spread {same:.2f} px; next right image {later:.2f}, last {earlier:.2f}",
+        is_ok=not is_off,
         threshold=f"others >= {_STEP_RATIO:g} of it",
-        verdict="fault" if is_off else "ok",
+        otherwise="fault",
         fix=f"the right images are a frame {'late' if later < earlier else 'early'}: trigger both "
-        "cameras together, or correct the stamps"
-        if is_off
-        else "",
+        "cameras together, or correct the stamps",
     )
 
 

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gvo.checkup.report import Finding, Limits, measured, unknown
+from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import StreamStamps, Survey
 from gvo.config import CheckConfig, Config
-from gvo.sources.recording import RecordingInfo
+from gvo.sources.frames import pair_limit_key
+from gvo.sources.recording import RecordingInfo, Sensor
 from gvo.types import FloatArray, IntArray
 
 # An interval this many periods long is a gap, not jitter.
@@ -23,14 +24,9 @@ _MIN_STRETCHES = 4
 _DRIFT_SIGMAS = 4.0
 
 
-def stream_names(info: RecordingInfo) -> tuple[str, str]:
-    """Return what the two streams are called."""
-    return ("left", "right") if info.sensor == "stereo" else ("colour", "depth")
-
-
 def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
     """Yield what all stamps of the recording say; no image is looked at."""
-    names = stream_names(info)
+    names = info.stream_names
     for name, stream in zip(names, survey.streams, strict=True):
         yield from _check_stream(name, stream.stamps_ns, config)
     yield from _check_pairs(survey, info, config)
@@ -53,7 +49,7 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
     yield measured(
         f"{name}: stamps",
         n_bad / len(stamps_ns),
-        _lost_limits(config.check),
+        lost_limits(config.check),
         unit="%",
         text=f"{n_bad} of {len(stamps_ns)} repeat or go back",
         fix="record anew, or sort by header stamp; such frames are skipped",
@@ -97,7 +93,7 @@ def _check_gaps(name: str, steps_s: FloatArray, n: int, config: Config) -> Itera
     yield measured(
         f"{name}: dropped frames",
         n_dropped / (n + n_dropped),
-        _lost_limits(config.check),
+        lost_limits(config.check),
         unit="%",
         text=f"{n_dropped} of {n + n_dropped}",
         fix="record with more bandwidth or a smaller rate; every dropped frame widens the motion",
@@ -109,9 +105,10 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
     if len(first) == 0 or len(second) == 0:
         return
     check = config.check
-    name = "/".join(stream_names(info))
-    is_stereo = info.sensor == "stereo"
-    most_ms = check.max_stereo_difference_ms if is_stereo else check.max_depth_difference_ms
+    name = "/".join(info.stream_names)
+    most_ms = check.max_depth_difference_ms
+    if info.sensor == "stereo":
+        most_ms = check.max_stereo_difference_ms
     signed_ms = _nearest_differences(first, second) / 1e6
     sizes_ms = np.abs(signed_ms)
     typical_ms, largest_ms = float(np.median(sizes_ms)), float(sizes_ms.max())
@@ -124,7 +121,7 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         f"{largest_ms:.3g} ms largest",
         fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
     )
-    yield _check_partners(name, first, survey.n_pairs, sizes_ms, is_stereo=is_stereo, config=config)
+    yield _check_partners(name, first, survey.n_pairs, sizes_ms, sensor=info.sensor, config=config)
 
 
 def _check_partners(
@@ -133,16 +130,16 @@ def _check_partners(
     n_pairs: int,
     sizes_ms: FloatArray,
     *,
-    is_stereo: bool,
+    sensor: Sensor,
     config: Config,
 ) -> Finding:
     n_alone = len(first) - n_pairs
-    key = "stereo_tolerance_ms" if is_stereo else "max_difference_ms"
+    key = pair_limit_key(sensor)
     limit_ms, enough_ms = getattr(config.sync, key), math.ceil(float(np.percentile(sizes_ms, 95)))
     return measured(
         f"{name}: frames without partner",
         n_alone / len(first),
-        _lost_limits(config.check),
+        lost_limits(config.check),
         unit="%",
         text=f"{n_alone} of {len(first)} at sync.{key}={limit_ms:g}",
         # More than half a period only pairs images with the partners of others.
@@ -173,14 +170,20 @@ def _check_clock(name: str, stream: StreamStamps, check: CheckConfig) -> Iterato
     stretches of the recording are compared: their slope is the drift of one clock against the
     other, their largest step a jump. Where the clocks differ by a constant, nothing is wrong.
     """
-    if len(stream.log_stamps_ns) == 0:
+    if len(stream.log_times_ns) == 0:
         return
     elapsed_s = (stream.headers_ns - stream.headers_ns[0]) / 1e9
-    offsets_ms = (stream.log_stamps_ns - stream.headers_ns) / 1e6
+    offsets_ms = (stream.log_times_ns - stream.headers_ns) / 1e6
     yield Finding(
         name=f"{name}: recording clock",
         value=f"{_duration_text(float(np.median(offsets_ms)))} after the header",
     )
+    yield from _check_drift(name, elapsed_s, offsets_ms, check)
+
+
+def _check_drift(
+    name: str, elapsed_s: FloatArray, offsets_ms: FloatArray, check: CheckConfig
+) -> Iterator[Finding]:
     n_stretches = min(_N_STRETCHES, len(offsets_ms) // _MIN_PER_STRETCH)
     if n_stretches < _MIN_STRETCHES:
         yield unknown(f"{name}: clock drift", f"{len(offsets_ms)} images are too few")
@@ -226,7 +229,3 @@ def _duration_text(milliseconds: float) -> str:
     if abs(milliseconds) < 1e8:
         return f"{milliseconds / 1e3:.3g} s"
     return f"{milliseconds / 86_400_000:.1f} days"
-
-
-def _lost_limits(check: CheckConfig) -> Limits:
-    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)

@@ -72,6 +72,9 @@ class BagWriter:
     path : Path
         `.bag`: ROS 1. `.mcap` or `.db3`: a file of ROS 2, made inside a folder of the same
         name without the suffix. No suffix: a ROS 2 bag folder.
+    keeps_order : bool
+        Every reader is to give the messages in the order in which they were written: one whose
+        stamp goes back, or repeats within its topic, is logged a nanosecond after the last.
 
     Attributes
     ----------
@@ -79,7 +82,7 @@ class BagWriter:
         The finished file or folder.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, keeps_order: bool = False) -> None:
         self.is_ros1 = path.suffix == ".bag"
         self.result = path
         self._writer: Writer1 | Writer2
@@ -95,6 +98,8 @@ class BagWriter:
         self._store = typestore(is_ros1=self.is_ros1)
         self._connections: dict[str, Connection] = {}
         self._log_time_ns = 0
+        self._keeps_order = keeps_order
+        self._newest_ns: dict[str, int] = {}  # log times by topic
 
     def __enter__(self) -> BagWriter:
         self._writer.open()
@@ -148,7 +153,7 @@ class BagWriter:
     def write(
         self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
     ) -> None:
-        """Write a message; its log time is the stamp, but never goes back.
+        """Write a message; its log time is the stamp, but never goes back, see `keeps_order`.
 
         Parameters
         ----------
@@ -162,8 +167,12 @@ class BagWriter:
             Of the topic, told with its first message: the last message is kept for those who
             subscribe later.
         """
-        # Readers sort by log time: a frame whose stamp goes back must stay where it was.
-        self._log_time_ns = max(self._log_time_ns, stamp_ns)
+        # Readers sort by log time: a frame whose stamp goes back must stay where it was. Those of
+        # one log time some readers sort by topic.
+        is_behind = stamp_ns < self._log_time_ns or stamp_ns == self._newest_ns.get(topic)
+        step_ns = 1 if self._keeps_order and is_behind else 0
+        self._log_time_ns = max(self._log_time_ns + step_ns, stamp_ns)
+        self._newest_ns[topic] = self._log_time_ns
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, type_, is_latched=is_latched)
         serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr

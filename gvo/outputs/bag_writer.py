@@ -5,28 +5,29 @@ from __future__ import annotations
 import tempfile
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
-from gvo.geometry.camera import Calibration
 from gvo.outputs.bag_messages import (
     BagWriter,
     Header,
     write_camera_info,
-    write_image,
+    write_transforms,
     write_truth,
 )
-from gvo.outputs.compressed_messages import write_compressed, write_compressed_depth
-from gvo.outputs.conversion import Conversion, check_new
-from gvo.outputs.depth_counts import MILLIMETRES, is_in_counts
-from gvo.sources.frames import ImagePreparer, make_preparers
+from gvo.outputs.bag_streams import BagStreams, plan_streams, static_poses
+from gvo.outputs.conversion import (
+    Conversion,
+    LeftOut,
+    check_images,
+    check_new,
+    readable_images,
+    true_poses,
+)
 from gvo.sources.recording import Source, StampedImage
 from gvo.types import FloatArray
 
@@ -49,7 +50,10 @@ def convert(
     not rectified; an RGB-D camera becomes `/camera/rgb/image_rect_color`, or `image_color`, and
     `/camera/depth/image` in metres (32FC1, NaN = unknown). Each image has a `CameraInfo` of its
     stamp beside it. The ground truth is written to `/tf`: `world` to `ground_truth`, the pose
-    of the rectified camera.
+    of the rectified camera. `/tf_static` holds the right camera in the left one, and both in
+    `body` where the recording says where they sit there; the frames are those of the rectified
+    cameras, also beside raw images. Where a recording cannot be read on, what was read is kept,
+    and the reason is in `skipped`.
 
     Parameters
     ----------
@@ -60,54 +64,37 @@ def convert(
     rectify : bool
         Write raw images rectified and grey, as the frames hold them.
     compress : bool
-        Write images as PNG, topics `.../compressed` and, for depth of whole millimetres,
-        `.../compressedDepth`; other depth stays as it is.
+        Write images as PNG, topics `.../compressed`; and depth, where the first image is of
+        whole millimetres, as `.../compressedDepth`. Other depth stays as it is.
     progress : callable, optional
         Called with the number of images written so far.
+
+    Returns
+    -------
+    Conversion
 
     Raises
     ------
     RecordingError
-        When the path exists, has another suffix or cannot be written, or a stamp does not fit.
+        When the path exists, has another suffix or cannot be written, a stamp does not fit, or
+        no image can be read.
     """
     path = Path(path)
     _check_target(path)
-    plan = _plan(source, rectify=rectify, compress=compress)
+    writer = _Writer(source, plan_streams(source, rectify=rectify, compress=compress))
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as folder:
-            with BagWriter(Path(folder) / path.name) as bag:
-                conversion = _write(bag, source, plan, path=path, progress=progress)
+            with BagWriter(Path(folder) / path.name, keeps_order=True) as bag:
+                writer.write(bag, progress)
             bag.result.rename(path)
     except (OSError, WriterError1, WriterError2) as error:
         raise RecordingError(f"{path}: cannot be written: {error}") from error
-    return conversion
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Stream:
-    """Where one stream goes."""
-
-    topic: str
-    frame_id: str
-    calibration: Calibration
-    prepare: ImagePreparer | None
-    is_compressed: bool
-
-    @property
-    def info_topic(self) -> str:
-        return f"{self.topic.rpartition('/')[0]}/camera_info"
-
-    def write(self, bag: BagWriter, pixels: NDArray[Any], header: Header) -> None:
-        """Write an image, as PNG where that was asked for."""
-        if not self.is_compressed:
-            write_image(bag, self.topic, pixels, header)
-        elif pixels.dtype == np.float32:
-            write_compressed_depth(bag, f"{self.topic}/compressedDepth", pixels, header)
-        else:
-            write_compressed(bag, f"{self.topic}/compressed", pixels, header)
-
-
-_Plan: TypeAlias = tuple[_Stream, _Stream]
+    return Conversion(
+        path=path,
+        n_images=sum(writer.n_images),
+        n_poses=writer.n_poses,
+        skipped=writer.left_out.lines(),
+    )
 
 
 def _check_target(path: Path) -> None:
@@ -115,109 +102,60 @@ def _check_target(path: Path) -> None:
     if path.suffix not in _SUFFIXES:
         raise RecordingError(
             f"{path}: expected a name ending in .bag, .mcap or .db3, or a folder name without "
-            f"a suffix, got {path.suffix}"
+            f"a suffix, got {path.suffix}; give --layout for the folder of a data set"
         )
 
 
-def _plan(source: Source, *, rectify: bool, compress: bool) -> _Plan:
-    info = source.info
-    # Depth that is moved to the colour camera is seen by the rectified one.
-    is_rectifying = info.depth_view is not None or (
-        rectify and not info.calibrations[0].is_rectified
-    )
-    prepares = make_preparers(info) if is_rectifying else (None, None)
-    is_rectified = is_rectifying or info.calibrations[0].is_rectified
-    if info.sensor == "rgbd":
-        topics = (
-            f"/camera/rgb/{'image_rect_color' if is_rectified else 'image_color'}",
-            "/camera/depth/image",
-        )
-        frame_ids = (info.frame_id or "camera_color_optical_frame",) * 2
-        raws = info.calibrations * 2
-        compressed = (compress, compress and _is_in_millimetres(source))
-    else:
-        name = "image_rect" if is_rectified else "image_raw"
-        topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
-        frame_ids = (info.frame_id or "camera_left_optical", "camera_right_optical")
-        raws = info.calibrations
-        compressed = (compress, compress)
-    calibrations = [_rectified(raw) if is_rectifying else raw for raw in raws]
-    first, second = (
-        _Stream(
-            topic=topic,
-            frame_id=frame_id,
-            calibration=calibration,
-            prepare=prepare,
-            is_compressed=is_compressed,
-        )
-        for topic, frame_id, calibration, prepare, is_compressed in zip(
-            topics, frame_ids, calibrations, prepares, compressed, strict=True
-        )
-    )
-    return first, second
+class _Writer:
+    """Writes images and poses in the order of their stamps."""
 
+    def __init__(self, source: Source, streams: BagStreams) -> None:
+        self._source = source
+        self._streams = streams
+        self.left_out = LeftOut()
+        truth = true_poses(source, self.left_out)
+        self._poses: deque[tuple[int, FloatArray]] = deque()
+        if truth is not None:
+            self._poses.extend(zip(truth.stamps_ns.tolist(), truth.T_world_cam, strict=True))
+        self.n_images = [0, 0]
+        self.n_poses = len(self._poses)
 
-def _rectified(raw: Calibration) -> Calibration:
-    return Calibration(
-        width=raw.width,
-        height=raw.height,
-        K=raw.P[:, :3].copy(),
-        D=np.zeros(5),
-        R=np.eye(3),
-        P=raw.P,
-        is_rectified=True,
-    )
+    def write(self, bag: BagWriter, progress: _Progress | None) -> None:
+        is_first = True
+        for image in readable_images(self._source, self.left_out):
+            if is_first:
+                self._write_static(bag, image.stamp_ns)
+                is_first = False
+            self._write_poses(bag, until_ns=image.stamp_ns)
+            self.n_images[image.stream] += self._write_image(bag, image)
+            if progress is not None:
+                progress(sum(self.n_images))
+        check_images((self.n_images[0], self.n_images[1]), self._source, self.left_out)
+        self._write_poses(bag)
 
+    def _write_static(self, bag: BagWriter, stamp_ns: int) -> None:
+        # Whoever plays the bag knows the cameras before the first image or pose comes.
+        stamp_ns = min([stamp_ns, *(first_ns for first_ns, _ in list(self._poses)[:1])])
+        first, second = self._streams
+        poses = static_poses(self._source, (first.frame_id, second.frame_id), stamp_ns)
+        write_transforms(bag, "/tf_static", poses, is_latched=True)
 
-def _is_in_millimetres(source: Source) -> bool:
-    """Tell whether the first depth image that can be read is of whole millimetres."""
-    for image in source.images():
-        if image.stream == 1:
-            try:
-                return is_in_counts(image.load(), MILLIMETRES)
-            except RecordingError:
-                continue
-    return False
+    def _write_poses(self, bag: BagWriter, until_ns: int | None = None) -> None:
+        """Write, and take away, the poses up to a stamp; all of them without one."""
+        while self._poses and (until_ns is None or self._poses[0][0] <= until_ns):
+            write_truth(bag, *self._poses.popleft())
 
-
-def _write(
-    bag: BagWriter, source: Source, plan: _Plan, *, path: Path, progress: _Progress | None
-) -> Conversion:
-    poses = _stamped_poses(source)
-    n_poses, n_images, skipped = len(poses), 0, []
-    for image in source.images():
-        _write_poses(bag, poses, until_ns=image.stamp_ns)
-        stream = plan[image.stream]
+    def _write_image(self, bag: BagWriter, image: StampedImage) -> bool:
+        """Write an image; False, with a note, where it cannot be read."""
+        stream = self._streams[image.stream]
         try:
-            pixels = _pixels(image, stream)
+            pixels = image.load()
+            if stream.prepare is not None:
+                pixels = stream.prepare(pixels)
         except RecordingError as error:
-            skipped.append(f"{stream.topic} at {image.stamp_ns} ns: {error}")
-            continue
+            self.left_out.add_image(stream.topic, image.stamp_ns, str(error))
+            return False
         header = Header(image.stamp_ns, stream.frame_id)
         write_camera_info(bag, stream.info_topic, stream.calibration, header)
         stream.write(bag, pixels, header)
-        n_images += 1
-        if progress is not None:
-            progress(n_images)
-    _write_poses(bag, poses)
-    return Conversion(path=path, n_images=n_images, n_poses=n_poses, skipped=tuple(skipped))
-
-
-def _stamped_poses(source: Source) -> deque[tuple[int, FloatArray]]:
-    truth = source.ground_truth()
-    if truth is None:
-        return deque()
-    return deque(zip(truth.stamps_ns.tolist(), truth.T_world_cam, strict=True))
-
-
-def _write_poses(
-    bag: BagWriter, poses: deque[tuple[int, FloatArray]], until_ns: int | None = None
-) -> None:
-    """Write, and take away, the poses up to a stamp; all of them without one."""
-    while poses and (until_ns is None or poses[0][0] <= until_ns):
-        write_truth(bag, *poses.popleft())
-
-
-def _pixels(image: StampedImage, stream: _Stream) -> NDArray[Any]:
-    pixels = image.load()
-    return pixels if stream.prepare is None else stream.prepare(pixels)
+        return True

@@ -1,4 +1,4 @@
-"""Messages of images as PNG, written to bags of ROS 1 or ROS 2."""
+"""Messages of compressed images, written to bags of ROS 1 or ROS 2."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
 from gvo.outputs.bag_messages import BagWriter, Header
-from gvo.outputs.depth_counts import MILLIMETRES, to_counts
+from gvo.outputs.depth_counts import MILLIMETRES, exact_counts
 from gvo.sources.topics import COMPRESSED_TYPE
 from gvo.types import DepthArray
 
@@ -32,10 +32,7 @@ def encode_png(pixels: NDArray[Any]) -> bytes:
     RecordingError
         When it cannot be one.
     """
-    is_encoded, data = cv2.imencode(".png", pixels)
-    if not is_encoded:
-        raise RecordingError(f"an image of {pixels.dtype} {pixels.shape} cannot be written as PNG")
-    return data.tobytes()
+    return _encode(".png", pixels)
 
 
 def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
@@ -58,7 +55,7 @@ def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], head
 
 
 def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header: Header) -> None:
-    """Write depth in whole millimetres as the transport `compressedDepth` does.
+    """Write depth without loss: in whole millimetres as the transport `compressedDepth` does.
 
     Parameters
     ----------
@@ -67,12 +64,24 @@ def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header
     topic : str
         Where to; ends in `/compressedDepth`.
     depth : ndarray of float32, shape (h, w)
-        Metres, NaN = unknown; up to 65.5 m.
+        Metres, NaN = unknown; as TIFF where it is not of whole millimetres, or beyond 65.5 m.
     header : Header
         Stamp and frame.
     """
-    counts, _ = to_counts(depth, MILLIMETRES)
-    _write(bag, topic, "16UC1; compressedDepth", _DEPTH_HEADER + encode_png(counts), header)
+    counts = exact_counts(depth, MILLIMETRES)
+    if counts is None:
+        _write(bag, topic, "32FC1; tiff compressed ", _encode(".tiff", depth), header)
+    else:
+        _write(bag, topic, "16UC1; compressedDepth", _DEPTH_HEADER + encode_png(counts), header)
+
+
+def _encode(suffix: str, pixels: NDArray[Any]) -> bytes:
+    is_encoded, data = cv2.imencode(suffix, pixels)
+    if not is_encoded:
+        raise RecordingError(
+            f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
+        )
+    return data.tobytes()
 
 
 def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -> None:

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.outputs.bag_writer import convert
 from gvo.outputs.conversion import Conversion
 from gvo.outputs.folder_writer import Layout, write_folder
 from gvo.sources.bag import BagSource
+from gvo.sources.opening import BAG_SUFFIXES
 from gvo.sources.recording import Source
 
 
@@ -21,6 +23,7 @@ def convert_recording(
     layout: Literal["bag"] | Layout | None = None,
     rectify: bool = False,
     compress: bool = False,
+    config: Config | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Conversion:
     """Write a recording as a bag or as a data-set folder.
@@ -38,13 +41,20 @@ def convert_recording(
         Write raw images rectified and grey, as the frames hold them.
     compress : bool
         Write the images of a bag as PNG; those of data sets are.
+    config : Config, optional
+        Of which `sync` matters, for the pairs of a KITTI folder.
     progress : callable, optional
         Called with the number of images written so far.
+
+    Returns
+    -------
+    Conversion
 
     Raises
     ------
     RecordingError
-        When the path exists or cannot be written, or the layout does not fit.
+        When the path exists or cannot be written, the layout does not fit, or no image can be
+        read.
     """
     path = Path(path)
     is_folder = (
@@ -52,7 +62,18 @@ def convert_recording(
     )
     if not is_folder:
         return convert(source, path, rectify=rectify, compress=compress, progress=progress)
+    if path.suffix in BAG_SUFFIXES:
+        raise RecordingError(
+            f"{path}: --layout {layout} makes a folder, expected no name of a bag; leave "
+            f"{path.suffix} away, or --layout"
+        )
     if compress:
         raise RecordingError(f"{path}: --png is for bags; the images of data sets are PNG anyway")
-    chosen: Layout | None = None if layout is None or layout == "bag" else layout
-    return write_folder(source, path, layout=chosen, rectify=rectify, progress=progress)
+    return write_folder(
+        source,
+        path,
+        layout=None if layout == "bag" else layout,
+        rectify=rectify,
+        config=config,
+        progress=progress,
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.sources.pixels import depth_from_counts
 from gvo.types import DepthArray
 
 MILLIMETRES = 1000.0
@@ -56,3 +57,18 @@ def to_counts(depth: DepthArray, scale: float) -> tuple[NDArray[np.uint16], int]
     is_far = counts > MAX_COUNT
     counts[is_far] = 0
     return counts.astype(np.uint16), int(np.count_nonzero(is_far))
+
+
+def exact_counts(depth: DepthArray, scale: float) -> NDArray[np.uint16] | None:
+    """Return counts from which the depth comes back bit by bit; None where there are none.
+
+    Parameters
+    ----------
+    depth : ndarray of float32, shape (h, w)
+        Metres, NaN = unknown.
+    scale : float
+        Counts per metre.
+    """
+    counts, _ = to_counts(depth, scale)
+    is_exact = np.array_equal(depth_from_counts(counts, scale, "depth"), depth, equal_nan=True)
+    return counts if is_exact else None

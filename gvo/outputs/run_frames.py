@@ -30,6 +30,7 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.outputs.bag_messages import FramePose
+from gvo.sources.tf_paths import bare
 from gvo.types import Estimate, FloatArray
 
 ESTIMATES: Final = ("raw", "causal", "smoothed")
@@ -74,11 +75,11 @@ class RunFrames:
 
     def __post_init__(self) -> None:
         """Choose names where none are given; tf refuses a leading slash."""
-        camera = self.camera.strip("/") or "camera_optical"
+        camera = bare(self.camera) or "camera_optical"
         names = {
-            "world": self.world.strip("/"),
+            "world": bare(self.world),
             "camera": camera,
-            "tracked": self.tracked.strip("/") or camera,
+            "tracked": bare(self.tracked) or camera,
         }
         for key, name in names.items():
             object.__setattr__(self, key, name)

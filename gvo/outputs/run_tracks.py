@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.outputs.bag_messages import pose_numbers
 from gvo.types import Estimate, FloatArray, IntArray
+
+_N_NUMBERS = 7
 
 
 class StampedPose(NamedTuple):
@@ -32,7 +35,7 @@ class Twist(NamedTuple):
 
 
 class Track:
-    """The poses of one estimate so far, 64 bytes each."""
+    """The poses of one estimate so far, 64 bytes each, in the order of their stamps."""
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
@@ -43,35 +46,33 @@ class Track:
 
     def add(self, estimate: Estimate) -> None:
         """Take the next pose, in any order of stamps."""
-        self._stamps_ns.append(estimate.stamp_ns)
-        self._poses.extend(pose_numbers(estimate.T_world_cam).tolist())
+        index = bisect_right(self._stamps_ns, estimate.stamp_ns)
+        self._stamps_ns.insert(index, estimate.stamp_ns)
+        numbers = pose_numbers(estimate.T_world_cam).tolist()
+        self._poses[_N_NUMBERS * index : _N_NUMBERS * index] = array("d", numbers)
 
     def before(self, stamp_ns: int) -> StampedPose | None:
         """Return stamp and pose (4, 4) of the latest pose before a stamp."""
-        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
-        earlier = np.flatnonzero(stamps_ns < stamp_ns)
-        if len(earlier) == 0:
+        index = bisect_left(self._stamps_ns, stamp_ns) - 1
+        if index < 0:
             return None
-        index = int(earlier[np.argmax(stamps_ns[earlier])])
-        numbers = np.array(self._poses[7 * index : 7 * index + 7])
+        numbers = np.array(self._poses[_N_NUMBERS * index : _N_NUMBERS * (index + 1)])
         R = np.asarray(Rotation.from_quat(numbers[3:]).as_matrix())
-        return StampedPose(int(stamps_ns[index]), se3.make_transform(R, numbers[:3]))
+        return StampedPose(self._stamps_ns[index], se3.make_transform(R, numbers[:3]))
 
     def poses(self, n_most: int | None = None) -> tuple[IntArray, FloatArray]:
-        """Return stamps (n,) and positions with quaternions (n, 7), in order of the stamps.
+        """Return stamps (n,) and positions with quaternions (n, 7).
 
         Of more than `n_most`, every second, fourth, ... and the last are taken: those shown stay
         the same while the track grows.
         """
-        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
-        order = np.argsort(stamps_ns)
         stride = 1
-        while n_most is not None and stride * (n_most - 1) < len(order) > n_most:
+        while n_most is not None and stride * (n_most - 1) < len(self) > n_most:
             stride *= 2
-        is_shown = np.arange(len(order)) % stride == 0
+        is_shown = np.arange(len(self)) % stride == 0
         is_shown[-1:] = True
-        order = order[is_shown]
-        return stamps_ns[order], np.array(self._poses).reshape(-1, 7)[order]
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        return stamps_ns[is_shown], np.array(self._poses).reshape(-1, _N_NUMBERS)[is_shown]
 
 
 def twist_between(

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.sources.bag_calibration import calibrations_of_file, calibrations_of_messages
+from gvo.sources.bag_cameras import camera_info_changes
 from gvo.sources.bag_reader import BagMessage, BagReader
 from gvo.sources.calibration_files import CalibrationPaths, paths_of
+from gvo.sources.ground_truth import TRUTH_FRAMES
 from gvo.sources.messages import (
     decode_compressed,
     decode_compressed_depth,
@@ -24,7 +26,14 @@ from gvo.sources.messages import (
 from gvo.sources.pixels import GreyRange
 from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.sources.tf import TfBuffer, read_tf
-from gvo.sources.topics import COMPRESSED_TYPE, CameraTopics, Topic, TopicChoice, choose_topics
+from gvo.sources.topics import (
+    COMPRESSED_TYPE,
+    CameraTopics,
+    Topic,
+    TopicChoice,
+    choose_topics,
+    find_camera_info,
+)
 from gvo.sources.truth_frames import FramedTruth, find_framed_truth
 from gvo.sources.truth_specs import BagTruthSpec
 from gvo.trajectory import Trajectory
@@ -50,6 +59,8 @@ class BagSource:
 
     Raises
     ------
+    ValueError
+        Where there is no path.
     RecordingError, CalibrationError
         When the bag cannot be read, or holds no camera or no calibration.
     """
@@ -64,8 +75,9 @@ class BagSource:
     ) -> None:
         config = config or Config()
         paths = [paths] if isinstance(paths, Path) else list(paths)
-        self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self._reader = BagReader(paths)
+        self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        self._tf: TfBuffer | None = None
         self._topics = self._choose_topics(topics or TopicChoice())
         if paths_of(calibration):
             found = calibrations_of_file(calibration, self._topics, self._reader)
@@ -135,7 +147,21 @@ class BagSource:
         RecordingError
             When the bag cannot be read.
         """
-        return read_tf(self._reader, frames=frames)
+        if self._tf is None:
+            self._tf = read_tf(self._reader, frames=frames)
+        return self._tf if self._tf.is_whole else read_tf(self._reader, frames=frames)
+
+    def camera_info_changes(self) -> dict[str, int]:
+        """Count, by topic, the `CameraInfo` that differ from the first one, which is used.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read.
+        """
+        topics = (self._topics.first, self._topics.second)
+        names = [find_camera_info(topic, self._reader.topics) for topic in topics]
+        return camera_info_changes(self._reader, [name for name in names if name])
 
     def truth(
         self,
@@ -165,9 +191,11 @@ class BagSource:
         RecordingError
             When the bag does not hold what was asked for.
         """
+        whole = self.transforms((TRUTH_FRAMES.parent, TRUTH_FRAMES.child))
         return find_framed_truth(
             self._reader,
             spec,
+            buffer=whole if whole.is_whole else None,
             where=self._where,
             frame=frame,
             camera_frame=self._info.frame_id,

@@ -19,6 +19,7 @@ from gvo.sources.messages import (
     decode_compressed_depth,
     stamp_of,
 )
+from gvo.sources.tf_paths import bare
 from gvo.sources.topics import (
     IMAGE_TYPE,
     CameraTopics,
@@ -138,10 +139,8 @@ def camera_info_changes(reader: BagReader, names: Collection[str]) -> dict[str, 
 
 def image_frame(reader: BagReader, image: Topic) -> str:
     """Return the frame that the first image of a topic names; empty where none does."""
-    for message in reader.messages([image.name]):
-        with suppress(RecordingError):
-            return str(message.decode().header.frame_id).strip("/")
-    return ""
+    message = _first_messages(reader, {image.name}).get(image.name)
+    return "" if message is None else bare(str(message.header.frame_id))
 
 
 def recorded_depth_scale(reader: BagReader, depth: Topic) -> float | None:
@@ -202,12 +201,10 @@ def _image_size(reader: BagReader, image: Topic, where: str) -> tuple[int, int]:
             content = message.decode()
             if image.type == IMAGE_TYPE:
                 return int(content.width), int(content.height)
-            is_depth = "compressedDepth" in content.format
-            height, width = (
-                decode_compressed_depth(content, 1.0, image.name).shape[:2]
-                if is_depth
-                else decode_compressed(content, image.name).shape[:2]
-            )
+            if "compressedDepth" in content.format:
+                height, width = decode_compressed_depth(content, 1.0, image.name).shape
+            else:
+                height, width = decode_compressed(content, image.name).shape[:2]
             return width, height
     raise CalibrationError(
         f"{where}: the CameraInfo of {image.name} leaves width and height 0, and none of its "

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.sources.bag_cameras import BagCamera
-from gvo.sources.bag_reader import BagReader
+from gvo.sources.bag_reader import BagMessage, BagReader
+from gvo.sources.messages import transform_of
 from gvo.sources.tf import TfBuffer, read_tf
 from gvo.types import Failure, FloatArray
 
 TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 
-_NORM_TOLERANCE = 1e-2
 # The topics of one stream of a bag that librealsense wrote.
 _REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/image/data")
 
@@ -96,7 +94,7 @@ def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Ex
     names = [f"{stream[1]}/tf/{common[0]}" for stream in streams if stream is not None]
     T_stream_reference = {}
     for message in reader.messages(names):
-        T_stream_reference[message.topic.name] = _transform(message.decode(), message.topic.name)
+        T_stream_reference[message.topic.name] = _transform(message)
     if len(T_stream_reference) != len(set(names)):
         return Failure(reason=f"{names[0]} or {names[1]} yields no message")
     T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)
@@ -113,10 +111,11 @@ def _references(reader: BagReader, stream: str) -> set[str]:
     }
 
 
-def _transform(message: Any, name: str) -> FloatArray:  # noqa: ANN401 - geometry_msgs/Transform
-    t = np.array([getattr(message.translation, axis) for axis in "xyz"], dtype=np.float64)
-    quaternion_xyzw = np.array([getattr(message.rotation, axis) for axis in "xyzw"])
-    norm = np.linalg.norm(quaternion_xyzw)
-    if not np.all(np.isfinite(t)) or not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        raise RecordingError(f"{name}: holds no transform; give --calibration FILE")
-    return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
+def _transform(message: BagMessage) -> FloatArray:
+    content = message.decode()
+    T = transform_of(content.translation, content.rotation)
+    if isinstance(T, Failure):
+        raise RecordingError(
+            f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
+        )
+    return T

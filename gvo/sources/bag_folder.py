@@ -48,7 +48,7 @@ def find_files(folder: Path) -> FolderFiles:
     RecordingError
         When there is none.
     """
-    held = sorted(path for path in folder.iterdir() if _is_storage(path))
+    held = sorted(path for path in folder.iterdir() if is_storage(path))
     has_metadata = (folder / "metadata.yaml").is_file()
     if not held and not has_metadata:
         raise RecordingError(f"{folder}: holds neither metadata.yaml nor a .mcap or .db3")
@@ -107,7 +107,8 @@ def unpack(path: Path, folder: Path) -> tuple[Path, str]:
     return target, f"{path}: is cut or damaged ({reason}); copy it anew" if reason else ""
 
 
-def _is_storage(path: Path) -> bool:
+def is_storage(path: Path) -> bool:
+    """Tell whether a path is a file of ROS 2, by its name, compressed or not."""
     return path.is_file() and path.name.removesuffix(_COMPRESSED).endswith(STORAGE_SUFFIXES)
 
 
@@ -121,7 +122,9 @@ def _find(name: str, held: list[Path]) -> Path | None:
 def _listed_files(metadata: Path) -> dict[str, str]:
     """Return the names of the files, and for each what is known of its size, as text."""
     try:
-        content = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+        content = yaml.safe_load(metadata.read_text(encoding="utf-8"))[
+            "rosbag2_bagfile_information"
+        ]
         names = [PurePath(name).name for name in content["relative_file_paths"]]
         files = {
             PurePath(file["path"]).name: f" ({file['message_count']} messages)"

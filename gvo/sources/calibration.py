@@ -9,13 +9,11 @@ from gvo.errors import CalibrationError
 from gvo.geometry.camera import Calibration
 from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
 from gvo.sources.camera_fields import CameraFields, read_numbers, shortened
+from gvo.sources.image_headers import MAX_PIXELS
 from gvo.types import FloatArray
 
 MAX_SIDE_PX = 32767
 """Largest width or height of an image, pixels: what OpenCV rectifies."""
-
-MAX_AREA_PX = 100_000_000
-"""Most pixels of an image: more is a damaged number, and would not fit into memory."""
 
 _ROTATION_TOLERANCE = 1e-3
 
@@ -143,13 +141,13 @@ def check_camera(calibration: Calibration, where: str) -> None:
     ------
     CalibrationError
         When a focal length or the image size is not positive, or the image is larger than
-        `MAX_SIDE_PX` or `MAX_AREA_PX`.
+        `MAX_SIDE_PX` a side, or `MAX_PIXELS`.
     """
     width, height = calibration.width, calibration.height
-    if max(width, height) > MAX_SIDE_PX or width * height > MAX_AREA_PX:
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
         raise CalibrationError(
             f"{where}: the image size must be at most {MAX_SIDE_PX} px a side and "
-            f"{MAX_AREA_PX // 10**6} megapixels, got {width}x{height}; mend the calibration"
+            f"{MAX_PIXELS // 10**6} megapixels, got {width}x{height}; mend the calibration"
         )
     try:
         calibration.pinhole()

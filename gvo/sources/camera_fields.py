@@ -53,7 +53,7 @@ class CameraFields:
     roi : RegionOfInterest
         What was cut out.
     frame_id : str
-        Of the camera in `/tf`, without slashes outside; empty where not known.
+        Of the camera in `/tf`, without a leading slash; empty where not known.
     is_distorted_by_zeros : bool
         D of zeros is meant: for `equidistant` no pinhole. Otherwise it says "no distortion".
     """

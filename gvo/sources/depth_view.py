@@ -17,8 +17,8 @@ from gvo.sources.recording import DepthView
 from gvo.types import Failure
 
 _REGISTERED = re.compile(r"(?<!un)(aligned|registered)")
+# Of the focal length and of the image size: calibrations of one camera differ by less.
 _TOLERANCE = 0.02
-"""Of the focal length and of the image size: calibrations of one camera differ by less."""
 _SAME_PLACE_M = 1e-6
 _SAME_PIXEL_PX = 0.5
 _REMEDY = "give a topic of depth registered to colour by --depth"

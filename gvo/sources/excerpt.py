@@ -12,7 +12,7 @@ from gvo.sources.sync import Pair
 from gvo.types import FaultyFrame
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Excerpt:
     """Which frames of a recording are wanted; all of them by default.
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.config import Config
+from gvo.config import Config, SyncConfig
 from gvo.errors import GvoError, RecordingError
 from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.sources.depth_registration import DepthRegistration
@@ -51,28 +51,49 @@ def frames(
     RecordingError
         When the recording cannot be read on; the frames before are yielded first.
     """
-    sensor = source.info.sensor
-    pairs = _paired(source, config, excerpt)
+    pairs = paired(source.images(), source.info.sensor, config.sync)
+    if excerpt is not None:
+        pairs = take_excerpt(pairs, excerpt)
     preparers = make_preparers(source.info)
     if config.runtime.threads == 1:
-        yield from _one_by_one(pairs, preparers, sensor)
+        yield from _one_by_one(pairs, preparers, source.info)
     else:
-        yield from _ahead(pairs, preparers, sensor)
+        yield from _ahead(pairs, preparers, source.info)
 
 
-def _paired(
-    source: Source, config: Config, excerpt: Excerpt | None
+def paired(
+    images: Iterable[StampedImage],
+    sensor: Sensor,
+    sync: SyncConfig,
+    *,
+    limit_ms: float | None = None,
 ) -> Iterator[Pair | FaultyFrame]:
-    """Decide which images make one frame."""
-    sensor = source.info.sensor
-    pairs = pair_images(
-        source.images(),
-        limit_ns=_limit_ns(sensor, config),
-        partner=_partner(sensor),
-        queue_size=config.sync.queue_size,
-        age_penalty=config.sync.age_penalty,
+    """Decide which images make one frame, see `pair_images`.
+
+    Parameters
+    ----------
+    images : iterable of StampedImage
+        Both streams, interleaved in any way.
+    sensor : {"stereo", "rgbd"}
+        Says which limit counts.
+    sync : SyncConfig
+    limit_ms : float, optional
+        Largest difference of the stamps of a pair, in place of the configured one.
+    """
+    key = pair_limit_key(sensor)
+    limit = float(getattr(sync, key)) if limit_ms is None else limit_ms
+    return pair_images(
+        images,
+        limit_ns=round(limit * 1e6),
+        partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
+        queue_size=sync.queue_size,
+        age_penalty=sync.age_penalty,
     )
-    return pairs if excerpt is None else take_excerpt(pairs, excerpt)
+
+
+def pair_limit_key(sensor: Sensor) -> str:
+    """Return the parameter of `sync` that says how far the stamps of a pair may differ, ms."""
+    return "stereo_tolerance_ms" if sensor == "stereo" else "max_difference_ms"
 
 
 class ImagePreparer:
@@ -158,7 +179,7 @@ class _Started:
     results: tuple[Future[NDArray[Any] | str], ...]
 
 
-def make_preparers(info: RecordingInfo) -> tuple[ImagePreparer, ImagePreparer]:
+def make_preparers(info: RecordingInfo) -> _Preparers:
     """Return what makes the raw images of both streams those of frames.
 
     Parameters
@@ -173,18 +194,18 @@ def make_preparers(info: RecordingInfo) -> tuple[ImagePreparer, ImagePreparer]:
 
 
 def _one_by_one(
-    items: Iterable[_Item], preparers: _Preparers, sensor: Sensor
+    items: Iterable[_Item], preparers: _Preparers, info: RecordingInfo
 ) -> Iterator[Frame | FaultyFrame]:
     for item in items:
         if isinstance(item, FaultyFrame):
             yield item
         else:
-            results = [_prepare(*job, sensor) for job in zip(item, preparers, strict=True)]
-            yield _make_frame(item, results, sensor)
+            results = [_prepare(*job, info) for job in zip(item, preparers, strict=True)]
+            yield _make_frame(item, results, info.sensor)
 
 
 def _ahead(
-    items: Iterator[_Item], preparers: _Preparers, sensor: Sensor
+    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo
 ) -> Iterator[Frame | FaultyFrame]:
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
         started: deque[_Started] = deque()
@@ -197,11 +218,11 @@ def _ahead(
             except GvoError as error:
                 fault = error  # what was read before it counts
             else:
-                started.append(_start(pool.submit, item, preparers, sensor))
+                started.append(_start(pool.submit, item, preparers, info))
                 if len(started) > _N_AHEAD:
-                    yield _finish(started.popleft(), sensor)
+                    yield _finish(started.popleft(), info.sensor)
         while started:
-            yield _finish(started.popleft(), sensor)
+            yield _finish(started.popleft(), info.sensor)
         if fault is not None:
             raise fault
 
@@ -210,12 +231,12 @@ def _start(
     submit: Callable[..., Future[NDArray[Any] | str]],
     item: _Item,
     preparers: _Preparers,
-    sensor: Sensor,
+    info: RecordingInfo,
 ) -> _Started:
     if isinstance(item, FaultyFrame):
         return _Started(item=item, results=())
     jobs = zip(item, preparers, strict=True)
-    return _Started(item=item, results=tuple(submit(_prepare, *job, sensor) for job in jobs))
+    return _Started(item=item, results=tuple(submit(_prepare, *job, info) for job in jobs))
 
 
 def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
@@ -224,13 +245,14 @@ def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
     return _make_frame(started.item, [result.result() for result in started.results], sensor)
 
 
-def _prepare(image: StampedImage, preparer: ImagePreparer, sensor: Sensor) -> NDArray[Any] | str:
+def _prepare(
+    image: StampedImage, preparer: ImagePreparer, info: RecordingInfo
+) -> NDArray[Any] | str:
     """Return the prepared image, or one line on what is wrong with it."""
     try:
         return preparer(image.load())
     except RecordingError as error:
-        name = ("left", "right") if sensor == "stereo" else ("colour", "depth")
-        return f"{name[image.stream]} image: {error}"
+        return f"{info.stream_names[image.stream]} image: {error}"
 
 
 def _make_frame(
@@ -244,19 +266,6 @@ def _make_frame(
     if sensor == "stereo":
         return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
     return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
-
-
-def _limit_ns(sensor: Sensor, config: Config) -> int:
-    sync = config.sync
-    limit_ms = sync.stereo_tolerance_ms if sensor == "stereo" else sync.max_difference_ms
-    return round(limit_ms * 1e6)
-
-
-def _partner(sensor: Sensor) -> str:
-    """Name the partner, and the parameter that says how far away its stamp may be."""
-    if sensor == "stereo":
-        return "right image within sync.stereo_tolerance_ms"
-    return "depth image within sync.max_difference_ms"
 
 
 def _size_text(shape: tuple[int, ...]) -> str:

@@ -10,7 +10,7 @@ from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.sources.calibration import check_camera
-from gvo.sources.calibration_files import CalibrationPaths, paths_of, read_cameras
+from gvo.sources.calibration_files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.sources.folders import FolderSource, StampedPath, first_image_size
 from gvo.sources.pixels import FULL_RANGE, GreyRange
 from gvo.sources.recording import RecordingInfo
@@ -61,22 +61,20 @@ class KittiSource(FolderSource):
         ]
         names = _find_pair(folder)
         left, right = (self._list_images(name) for name in names)
-        explicit = paths_of(calibration)
-        files = explicit or (folder / "calib.txt",)
-        origin, T_body_cam = " + ".join(str(file) for file in files), None
-        if explicit:
+        files = paths_of(calibration)
+        if files:
             cameras = read_cameras(files, sensor="stereo", is_rectified=True)
-            calibrations, T_body_cam = cameras.pair, cameras.T_body_cam
         else:
+            files = (folder / "calib.txt",)
             paths = [path for _, path in left]
             size = first_image_size(paths, folder / names[0], grey_range)
-            calibrations = _read_calibrations(files[0], names, size)
-        self._t_cam0_cam = _camera_offset(calibrations[0])
-        state = "rectified" if calibrations[0].is_rectified else "raw"
+            cameras = _read_cameras(files[0], names, size)
+        self._t_cam0_cam = _camera_offset(cameras.calibrations[0])
+        state = "rectified" if cameras.calibrations[0].is_rectified else "raw"
         decisions = [
             f"stereo: {names[0]} + {names[1]} ({len(left)} + {len(right)} images)",
             f"calibration: {' + '.join(file.name for file in files)}, {state}",
-            f"baseline: {stereo_baseline(calibrations, origin):.4f} m",
+            f"baseline: {stereo_baseline(cameras.pair, cameras.origin):.4f} m",
         ]
         n_missing = len(self._stamps_ns) - len(left)
         if n_missing:
@@ -84,10 +82,10 @@ class KittiSource(FolderSource):
         info = RecordingInfo(
             name=folder.resolve().name,
             sensor="stereo",
-            calibrations=calibrations,
+            calibrations=cameras.calibrations,
             n_images=len(left),
             decisions=decisions,
-            T_body_cam=T_body_cam,
+            T_body_cam=cameras.T_body_cam,
         )
         super().__init__(info, left, right, grey_range=grey_range)
 
@@ -146,12 +144,10 @@ def _find_pair(folder: Path) -> tuple[str, str]:
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
 
 
-def _read_calibrations(
-    path: Path, names: tuple[str, str], size: tuple[int, int]
-) -> tuple[Calibration, Calibration]:
+def _read_cameras(path: Path, names: tuple[str, str], size: tuple[int, int]) -> CameraSet:
     projections = _read_projections(path)
-    left, right = (_rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names)
-    return left, right
+    cameras = (_rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names)
+    return CameraSet(calibrations=tuple(cameras), origin=str(path))
 
 
 def _read_projections(path: Path) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""ROS messages of images and calibrations, decoded."""
+"""ROS messages of images, calibrations and transforms, decoded."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from gvo.geometry import se3
 from gvo.sources.camera_fields import CameraFields, RegionOfInterest
 from gvo.sources.encodings import (
     BAYER,
@@ -29,8 +31,10 @@ from gvo.sources.pixels import (
     to_8_bit,
 )
 from gvo.sources.rvl import decode_rvl
-from gvo.types import DepthArray, FloatArray, ImageArray
+from gvo.sources.tf_paths import bare
+from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
+_NORM_TOLERANCE = 1e-2  # of quaternions
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
 
@@ -71,6 +75,31 @@ def stamp_of(header: HeaderMessage) -> int:
         Of ROS 1 or ROS 2.
     """
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401
+    """Return the matrix of a transform or pose, shape (4, 4).
+
+    Parameters
+    ----------
+    translation : geometry_msgs/Vector3 or geometry_msgs/Point
+        Metres.
+    rotation : geometry_msgs/Quaternion
+        Of length one, up to a hundredth.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4), or Failure
+        The failure says what is wrong with the numbers.
+    """
+    t = np.array([getattr(translation, axis) for axis in "xyz"], dtype=np.float64)
+    quaternion_xyzw = np.array([getattr(rotation, axis) for axis in "xyzw"])
+    if not np.all(np.isfinite(t)):
+        return Failure(reason="the position is not finite")
+    norm = float(np.linalg.norm(quaternion_xyzw))
+    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        return Failure(reason=f"the quaternion has the norm {norm:.3g}, expected 1")
+    return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
 
 
 def decode_grey_or_color(
@@ -236,7 +265,7 @@ def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - R
             width=int(message.roi.width),
             height=int(message.roi.height),
         ),
-        frame_id=str(message.header.frame_id).strip("/"),
+        frame_id=bare(str(message.header.frame_id)),
     )
 
 

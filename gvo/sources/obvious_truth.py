@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.ground_truth import TRUTH_FRAMES, TRUTH_TYPES, BagTruth, read_bag_truth
-from gvo.sources.tf import TfBuffer
+from gvo.sources.tf import TfBuffer, read_tf
 from gvo.sources.topics import Topic
 from gvo.sources.truth_specs import TopicTruth
 from gvo.types import Failure
@@ -39,14 +39,16 @@ def is_named_truth(topic: str) -> bool:
     return _IS_TRUTH.search(topic.lower()) is not None
 
 
-def find_obvious_truth(reader: BagReader, buffer: TfBuffer, *, where: str) -> BagTruth | Failure:
+def find_obvious_truth(
+    reader: BagReader, buffer: TfBuffer | None = None, *, where: str
+) -> BagTruth | Failure:
     """Find the ground truth that names itself: `world` -> `ground_truth` in tf, or one topic.
 
     Parameters
     ----------
     reader : BagReader
-    buffer : TfBuffer
-        Of the bag.
+    buffer : TfBuffer, optional
+        Of the bag; read from it where omitted.
     where : str
         The bag, for messages.
 
@@ -60,7 +62,9 @@ def find_obvious_truth(reader: BagReader, buffer: TfBuffer, *, where: str) -> Ba
     RecordingError
         When the bag cannot be read on, or what names itself truth holds no pose.
     """
-    if len(buffer.edge_stamps_ns(TRUTH_FRAMES.parent, TRUTH_FRAMES.child)):
+    frames = (TRUTH_FRAMES.parent, TRUTH_FRAMES.child)
+    buffer = read_tf(reader, frames=frames) if buffer is None else buffer
+    if len(buffer.edge_stamps_ns(*frames)):
         return read_bag_truth(reader, TRUTH_FRAMES, where=where, buffer=buffer)
     candidates = truth_topics(reader.topics)
     if not candidates:

@@ -9,6 +9,8 @@ from pathlib import Path
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.sources.bag import BagSource
+from gvo.sources.bag_folder import STORAGE_SUFFIXES, is_storage
+from gvo.sources.calibration_files import CalibrationPaths
 from gvo.sources.euroc import EurocSource
 from gvo.sources.kitti import KittiSource
 from gvo.sources.pixels import GreyRange
@@ -16,7 +18,7 @@ from gvo.sources.recording import Source
 from gvo.sources.topics import TopicChoice
 from gvo.sources.tum import TumSource
 
-BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+BAG_SUFFIXES = (".bag", *STORAGE_SUFFIXES)
 _KINDS = (
     "a recording is a .bag, .mcap or .db3 file, a ROS 2 bag folder (metadata.yaml), or a folder "
     "of KITTI odometry (calib.txt), EuRoC (mav0 or cam0) or TUM RGB-D (rgb.txt)"
@@ -30,7 +32,7 @@ class RecordingOptions:
 
     Parameters
     ----------
-    calibration : sequence of Path
+    calibration : Path or sequence of Path
         Files that replace the recording's own calibration: one or two, or a folder.
     left, right : str, optional
         Topics of a stereo pair in a bag.
@@ -38,7 +40,7 @@ class RecordingOptions:
         Topics of an RGB-D camera in a bag.
     """
 
-    calibration: Sequence[Path] = ()
+    calibration: CalibrationPaths = None
     left: str | None = None
     right: str | None = None
     color: str | None = None
@@ -64,12 +66,16 @@ def open_recording(
 
     Raises
     ------
+    ValueError
+        Where there is no path.
     RecordingError
         When a path is missing or holds no recording, or does not hold what is needed.
     CalibrationError
         When the camera is not calibrated.
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(one) for one in path]
+    if not paths:
+        raise ValueError("expected at least one path of a recording")
     config = config or Config()
     options = options or RecordingOptions()
     for one in paths:
@@ -89,10 +95,8 @@ def open_recording(
 def is_bag(path: Path) -> bool:
     """Tell whether a path that exists is a bag of ROS, by its name or by what it holds."""
     if path.is_file():
-        return path.suffix in BAG_SUFFIXES
-    return (path / "metadata.yaml").is_file() or any(
-        child.suffix in (".mcap", ".db3") for child in path.iterdir()
-    )
+        return path.suffix == ".bag" or is_storage(path)
+    return (path / "metadata.yaml").is_file() or any(map(is_storage, path.iterdir()))
 
 
 def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:

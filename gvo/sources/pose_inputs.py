@@ -5,14 +5,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gvo.errors import RecordingError
 from gvo.sources.bag_reader import BagReader
-from gvo.sources.ground_truth import TRUTH_FRAMES, TRUTH_TYPES, BagTruth, read_bag_truth
+from gvo.sources.ground_truth import TRUTH_TYPES, BagTruth, read_bag_truth
 from gvo.sources.obvious_truth import find_obvious_truth
-from gvo.sources.opening import BAG_SUFFIXES
+from gvo.sources.opening import is_bag
 from gvo.sources.tf import read_tf
 from gvo.sources.truth_frames import in_frame
 from gvo.sources.truth_specs import parse_bag_truth
@@ -21,6 +22,8 @@ from gvo.trajectory_files import read_trajectory
 from gvo.types import Failure
 
 _MARK = "#"
+# The frames of a run's bag are those of the robot under names of their own.
+_OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed)/")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,9 +52,9 @@ class PoseInput:
 
 
 def is_in_bag(text: str) -> bool:
-    """Tell whether the text is `BAG#WHAT`, or the file of a bag. A file of that name wins."""
+    """Tell whether the text is `BAG#WHAT`, or a bag. A file or folder of that name wins."""
     if Path(text).exists():
-        return Path(text).is_file() and Path(text).suffix in BAG_SUFFIXES
+        return is_bag(Path(text))
     path, mark, _ = text.partition(_MARK)
     return bool(mark) and Path(path).exists()
 
@@ -99,11 +102,12 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     found = PoseInput(
         name=what or Path(path).stem,
         trajectory=truth.trajectory,
-        child_frame=truth.child_frame,
+        # what is named ground truth is of the camera, whatever frame it has
+        child_frame="" if truth.is_of_camera else _OWN_FRAME.sub("", truth.child_frame),
         decision=truth.decision,
         warning=reader.damage,
     )
-    if not frame or truth.child_frame in ("", frame):
+    if not frame or found.child_frame in ("", frame):
         return found
     return _brought(found, truth, reader, frame)
 
@@ -111,8 +115,7 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
 def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     if what:
         return read_bag_truth(reader, parse_bag_truth(what), where=path)
-    tree = read_tf(reader, frames=(TRUTH_FRAMES.parent, TRUTH_FRAMES.child))
-    truth = find_obvious_truth(reader, tree, where=path)
+    truth = find_obvious_truth(reader, where=path)
     if not isinstance(truth, Failure):
         return truth
     held = [f"{path}{_MARK}{topic.name}" for topic in reader.topics if topic.type in TRUTH_TYPES]

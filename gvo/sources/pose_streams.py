@@ -55,7 +55,7 @@ class PoseStream(Protocol):
         What was decided in reading it.
     n_poses : int
         How many may come.
-    stamps_from : {"file", "times", "rows"}
+    stamps_from : {"file", "times", "rows", "topic"}
         As of `Trajectory`.
     """
 

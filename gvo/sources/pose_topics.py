@@ -7,25 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.edges import InputFaults
-from gvo.sources.messages import stamp_of
+from gvo.sources.messages import stamp_of, transform_of
 from gvo.sources.pose_streams import PoseSample
-from gvo.sources.topics import Topic
+from gvo.sources.tf_paths import bare
+from gvo.sources.topics import Topic, describe_topics, find_topic
 from gvo.trajectory import StampsFrom
-from gvo.types import FloatArray
+from gvo.types import Failure, FloatArray
 
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
 _COVARIANCE_TYPES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 POSE_TYPES = (*_COVARIANCE_TYPES, "geometry_msgs/msg/PoseStamped", _TRANSFORM_TYPE)
 """Message types that hold a pose of a stamp; the last two without a covariance."""
-
-_NORM_TOLERANCE = 1e-2
 
 
 class TopicStream:
@@ -40,7 +38,7 @@ class TopicStream:
     Attributes
     ----------
     parent_frame, child_frame : str
-        As the first pose names them, without leading slashes: T_parent_child is the pose. Empty
+        As the first pose names them, without a leading slash: T_parent_child is the pose. Empty
         before it is read; the child also where the type names none.
     """
 
@@ -50,7 +48,7 @@ class TopicStream:
         self.name = topic.name
         self.decisions = [f"{topic.name}: {topic.type}, {topic.n_messages} messages"]
         self.n_poses = topic.n_messages
-        self.stamps_from: StampsFrom = "file"
+        self.stamps_from: StampsFrom = "topic"
         self.parent_frame = ""
         self.child_frame = ""
         self._has_frames = False
@@ -85,7 +83,7 @@ class TopicStream:
     def _is_of_the_frames(self, message: Any, faults: InputFaults) -> bool:  # noqa: ANN401
         """Tell whether a message is of the frames that the first one is of."""
         names = (message.header.frame_id, getattr(message, "child_frame_id", ""))
-        parent, child = (name.strip("/") for name in names)
+        parent, child = map(bare, names)
         if not self._has_frames:
             self.parent_frame, self.child_frame, self._has_frames = parent, child, True
         is_same = (parent, child) == (self.parent_frame, self.child_frame)
@@ -129,36 +127,29 @@ def find_topics(
         raise RecordingError(f"{where}: holds no poses; expected a topic of {', '.join(types)}")
     raise RecordingError(
         f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
-        f"several: {_list(found)}"
+        f"several: {describe_topics(found)}"
     )
 
 
 def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
-    for topic in topics:
-        if topic.name.strip("/") == name.strip("/"):
-            return topic
-    held = _list(topics) if topics else "none"
-    raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
-
-
-def _list(topics: Sequence[Topic]) -> str:
-    return ", ".join(f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics)
+    topic = find_topic(name, topics)
+    if topic is None:
+        held = describe_topics(topics) or "none"
+        raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
+    return topic
 
 
 def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at run time
     stamp_ns = stamp_of(message.header)
     has_covariance = topic.type in _COVARIANCE_TYPES
     position, orientation = _parts(message, topic.type)
-    t = np.array([getattr(position, axis) for axis in "xyz"], dtype=np.float64)
-    quaternion_xyzw = np.array([getattr(orientation, axis) for axis in "xyzw"])
-    norm = np.linalg.norm(quaternion_xyzw)
-    if not np.isfinite(t).all() or not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        raise RecordingError(f"{topic.name} at {stamp_ns} ns: the pose is no transform")
-    R = np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix())
+    T = transform_of(position, orientation)
+    if isinstance(T, Failure):
+        raise RecordingError(f"{topic.name} at {stamp_ns} ns: the pose is no transform: {T.reason}")
     return PoseSample(
         stamp_ns=stamp_ns,
-        T_world_frame=se3.make_transform(R, t),
-        covariance=_covariance(message.pose.covariance, R) if has_covariance else None,
+        T_world_frame=T,
+        covariance=_covariance(message.pose.covariance, T[:3, :3]) if has_covariance else None,
     )
 
 

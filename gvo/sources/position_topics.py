@@ -12,6 +12,7 @@ from gvo.sources.bag_reader import BagReader
 from gvo.sources.edges import InputFaults
 from gvo.sources.geodesy import local_enu
 from gvo.sources.messages import stamp_of
+from gvo.sources.tf_paths import bare
 from gvo.sources.topics import Topic
 from gvo.types import FloatArray, IntArray
 
@@ -77,7 +78,7 @@ def read_positions(reader: BagReader, topic: Topic, faults: InputFaults) -> Posi
             faults.add("messages hold no position and were skipped", str(error))
             continue
         if frame is None:  # the first one's counts: neither fixes nor points change theirs
-            frame = content.header.frame_id.strip("/")
+            frame = bare(content.header.frame_id)
     if frame is None:
         reason = "; ".join(faults.warnings()) or f"none of {topic.n_messages} messages is there"
         raise RecordingError(f"{topic.name}: holds no position: {reason}")

@@ -92,6 +92,11 @@ class RecordingInfo:
     T_body_cam: FloatArray | None = None
 
     @property
+    def stream_names(self) -> tuple[str, str]:
+        """What stream 0 and 1 are called in messages."""
+        return ("left", "right") if self.sensor == "stereo" else ("colour", "depth")
+
+    @property
     def camera(self) -> StereoCamera | PinholeCamera:
         """The camera of the rectified frames."""
         if self.sensor == "stereo":

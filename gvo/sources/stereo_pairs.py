@@ -13,10 +13,10 @@ from gvo.sources.calibration import check_camera
 from gvo.types import FloatArray
 
 _MAX_ANGLE_RAD = 1e-3
+# How far the baseline of rectified cameras may lean, by the rounding of tf, as a tangent.
 _MAX_SLOPE = 0.01
-"""How far the baseline of rectified cameras may lean, by the rounding of tf, as a tangent."""
+# Up to here two cameras are one: what is left moves no pixel by a tenth.
 _ALIKE = 1e-5
-"""Up to here two cameras are one: what is left moves no pixel by a tenth."""
 
 
 def has_baseline(left: Calibration, right: Calibration) -> bool:

@@ -58,6 +58,11 @@ class TfBuffer:
         return self._n_moving + len(self._static)
 
     @property
+    def is_whole(self) -> bool:
+        """Tell whether no transform was left out by `keep`."""
+        return self._kept is None
+
+    @property
     def frames(self) -> tuple[str, ...]:
         """Names of all frames, sorted, without leading slashes."""
         return tuple(sorted(self._names))

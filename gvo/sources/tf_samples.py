@@ -26,16 +26,14 @@ class Samples:
         Translation, metres, and quaternion (x, y, z, w) of T_parent_child.
     parents : ndarray of int64, shape (n,)
         Numbers of the parent frames.
+    changes_parent : bool
+        Whether the child hangs on more than one parent over time.
     """
 
     stamps_ns: IntArray
     poses: FloatArray
     parents: IntArray
-
-    @property
-    def changes_parent(self) -> bool:
-        """Whether the child hangs on more than one parent over time."""
-        return bool(np.any(self.parents[1:] != self.parents[:-1]))
+    changes_parent: bool
 
     def parents_at(self, stamps_ns: IntArray) -> IntArray:
         """Return the parent at stamps (m,); outside of the known range that of its end."""
@@ -80,6 +78,7 @@ class SampleLog:
             stamps_ns=np.empty(0, dtype=np.int64),
             poses=np.empty((0, _N_NUMBERS)),
             parents=np.empty(0, dtype=np.int32),
+            changes_parent=False,
         )
         self._clear_tail()
 
@@ -117,7 +116,13 @@ def _sorted(stamps_ns: IntArray, poses: FloatArray, parents: IntArray) -> Sample
         is_last = np.append(np.diff(stamps_ns[order]) > 0, True)
         kept = order[is_last]
         stamps_ns, poses, parents = stamps_ns[kept], poses[kept], parents[kept]
-    return Samples(stamps_ns=stamps_ns, poses=poses, parents=parents)
+    return Samples(
+        stamps_ns=stamps_ns,
+        poses=poses,
+        parents=parents,
+        # Told here: each lookup asks for it.
+        changes_parent=bool(np.any(parents[1:] != parents[:-1])),
+    )
 
 
 def _between(start: FloatArray, end: FloatArray, shares: FloatArray) -> FloatArray:

@@ -125,7 +125,8 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     """
     images = [topic for topic in topics if topic.type in (IMAGE_TYPE, COMPRESSED_TYPE)]
     if not images:
-        raise RecordingError(f"{where}: holds no image topics; it holds {_list(topics)}")
+        held = describe_topics(topics) or "no messages"
+        raise RecordingError(f"{where}: holds no image topics; it holds {held}")
     sensor, names = _wanted(choice, where)
     chosen = [None if name is None else _find(name, images, where) for name in names]
     first, second = chosen
@@ -199,10 +200,11 @@ def _wanted(choice: TopicChoice, where: str) -> tuple[Sensor | None, _Names]:
 
 
 def _find(name: str, images: Sequence[Topic], where: str) -> Topic:
-    for topic in images:
-        if topic.name.strip("/") == name.strip("/"):
-            return topic
-    raise RecordingError(f"{where}: has no image topic {name}; it has {_list(images)}")
+    topic = find_topic(name, images)
+    if topic is None:
+        held = describe_topics(images)
+        raise RecordingError(f"{where}: has no image topic {name}; it has {held}")
+    return topic
 
 
 def _fitting(
@@ -283,14 +285,19 @@ def _explain(where: str, images: Sequence[Topic], candidates: Sequence[CameraTop
         choices = " or ".join(candidate.flags for candidate in candidates)
         return f"{where}: holds more than one camera; choose {choices}"
     return (
-        f"{where}: no stereo pair and no RGB-D camera among the image topics {_list(images)}; "
-        "choose --left TOPIC --right TOPIC or --color TOPIC --depth TOPIC"
+        f"{where}: no stereo pair and no RGB-D camera among the image topics "
+        f"{describe_topics(images)}; choose --left TOPIC --right TOPIC or --color TOPIC --depth "
+        "TOPIC"
     )
 
 
-def _list(topics: Sequence[Topic]) -> str:
-    if not topics:
-        return "no messages"
+def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
+    """Return the topic of a name, with or without the leading slash; None where there is none."""
+    return next((topic for topic in topics if topic.name.strip("/") == name.strip("/")), None)
+
+
+def describe_topics(topics: Sequence[Topic]) -> str:
+    """Return the first topics with types and numbers of messages in one line; empty for none."""
     items = [f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics[:_N_LISTED]]
     n_more = len(topics) - len(items)
     return ", ".join(items) + (f" and {n_more} more" if n_more else "")

@@ -8,9 +8,10 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.sources.bag_reader import BagReader
-from gvo.sources.ground_truth import TRUTH_FRAMES, BagTruth, read_bag_truth
+from gvo.sources.ground_truth import BagTruth, read_bag_truth
 from gvo.sources.obvious_truth import find_obvious_truth
 from gvo.sources.tf import TfBuffer, read_tf
+from gvo.sources.tf_paths import bare
 from gvo.sources.truth_specs import BagTruthSpec
 from gvo.trajectory import Trajectory
 from gvo.types import BoolArray, Failure, FloatArray
@@ -91,9 +92,7 @@ def find_framed_truth(
     """
     truth: BagTruth | Failure
     if spec is None:
-        own = (TRUTH_FRAMES.parent, TRUTH_FRAMES.child)
-        tree = read_tf(reader, frames=own) if buffer is None else buffer
-        truth = find_obvious_truth(reader, tree, where=where)
+        truth = find_obvious_truth(reader, buffer, where=where)
         if isinstance(truth, Failure):
             return truth
     else:
@@ -136,16 +135,16 @@ def in_frame(
     FramedTruth or Failure
         The failure says why tf does not bring the child frame of poses to the frame.
     """
-    camera = _Place(name=camera_frame.strip("/"))
+    camera = _Place(name=bare(camera_frame))
     asked = camera
     if T_frame_cam is not None:
         asked = _Place(name=camera.name, T_name_frame=se3.invert(T_frame_cam))
     elif frame:
-        asked = _Place(name=frame.strip("/"))
+        asked = _Place(name=bare(frame))
     if not truth.is_of_camera and not truth.child_frame:
         return _framed(truth, f"; it names no frame, taken for {frame or 'the camera'}")
-    child = camera if truth.is_of_camera else _Place(name=truth.child_frame.strip("/"))
-    if child is asked or (not truth.is_of_camera and child.name == frame.strip("/")):
+    child = camera if truth.is_of_camera else _Place(name=bare(truth.child_frame))
+    if child is asked or (not truth.is_of_camera and child.name == bare(frame)):
         return _framed(truth, "")
     if not truth.trajectory.has_rotations:
         return _at_point(truth, buffer, child, asked)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from gvo.errors import TrajectoryError
+from gvo.sources.tf_paths import bare
 
 _KINDS = "a file of poses, tf:PARENT:CHILD, or a topic (/NAME, or topic:NAME)"
 
@@ -91,7 +92,7 @@ def parse_bag_truth(text: str) -> BagTruthSpec:
     """
     kind, _, rest = text.partition(":")
     if kind == "tf" and rest:
-        names = [name.strip("/") for name in rest.split(":")]
+        names = [bare(name) for name in rest.split(":")]
         if len(names) != 2 or not all(names) or names[0] == names[1]:
             raise TrajectoryError(f"{text}: expected two frames, as in tf:map:base_link")
         return TfTruth(parent=names[0], child=names[1])

@@ -120,6 +120,23 @@ class TumSource(FolderSource):
         return read_trajectory(path) if path.is_file() else None
 
 
+def published_calibration(name: str) -> Calibration | None:
+    """Return the published calibration of the camera that a folder's name tells.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder.
+
+    Returns
+    -------
+    Calibration or None
+        None where the name tells none of the three cameras.
+    """
+    named = _CAMERA_NAME.search(name.lower())
+    return None if named is None else _published_camera(*_CAMERAS[named[1]])
+
+
 def _list_images(table: Path) -> list[StampedPath]:
     return [
         (

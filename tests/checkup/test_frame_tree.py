@@ -30,8 +30,10 @@ def tree(*, leave_out: str = "", moving_ns: Any = STAMPS_NS) -> TfBuffer:
     return buffer
 
 
-def look(buffer: TfBuffer, camera: str = "camera_optical") -> dict[str, Finding]:
-    found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame="base_link", check=CheckConfig())
+def look(
+    buffer: TfBuffer, camera: str = "camera_optical", base: str = "base_link"
+) -> dict[str, Finding]:
+    found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame=base, check=CheckConfig())
     return {finding.name: finding for finding in found}
 
 
@@ -39,9 +41,9 @@ def complaints(findings: dict[str, Finding]) -> set[str]:
     return {name for name, finding in findings.items() if finding.verdict in ("warning", "fault")}
 
 
-@pytest.mark.parametrize("camera", ["camera_optical", "/camera_optical"])
-def test_a_whole_tree_is_fine(camera: str) -> None:
-    findings = look(tree(), camera)
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_a_whole_tree_is_fine(slash: str) -> None:
+    findings = look(tree(), f"{slash}camera_optical", f"{slash}base_link")
     assert complaints(findings) == set()
     assert findings["tf: camera"].value == "base_link - camera_link - camera_optical"
     assert findings["tf: frames"].value == "5 in 1 tree (root odom)"
@@ -83,6 +85,16 @@ def test_a_single_transform_is_no_robot_that_misses_its_camera() -> None:
     findings = look(buffer)
     assert complaints(findings) == set()
     assert findings["tf: frames"].value == "ground_truth, world"
+
+
+def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
+    buffer = tree()
+    buffer.add("world", "ground_truth", 0, np.eye(4))
+    assert complaints(look(buffer)) == set()
+    cameras = TfBuffer()
+    cameras.add("world", "ground_truth", 0, np.eye(4))
+    cameras.add("left", "right", 0, np.eye(4), is_static=True)
+    assert complaints(look(cameras, "left")) == set()
 
 
 def test_the_tree_is_part_of_a_checkup(bench: Any) -> None:

@@ -97,6 +97,16 @@ def test_images_that_have_nothing_to_do_with_the_depth_give_no_answer() -> None:
     assert isinstance(estimate_misregistration(noise), Failure)
 
 
+def test_things_at_the_border_alone_give_no_answer_and_no_warning() -> None:
+    found = []
+    for seed in range(8):
+        image = np.random.default_rng(seed).integers(0, 255, (240, 320)).astype(np.uint8)
+        depth = np.full((240, 320), 3.0, np.float32)
+        depth[:, 2:6] = 1.0  # a mast, nearer to the border than the search reaches
+        found.append(RgbdFrame(stamp_ns=seed, image=image, depth=depth))
+    assert isinstance(estimate_misregistration(found), Failure)
+
+
 def test_a_wall_has_no_steps() -> None:
     depth = np.full((40, 60), 2.0, dtype=np.float32)
     assert not np.any(depth_steps(depth))

@@ -281,6 +281,18 @@ def test_damage_ends_the_reading_but_not_the_check(bench: Any) -> None:
     assert bench.find(checkup, "depth: scale").verdict == "ok"
 
 
+@pytest.mark.parametrize(("n_changed", "verdict"), [(0, "ok"), (3, "warning")])
+def test_a_calibration_that_changes_on_the_way_is_told(
+    bench: Any, n_changed: int, verdict: str
+) -> None:
+    recording = bench.render("handheld", "rgbd")
+    changes = {"/camera/camera_info": n_changed}
+    checkup = check_recording(recording, Config(), n_samples=2, calibration_changes=changes)
+    found = bench.find(checkup, "changed CameraInfo")
+    assert found.verdict == verdict
+    assert ("3 of /camera/camera_info" in str(found.value)) == (n_changed > 0)
+
+
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
 @pytest.mark.parametrize("n_items", [0, 1, 2, 3, 4])
 def test_hardly_any_images_are_reported_and_nothing_breaks(

@@ -41,11 +41,16 @@ def test_json_holds_every_finding_and_no_nan(checkup: Checkup) -> None:
 
 @given(CHECKUPS)
 def test_the_table_has_a_line_per_finding_and_aligned_columns(checkup: Checkup) -> None:
-    header, *rows, last = format_checkup(checkup).split("\n")
-    assert len(rows) == len(checkup.findings)
+    n_told = next((n for n, f in enumerate(checkup.findings) if f.verdict != "info"), None)
+    told = checkup.findings[:n_told]
+    text = format_checkup(checkup)
+    assert text.endswith("\n")
+    lines = text.splitlines()
+    assert lines[: len(told)] == [finding.value_text for finding in told]
+    header, *rows, last = lines[len(told) :]
     assert last.startswith(checkup.recording)
     column = header.index("verdict")
-    for row, finding in zip(rows, checkup.findings, strict=True):
+    for row, finding in zip(rows, checkup.findings[len(told) :], strict=True):
         assert row.startswith(finding.name)
         if finding.verdict != "info":
             assert row[column:].startswith(finding.verdict)
@@ -92,16 +97,45 @@ def test_warnings_alone_do_not_make_a_recording_unusable() -> None:
     assert Checkup(recording="r", findings=(warning,)).is_healthy
     checkup = Checkup(recording="r", findings=(warning, fault, warning))
     assert not checkup.is_healthy
-    assert format_checkup(checkup).endswith("r: 1 fault, 2 warnings")
+    assert format_checkup(checkup).endswith("\nr: 1 fault, 2 warnings\n")
+
+
+def _of_streams(**second: str) -> list[str]:
+    first = {"name": "left: rows", "value": "3", "threshold": "<= 5", "verdict": "ok"}
+    findings = (Finding(**first), Finding(**(first | second)))  # type: ignore[arg-type]
+    return format_checkup(Checkup(recording="r", findings=findings)).splitlines()[1:-1]
+
+
+def test_two_streams_share_a_line_where_both_are_well() -> None:
+    (row,) = _of_streams(name="right: rows", value="4")
+    assert row.split("  ")[0] == "left, right: rows"
+    assert "3 | 4" in row
+    (row,) = _of_streams(name="right: rows")
+    assert "|" not in row
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        {"name": "right: rows", "verdict": "warning", "fix": "do"},
+        {"name": "right: rows", "threshold": "<= 6"},
+        {"name": "right: columns"},
+    ],
+)
+def test_what_differs_in_more_than_the_value_has_a_line_of_its_own(second: dict[str, str]) -> None:
+    assert len(_of_streams(**second)) == 2
+
+
+def test_line_ends_in_damaged_names_do_not_break_the_table() -> None:
+    finding = Finding(name="tf: a\nb", value="c\r\nd", fix="e\n")
+    assert (finding.name, finding.value, finding.fix) == ("tf: a b", "c d", "e")
 
 
 @pytest.mark.parametrize(
     "content",
     [
         {"name": ""},
-        {"name": "two\nlines"},
-        {"value": "two\nlines"},
-        {"fix": "two\nlines"},
+        {"name": " \n"},
         {"verdict": "fault"},
     ],
 )

@@ -36,7 +36,7 @@ def stream(stamps_ns: np.ndarray[Any, Any], logs_ns: np.ndarray[Any, Any] | None
     none = np.zeros(0, dtype=np.int64)
     return StreamStamps(
         stamps_ns=stamps_ns,
-        log_stamps_ns=none if logs_ns is None else logs_ns.astype(np.int64),
+        log_times_ns=none if logs_ns is None else logs_ns.astype(np.int64),
         headers_ns=none if logs_ns is None else stamps_ns,
     )
 

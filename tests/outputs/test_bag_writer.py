@@ -188,17 +188,19 @@ def test_another_reader_finds_the_topics_and_the_stamps(tmp_path: Path, name: st
             "/stereo/right/camera_info": "sensor_msgs/msg/CameraInfo",
             "/stereo/right/image_rect": "sensor_msgs/msg/Image",
             "/tf": "tf2_msgs/msg/TFMessage",
+            "/tf_static": "tf2_msgs/msg/TFMessage",
         }
         log_times = []
         for connection, log_time_ns, data in reader.messages():
             message: Any = reader.deserialize(data, connection.msgtype)
-            header = (message.transforms[0] if connection.topic == "/tf" else message).header
+            is_tf = connection.topic.startswith("/tf")
+            header = (message.transforms[0] if is_tf else message).header
             assert header.stamp.sec * 10**9 + header.stamp.nanosec == log_time_ns
             log_times.append(log_time_ns)
             if connection.topic == "/stereo/left/image_rect":
                 assert (header.frame_id, message.encoding) == ("camera_left_optical", "mono8")
         assert log_times == sorted(log_times)
-        assert len(log_times) == 16 + 20
+        assert len(log_times) == 16 + 20 + 1
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
@@ -270,3 +272,73 @@ def test_rendered_recordings_are_written_as_they_are(tmp_path: Path, sensor: Sen
     source = SyntheticRecording("handheld", sensor, n_frames=3, scale=0.25)
     convert(source, tmp_path / "a.mcap")
     _assert_same(source, open_recording(tmp_path / "a.mcap"))
+
+
+def _transforms(path: Path, topic: str) -> list[tuple[int, str, str, NDArray[np.float64]]]:
+    """Return log time, parent, child and T_parent_child of all transforms of a topic."""
+    found = []
+    with AnyReader([path]) as reader:
+        connections = [one for one in reader.connections if one.topic == topic]
+        for connection, log_time_ns, data in reader.messages(connections):
+            message: Any = reader.deserialize(data, connection.msgtype)
+            for one in message.transforms:
+                t, q = one.transform.translation, one.transform.rotation
+                R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
+                T = make_transform(R, np.array([t.x, t.y, t.z]))
+                found.append((log_time_ns, one.header.frame_id, one.child_frame_id, T))
+    return found
+
+
+@_KINDS
+def test_the_cameras_stand_in_tf_before_the_first_image(tmp_path: Path, name: str) -> None:
+    source = _stereo(*_raw_pair(), truth=_truth(3))
+    T_body_cam = make_transform(_raw_pair()[1].R, np.array([0.3, -0.2, 0.1]))
+    source._info = replace(source.info, T_body_cam=T_body_cam, frame_id="cam_left")
+    convert(source, tmp_path / name)
+    body, right = _transforms(tmp_path / name, "/tf_static")
+    assert body[1:3] == ("body", "cam_left")
+    np.testing.assert_allclose(body[3], T_body_cam, atol=1e-15)
+    assert right[1:3] == ("cam_left", "camera_right_optical")
+    np.testing.assert_allclose(right[3][:3, 3], [0.537 / 3, 0, 0], rtol=1e-12)
+    assert {pose[1:3] for pose in _transforms(tmp_path / name, "/tf")} == {
+        ("world", "ground_truth")
+    }
+    with AnyReader([tmp_path / name]) as reader:
+        (static,) = [one for one in reader.connections if one.topic == "/tf_static"]
+        extension: Any = static.ext
+        if name == "a.bag":
+            assert extension.latching == 1
+        else:
+            assert extension.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
+        first_ns = min(log_time_ns for _, log_time_ns, _ in reader.messages())
+        assert body[0] == first_ns
+
+
+@_KINDS
+def test_images_and_their_calibration_name_one_frame(tmp_path: Path, name: str) -> None:
+    source = _stereo()
+    source._info = replace(source.info, frame_id="camera_right_optical")
+    convert(source, tmp_path / name)
+    frames_of: dict[str, set[str]] = {}
+    with AnyReader([tmp_path / name]) as reader:
+        for connection, _, data in reader.messages():
+            if connection.topic.startswith("/stereo"):
+                message: Any = reader.deserialize(data, connection.msgtype)
+                side = connection.topic.split("/")[2]
+                frames_of.setdefault(side, set()).add(message.header.frame_id)
+    (left,), (right,) = frames_of["left"], frames_of["right"]
+    assert left == "camera_right_optical"
+    assert right != left
+    assert {pose[1:3] for pose in _transforms(tmp_path / name, "/tf_static")} == {(left, right)}
+
+
+def test_a_copy_of_a_bag_keeps_the_frame_and_the_body(tmp_path: Path) -> None:
+    source = _stereo()
+    T_body_cam = make_transform(_raw_pair()[0].R, np.array([0.3, -0.2, 0.1]))
+    source._info = replace(source.info, T_body_cam=T_body_cam, frame_id="left_eye")
+    convert(source, tmp_path / "a.bag")
+    convert(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap")
+    copy = open_recording(tmp_path / "b.mcap")
+    assert copy.info.frame_id == "left_eye"
+    body, _ = _transforms(tmp_path / "b.mcap", "/tf_static")
+    np.testing.assert_allclose(body[3], T_body_cam, atol=1e-15)

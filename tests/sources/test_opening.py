@@ -8,7 +8,7 @@ import pytest
 from gvo.config import Config, DepthConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.sources.kitti import KittiSource
-from gvo.sources.opening import RecordingOptions, open_recording
+from gvo.sources.opening import RecordingOptions, is_bag, open_recording
 from gvo.sources.tum import TumSource
 
 
@@ -39,6 +39,19 @@ def test_folders_are_recognised_by_what_they_hold(tmp_path: Path, tiny: Any) -> 
         (tmp_path / name).touch()
         with pytest.raises(RecordingError, match="empty"):
             open_recording(tmp_path / name)
+
+
+def test_no_path_at_all_is_a_misuse() -> None:
+    with pytest.raises(ValueError, match="at least one path"):
+        open_recording([])
+
+
+def test_compressed_files_of_ros2_are_bags_with_and_without_metadata(tmp_path: Path) -> None:
+    assert not is_bag(tmp_path)
+    file = tmp_path / "drive.mcap.zstd"
+    file.touch()
+    assert is_bag(file)
+    assert is_bag(tmp_path)
 
 
 def test_options_and_configuration_reach_the_source(tmp_path: Path, tiny: Any) -> None:

@@ -94,6 +94,11 @@ def test_a_folder_of_ros2_is_a_bag(tmp_path: Path) -> None:
     bag.pose("/odom", ODOMETRY, 3, np.eye(4))
     folder = bag.write().parent
     assert read_poses(f"{folder}#/odom").stamps_ns.tolist() == [3]
+    with pytest.raises(RecordingError, match="name the poses"):
+        read_poses(str(folder))
+    bag = PoseBag(tmp_path / "d.mcap")
+    bag.pose("/gt_pose", ODOMETRY, 4, np.eye(4))
+    assert read_poses(str(bag.write().parent)).stamps_ns.tolist() == [4]
 
 
 def test_what_is_neither_is_refused_in_one_line(bag: Path, tmp_path: Path) -> None:

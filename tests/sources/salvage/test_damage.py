@@ -166,8 +166,11 @@ def test_of_chunks_with_a_checksum_none_that_was_changed_is_read(
     assert found is not None
     messages, damage = found
     assert messages == sorted(set(messages) & set(_ALL))
-    assert 1 <= len(_ALL) - len(messages) <= 4 * len(changes)
-    assert "cannot be read" in damage
+    n_lost = len(_ALL) - len(messages)
+    assert n_lost <= 4 * len(changes)
+    # LZ4 may say the same in other bytes: a copy from elsewhere, of the same content
+    assert n_lost >= 1 or name == "lz4.mcap"
+    assert ("cannot be read" in damage) == (n_lost >= 1)
 
 
 def _changes(places: st.SearchStrategy[int]) -> st.SearchStrategy[dict[int, int]]:

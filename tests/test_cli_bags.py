@@ -1,0 +1,484 @@
+"""Bags as people have them, on the command line: split, cut, with tf and truth; bags of runs."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import gvo
+from gvo.geometry import se3
+from gvo.geometry.se3 import make_transform
+from gvo.sources.recording import StampedImage
+from gvo.trajectory_files import read_trajectory
+from gvo.types import FloatArray, IntArray
+from tests.rendered_walk import (
+    CAMERA,
+    LEFT,
+    N_FRAMES,
+    RIGHT,
+    STAMPS_NS,
+    T_BASE_CAM,
+    TRAJECTORIES,
+    Walk,
+    ate_by_hand,
+    copy_messages,
+    moved_by_hand,
+    on_a_robot,
+    read_bag,
+    true_poses,
+    truth_stamps,
+)
+from tests.sources.pose_bags import ODOMETRY, PoseBag
+
+Command = Callable[..., Any]
+GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+
+
+def is_one_line(text: str) -> bool:
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def poses(folder: Path, name: str) -> FloatArray:
+    return read_trajectory(folder / f"{name}.txt").T_world_cam
+
+
+def frame_stamps(folder: Path) -> list[int]:
+    with (folder / "frames.csv").open() as file:
+        return [int(row["stamp_ns"]) for row in csv.DictReader(file)]
+
+
+def assert_same_bytes(one: Path, other: Path) -> None:
+    names = [f"{name}{end}" for name in TRAJECTORIES for end in (".txt", "_covariance.csv")]
+    for name in [*names, "frames.csv"]:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def robot_bag(walk_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return one bag of everything: images, tf with map -> base_link, wheel odometry."""
+    folder = tmp_path_factory.mktemp("robot")
+    bag = on_a_robot(folder / "frames.mcap")
+    stamps_ns = truth_stamps()
+    T_map_base = robot_poses(stamps_ns)
+    for stamp_ns, T in zip(stamps_ns.tolist(), T_map_base, strict=True):
+        bag.tf(stamp_ns, "map", "base_link", T)
+        bag.pose("/odom", ODOMETRY, stamp_ns, np.eye(4), child="base_link")
+    return copy_messages([walk_bag, bag.write()], folder / "robot.mcap")
+
+
+def robot_poses(stamps_ns: Any) -> FloatArray:
+    """Return the exact T_map_base of `robot_bag`."""
+    T_map_world = se3.exp(np.array([0.1, 0.2, 2.0, 30.0, -20.0, 1.0]))
+    return np.asarray(T_map_world @ true_poses(stamps_ns) @ np.linalg.inv(T_BASE_CAM))
+
+
+def test_a_run_in_the_frame_of_the_robot_lies_on_its_truth(
+    command: Command, robot_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    options = ["--frame", "base_link", "--ground-truth", "tf:map:base_link"]
+    answer = command("run", robot_bag, "--out", tmp_path, *options, "--initial-pose", "truth")
+    assert (answer.code, answer.err) == (0, "")
+    assert "frame: base_link" in answer.out
+    assert "ground truth: tf map -> base_link" in answer.out
+    exact = robot_poses(STAMPS_NS)
+    for entry in json.loads((tmp_path / "summary.json").read_text())["errors"]:
+        found = poses(tmp_path, entry["name"])
+        # the same motion as that of the camera's run, from the true pose
+        wanted = moved_by_hand(poses(walk_run, entry["name"]), T_BASE_CAM, found[0])
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+        np.testing.assert_allclose(found[0], exact[0], atol=1e-4)
+        by_hand = ate_by_hand(found[:, :3, 3], exact[:, :3, 3])
+        assert entry["ate_m"] == pytest.approx(by_hand, abs=5e-5)
+    estimates = [tmp_path / "raw.txt", "--align", "none", "--json"]
+    compared = command("compare", f"{robot_bag}#tf:map:base_link", *estimates)
+    assert json.loads(compared.out)["estimates"][0]["ate_m"] < 0.02
+
+
+def test_wheel_odometry_is_no_truth(command: Command, robot_bag: Path, tmp_path: Path) -> None:
+    answer = command("run", robot_bag, "--out", tmp_path)
+    assert answer.code == 0
+    assert "ground truth: none: no frame and no topic is named as ground truth" in answer.out
+    assert json.loads((tmp_path / "summary.json").read_text())["errors"] == []
+
+
+def test_an_obvious_truth_is_found_and_told(
+    command: Command, walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    bag = PoseBag(tmp_path / "vicon.mcap")
+    stamps_ns = truth_stamps()
+    for stamp_ns, T in zip(stamps_ns.tolist(), true_poses(stamps_ns), strict=True):
+        bag.pose("/vicon/camera/odom", ODOMETRY, stamp_ns, T, child=CAMERA)
+    answer = command("run", walk_bag, bag.write(), "--out", tmp_path / "out")
+    assert (answer.code, answer.err) == (0, "")
+    assert "ground truth: /vicon/camera/odom (nav_msgs/msg/Odometry)" in answer.out
+    assert_same_bytes(tmp_path / "out", walk_run)
+    exact = true_poses(STAMPS_NS)[:, :3, 3]
+    for entry in json.loads((tmp_path / "out/summary.json").read_text())["errors"]:
+        expected = ate_by_hand(poses(walk_run, entry["name"])[:, :3, 3], exact)
+        assert entry["ate_m"] == pytest.approx(expected, abs=5e-5)
+
+
+def test_the_initial_pose_moves_all_poses(
+    command: Command, walk_bag: Path, walk_run: Path, tmp_path: Path
+) -> None:
+    quaternion_xyzw = [0.1, -0.2, 0.3, 0.9273618495495704]
+    numbers = ",".join(map(str, [4.0, -5.0, 6.0, *quaternion_xyzw]))
+    answer = command("run", walk_bag, "--out", tmp_path, "--initial-pose", numbers)
+    assert answer.code == 0, answer.err
+    R = np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix())
+    T_initial = make_transform(R, np.array([4.0, -5.0, 6.0]))
+    for name in TRAJECTORIES:
+        expected = T_initial @ poses(walk_run, name)
+        np.testing.assert_allclose(poses(tmp_path, name), expected, atol=1e-8)
+        covariances = f"{name}_covariance.csv"
+        mine, theirs = (
+            np.loadtxt(folder / covariances, delimiter=",", skiprows=1)
+            for folder in (tmp_path, walk_run)
+        )
+        np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-18)
+
+
+def chosen_stamps(start_s: float, duration_s: float | None, every: int) -> list[int]:
+    elapsed_s = (STAMPS_NS - STAMPS_NS[0]) / 1e9
+    end_s = np.inf if duration_s is None else start_s + duration_s
+    chosen: list[int] = STAMPS_NS[(elapsed_s >= start_s) & (elapsed_s < end_s)].tolist()
+    return chosen[::every]
+
+
+@pytest.mark.parametrize(
+    ("start_s", "duration_s", "every"), [(0.35, None, 1), (0.0, 0.75, 2), (0.25, 0.8, 3)]
+)
+@pytest.mark.parametrize("kind", ["bag", "folder"])
+def test_only_the_excerpt_is_run(
+    command: Command,
+    walk_bag: Path,
+    tmp_path: Path,
+    *,
+    kind: str,
+    start_s: float,
+    duration_s: float | None,
+    every: int,
+) -> None:
+    recording = walk_bag
+    if kind == "folder":
+        recording = tmp_path / "walk"
+        assert command("convert", walk_bag, recording, "--layout", "euroc").code == 0
+    options = ["--start", start_s, "--every", every]
+    options += [] if duration_s is None else ["--duration", duration_s]
+    answer = command("run", recording, "--out", tmp_path / "out", *options)
+    assert answer.code == 0, answer.err
+    assert frame_stamps(tmp_path / "out") == chosen_stamps(start_s, duration_s, every)
+    np.testing.assert_allclose(poses(tmp_path / "out", "raw")[0], np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--start", "nan"], ["--start", "nan"]),
+        (["--start=-1"], ["--start", "-1"]),
+        (["--start", "inf"], ["--start", "inf"]),
+        (["--start", "60"], ["no frame at 60 s", "1.5 s long"]),
+        (["--duration", "nan"], ["--duration", "nan"]),
+        (["--duration", "0"], ["--duration", "0"]),
+        (["--duration=-1"], ["--duration", "-1"]),
+        (["--every", "0"], ["--every", "0"]),
+        (["--every=-2"], ["--every", "-2"]),
+        (["--initial-pose", "1,2"], ["--initial-pose", "X,Y,Z"]),
+        (["--initial-pose", "1,2,nan"], ["--initial-pose", "X,Y,Z"]),
+        (["--initial-pose", "0,0,0,1,1,1,1"], ["--initial-pose", "norm 2"]),
+        (["--initial-pose", "truth"], ["--initial-pose truth", "no ground truth"]),
+        (["--frame", "gripper"], ["--frame gripper", CAMERA]),
+        (["--ground-truth", "tf:map"], ["tf:map", "two frames"]),
+        (["--ground-truth", "tf:map:gripper"], ["gripper", "map"]),
+        (["--ground-truth", "/odometry"], ["/odometry", "/odom"]),
+        (["--bag", "run.db3"], ["run.db3", ".mcap"]),
+        (["--bag", "taken.mcap"], ["taken.mcap", "exists already"]),
+        (["--bag", "{robot}"], ["robot.mcap", "exists already"]),
+        (["--calibration", "none.yaml"], ["none.yaml"]),
+    ],
+)
+def test_nonsense_gets_one_line_and_exit_code_2(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    robot_bag: Path,
+    tmp_path: Path,
+    *,
+    options: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("taken.mcap").write_text("mine")
+    given = [option.format(robot=robot_bag) for option in options]
+    answer = command("run", robot_bag, "--out", "out", *given)
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    for word in words:
+        assert word in answer.err
+    assert not list(Path().glob("out/*.png"))
+    assert Path("taken.mcap").read_text() == "mine"
+
+
+def test_a_taken_bag_is_refused_before_anything_is_written(
+    command: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "run.mcap").write_text("mine")
+    out = tmp_path / "out"
+    assert command("run", walk_bag, "--out", out, "--bag", tmp_path / "run.mcap").code == 2
+    assert not out.exists()
+
+
+def in_halves(bag: Path, folder: Path) -> list[Path]:
+    middle_ns = int(STAMPS_NS[N_FRAMES // 2])
+    return [
+        copy_messages([bag], folder / "b.mcap", lambda _, log_ns: log_ns >= middle_ns),
+        copy_messages([bag], folder / "a.mcap", lambda _, log_ns: log_ns < middle_ns),
+    ]
+
+
+def by_camera(bag: Path, folder: Path) -> list[Path]:
+    return [
+        copy_messages([bag], folder / "left.mcap", lambda topic, _: "/left/" in topic),
+        copy_messages([bag], folder / "right.mcap", lambda topic, _: "/right/" in topic),
+    ]
+
+
+@pytest.mark.parametrize("split", [in_halves, by_camera])
+def test_split_bags_give_the_same_bytes_as_the_whole(
+    command: Command,
+    walk_bag: Path,
+    walk_run: Path,
+    tmp_path: Path,
+    *,
+    split: Callable[[Path, Path], Sequence[Path]],
+) -> None:
+    parts = split(walk_bag, tmp_path)
+    answer = command("run", *parts, "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    assert_same_bytes(tmp_path / "out", walk_run)
+
+
+def test_a_bag_and_a_folder_are_not_one_recording(
+    command: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "folder").mkdir()
+    answer = command("run", walk_bag, tmp_path / "folder", "--out", tmp_path / "out")
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "only several bags can be one recording" in answer.err
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".mcap"])
+def test_of_a_cut_bag_what_can_be_read_is_run(
+    command: Command, walk_run: Path, tmp_path: Path, suffix: str
+) -> None:
+    path = tmp_path / f"cut{suffix}"
+    gvo.convert(Walk(), path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(0.7 * len(content))])
+    answer = command("run", path, "--out", tmp_path / "out", "--bag", tmp_path / "out.mcap")
+    assert answer.code == 3, answer.err
+    assert all(line.startswith("gvo: warning: ") for line in answer.err.splitlines())
+    assert f"cut{suffix}" in answer.err
+    assert "%" in answer.err
+    n = len(read_trajectory(tmp_path / "out/raw.txt"))
+    assert N_FRAMES // 3 < n < N_FRAMES
+    for name in ("raw", "causal"):
+        np.testing.assert_array_equal(poses(tmp_path / "out", name), poses(walk_run, name)[:n])
+    assert len(poses(tmp_path / "out", "smoothed")) == n
+    assert len(read_bag(tmp_path / "out.mcap")["/gvo/raw/odometry"]) == n
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+@pytest.mark.parametrize("frame", [None, "base_link"])
+def test_the_bag_of_a_run_holds_the_poses_of_its_files(
+    command: Command, robot_bag: Path, tmp_path: Path, frame: str | None, suffix: str
+) -> None:
+    path, out = tmp_path / f"run{suffix}", tmp_path / "out"
+    options = [] if frame is None else ["--frame", frame]
+    answer = command("run", robot_bag, "--out", out, "--bag", path, *options)
+    assert (answer.code, answer.err) == (0, "")
+    messages = read_bag(path)
+    for name in TRAJECTORIES:
+        found = {}
+        for _, content in messages[f"/gvo/{name}/odometry"]:
+            assert content.child_frame_id == f"gvo/{name}/{frame or CAMERA}"
+            found[stamp_ns(content.header)] = matrix(content.pose.pose)
+        trajectory = read_trajectory(out / f"{name}.txt")
+        assert sorted(found) == trajectory.stamps_ns.tolist()
+        np.testing.assert_allclose(
+            np.array([found[stamp] for stamp in sorted(found)]), trajectory.T_world_cam, atol=2e-9
+        )
+    compared = command("compare", out / "raw.txt", f"{path}#/gvo/raw/odometry", "--json")
+    assert json.loads(compared.out)["estimates"][0]["ate_m"] < 1e-8
+    path_poses = messages["/gvo/smoothed/path"][-1][1].poses
+    assert [stamp_ns(pose.header) for pose in path_poses] == STAMPS_NS.tolist()
+
+
+def stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec * 10**9 + header.stamp.nanosec)
+
+
+def matrix(pose: Any) -> FloatArray:
+    q, t = pose.orientation, pose.position
+    R = np.asarray(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix())
+    return make_transform(R, np.array([t.x, t.y, t.z]))
+
+
+def test_a_signal_leaves_a_bag_that_can_be_read(walk_bag: Path, tmp_path: Path) -> None:
+    path, out = tmp_path / "run.mcap", tmp_path / "out"
+    process = subprocess.Popen(
+        [*GVO, "run", str(walk_bag), "--out", str(out), "--bag", str(path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "COLUMNS": "80"},
+    )
+    raw = out / "raw.txt"
+    deadline = time.monotonic() + 60
+    while not (raw.exists() and raw.read_text().count("\n") >= 3):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, b"")
+    messages = read_bag(path)
+    for name in TRAJECTORIES:
+        assert len(messages[f"/gvo/{name}/odometry"]) == len(poses(out, name))
+
+
+def findings(answer: Any) -> dict[str, str]:
+    checkup = json.loads(answer.out)
+    assert set(checkup) == {"recording", "is_healthy", "n_warnings", "n_faults", "findings"}
+    return {finding["name"]: finding["verdict"] for finding in checkup["findings"]}
+
+
+def test_check_finds_nothing_on_a_clean_bag(command: Command, robot_bag: Path) -> None:
+    answer = command("check", robot_bag)
+    assert (answer.code, answer.err) == (0, "")
+    assert answer.out.splitlines()[-1] == "robot: healthy"
+    answer = command("check", robot_bag, "--json")
+    assert answer.code == 0
+    assert not {"fault", "warning"} & set(findings(answer).values())
+
+
+class Exchanged(Walk):
+    """The images of the left camera on the topic of the right one, and the other way round."""
+
+    def images(self) -> Iterator[StampedImage]:
+        for image in super().images():
+            yield replace(image, stream=1 - image.stream)
+
+
+def test_check_finds_the_images_exchanged(command: Command, tmp_path: Path) -> None:
+    gvo.convert(Exchanged(), tmp_path / "exchanged.mcap")
+    answer = command("check", tmp_path / "exchanged.mcap", "--json")
+    assert (answer.code, answer.err) == (1, "")
+    assert [name for name, verdict in findings(answer).items() if verdict == "fault"] == [
+        "left/right: order"
+    ]
+
+
+def test_check_refuses_a_right_camera_that_lies_to_the_left(
+    command: Command, walk_bag: Path
+) -> None:
+    answer = command("check", walk_bag, "--left", RIGHT, "--right", LEFT)
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "exchanged?" in answer.err
+
+
+def test_check_tells_of_a_cut_bag(command: Command, walk_bag: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    content = walk_bag.read_bytes()
+    path.write_bytes(content[: int(0.7 * len(content))])
+    answer = command("check", path, "--json")
+    assert answer.code in (0, 1)
+    assert {"fault", "warning"} & set(findings(answer).values())
+
+
+@pytest.mark.parametrize("name", ["missing.bag", "empty.mcap", "."])
+def test_what_is_no_recording_cannot_be_checked(
+    command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty.mcap").touch()
+    answer = command("check", name)
+    assert (answer.code, answer.out) == (2, "")
+    assert is_one_line(answer.err), answer.err
+
+
+@pytest.mark.recorded
+def test_recorded_chains_of_tf_have_no_error_against_themselves(
+    command: Command, gvo_data: Path
+) -> None:
+    chains = ["odom:base_link", "map:base_link", "map:camera_link", "odom:base_footprint"]
+    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
+    n_compared = 0
+    for chain in chains:
+        answer = command("compare", f"{path}#tf:{chain}", f"{path}#tf:{chain}", "--json")
+        if answer.code == 2 and "holds no frame" in answer.err:
+            continue
+        (entry,) = json.loads(answer.out)["estimates"]
+        assert entry["n"] > 100
+        assert entry["ate_m"] < 1e-9
+        assert entry["rpe_m"] < 1e-9
+        n_compared += 1
+    assert n_compared >= 1
+
+
+@pytest.mark.recorded
+def test_recorded_poses_of_two_topics_are_compared_between_their_stamps(
+    command: Command, gvo_data: Path
+) -> None:
+    path = gvo_data / "bags/good/pose_streams.bag"
+    answer = command("compare", f"{path}#groundtruth", f"{path}#ORB-SLAM", "--json")
+    assert (answer.code, answer.err) == (0, "")
+    (entry,) = json.loads(answer.out)["estimates"]
+    messages = read_bag(path)
+    (true_ns, truth), (stamps_ns, estimate) = (
+        positions_of(messages[topic]) for topic in ("groundtruth", "ORB-SLAM")
+    )
+    after = np.clip(np.searchsorted(true_ns, stamps_ns), 1, len(true_ns) - 1)
+    is_near = (true_ns[after] - true_ns[after - 1] <= 250_000_000) & (stamps_ns <= true_ns[-1])
+    elapsed, known = ((ns - true_ns[0]) / 1e9 for ns in (stamps_ns[is_near], true_ns))
+    between = np.stack([np.interp(elapsed, known, axis) for axis in truth.T], axis=1)
+    assert entry["n"] == np.count_nonzero(is_near)
+    assert entry["ate_m"] == pytest.approx(ate_by_hand(estimate[is_near], between), abs=1e-6)
+
+
+def positions_of(messages: list[tuple[int, Any]]) -> tuple[IntArray, FloatArray]:
+    rows = [(stamp_ns(content.header), matrix(content.pose)[:3, 3]) for _, content in messages]
+    return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+
+
+@pytest.mark.recorded
+def test_the_body_of_euroc_has_the_errors_of_its_camera(
+    command: Command, gvo_data: Path, tmp_path: Path
+) -> None:
+    folder = gvo_data / "euroc_mh01_start"
+    errors = {}
+    for name, options in (("cam", []), ("body", ["--frame", "body"])):
+        answer = command("run", folder, "--out", tmp_path / name, *options)
+        assert (answer.code, answer.err) == (0, "")
+        summary = json.loads((tmp_path / name / "summary.json").read_text())
+        errors[name] = summary["errors"]
+    truth = folder / "mav0/state_groundtruth_estimate0/data.csv"
+    files = [tmp_path / "body" / f"{name}.txt" for name in TRAJECTORIES]
+    compared = json.loads(command("compare", truth, *files, "--json").out)["estimates"]
+    for cam, body, by_file in zip(errors["cam"], errors["body"], compared, strict=True):
+        assert by_file["ate_m"] == pytest.approx(body["ate_m"], abs=1e-8)
+        assert by_file["rpe_m"] == pytest.approx(body["rpe_m"], abs=1e-8)
+        # of another point of the same body: a lever arm of 7 cm
+        assert body["ate_m"] == pytest.approx(cam["ate_m"], rel=0.05)
+        assert body["rpe_deg"] == pytest.approx(cam["rpe_deg"], rel=1e-6)
+        assert body["ate_m"] < 0.01

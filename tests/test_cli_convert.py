@@ -1,0 +1,173 @@
+"""`gvo convert`, in both directions."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import gvo
+from gvo.geometry.se3 import make_transform
+from gvo.outputs.bag_writer import convert
+from gvo.outputs.folder_writer import write_folder
+from gvo.sources.recording import StampedImage
+from gvo.sources.synthetic import SyntheticRecording
+from gvo.trajectory_files import read_trajectory
+from tests.conftest import Command
+from tests.sources.conftest import Item, ListSource, Tiny
+
+_TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
+
+
+@pytest.fixture
+def kitti(tmp_path: Path) -> Path:
+    """Return a KITTI folder of noise."""
+    return Tiny().write_kitti(tmp_path / "kitti", n_frames=3)
+
+
+def test_there_and_back_again(command: Command, tmp_path: Path, kitti: Path) -> None:
+    for name in ("a.bag", "b.mcap", "c.db3", "d"):
+        answer = command("convert", kitti, tmp_path / name)
+        assert (answer.code, answer.err) == (0, "")
+        assert answer.out == f"wrote {tmp_path / name}: 6 images, 3 true poses\n"
+        back = tmp_path / f"back_{name[0]}"
+        assert command("convert", tmp_path / name, back).code == 0
+        assert (back / "calib.txt").read_text().split() == _rows(kitti)
+        mine = [(image.stamp_ns, image.load().tobytes()) for image in _images(back)]
+        assert mine == [(image.stamp_ns, image.load().tobytes()) for image in _images(kitti)]
+
+
+def _rows(kitti: Path) -> list[str]:
+    """Return the numbers of the two cameras that were converted."""
+    lines = (kitti / "calib.txt").read_text().splitlines()
+    return [word for line in lines[:2] for word in line.split()]
+
+
+def _images(folder: Path) -> list[StampedImage]:
+    return list(gvo.open_recording(folder).images())
+
+
+def test_a_run_on_what_comes_back_writes_the_same_bytes(command: Command, tmp_path: Path) -> None:
+    convert(SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.25), tmp_path / "a.mcap")
+    assert command("convert", tmp_path / "a.mcap", tmp_path / "kitti").code == 0
+    assert command("convert", tmp_path / "kitti", tmp_path / "b.bag", "--png").code == 0
+    for name in ("a.mcap", "kitti", "b.bag"):
+        assert command("run", tmp_path / name, "--out", tmp_path / f"run_{name}").code == 0
+    for trajectory in _TRAJECTORIES:
+        first, *others = (
+            (tmp_path / f"run_{name}" / trajectory).read_bytes()
+            for name in ("a.mcap", "kitti", "b.bag")
+        )
+        assert others == [first, first]
+
+
+def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path: Path) -> None:
+    rendered = SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.25)
+    source = ListSource(
+        "stereo",
+        [(image.stream, image.stamp_ns, image.load()) for image in rendered.images()],
+        calibrations=rendered.info.calibrations,
+        truth=rendered.ground_truth(),
+    )
+    R = np.asarray(Rotation.from_euler("xyz", [80, -10, 95], degrees=True).as_matrix())
+    T_body_cam = make_transform(R, np.array([0.1, -0.2, 0.3]))
+    source.info = replace(source.info, T_body_cam=T_body_cam)
+    write_folder(source, tmp_path / "euroc", layout="euroc")
+    for name in ("a.bag", "b.mcap"):
+        assert command("convert", tmp_path / "euroc", tmp_path / name).code == 0
+    outs = []
+    for name in ("euroc", "a.bag", "b.mcap"):
+        outs.append(tmp_path / f"run_{name}")
+        answer = command("run", tmp_path / name, "--frame", "body", "--out", outs[-1])
+        assert answer.code == 0
+        assert "ATE" in answer.out
+    for trajectory in _TRAJECTORIES:
+        folder, *bags = (read_trajectory(out / trajectory) for out in outs)
+        for bag in bags:
+            np.testing.assert_allclose(bag.T_world_cam, folder.T_world_cam, rtol=0, atol=2e-9)
+    camera = tmp_path / "camera"
+    assert command("run", tmp_path / "a.bag", "--out", camera).code == 0
+    T_first_cam = read_trajectory(camera / "raw.txt").T_world_cam
+    T_first_body = read_trajectory(outs[0] / "raw.txt").T_world_cam
+    np.testing.assert_allclose(
+        T_first_body, T_body_cam @ T_first_cam @ np.linalg.inv(T_body_cam), rtol=0, atol=1e-8
+    )
+
+
+def test_a_bag_that_is_cut_off_gives_what_it_holds_and_exit_code_3(
+    command: Command, tmp_path: Path, kitti: Path
+) -> None:
+    tiny = Tiny()
+    items: list[Item] = [
+        (stream, 10**8 * k, tiny.texture(2 * k + stream)) for k in range(800) for stream in (0, 1)
+    ]
+    convert(tiny.stereo(items), tmp_path / "whole.bag")
+    data = (tmp_path / "whole.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: len(data) * 2 // 3])
+    for target in ("folder", "b.mcap"):
+        answer = command("convert", tmp_path / "cut.bag", tmp_path / target)
+        assert answer.code == 3
+        assert "missing" in answer.err
+        assert len(answer.err.splitlines()) <= 8
+        copies = [i.load() for i in gvo.open_recording(tmp_path / target).images() if not i.stream]
+        assert 100 < len(copies) < 800
+        for k, pixels in enumerate(copies):
+            np.testing.assert_array_equal(pixels, tiny.texture(2 * k))
+
+
+def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> None:
+    tiny = Tiny()
+    for part in range(2):
+        items: list[Item] = [
+            (stream, 10**9 * part + 10**8 * k, tiny.texture(10 * part + 2 * k + stream))
+            for k in range(3)
+            for stream in (0, 1)
+        ]
+        convert(tiny.stereo(items), tmp_path / f"{part}.bag")
+    answer = command("convert", tmp_path / "0.bag", tmp_path / "1.bag", tmp_path / "all")
+    assert answer.code == 0
+    assert [image.stamp_ns for image in _images(tmp_path / "all") if image.stream == 0] == [
+        10**9 * part + 10**8 * k for part in range(2) for k in range(3)
+    ]
+
+
+def test_settings_reach_the_pairs_of_kitti(command: Command, tmp_path: Path) -> None:
+    tiny = Tiny()
+    items: list[Item] = [
+        (stream, 10**8 * k + 3_000_000 * stream, tiny.texture(k))
+        for k in range(3)
+        for stream in (0, 1)
+    ]
+    convert(tiny.stereo(items), tmp_path / "a.bag")
+    assert command("convert", tmp_path / "a.bag", tmp_path / "none").code == 2
+    answer = command(
+        "convert", tmp_path / "a.bag", tmp_path / "all", "--set", "sync.stereo_tolerance_ms=5"
+    )
+    assert (answer.code, len(_images(tmp_path / "all"))) == (0, 6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["convert", "{kitti}", "a.zip"], r"a.zip: expected a name ending in .bag"),
+        (["convert", "{kitti}", "{kitti}"], "exists already"),
+        (["convert", "{kitti}", "a", "--layout", "tum"], "cannot have the layout tum"),
+        (["convert", "{kitti}", "a.bag", "--layout", "euroc"], "leave .bag away"),
+        (["convert", "{kitti}", "a", "--layout", "euroc", "--png"], "--png is for bags"),
+    ],
+)
+def test_misuse_is_one_line_and_exit_code_2(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    kitti: Path,
+    arguments: list[str],
+    expected: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = command(*(argument.format(kitti=kitti) for argument in arguments))
+    assert answer.code == 2
+    assert expected in answer.err
+    assert answer.err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["kitti"]

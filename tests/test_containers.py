@@ -1,0 +1,305 @@
+"""One recording in every container: ROS 1, ROS 2 in sqlite3 and MCAP, plain and compressed."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from scipy.spatial.transform import Rotation
+
+import gvo
+from gvo.geometry.camera import Calibration, stereo_camera
+from gvo.geometry.lens import DistortionModel
+from gvo.outputs.bag_writer import convert
+from gvo.outputs.converting import convert_recording
+from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.sources.synthetic import SyntheticRecording
+from gvo.trajectory import Trajectory
+from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
+
+_CONTAINERS = ("a.bag", "a.mcap", "a.db3", "folder")
+_N_FRAMES = 6
+_LENSES: dict[DistortionModel, list[float]] = {
+    "plumb_bob": [-0.12, 0.03, 1e-3, -5e-4, 0.0],
+    "rational_polynomial": [-0.2, 0.05, 5e-4, 5e-4, 0.01, -0.05, 0.02, 0.003],
+    "equidistant": [-0.03, 0.01, -0.002, 0.0],
+}
+_EVERY = 3  # of the frames of the world, so that the camera moves between two of them
+
+
+class Rendered:
+    """A walk in a room, rendered once."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self._rendered = SyntheticRecording(
+            "handheld", sensor, n_frames=_EVERY * _N_FRAMES, scale=0.35
+        )
+        self._pixels: dict[tuple[int, int], NDArray[Any]] = {}
+
+    @property
+    def info(self) -> RecordingInfo:
+        return replace(self._rendered.info, n_images=_N_FRAMES)
+
+    def images(self) -> Iterator[StampedImage]:
+        for index, image in enumerate(self._rendered.images()):
+            if index // 2 % _EVERY == 0:
+                yield replace(image, load=partial(self._load, image))
+
+    def ground_truth(self) -> Trajectory | None:
+        return self._rendered.ground_truth().select(slice(None, None, _EVERY))
+
+    def _load(self, image: StampedImage) -> NDArray[Any]:
+        key = (image.stamp_ns, image.stream)
+        if key not in self._pixels:
+            self._pixels[key] = image.load()
+        return self._pixels[key]
+
+
+_STEREO, _RGBD = Rendered("stereo"), Rendered("rgbd")
+
+
+class RawPair:
+    """A rendered pair as cameras with lenses, turned against each other, would see it."""
+
+    def __init__(self, rendered: Rendered, model: DistortionModel) -> None:
+        self._rendered = rendered
+        self._calibrations = tuple(
+            _raw(ideal, model, turn)
+            for ideal, turn in zip(
+                rendered.info.calibrations,
+                ([0.01, -0.004, 0.006], [-0.006, 0.005, -0.01]),
+                strict=True,
+            )
+        )
+        self._maps = [_distortion_maps(calibration) for calibration in self._calibrations]
+
+    @property
+    def info(self) -> RecordingInfo:
+        return replace(self._rendered.info, calibrations=self._calibrations)
+
+    def images(self) -> Iterator[StampedImage]:
+        for image in self._rendered.images():
+            yield replace(image, load=partial(self._load, image))
+
+    def ground_truth(self) -> Trajectory | None:
+        return self._rendered.ground_truth()
+
+    def _load(self, image: StampedImage) -> NDArray[Any]:
+        pixels = cv2.remap(image.load(), *self._maps[image.stream], cv2.INTER_CUBIC)
+        return np.asarray(pixels)
+
+
+class Millimetres:
+    """A recording whose depth is in whole millimetres, as sensors give it."""
+
+    def __init__(self, rendered: Rendered) -> None:
+        self._rendered = rendered
+        self.info = rendered.info
+        self.ground_truth = rendered.ground_truth
+
+    def images(self) -> Iterator[StampedImage]:
+        for image in self._rendered.images():
+            yield replace(image, load=partial(self._load, image))
+
+    def _load(self, image: StampedImage) -> NDArray[Any]:
+        pixels = image.load()
+        if image.stream == 0:
+            return pixels
+        rounded: NDArray[np.float32] = np.round(pixels * 1000).astype(np.float32) / np.float32(1000)
+        return rounded
+
+
+def _raw(ideal: Calibration, model: DistortionModel, turn: list[float]) -> Calibration:
+    """Return a camera whose rectified image is the ideal one, its view a little wider."""
+    K = ideal.K * np.array([[0.9, 1, 1], [1, 0.9, 1], [1, 1, 1]])
+    return replace(
+        ideal,
+        K=K,
+        D=np.array(_LENSES[model]),
+        R=np.asarray(Rotation.from_rotvec(turn).as_matrix()),
+        is_rectified=False,
+        model=model,
+    )
+
+
+def _distortion_maps(camera: Calibration) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where in the ideal image each raw pixel lies: the inverse of the rectification."""
+    grid = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.stack(grid, axis=-1).reshape(-1, 2).astype(np.float64)
+    rays: FloatArray = (
+        np.linalg.inv(camera.K) @ np.column_stack([pixels, np.ones(len(pixels))]).T
+    ).T
+    for _ in range(50):
+        errors = pixels - camera.lens.project(rays)
+        rays[:, :2] += errors / np.diag(camera.K)[:2]
+    assert np.abs(errors).max() < 1e-6
+    u, v, w = camera.P[:, :3] @ camera.R @ rays.T
+    shape = (camera.height, camera.width)
+    return (u / w).astype(np.float32).reshape(shape), (v / w).astype(np.float32).reshape(shape)
+
+
+def _estimates(source: Source) -> tuple[Trajectory, Trajectory]:
+    """Return the raw and the smoothed trajectory of odometry."""
+    odometry = gvo.Odometry(source.info.camera)
+    raw: list[Estimate] = []
+    smoothed: list[Estimate] = []
+    for frame in gvo.frames(source, gvo.Config()):
+        assert not isinstance(frame, FaultyFrame)
+        result = odometry.track(frame)
+        raw.append(result.raw)
+        smoothed += result.finished
+    smoothed += odometry.finish()
+    assert len(raw) == len(smoothed) == _N_FRAMES
+    return Trajectory.of(raw), Trajectory.of(smoothed)
+
+
+def _bytes(trajectories: tuple[Trajectory, Trajectory]) -> list[bytes]:
+    return [
+        array.tobytes()
+        for trajectory in trajectories
+        for array in (trajectory.stamps_ns, trajectory.T_world_cam, trajectory.covariances)
+        if array is not None
+    ]
+
+
+def _error(source: Source) -> float:
+    """Return how far the last smoothed pose is from the true one, metres."""
+    truth = source.ground_truth()
+    assert truth is not None
+    T_first_last = np.linalg.inv(truth.T_world_cam[0]) @ truth.T_world_cam[-1]
+    _, smoothed = _estimates(source)
+    return float(np.linalg.norm(smoothed.positions[-1] - T_first_last[:3, 3]))
+
+
+def _frames(source: Source) -> list[tuple[int, bytes, bytes]]:
+    found = []
+    for frame in gvo.frames(source, gvo.Config()):
+        if isinstance(frame, StereoFrame):
+            found.append((frame.stamp_ns, frame.left.tobytes(), frame.right.tobytes()))
+        else:
+            assert isinstance(frame, RgbdFrame)
+            found.append((frame.stamp_ns, frame.image.tobytes(), frame.depth.tobytes()))
+    assert len(found) == _N_FRAMES
+    return found
+
+
+_SOURCES: dict[str, Source] = {
+    "rectified": _STEREO,
+    "raw": RawPair(_STEREO, "plumb_bob"),
+    "metres": _RGBD,
+    "millimetres": Millimetres(_RGBD),
+}
+
+
+Origin = tuple[Source, list[tuple[int, bytes, bytes]], list[bytes]]
+
+
+@pytest.fixture(scope="module", params=sorted(_SOURCES))
+def origin(request: pytest.FixtureRequest) -> Origin:
+    """Return a recording, its frames, and what odometry makes of it."""
+    source = _SOURCES[request.param]
+    return source, _frames(source), _bytes(_estimates(source))
+
+
+@pytest.mark.parametrize("is_png", [False, True], ids=["plain", "png"])
+@pytest.mark.parametrize("name", _CONTAINERS)
+def test_every_container_gives_the_same_frames_and_trajectories_bit_by_bit(
+    origin: Origin, tmp_path: Path, name: str, is_png: bool
+) -> None:
+    source, frames, estimates = origin
+    convert(source, tmp_path / name, compress=is_png)
+    copy = gvo.open_recording(tmp_path / name)
+    assert _frames(copy) == frames
+    assert _bytes(_estimates(copy)) == estimates
+    with AnyReader([tmp_path / name]) as reader:
+        suffixes = [topic.rpartition("/")[2] for topic in reader.topics]
+    n_compressed = suffixes.count("compressed") + suffixes.count("compressedDepth")
+    # Depth that is not of whole millimetres stays as it is.
+    assert n_compressed == ((1 if source is _RGBD else 2) if is_png else 0)
+
+
+def _rewrite(path: Path, writer: Writer1 | Writer2) -> None:
+    """Copy all messages into a bag, as they are."""
+    with AnyReader([path]) as reader, writer:
+        connections: dict[str, Any] = {}
+        for connection, log_time_ns, data in reader.messages():
+            topic = connection.topic
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, connection.msgtype, typestore=reader.typestore
+                )
+            writer.write(connections[topic], log_time_ns, data)
+
+
+@pytest.mark.parametrize("compression", list(Writer1.CompressionFormat))
+def test_chunks_of_ros1_may_be_compressed(
+    tmp_path: Path, compression: Writer1.CompressionFormat
+) -> None:
+    convert(_STEREO, tmp_path / "a.bag")
+    writer = Writer1(tmp_path / "b.bag")
+    writer.set_compression(compression)
+    _rewrite(tmp_path / "a.bag", writer)
+    assert (tmp_path / "b.bag").stat().st_size < (tmp_path / "a.bag").stat().st_size
+    assert _frames(gvo.open_recording(tmp_path / "b.bag")) == _frames(_STEREO)
+
+
+@pytest.mark.parametrize(
+    ("storage", "mode"),
+    [
+        (StoragePlugin.SQLITE3, CompressionMode.FILE),
+        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+        (StoragePlugin.MCAP, CompressionMode.FILE),
+        (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+        (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    ],
+)
+def test_ros2_may_be_compressed_by_zstd(
+    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode
+) -> None:
+    convert(_STEREO, tmp_path / "a")
+    writer = Writer2(tmp_path / "b", version=8, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    _rewrite(tmp_path / "a", writer)
+    sizes = [sum(path.stat().st_size for path in (tmp_path / name).iterdir()) for name in "ab"]
+    assert sizes[1] < sizes[0]
+    assert _frames(gvo.open_recording(tmp_path / "b")) == _frames(_STEREO)
+
+
+@pytest.mark.parametrize("model", sorted(_LENSES))
+def test_raw_images_give_what_they_give_rectified_beforehand_bit_by_bit(
+    tmp_path: Path, model: DistortionModel
+) -> None:
+    raw = RawPair(_STEREO, model)
+    convert(raw, tmp_path / "raw.mcap")
+    convert(raw, tmp_path / "rectified.bag", rectify=True)
+    on_the_fly, beforehand = (
+        gvo.open_recording(tmp_path / name) for name in ("raw.mcap", "rectified.bag")
+    )
+    assert not on_the_fly.info.calibrations[0].is_rectified
+    assert beforehand.info.calibrations[0].is_rectified
+    assert _bytes(_estimates(on_the_fly)) == _bytes(_estimates(beforehand))
+
+
+@pytest.mark.parametrize("model", sorted(_LENSES))
+def test_behind_a_lens_and_rectified_anew_the_motion_is_the_same(
+    tmp_path: Path, model: DistortionModel
+) -> None:
+    convert(RawPair(_STEREO, model), tmp_path / "raw.bag")
+    raw = gvo.open_recording(tmp_path / "raw.bag")
+    convert_recording(raw, tmp_path / "euroc")
+    anew = gvo.open_recording(tmp_path / "euroc")
+    # R and P are others: each is measured against the truth of its own rectified camera.
+    assert not np.allclose(anew.info.calibrations[0].P, raw.info.calibrations[0].P, atol=1e-3)
+    first, second = (stereo_camera(*one.info.calibrations).baseline for one in (raw, anew))
+    assert second == pytest.approx(first, rel=1e-9)
+    errors = [_error(source) for source in (_STEREO, raw, anew)]
+    assert max(errors) < 0.006
