@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gvo.geometry.camera import PinholeCamera, StereoCamera
     from gvo.odometry import FrameResult, Odometry
     from gvo.outputs.bag_writer import convert
+    from gvo.outputs.converting import convert_recording
     from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import format_evaluations
     from gvo.run_inputs import asked_truth, choose_frame, read_ground_truth
@@ -53,6 +54,7 @@ _MODULES = {
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry": ("FrameResult", "Odometry"),
     "gvo.outputs.bag_writer": ("convert",),
+    "gvo.outputs.converting": ("convert_recording",),
     "gvo.outputs.plots": ("plot_trajectories",),
     "gvo.outputs.tables": ("format_evaluations",),
     "gvo.run_inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
@@ -113,6 +115,7 @@ __all__ = [
     "asked_truth",
     "choose_frame",
     "convert",
+    "convert_recording",
     "evaluate",
     "format_evaluations",
     "frames",

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import gvo
-from gvo.outputs.converting import convert_recording
 
 
 def main() -> int:
@@ -26,7 +25,7 @@ def main() -> int:
     parser.add_argument("--png", action="store_true", help="compress the images of a bag")
     arguments = parser.parse_args()
 
-    written = convert_recording(
+    written = gvo.convert_recording(
         gvo.open_recording(arguments.recording),
         arguments.target,
         layout=arguments.layout,
