@@ -49,6 +49,9 @@ class SyncConfig(Section):
     stereo_tolerance_ms: float = _parameter(
         0.0, "largest difference between the stamps of left and right; 0: equal stamps", "ms", ge=0
     )
+    stamps: Literal["header", "recording"] = _parameter(
+        "header", "whose clock stamps the images of a bag: recording, where the driver stamps none"
+    )
     queue_size: int = _parameter(
         100, "images of a stream that are kept while their partners may come", ge=2, le=10000
     )
@@ -318,6 +321,9 @@ class CheckConfig(Section):
     )
     max_row_spread_px: float = _parameter(
         2.0, "95 % of the row differences are below; above is a fault", "px", ge=0
+    )
+    max_lens_k1: float = _parameter(
+        0.15, "radial distortion k1 left in rectified images; above is a fault", ge=0
     )
     min_stereo_matches: int = _parameter(60, "matches of left and right per frame", ge=0)
     max_negative_share: float = _parameter(

@@ -22,6 +22,9 @@ SHORT_STEP = 1
 """Poses between two starts of segments there: every pose starts one."""
 
 
+_MIN_PATH_M = 1e-6
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evaluation:
     """The errors of one estimate against a reference, over the associated poses.
@@ -262,7 +265,7 @@ def _path_length(trajectory: Trajectory) -> float:
 
 def _path_ratio(reference: Trajectory, estimate: Trajectory) -> float | None:
     length = _path_length(reference)
-    return _path_length(estimate) / length if length > 0 else None
+    return _path_length(estimate) / length if length > _MIN_PATH_M else None
 
 
 def _coverage(reference: Trajectory, associated: Trajectory) -> float:

@@ -70,6 +70,8 @@ class OutputFrame:
         self._is_camera = T_frame_cam is None
         self._T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
         self._guessed_stamps_ns: set[int] = set()
+        self._mount_low = np.full(3, np.inf)
+        self._mount_high = np.full(3, -np.inf)
         self._T_world_cam_first = np.eye(4)
         self._T_frame_cam: FloatArray | None = None
         if callable(T_frame_cam):
@@ -145,6 +147,11 @@ class OutputFrame:
         """Frames whose transform `/tf` does not hold: the one nearest in time was taken."""
         return len(self._guessed_stamps_ns)
 
+    @property
+    def mount_travel_m(self) -> float:
+        """How far the camera went in the frame so far, metres: the diagonal of its places."""
+        return float(np.linalg.norm(np.maximum(self._mount_high - self._mount_low, 0.0)))
+
     def start(self, stamp_ns: int, T_initial: FloatArray | None = None) -> None:
         """Say which frame is the first one.
 
@@ -172,6 +179,8 @@ class OutputFrame:
     def T_frame_cam(self, stamp_ns: int) -> FloatArray:  # noqa: N802 - the field's name
         """Return how the camera sits in the frame at a stamp, shape (4, 4), metres."""
         T, is_guessed = self._mount(stamp_ns)
+        self._mount_low = np.minimum(self._mount_low, T[:3, 3])
+        self._mount_high = np.maximum(self._mount_high, T[:3, 3])
         if is_guessed:
             self._guessed_stamps_ns.add(stamp_ns)
         return T

@@ -112,6 +112,7 @@ class RunLoop:
         self.tally.window, self.tally.polish = window.counts, window.polish
         self.tally.rig_offsets = self._odometry.rig_offsets
         self.tally.n_guessed = self.frame.n_guessed
+        self.tally.mount_travel_m = self.frame.mount_travel_m
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
         iterator = frames(self.source, self.config, self._excerpt)

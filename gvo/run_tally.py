@@ -14,6 +14,10 @@ from gvo.odometry import FrameResult
 from gvo.types import FaultyFrame, Status
 
 _BIN_WIDTH = 0.01
+# With more poses that only continue a velocity, a trajectory is in parts made up.
+_MAX_UNTIED_SHARE = 0.1
+# A head that turns on a robot moves its camera by less.
+_MAX_MOUNT_TRAVEL_M = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +65,7 @@ class RunTally:
     first_untied: str = ""
     broken_off: str = ""
     n_guessed: int = 0
+    mount_travel_m: float = 0.0
     window: WindowCounts = field(default_factory=WindowCounts)
     polish: Polish | None = None
     rig_offsets: RigOffsets | None = None
@@ -90,6 +95,7 @@ class RunTally:
     def is_partly(self) -> bool:
         """Tell whether frames are missing, or poses not tied to the others."""
         is_loose = self.n_with_pose > 1 and self.n_tracked < 2
+        is_loose |= self.n_with_pose - self.n_tracked > _MAX_UNTIED_SHARE * self.n_with_pose
         return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
 
     def progress(self, n_images: int) -> Progress:
@@ -123,7 +129,9 @@ class RunTally:
         """Return what was skipped or broke off, a line each."""
         warnings = []
         if self.broken_off:
-            warnings.append(f"the run broke off after {self.n_frames} frames: {self.broken_off}")
+            warnings.append(
+                f"not all could be read, {self.n_frames} frames were: {self.broken_off}"
+            )
         if self.n_faulty:
             warnings.append(
                 f"{self.n_faulty} of {self.n_frames} frames are faulty and were skipped; "
@@ -149,6 +157,12 @@ class RunTally:
             warnings.append(
                 f"{n_untied} of {self.n_with_pose} poses continue the last velocity, without a "
                 "registration (frames.csv: coasting, lost)"
+            )
+        if self.mount_travel_m > _MAX_MOUNT_TRAVEL_M:
+            warnings.append(
+                f"tf moves the camera by {self.mount_travel_m:.1f} m in the frame asked for: a "
+                "frame that stands in the world has no trajectory; ask for one of the robot, and "
+                "name the fixed one by --world"
             )
         if self.n_guessed:
             warnings.append(

@@ -164,7 +164,7 @@ def _conclude(
     try:
         if isinstance(truth, FramedTruth):
             compared = TruthComparison.of(_within(truth, folder, loop), estimates)
-            warnings += [f"ground truth: {truth.warning}"] if truth.warning else []
+            warnings += [f"ground truth: {text}" for text in compared.warnings()]
     except GvoError as error:
         fault = str(error)
     if fault:

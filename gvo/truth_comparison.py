@@ -5,9 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from gvo.evaluation import Evaluation, evaluate
 from gvo.sources.truth_frames import FramedTruth
 from gvo.trajectory import Trajectory
+
+# A truth that stands while the estimate moves is none of it.
+_MIN_EXTENT_M = 0.1
+_MIN_SHARE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,7 +53,24 @@ class TruthComparison:
         )
         return cls(truth=truth, estimates=comparable, evaluations=evaluations)
 
+    def warnings(self) -> list[str]:
+        """Return what the errors are to be taken with, a line each."""
+        warnings = [self.truth.warning] if self.truth.warning else []
+        true_m = _extent(self.truth.trajectory)
+        estimated_m = max(map(_extent, self.estimates.values()))
+        if estimated_m > _MIN_EXTENT_M and true_m < _MIN_SHARE * estimated_m:
+            warnings.append(
+                f"it moves by {true_m:.2g} m where the estimate moves by {estimated_m:.2g} m: is "
+                "it of another frame, are PARENT and CHILD exchanged?"
+            )
+        return warnings
+
     def measure(self, estimate: Trajectory) -> float:
         """Return the absolute trajectory error of another estimate, metres."""
         comparable = self.truth.comparable(estimate)
         return evaluate(self.truth.trajectory, comparable, name="").ate_m
+
+
+def _extent(trajectory: Trajectory) -> float:
+    """Return the diagonal of the box around the positions, metres."""
+    return float(np.linalg.norm(np.ptp(trajectory.positions, axis=0)))

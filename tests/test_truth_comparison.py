@@ -83,6 +83,21 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
     assert TruthComparison.of(unknown, {"right": estimate(poses)}).evaluations[0].ate_m > 0.01
 
 
+def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
+    poses = Walk().true_poses().T_world_cam
+    standing = FramedTruth(
+        trajectory=estimate(np.tile(np.eye(4), (len(poses), 1, 1))),
+        T_frame_point=np.eye(4),
+        decision="",
+    )
+    found = TruthComparison.of(standing, {"raw": estimate(poses)})
+    assert found.evaluations[0].path_ratio is None
+    (warning,) = found.warnings()
+    assert "exchanged?" in warning
+    moving = FramedTruth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
+    assert TruthComparison.of(moving, {"raw": estimate(poses)}).warnings() == []
+
+
 def test_nothing_of_another_time_is_compared() -> None:
     poses = Walk().true_poses()
     late = Trajectory(stamps_ns=poses.stamps_ns + 10**12, T_world_cam=poses.T_world_cam)

@@ -72,7 +72,7 @@ def check_recording(
         *check_images(found.samples, config),
     ]
     if info.sensor == "stereo":
-        findings += check_stereo(found.samples, config)
+        findings += check_stereo(found.samples, info.camera, config)
     else:
         findings += check_depth(found.samples, config)
     if calibration_changes is not None:
@@ -129,7 +129,7 @@ def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
         yield measured(
             "baseline",
             camera.baseline,
-            Limits(low=low, high=high),
+            Limits(low=low, high=high, fault_low=low / 10.0, fault_high=high * 10.0),
             unit="m",
             fix="P[3] of the right CameraInfo is -fx * baseline in metres",
         )

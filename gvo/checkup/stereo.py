@@ -8,11 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gvo.checkup.lens import lens_error
 from gvo.checkup.report import Finding, Limits, judged, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.checkup.stereo_matches import FreeMatcher, FreeMatches
 from gvo.config import CheckConfig, Config
-from gvo.types import FloatArray, StereoFrame
+from gvo.geometry.camera import PinholeCamera
+from gvo.types import Failure, FloatArray, StereoFrame
 
 # Disparities nearer to zero have no sure sign: far points and the noise of a match.
 _SIGN_PX = 1.0
@@ -57,7 +59,9 @@ def row_error(matches: FreeMatches) -> RowError:
     )
 
 
-def check_stereo(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
+def check_stereo(
+    samples: Sequence[Sample], camera: PinholeCamera, config: Config
+) -> Iterator[Finding]:
     """Yield what the matches of left and right say."""
     check = config.check
     pairs = [sample.first for sample in samples if isinstance(sample.first, StereoFrame)]
@@ -79,6 +83,7 @@ def check_stereo(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
         yield unknown("left/right: rows", f"{len(matches)} matches are too few")
         return
     yield from _check_rows(matches, check)
+    yield _check_lens(matches, camera, check)
     yield _check_order(matches, check)
     yield _check_step(samples, matcher)
 
@@ -110,6 +115,20 @@ def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
     yield Finding(
         name="left/right: row search",
         value=f"+/- {seed:g} px would hold 95 % (stereo.row_tolerance_px)",
+    )
+
+
+def _check_lens(matches: FreeMatches, camera: PinholeCamera, check: CheckConfig) -> Finding:
+    error = lens_error(matches, camera)
+    if isinstance(error, Failure):
+        return unknown("left/right: lens distortion", error.reason)
+    return measured(
+        "left/right: lens distortion",
+        error.k1,
+        Limits(fault_low=-check.max_lens_k1, fault_high=check.max_lens_k1),
+        text=f"k1 of about {error.k1:+.2f} is left, sigma {error.sigma:.3f}",
+        fix="the images are raw or wrongly calibrated: choose the raw topics with their D, or give "
+        "a --calibration FILE with D",
     )
 
 

@@ -52,7 +52,9 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
         lost_limits(config.check),
         unit="%",
         text=f"{n_bad} of {len(stamps_ns)} repeat or go back",
-        fix="record anew, or sort by header stamp; such frames are skipped",
+        fix="the driver stamps nothing: --set sync.stamps=recording takes the bag's clock"
+        if np.median(stamps_ns) == 0
+        else "record anew, or sort by header stamp; such frames are skipped",
     )
     forward = steps_ns[steps_ns > 0]
     if len(forward) < 2:
@@ -109,7 +111,11 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
     most_ms = check.max_depth_difference_ms
     if info.sensor == "stereo":
         most_ms = check.max_stereo_difference_ms
-    signed_ms = _nearest_differences(first, second) / 1e6
+    # Of streams of two rates only the slower one's images have partners, all of them.
+    if len(second) < len(first) and info.sensor == "rgbd":
+        signed_ms = -_nearest_differences(second, first) / 1e6
+    else:
+        signed_ms = _nearest_differences(first, second) / 1e6
     sizes_ms = np.abs(signed_ms)
     typical_ms, largest_ms = float(np.median(sizes_ms)), float(sizes_ms.max())
     yield measured(
@@ -121,27 +127,31 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
         f"{largest_ms:.3g} ms largest",
         fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
     )
-    yield _check_partners(name, first, survey.n_pairs, sizes_ms, sensor=info.sensor, config=config)
+    n_frames = min(len(first), len(second)) if info.sensor == "rgbd" else len(first)
+    yield _check_partners(
+        name, first, (n_frames, survey.n_pairs), sizes_ms, sensor=info.sensor, config=config
+    )
 
 
 def _check_partners(
     name: str,
     first: IntArray,
-    n_pairs: int,
+    counts: tuple[int, int],
     sizes_ms: FloatArray,
     *,
     sensor: Sensor,
     config: Config,
 ) -> Finding:
-    n_alone = len(first) - n_pairs
+    n_frames, n_pairs = counts
+    n_alone = max(n_frames - n_pairs, 0)
     key = pair_limit_key(sensor)
     limit_ms, enough_ms = getattr(config.sync, key), math.ceil(float(np.percentile(sizes_ms, 95)))
     return measured(
         f"{name}: frames without partner",
-        n_alone / len(first),
+        n_alone / n_frames,
         lost_limits(config.check),
         unit="%",
-        text=f"{n_alone} of {len(first)} at sync.{key}={limit_ms:g}",
+        text=f"{n_alone} of {n_frames} at sync.{key}={limit_ms:g}",
         # More than half a period only pairs images with the partners of others.
         fix=f"--set sync.{key}={enough_ms} pairs 95 % of them"
         if limit_ms < enough_ms <= _half_period_ms(first) + 1.0

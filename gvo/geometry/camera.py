@@ -112,7 +112,7 @@ class StereoCamera(PinholeCamera):
         PinholeCamera.__post_init__(self)
         if not np.isfinite(self.baseline) or self.baseline <= 0:
             raise CalibrationError(
-                f"the baseline must be positive, got {self.baseline} m "
+                f"the baseline must be positive, got {self.baseline:g} m "
                 "(are left and right exchanged?)"
             )
 

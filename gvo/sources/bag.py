@@ -55,7 +55,8 @@ class BagSource:
     calibration : Path or sequence of Path, optional
         Files that replace the `CameraInfo` messages, see `read_cameras`.
     config : Config, optional
-        Of which `depth.scale` (otherwise that of the calibration, or 1000) and `images` matter.
+        Of which `depth.scale` (otherwise that of the calibration, or 1000), `images` and
+        `sync.stamps` matter.
 
     Raises
     ------
@@ -78,6 +79,7 @@ class BagSource:
         self._reader = BagReader(paths)
         self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self._tf: TfBuffer | None = None
+        self._takes_log_time = config.sync.stamps == "recording"
         self._topics = self._choose_topics(topics or TopicChoice())
         if paths_of(calibration):
             found = calibrations_of_file(calibration, self._topics, self._reader)
@@ -230,6 +232,8 @@ class BagSource:
         else:
             decode = self._decoder(message.topic, is_depth=self._is_depth(stream))
             stamp_ns, load = stamp_of(content.header), partial(decode, content)
+        if self._takes_log_time:
+            stamp_ns = message.log_time_ns
         return StampedImage(
             stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=message.log_time_ns
         )

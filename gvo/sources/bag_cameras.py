@@ -155,15 +155,29 @@ def recorded_depth_scale(reader: BagReader, depth: Topic) -> float | None:
 
 
 def _first_messages(reader: BagReader, names: Collection[str]) -> dict[str, Any]:
-    """Return the first message of each topic that can be decoded."""
+    """Return the first message of each topic that can be decoded, one that is calibrated first.
+
+    A driver may send `CameraInfo` of zeros until it has read its calibration.
+    """
     found: dict[str, Any] = {}
+    uncalibrated: dict[str, Any] = {}
     for message in reader.messages(names):
         if message.topic.name not in found:
             with suppress(RecordingError):
-                found[message.topic.name] = message.decode()
+                content = message.decode()
+                if _is_calibrated(content):
+                    found[message.topic.name] = content
+                else:
+                    uncalibrated.setdefault(message.topic.name, content)
         if len(found) == len(names):
             break
-    return found
+    return uncalibrated | found
+
+
+def _is_calibrated(message: Any) -> bool:  # noqa: ANN401 - of any type
+    matrices = [getattr(message, name, None) for name in ("K", "k", "P", "p")]
+    numbers = [matrix for matrix in matrices if matrix is not None]
+    return not numbers or any(np.any(matrix) for matrix in numbers)
 
 
 def _bag_camera(

@@ -57,7 +57,9 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
     if not np.any(K):
         K = P[:, :3].copy()
     if not np.any(K):
-        raise CalibrationError(f"{where}: the camera is not calibrated: K and P are zero")
+        raise CalibrationError(
+            f"{where}: the camera is not calibrated: K and P are zero; give --calibration FILE"
+        )
     if not np.any(P):
         P = np.hstack([K, np.zeros((3, 1))])
     if not np.any(R):

@@ -54,8 +54,12 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: the calibration cannot be read: {error}") from error
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: the calibration cannot be read: {error.strerror}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f"{path}: the calibration is no text") from error
     if text.startswith(_OPENCV_HEADER):
         text = text.partition("\n")[2]  # with its colon it is no directive of YAML
     try:

@@ -147,7 +147,7 @@ class ImagePreparer:
         if pixels.shape[:2] != self._size:
             raise RecordingError(
                 f"expected {_size_text(self._size)} pixels by the calibration, got "
-                f"{_size_text(pixels.shape)}"
+                f"{_size_text(pixels.shape)}; give that of these images by --calibration FILE"
             )
         return self._depth(pixels) if self._is_depth else self._grey(pixels)
 

@@ -138,6 +138,8 @@ class _Answers:
             reason = f"the stamp goes back from {self.last_ns} to {image.stamp_ns} ns"
         else:
             reason = f"the stamp {image.stamp_ns} ns repeats"
+        if image.stamp_ns == 0:
+            reason += "; the driver stamps nothing: --set sync.stamps=recording takes the bag's"
         self._ready.append(FaultyFrame(stamp_ns=image.stamp_ns, reason=reason))
 
     def add_alone(
@@ -208,7 +210,9 @@ class _ExactTime:
             self._answers.pass_partner(partner)
         if image is not None:
             partners = (stamp for stamp, images in self._waiting.items() if images[1] is not None)
-            self._answers.add_alone(image, min(partners, default=None), is_crowded=is_crowded)
+            next_ns = min(partners, default=None)
+            # Where a later partner is known, a longer queue would not have helped.
+            self._answers.add_alone(image, next_ns, is_crowded=is_crowded and next_ns is None)
 
 
 class _ApproximateTime:

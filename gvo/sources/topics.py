@@ -25,6 +25,7 @@ _SIDES = (
     ("camera0", "camera1"),
     ("camera_0", "camera_1"),
     ("infra1", "infra2"),
+    ("fisheye1", "fisheye2"),
 )
 _COLOR = re.compile(r"rgb|colou?r")
 _DEPTH = re.compile(r"depth")
@@ -138,6 +139,14 @@ def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> C
     ]
     if len(candidates) == 1:
         return candidates[0]
+    for name, topic in zip(("right", "left", "depth", "color"), [*chosen, *chosen], strict=True):
+        # Of each sensor the two flags, the other's of the one that was given.
+        is_of = sensor == ("stereo" if name in ("left", "right") else "rgbd")
+        if topic is not None and not candidates and is_of:
+            raise RecordingError(
+                f"{where}: no partner of {topic.name} is known by its name; give --{name} TOPIC, "
+                f"one of {describe_topics(images)}"
+            )
     raise RecordingError(_explain(where, images, candidates))
 
 

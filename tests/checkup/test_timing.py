@@ -128,8 +128,15 @@ def test_depth_beside_colour_by_15_ms_is_found_with_its_sign(offset_ms: int) -> 
     assert f"({offset_ms:+d} signed)" in finding.text
 
 
+@pytest.mark.parametrize("is_depth_slower", [True, False])
+def test_a_stream_of_half_the_rate_lacks_nothing(is_depth_slower: bool) -> None:
+    streams = [regular(), regular()[::2]]
+    first, second = streams if is_depth_slower else streams[::-1]
+    assert complaints(timing(first, second, n_pairs=150)) == set()
+
+
 def test_missing_partners_are_counted_and_blamed_on_the_stream() -> None:
-    findings = timing(regular(), regular()[::2], n_pairs=150)
+    findings = timing(regular(), regular()[::2], n_pairs=75)
     finding = findings["colour/depth: frames without partner"]
     assert (finding.verdict, finding.value) == ("fault", 50.0)
     assert "dropped frames" in finding.fix

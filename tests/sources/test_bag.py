@@ -296,6 +296,23 @@ def test_several_bags_are_one_recording(tmp_path: Path, tiny: Any) -> None:
     assert len(found) == whole.info.n_images > 1
 
 
+def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny: Any) -> None:
+    plain: list[tuple[str, str, int, Any]] = list(_stereo(tiny))
+    for _, _, _, message in plain:
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+    path = _write(tmp_path / "a.bag", plain)
+    read = list(frames(BagSource(path), Config()))
+    faulty = [item for item in read if isinstance(item, FaultyFrame)]
+    assert all("--set sync.stamps=recording" in item.reason for item in faulty)
+    assert len(faulty) == len(read) - 1 > 0
+    settings = {"sync": {"stamps": "recording", "stereo_tolerance_ms": 1.0}}
+    config = Config.model_validate(settings)
+    stamped = list(frames(BagSource(path, config=config), config))
+    assert [type(item) for item in stamped] == [StereoFrame] * len(read)
+    left = [stamp for name, _, stamp, _ in plain if name == "/s/left/image_rect"]
+    assert [item.stamp_ns for item in stamped] == left
+
+
 def test_of_a_cut_bag_the_start_is_read_and_the_loss_told(tmp_path: Path, tiny: Any) -> None:
     path = _write(tmp_path / "a.bag", _stereo(tiny))
     data = path.read_bytes()

@@ -67,7 +67,10 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
     faults = [(item.stamp_ns, item.reason) for item in read if isinstance(item, FaultyFrame)]
     assert faults == [
         (20, "left image: a.png: damaged"),
-        (30, "right image: expected 48x32 pixels by the calibration, got 48x31"),
+        (
+            30,
+            "right image: expected 48x32 pixels by the calibration, got 48x31; give that of these images by --calibration FILE",
+        ),
         (40, "no right image within sync.stereo_tolerance_ms=0: the nearest is 1e-05 ms away"),
         (50, "left image: b; right image: c"),
         (45, "the stamp goes back from 50 to 45 ns"),
@@ -136,7 +139,10 @@ def test_the_size_of_depth_is_checked_against_its_own_camera(tiny: Any) -> None:
     source.info = replace(source.info, depth_view=_seen_from_beside())
     (faulty,) = _read(source)
     assert isinstance(faulty, FaultyFrame)
-    assert faulty.reason == ("depth image: expected 24x16 pixels by the calibration, got 48x32")
+    assert faulty.reason == (
+        "depth image: expected 24x16 pixels by the calibration, got 48x32; give that of these "
+        "images by --calibration FILE"
+    )
 
 
 @_THREADS
