@@ -69,7 +69,8 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
         (20, "left image: a.png: damaged"),
         (
             30,
-            "right image: expected 48x32 pixels by the calibration, got 48x31; give that of these images by --calibration FILE",
+            "right image: expected 48x32 pixels by the calibration, got 48x31; give that of these "
+            "images by --calibration FILE",
         ),
         (40, "no right image within sync.stereo_tolerance_ms=0: the nearest is 1e-05 ms away"),
         (50, "left image: b; right image: c"),
