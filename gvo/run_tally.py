@@ -125,6 +125,10 @@ class RunTally:
             self.n_unpaired += 1
             self.first_unpaired = self.first_unpaired or reason
 
+    def reason(self) -> str:
+        """Return why there is no frame with a pose."""
+        return self.broken_off or self.first_fault or self.first_unpaired or "it holds no image"
+
     def warnings(self) -> list[str]:
         """Return what was skipped or broke off, a line each."""
         warnings = []

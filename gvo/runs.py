@@ -114,7 +114,7 @@ def run_recording(
     """
     config = config or Config()
     frame = frame or OutputFrame(source.info.frame_id)
-    truth, fault = _find_truth(source, ground_truth, frame)
+    truth = _find_truth(source, ground_truth, frame)
     loop = RunLoop(
         source,
         config,
@@ -131,70 +131,79 @@ def run_recording(
             outputs.append(stack.enter_context(RunBag(bag, names)))
         folder = stack.enter_context(RunFolder(Path(out)))
         loop.run([folder, *outputs], on_progress)
-    return _conclude(loop, folder, truth, fault, is_asked=ground_truth is not None)
+    if loop.tally.n_with_pose == 0:
+        raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
+    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+    compared = _compare(truth, folder, loop, estimates)
+    return _conclude(loop, folder, compared, estimates, is_asked=ground_truth is not None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Fault(Failure):
+    """Why there is no truth to compare with, though there should be one."""
 
 
 def _find_truth(
     source: Source, given: Trajectory | FramedTruth | None, frame: OutputFrame
-) -> tuple[FramedTruth | Failure, str]:
-    """Return the truth, and what is wrong with that of the recording."""
+) -> FramedTruth | Failure:
     if isinstance(given, Trajectory):
-        return FramedTruth(trajectory=given, T_frame_point=np.eye(4), decision="given"), ""
+        return FramedTruth(trajectory=given, T_frame_point=np.eye(4), decision="given")
     if given is not None:
-        return given, ""
+        return given
     try:
-        return own_truth(source, frame=frame), ""
+        return own_truth(source, frame=frame)
     except GvoError as error:
         # What was not asked for must not keep the run from being made.
-        return Failure(reason=str(error)), str(error)
+        return _Fault(reason=str(error))
+
+
+def _compare(
+    truth: FramedTruth | Failure,
+    folder: RunFolder,
+    loop: RunLoop,
+    estimates: dict[str, Trajectory],
+) -> TruthComparison | Failure:
+    if isinstance(truth, Failure):
+        return truth
+    try:
+        return TruthComparison.of(_within(truth, folder, loop), estimates)
+    except GvoError as error:
+        return _Fault(reason=str(error))
 
 
 def _conclude(
-    loop: RunLoop, folder: RunFolder, truth: FramedTruth | Failure, fault: str, *, is_asked: bool
+    loop: RunLoop,
+    folder: RunFolder,
+    compared: TruthComparison | Failure,
+    estimates: dict[str, Trajectory],
+    *,
+    is_asked: bool,
 ) -> RunResult:
-    tally = loop.tally
-    if tally.n_with_pose == 0:
-        reason = (
-            tally.broken_off or tally.first_fault or tally.first_unpaired or "it holds no image"
-        )
-        raise RecordingError(f"{loop.source.info.name}: no usable frame: {reason}")
-    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    warnings = tally.warnings()
-    compared: TruthComparison | None = None
-    try:
-        if isinstance(truth, FramedTruth):
-            compared = TruthComparison.of(_within(truth, folder, loop), estimates)
-            warnings += [f"ground truth: {text}" for text in compared.warnings()]
-    except GvoError as error:
-        fault = str(error)
-    if fault:
-        warnings.append(f"not compared with the ground truth: {fault}")
+    """Write summary and picture."""
+    warnings = loop.tally.warnings()
+    found = compared if isinstance(compared, TruthComparison) else None
+    if found is not None:
+        warnings += [f"ground truth: {text}" for text in found.warnings()]
+    elif isinstance(compared, _Fault):
+        warnings.append(f"not compared with the ground truth: {compared.reason}")
     summary = _summary(loop, compared, warnings)
-    if isinstance(truth, Failure) or compared is None:
-        reason = truth.reason if isinstance(truth, Failure) else fault
-        summary["ground_truth"] = f"none: {reason}"
     if loop.comparison is not None:
+        measure = None if found is None else found.measure
         summary["smoothing"] = loop.comparison.conclude(
-            folder.path,
-            measure=None if compared is None else compared.measure,
-            place=loop.frame.place,
+            folder.path, measure=measure, place=loop.frame.place
         )
     folder.write_summary(summary)
-    _plot(folder.path / PICTURE, compared, estimates)
-    is_partly = tally.is_partly or (is_asked and compared is None)
+    if found is None:
+        plot_trajectories(folder.path / PICTURE, None, estimates)
+    else:
+        plot_trajectories(folder.path / PICTURE, found.truth.trajectory, found.estimates)
+    is_partly = loop.tally.is_partly or (is_asked and found is None)
     return RunResult(
         summary=summary,
-        evaluations=() if compared is None else compared.evaluations,
+        evaluations=() if found is None else found.evaluations,
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
-
-
-def _plot(path: Path, compared: TruthComparison | None, estimates: dict[str, Trajectory]) -> None:
-    if compared is None:
-        plot_trajectories(path, None, estimates)
-    else:
-        plot_trajectories(path, compared.truth.trajectory, compared.estimates)
 
 
 def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth:
@@ -215,9 +224,14 @@ def _frame_text(frame: OutputFrame) -> str:
 
 
 def _summary(
-    loop: RunLoop, compared: TruthComparison | None, warnings: list[str]
+    loop: RunLoop, compared: TruthComparison | Failure, warnings: list[str]
 ) -> dict[str, Any]:
     info, tally = loop.source.info, loop.tally
+    evaluations: tuple[Evaluation, ...] = ()
+    if isinstance(compared, Failure):
+        truth = f"none: {compared.reason}"
+    else:
+        truth, evaluations = compared.truth.decision, compared.evaluations
     medians = {stage: durations.median() for stage, durations in tally.stages.items()}
     return {
         "gvo_version": __version__,
@@ -225,7 +239,7 @@ def _summary(
         "sensor": info.sensor,
         "decisions": list(info.decisions),
         "frame": _frame_text(loop.frame),
-        "ground_truth": "" if compared is None else compared.truth.decision,
+        "ground_truth": truth,
         "frames": tally.n_frames,
         "tracked": tally.n_tracked,
         "coverage": tally.n_with_pose / tally.n_frames,
@@ -236,7 +250,7 @@ def _summary(
         "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
-        "errors": evaluations_json(() if compared is None else compared.evaluations)["estimates"],
+        "errors": evaluations_json(evaluations)["estimates"],
         "warnings": warnings,
         "configuration": loop.config.model_dump(),
     }

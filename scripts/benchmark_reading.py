@@ -45,6 +45,8 @@ def main() -> None:
     parser.add_argument("bags", type=Path, nargs="+", metavar="BAG")
     parser.add_argument("--rounds", type=int, default=5, help="passes of each, in turns")
     arguments = parser.parse_args()
+    if arguments.rounds < 1:
+        parser.error("--rounds must be at least 1")
     print("| bag | images | bare ms | frames ms | ratio |")
     print("|---|---|---|---|---|")
     with one_opencv_thread():

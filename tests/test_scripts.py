@@ -49,6 +49,15 @@ def test_a_rendered_bag_can_be_run(tmp_path: Path) -> None:
     assert source.ground_truth() is not None
 
 
+def test_reading_is_timed_against_the_bare_loop(drive_bag: Path, room_bag: Path) -> None:
+    answer = run("benchmark_reading", drive_bag, room_bag, "--rounds", 1)
+    assert answer.returncode == 0, answer.stderr
+    rows = table(answer.stdout.splitlines(), "bag")
+    assert [rows[name][0] for name in ("drive.mcap", "room.bag")] == ["40", "40"]
+    for _, bare_ms, frames_ms, ratio in rows.values():
+        assert min(float(bare_ms), float(frames_ms), float(ratio)) > 0.0
+
+
 def table(lines: list[str], first: str) -> dict[str, list[str]]:
     """Return the rows of the Markdown table whose first heading is given, by their first cell."""
     start = next(n for n, line in enumerate(lines) if line.startswith(f"| {first} "))
@@ -200,6 +209,8 @@ def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(tmp_path: P
         ("benchmark", []),
         ("benchmark", ["--soak", "10"]),
         ("benchmark", ["x.bag", "--rounds", "0"]),
+        ("benchmark_reading", ["missing.bag"]),
+        ("benchmark_reading", ["x.bag", "--rounds", "0"]),
         ("make_demo_bag", ["missing/folder/that/is.a.txt"]),
         ("make_demo_bag", ["x.bag", "--frames", "0"]),
     ],

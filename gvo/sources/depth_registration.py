@@ -139,7 +139,8 @@ def _close_gaps(painted: DepthArray, square: NDArray[np.uint8]) -> DepthArray:
 
 def _check_rigid(T: FloatArray) -> None:
     R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or not np.all(np.isfinite(T)):
+    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0
+    if not is_rotation or not np.all(np.isfinite(T)):
         raise ValueError(f"T_color_depth must be a rigid transform, got {T.tolist()}")
 
 
