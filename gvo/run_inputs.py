@@ -123,11 +123,10 @@ def own_truth(source: Source, *, frame: OutputFrame | None = None) -> FramedTrut
 
 
 def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
-    """Return what the bag knows of frames; None where the recording is no bag or holds no tf."""
+    """Return what a bag knows of frames; None where the recording is no bag."""
     if not isinstance(source, BagSource):
         return None
-    buffer = source.transforms([name for name in frames if name])
-    return buffer if buffer.frames else None
+    return source.transforms([name for name in frames if name])
 
 
 def count_calibration_changes(source: Source) -> dict[str, int] | None:

@@ -75,7 +75,9 @@ def test_transforms_are_there_where_a_bag_holds_them(
     images = copy_messages(
         [walk_bag], tmp_path / "images.mcap", lambda topic, _: "/tf" not in topic
     )
-    assert read_transforms(gvo.open_recording(images), ["base_link"]) is None
+    empty = read_transforms(gvo.open_recording(images), ["base_link"])
+    assert empty is not None
+    assert empty.frames == ()
     assert read_transforms(Walk(), ["base_link"]) is None
 
 

@@ -121,6 +121,18 @@ def test_a_stream_that_lags_by_a_frame_is_found_although_its_stamps_are_right(
     assert bench.complaints(checkup) <= {finding.name} | others
 
 
+@pytest.mark.parametrize(("factor", "verdict"), [(1000.0, "fault"), (0.001, "fault"), (1, "ok")])
+def test_a_baseline_in_another_unit_is_found(bench: Any, factor: float, verdict: str) -> None:
+    recording = bench.render("driving", "stereo")
+    left, right = recording.info.calibrations
+    P = right.P.copy()
+    P[0, 3] *= factor
+    info = replace(recording.info, calibrations=(left, replace(right, P=P)))
+    finding = bench.find(bench.check(replace(recording, info=info)), "baseline")
+    assert finding.verdict == verdict
+    assert finding.value == pytest.approx(0.53715 * factor)
+
+
 @pytest.mark.parametrize("k1", [-0.3, 0.25])
 @pytest.mark.parametrize("world", ["driving", "handheld"])
 def test_a_lens_that_was_not_rectified_is_found_though_rows_hardly_differ(
