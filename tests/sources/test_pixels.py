@@ -183,6 +183,17 @@ def test_zero_and_the_largest_count_are_unknown() -> None:
     np.testing.assert_array_equal(np.isnan(depth), [[True, True, False]])
 
 
+def test_depth_of_which_all_unknown_is_marked_is_not_copied() -> None:
+    marked = np.array([[0.5, np.nan], [65.0, 1e-3]], dtype=np.float32)
+    assert depth_from_metres(marked) is marked
+    for wrong in (0.0, -0.5, np.inf, -np.inf):
+        spoilt = marked.copy()
+        spoilt[0, 0] = wrong
+        depth = depth_from_metres(spoilt)
+        np.testing.assert_array_equal(depth, [[np.nan, np.nan], *marked[1:]])
+        assert spoilt[0, 0] == wrong
+
+
 def test_metres_that_are_not_positive_are_unknown() -> None:
     depth = depth_from_metres(np.array([[0.0, -1.0, np.inf, -np.inf, np.nan, 2.0]]))
     np.testing.assert_array_equal(np.isnan(depth), [[True] * 5 + [False]])
