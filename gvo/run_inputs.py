@@ -82,7 +82,7 @@ def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) 
     frame = frame or OutputFrame()
     spec = parse_truth(text)
     if isinstance(spec, FileTruth):
-        return _as_it_stands(read_ground_truth(spec.path), str(spec.path))
+        return FramedTruth(trajectory=read_ground_truth(spec.path), decision=str(spec.path))
     if not isinstance(source, BagSource):
         raise TrajectoryError(
             f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
@@ -119,7 +119,7 @@ def own_truth(source: Source, *, frame: OutputFrame | None = None) -> FramedTrut
     truth = source.ground_truth()
     if truth is None:
         return Failure(reason="the recording holds none")
-    return _as_it_stands(frame.convert(truth), "of the recording")
+    return FramedTruth(trajectory=frame.convert(truth), decision="of the recording")
 
 
 def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
@@ -235,10 +235,6 @@ def initial_pose(truth: FramedTruth | Failure, stamp_ns: int) -> FloatArray:
     poses = at_first if len(at_first) else truth.trajectory
     first: FloatArray = poses.T_world_cam[0]
     return first
-
-
-def _as_it_stands(trajectory: Trajectory, decision: str) -> FramedTruth:
-    return FramedTruth(trajectory=trajectory, T_frame_point=np.eye(4), decision=decision)
 
 
 def _name_in_tf(frame: OutputFrame) -> str:

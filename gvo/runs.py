@@ -147,7 +147,7 @@ def _find_truth(
     source: Source, given: Trajectory | FramedTruth | None, frame: OutputFrame
 ) -> FramedTruth | Failure:
     if isinstance(given, Trajectory):
-        return FramedTruth(trajectory=given, T_frame_point=np.eye(4), decision="given")
+        return FramedTruth(trajectory=given, decision="given")
     if given is not None:
         return given
     try:

@@ -22,8 +22,9 @@ from gvo.outputs.conversion import (
     pose_on_body,
     readable_images,
 )
-from gvo.outputs.depth_counts import MILLIMETRES, exact_counts
+from gvo.outputs.depth_counts import exact_counts
 from gvo.sources.frames import ImagePreparer
+from gvo.sources.pixels import MILLIMETRES
 from gvo.sources.recording import RecordingInfo, Source
 from gvo.types import FloatArray
 

@@ -3,36 +3,19 @@
 from __future__ import annotations
 
 import struct
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.errors import RecordingError
 from gvo.outputs.bag_messages import BagWriter, Header
-from gvo.outputs.depth_counts import MILLIMETRES, exact_counts
+from gvo.outputs.depth_counts import exact_counts
+from gvo.outputs.image_files import encode_jpeg, encode_png, encode_tiff
+from gvo.sources.pixels import MILLIMETRES
 from gvo.sources.topics import COMPRESSED_TYPE
-from gvo.types import DepthArray
+from gvo.types import DepthArray, ImageArray
 
 # The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
 _DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
-
-
-def encode_png(pixels: NDArray[Any]) -> bytes:
-    """Return an image as a PNG file.
-
-    Parameters
-    ----------
-    pixels : ndarray of uint8 or uint16, shape (h, w) or (h, w, 3)
-        Grey, or colour in BGR order.
-
-    Raises
-    ------
-    RecordingError
-        When it cannot be one.
-    """
-    return _encode(".png", pixels)
 
 
 def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
@@ -70,18 +53,26 @@ def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header
     """
     counts = exact_counts(depth, MILLIMETRES)
     if counts is None:
-        _write(bag, topic, "32FC1; tiff compressed ", _encode(".tiff", depth), header)
+        _write(bag, topic, "32FC1; tiff compressed ", encode_tiff(depth), header)
     else:
         _write(bag, topic, "16UC1; compressedDepth", _DEPTH_HEADER + encode_png(counts), header)
 
 
-def _encode(suffix: str, pixels: NDArray[Any]) -> bytes:
-    is_encoded, data = cv2.imencode(suffix, pixels)
-    if not is_encoded:
-        raise RecordingError(
-            f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
-        )
-    return data.tobytes()
+def write_picture(bag: BagWriter, topic: str, header: Header, image: ImageArray) -> None:
+    """Write a picture as JPEG.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to; by convention it ends in `/compressed`.
+    header : Header
+        Stamp and frame of the camera.
+    image : ndarray of uint8, shape (height, width, 3)
+        BGR.
+    """
+    _write(bag, topic, "jpeg", encode_jpeg(image), header)
 
 
 def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -> None:

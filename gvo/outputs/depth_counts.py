@@ -8,9 +8,6 @@ from numpy.typing import NDArray
 from gvo.sources.pixels import depth_from_counts
 from gvo.types import DepthArray
 
-MILLIMETRES = 1000.0
-"""Counts per metre of depth in millimetres."""
-
 MAX_COUNT = 65534
 """Largest count: 0 and 65535 are unknown."""
 

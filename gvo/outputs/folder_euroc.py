@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.outputs.compressed_messages import encode_png
 from gvo.outputs.conversion import LeftOut, pose_on_body
 from gvo.outputs.folder_calibrations import write_sensor_yaml
 from gvo.outputs.folder_streams import FolderStreams
+from gvo.outputs.image_files import encode_png
 from gvo.sources.recording import Source, StampedImage
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import write_euroc

@@ -9,10 +9,10 @@ import numpy as np
 
 from gvo.config import SyncConfig
 from gvo.geometry import se3
-from gvo.outputs.compressed_messages import encode_png
 from gvo.outputs.conversion import LeftOut
 from gvo.outputs.folder_calibrations import write_projections
 from gvo.outputs.folder_streams import FolderStreams
+from gvo.outputs.image_files import encode_png
 from gvo.sources.frames import paired
 from gvo.sources.recording import Source, StampedImage
 from gvo.trajectory import Trajectory, format_stamp

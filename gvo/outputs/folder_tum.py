@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from gvo.errors import RecordingError
-from gvo.outputs.compressed_messages import encode_png
 from gvo.outputs.conversion import LeftOut, ideal_calibration
-from gvo.outputs.depth_counts import MAX_COUNT, MILLIMETRES, is_in_counts, to_counts
+from gvo.outputs.depth_counts import MAX_COUNT, is_in_counts, to_counts
 from gvo.outputs.folder_calibrations import write_camera_info_yaml
 from gvo.outputs.folder_streams import FolderStreams
+from gvo.outputs.image_files import encode_png
+from gvo.sources.pixels import MILLIMETRES
 from gvo.sources.recording import Source, StampedImage
 from gvo.sources.tum import DEFAULT_SCALE, published_calibration
 from gvo.trajectory import Trajectory, format_stamp

@@ -75,25 +75,6 @@ def draw_matches(
     return canvas
 
 
-def encode_jpeg(image: ImageArray, *, quality: int = 80) -> ImageArray:
-    """Return a JPEG file of an image.
-
-    Parameters
-    ----------
-    image : ndarray of uint8, shape (height, width, 3)
-        BGR.
-    quality : int
-        0 to 100.
-
-    Returns
-    -------
-    ndarray of uint8, shape (n,)
-        The bytes of the file.
-    """
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(data, dtype=np.uint8).ravel()
-
-
 def _fixed_point(pixels: FloatArray) -> IntArray:
     scaled = np.rint(np.clip(pixels, -_MAX_PX, _MAX_PX) * 2**_BITS)
     return np.asarray(scaled, dtype=np.int64)

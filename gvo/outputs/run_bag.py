@@ -47,13 +47,13 @@ from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.odometry import FrameResult
 from gvo.outputs.bag_messages import BagWriter, Header, write_transforms
+from gvo.outputs.compressed_messages import write_picture
 from gvo.outputs.overlays import draw_matches
 from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.run_messages import (
     write_diagnostics,
     write_odometry,
     write_path,
-    write_picture,
     write_points,
 )
 from gvo.outputs.run_tracks import StampedPose, Track, twist_between

@@ -9,10 +9,8 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.outputs.bag_messages import BagWriter, Header, pose_numbers
-from gvo.outputs.overlays import encode_jpeg
 from gvo.outputs.run_tracks import Twist
-from gvo.sources.topics import COMPRESSED_TYPE
-from gvo.types import BoolArray, Estimate, FloatArray, ImageArray, IntArray, Status
+from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
 PATH_TYPE: Final = "nav_msgs/msg/Path"
@@ -168,26 +166,6 @@ def write_points(
         is_dense=True,
     )
     bag.write(topic, CLOUD_TYPE, message, header.stamp_ns)
-
-
-def write_picture(bag: BagWriter, topic: str, header: Header, image: ImageArray) -> None:
-    """Write a picture as a `sensor_msgs/CompressedImage` of format jpeg.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        Where to; by convention it ends in `/compressed`.
-    header : Header
-        Stamp and frame of the camera.
-    image : ndarray of uint8, shape (height, width, 3)
-        BGR.
-    """
-    message = bag.make(
-        COMPRESSED_TYPE, header=bag.header(header), format="jpeg", data=encode_jpeg(image)
-    )
-    bag.write(topic, COMPRESSED_TYPE, message, header.stamp_ns)
 
 
 def write_diagnostics(

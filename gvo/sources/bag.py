@@ -23,7 +23,7 @@ from gvo.sources.messages import (
     decode_grey_or_color,
     stamp_of,
 )
-from gvo.sources.pixels import GreyRange
+from gvo.sources.pixels import MILLIMETRES, GreyRange
 from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.sources.tf import TfBuffer, read_tf
 from gvo.sources.topics import (
@@ -38,9 +38,6 @@ from gvo.sources.truth_frames import FramedTruth, find_framed_truth
 from gvo.sources.truth_specs import BagTruthSpec
 from gvo.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
-
-DEFAULT_SCALE = 1000.0
-"""Counts per metre of integer depth in messages: millimetres, by REP 118."""
 
 
 class BagSource:
@@ -85,7 +82,7 @@ class BagSource:
             found = calibrations_of_file(calibration, self._topics, self._reader)
         else:
             found = calibrations_of_messages(self._reader, self._topics, self._where)
-        self._scale = config.depth.scale or found.depth_scale or DEFAULT_SCALE
+        self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
         decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
         if self._topics.sensor == "rgbd":

@@ -56,6 +56,9 @@ class GreyRange:
         return (above * 256 // (self.white + 1 - self.black)).astype(np.uint8)
 
 
+MILLIMETRES = 1000.0
+"""Counts per metre of depth in millimetres: integer depth in messages is so by REP 118."""
+
 # All positive finite numbers: neither zero nor infinity, and no comparison holds for NaN.
 _KNOWN_DEPTH_M = (
     float(np.nextafter(np.float32(0), np.float32(1))),

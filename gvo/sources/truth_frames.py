@@ -25,17 +25,17 @@ class FramedTruth:
     ----------
     trajectory : Trajectory
         T_parent_frame; of positions without rotations those of the point that was measured.
-    T_frame_point : ndarray of float64, shape (4, 4)
-        Where that point lies in the frame, metres; the identity for poses.
     decision : str
         What was read and how it was brought into the frame, in one line.
+    T_frame_point : ndarray of float64, shape (4, 4)
+        Where that point lies in the frame, metres; the identity for poses.
     warning : str
         What the errors are to be taken with, in one line; empty where there is nothing.
     """
 
     trajectory: Trajectory
-    T_frame_point: FloatArray
     decision: str
+    T_frame_point: FloatArray = field(default_factory=lambda: np.eye(4))
     warning: str = ""
 
     def comparable(self, estimate: Trajectory) -> Trajectory:
@@ -205,6 +205,4 @@ def _between(
 
 
 def _framed(truth: BagTruth, how: str) -> FramedTruth:
-    return FramedTruth(
-        trajectory=truth.trajectory, T_frame_point=np.eye(4), decision=f"{truth.decision}{how}"
-    )
+    return FramedTruth(trajectory=truth.trajectory, decision=f"{truth.decision}{how}")

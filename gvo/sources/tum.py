@@ -21,7 +21,7 @@ from gvo.sources.calibration_files import (
 )
 from gvo.sources.camera_fields import CameraFields
 from gvo.sources.folders import FolderSource, StampedPath
-from gvo.sources.pixels import FULL_RANGE, GreyRange, read_depth
+from gvo.sources.pixels import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
 from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import read_rows, read_stamp
 from gvo.trajectory import Trajectory
@@ -29,8 +29,6 @@ from gvo.trajectory_files import read_trajectory
 
 DEFAULT_SCALE = 5000.0
 """Counts per metre of the benchmark's depth images."""
-MILLIMETRES = 1000.0
-"""Counts per metre of depth images in millimetres."""
 
 _PLAUSIBLE_MEDIAN_M = (0.5, 10.0)
 

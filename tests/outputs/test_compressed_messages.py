@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from gvo.errors import RecordingError
 from gvo.outputs.bag_writer import convert
-from gvo.outputs.compressed_messages import encode_png
+from gvo.outputs.image_files import encode_png
 from gvo.sources.opening import open_recording
 from tests.sources.conftest import Item, Tiny
 

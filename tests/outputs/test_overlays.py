@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.outputs.overlays import INLIER_COLOUR, OUTLIER_COLOUR, draw_matches, encode_jpeg
+from gvo.outputs.image_files import encode_jpeg
+from gvo.outputs.overlays import INLIER_COLOUR, OUTLIER_COLOUR, draw_matches
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
 _pixels = st.tuples(st.floats(-30, 150), st.floats(-30, 110))
@@ -93,6 +94,7 @@ def test_a_coloured_image_and_unequal_counts_are_refused() -> None:
 
 def test_a_jpeg_shows_the_picture() -> None:
     smooth = cv2.GaussianBlur(_draw([((20.0, 30.0), (60.0, 35.0), True)]), (0, 0), 3)
-    decoded = cv2.imdecode(encode_jpeg(np.asarray(smooth, dtype=np.uint8)), cv2.IMREAD_COLOR)
+    data = encode_jpeg(np.asarray(smooth, dtype=np.uint8))
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
     np.testing.assert_allclose(decoded.astype(float), smooth.astype(float), atol=12)
