@@ -14,6 +14,7 @@ from gvo.backend.comparison import MeasurementLog
 from gvo.backend.window import SlidingWindow
 from gvo.chain import RawChain, RawStep
 from gvo.config import Config, WindowConfig
+from gvo.frame_links import FrameLink, LinkKind, judge_links
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.offset import RigOffsets
@@ -52,6 +53,10 @@ class FrameResult:
         the window.
     registration : RelativePose or None
         Against the frame that the raw chain goes on from; None where there is none.
+    links : tuple of FrameLink
+        The edges that were offered to the window with the frame.
+    keyframes_ns : tuple of int
+        Stamps of the kept frames, oldest first; of this one too, where it became one.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -67,6 +72,8 @@ class FrameResult:
     n_inliers: int
     n_links: int
     registration: RelativePose | None = None
+    links: tuple[FrameLink, ...] = ()
+    keyframes_ns: tuple[int, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -145,8 +152,9 @@ class Odometry:
         with watch.stage("register"):
             step = self._chain.advance(observations)
         with watch.stage("links"):
-            edges, scores = self._edges(observations, step)
+            offered, scores = self._edges(observations, step)
         with watch.stage("window"):
+            edges = [edge for _, edge in offered]
             causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges)
             self._update_keyframes(observations, scores, causal)
             self._hold_anchor()
@@ -163,6 +171,8 @@ class Odometry:
             n_inliers=step.n_inliers,
             n_links=len(edges) - len(causal.rejected),
             registration=step.registration,
+            links=judge_links(offered, frame.stamp_ns, self._window),
+            keyframes_ns=tuple(self._keyframes.stamps_ns),
             stage_ms=watch.stage_ms,
         )
 
@@ -170,14 +180,20 @@ class Odometry:
         """Return the smoothed poses of the frames still in the window."""
         return tuple(self._window.finish())
 
-    def _edges(self, observations: Any, step: RawStep) -> tuple[list[Edge], dict[int, float]]:  # noqa: ANN401
+    def _edges(
+        self,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        step: RawStep,
+    ) -> tuple[list[tuple[LinkKind, Edge]], dict[int, float]]:
         """Return the edges of a frame, to its predecessor first, and the keyframes' scores."""
         if step.reference_ns is None:
             return [], {}
         # A step that only goes on as before is no measurement: the window does that by itself.
-        first = _edge_of(step) if step.is_registered else None
+        first: list[tuple[LinkKind, Edge]] = []
+        if step.is_registered:
+            first.append(("step", _edge_of(step)))
         if step.reference_ns not in self._window:  # not even alone would it go in
-            return list(filter(None, [first])), {}
+            return first, {}
         T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
         T_frame_keyframes = {
             stamp_ns: se3.invert(T_world_frame) @ self._window.pose(stamp_ns)
@@ -186,12 +202,12 @@ class Odometry:
         }
         scores = self._keyframes.scores(T_frame_keyframes)
         chosen = choose_links(scores, self._config.window, exclude=step.reference_ns)
-        links = [
-            self._link(stamp_ns, observations, se3.invert(T_frame_keyframes[stamp_ns]))
-            for stamp_ns in chosen
+        links: list[tuple[LinkKind, Edge | None]] = [
+            ("keyframe", self._link(ns, observations, se3.invert(T_frame_keyframes[ns])))
+            for ns in chosen
         ]
-        links.append(zero_motion_edge(step, self._config.window))
-        return list(filter(None, [first, *links])), scores
+        links.append(("standstill", zero_motion_edge(step, self._config.window)))
+        return first + [(kind, edge) for kind, edge in links if edge is not None], scores
 
     def _link(
         self,

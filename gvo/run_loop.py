@@ -76,6 +76,7 @@ class RunLoop:
         self.tally = RunTally()
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
+        self._read_ms = 0.0
         log = None if comparison is None else comparison.log
         self._odometry = Odometry(source.info.camera, config, log=log)
 
@@ -125,7 +126,8 @@ class RunLoop:
             except RecordingError as error:
                 self.tally.broken_off = str(error)
                 return
-            self.tally.add_duration("read", 1e3 * (time.perf_counter() - start))
+            self._read_ms = 1e3 * (time.perf_counter() - start)
+            self.tally.add_duration("read", self._read_ms)
             yield item
 
     def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
@@ -146,6 +148,7 @@ class RunLoop:
             raw=self.frame.apply(result.raw),
             causal=self.frame.apply(result.causal),
             finished=self._placed(result.finished),
+            stage_ms={"read": self._read_ms, **result.stage_ms},
         )
         for output in outputs:
             output.add_frame(item, placed)

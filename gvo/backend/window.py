@@ -297,6 +297,14 @@ class SlidingWindow:
         """Return T_world_frame of all poses of the window, oldest first."""
         return {frame_id: self.pose(frame_id) for frame_id in self._members}
 
+    def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
+        """Return the edges from earlier frames that were accepted for a frame.
+
+        Empty where it is not in the window.
+        """
+        member = self._members.get(frame_id)
+        return () if member is None else tuple(member.edges)
+
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
         return self._member(frame_id).stamp_ns

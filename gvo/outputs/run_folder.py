@@ -30,10 +30,12 @@ FRAMES_HEADER = (
     "n_links",
     "reason",
 )
+EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
+TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
 
 
 class RunFolder:
-    """Trajectories, covariances and the table of frames, appended line by line.
+    """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` puts them in the
     order of their stamps.
@@ -72,6 +74,9 @@ class RunFolder:
                 self._open(f"{name}.txt", "")
                 self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
             self._open("frames.csv", _csv_line(columns))
+            if columns is FRAMES_HEADER:
+                self._open("edges.csv", _csv_line(EDGES_HEADER))
+                self._open("timings.csv", _csv_line(TIMINGS_HEADER))
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:
@@ -102,6 +107,8 @@ class RunFolder:
             result.reason,
         )
         self.add_poses(result.raw, result.causal, row)
+        self._write("edges.csv", "".join(map(_csv_line, _link_rows(result))))
+        self._write("timings.csv", _csv_line((result.stamp_ns, *_times(result))))
         self.add_smoothed(result.finished)
 
     def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
@@ -160,6 +167,18 @@ class RunFolder:
     ) -> None:
         """Close the files, also where the run was interrupted."""
         self.close()
+
+
+def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
+    for link in result.links:
+        chi2 = "" if link.chi2 is None else f"{link.chi2:.6g}"
+        yield result.stamp_ns, link.reference_ns, link.kind, int(link.is_accepted), chi2
+
+
+def _times(result: FrameResult) -> Iterator[str]:
+    for name in TIMINGS_HEADER[1:]:
+        elapsed_ms = result.stage_ms.get(name.removesuffix("_ms"))
+        yield "" if elapsed_ms is None else f"{elapsed_ms:.3f}"
 
 
 def _sort_lines(path: Path, *, n_header: int) -> None:

@@ -1,0 +1,79 @@
+"""The edges that came with a frame, and how well the window's poses fit them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from gvo.backend.window import SlidingWindow
+from gvo.geometry import se3
+from gvo.types import Edge
+
+LinkKind: TypeAlias = Literal["step", "keyframe", "standstill"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameLink:
+    """An edge from an earlier frame to the newest one, after the window took it.
+
+    Parameters
+    ----------
+    reference_ns : int
+        Stamp of the earlier frame.
+    kind : {"step", "keyframe", "standstill"}
+        To the frame that the raw chain goes on from, to a keyframe, or without motion.
+    chi2 : float or None
+        Squared norm of the whitened residual, of 6 degrees of freedom: about 6 where the stated
+        covariances are right; None where the earlier frame left the window with the update.
+    is_accepted : bool
+        False where the window refused the edge.
+    """
+
+    reference_ns: int
+    kind: LinkKind
+    chi2: float | None
+    is_accepted: bool
+
+
+def judge_links(
+    offered: Sequence[tuple[LinkKind, Edge]], frame_id: int, window: SlidingWindow
+) -> tuple[FrameLink, ...]:
+    """Compare the edges of the newest frame with the poses of the window.
+
+    Parameters
+    ----------
+    offered : sequence of (kind, Edge)
+        As they were offered to the window; frames are named by their stamps.
+    frame_id : int
+        The newest frame.
+    window : SlidingWindow
+        After it took the frame.
+    """
+    accepted = {id(edge) for edge in window.edges(frame_id)}
+    is_there = frame_id in window
+    known = [edge for _, edge in offered if is_there and edge.reference_id in window]
+    chi2 = dict(zip(map(id, known), _chi2(known, frame_id, window), strict=True))
+    return tuple(
+        FrameLink(
+            reference_ns=int(edge.reference_id),  # type: ignore[call-overload]
+            kind=kind,
+            chi2=chi2.get(id(edge)),
+            is_accepted=id(edge) in accepted,
+        )
+        for kind, edge in offered
+    )
+
+
+def _chi2(edges: Sequence[Edge], frame_id: int, window: SlidingWindow) -> list[float]:
+    if not edges:
+        return []
+    T_world_frame = window.pose(frame_id)
+    T_world_references = np.stack([window.pose(edge.reference_id) for edge in edges])
+    measured = np.stack([edge.T_reference_frame for edge in edges])
+    residuals = se3.log(se3.invert(measured) @ se3.invert(T_world_references) @ T_world_frame)
+    covariances = np.stack([edge.covariance for edge in edges])
+    whitened = np.linalg.solve(covariances, residuals[..., np.newaxis])[..., 0]
+    return [float(value) for value in np.einsum("ni,ni->n", residuals, whitened)]
