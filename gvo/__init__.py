@@ -6,6 +6,8 @@ The public names are loaded when they are first used, so that the command line a
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from gvo.version import __version__
+
 if TYPE_CHECKING:
     from gvo.backend.comparison import MeasurementLog
     from gvo.backend.window import SlidingWindow
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import format_evaluations
     from gvo.run_inputs import asked_truth, choose_frame, read_ground_truth
+    from gvo.run_outputs import RunOutputs
     from gvo.runs import RunResult, run_recording
     from gvo.sources.excerpt import Excerpt
     from gvo.sources.frames import frames
@@ -42,8 +45,6 @@ if TYPE_CHECKING:
         StereoFrame,
     )
 
-__version__ = "0.1.0"
-
 _MODULES = {
     "gvo.backend.comparison": ("MeasurementLog",),
     "gvo.backend.window": ("SlidingWindow",),
@@ -58,6 +59,7 @@ _MODULES = {
     "gvo.outputs.plots": ("plot_trajectories",),
     "gvo.outputs.tables": ("format_evaluations",),
     "gvo.run_inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
+    "gvo.run_outputs": ("RunOutputs",),
     "gvo.runs": ("RunResult", "run_recording"),
     "gvo.sources.excerpt": ("Excerpt",),
     "gvo.sources.frames": ("frames",),
@@ -103,6 +105,7 @@ __all__ = [
     "Rejected",
     "RelativePose",
     "RgbdFrame",
+    "RunOutputs",
     "RunResult",
     "SlidingWindow",
     "Status",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Generic
 
 import numpy as np
@@ -88,6 +89,29 @@ class RawChain(Generic[ObservationsT]):
     def anchor_ns(self) -> int | None:
         """Stamp of the last registered frame, which the next one may be tied to."""
         return None if self._anchor is None else self._anchor.observations.stamp_ns
+
+    def reconfigure(
+        self,
+        frontend: Frontend[ObservationsT],
+        config: WindowConfig,
+        observations: Mapping[int, ObservationsT],
+    ) -> None:
+        """Go on with another front-end or configuration; poses and velocity stay.
+
+        Parameters
+        ----------
+        frontend : Frontend
+        config : WindowConfig
+        observations : mapping of int to observations
+            What the front-end keeps of the last frame and of the last registered one, by their
+            stamps; where one is missing, what was kept before is registered.
+        """
+        self._frontend, self._config = frontend, config
+        is_same = self._anchor is self._predecessor
+        self._predecessor = _with_observations(self._predecessor, observations)
+        self._anchor = (
+            self._predecessor if is_same else _with_observations(self._anchor, observations)
+        )
 
     def advance(self, current: ObservationsT) -> RawStep:
         """Register the next frame and return its step.
@@ -192,6 +216,15 @@ class RawChain(Generic[ObservationsT]):
             n_matches=failure.n_matches,
             n_inliers=failure.n_inliers,
         )
+
+
+def _with_observations(
+    link: _Link[ObservationsT] | None, observations: Mapping[int, ObservationsT]
+) -> _Link[ObservationsT] | None:
+    if link is None:
+        return None
+    stamp_ns = link.observations.stamp_ns
+    return replace(link, observations=observations.get(stamp_ns, link.observations))
 
 
 def _link_of(observations: ObservationsT, estimate: Estimate) -> _Link[ObservationsT]:

@@ -10,15 +10,29 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from gvo import __version__
+from gvo import cli_seeing
+from gvo.cli_options import (
+    CalibrationFiles,
+    Color,
+    ConfigFile,
+    Depth,
+    Duration,
+    Every,
+    Left,
+    Out,
+    Recordings,
+    Right,
+    Settings,
+    Start,
+    load,
+    open_source,
+)
 from gvo.errors import ConfigurationError, GvoError
 from gvo.terminal import both, interruptible, progress, report, report_smoothed, warn
+from gvo.version import __version__
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from gvo.config import Config
-    from gvo.sources.recording import Source
     from gvo.trajectory import Trajectory
 
 app = typer.Typer(
@@ -29,30 +43,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
-]
-_ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
-]
 _Compare = Annotated[
     bool,
     typer.Option("--compare", help="Also smooth by full iSAM2 and batch; print the difference."),
 ]
-_Recordings = Annotated[
-    list[Path], typer.Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
-]
-_CalibrationFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
-    ),
-]
-_Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")]
-_Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")]
-_Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")]
-_Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 EXIT_FAULTS = 1
 
@@ -94,7 +88,7 @@ def _options(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
+    out: Out = Path("gvo-demo"),
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.demo import BAG_NAME, run_demo
@@ -107,15 +101,13 @@ def demo(
 
 @app.command()
 def run(
-    recordings: _Recordings,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
-    config: _ConfigFile = None,
-    set_: _Settings = None,
-    start: Annotated[float, typer.Option(metavar="S", help="Leave out the first seconds.")] = 0.0,
-    duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Read no more than so many seconds.")
-    ] = None,
-    every: Annotated[int, typer.Option(metavar="N", help="Take each Nth frame only.")] = 1,
+    recordings: Recordings,
+    out: Out,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+    every: Every = 1,
     frame: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Write poses of this frame of tf, not the camera's."),
@@ -137,24 +129,41 @@ def run(
     world: Annotated[
         str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
     ] = "world",
-    calibration: _CalibrationFiles = None,
-    left: _Left = None,
-    right: _Right = None,
-    color: _Color = None,
-    depth: _Depth = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder of PNG."),
+    ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
+    ] = None,
+    with_report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
+    ] = True,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
+    ] = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
     compare_smoothing: _Compare = False,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.output_frame import parse_initial_pose
     from gvo.run_inputs import asked_truth, choose_frame
+    from gvo.run_outputs import RunOutputs
     from gvo.runs import run_recording
     from gvo.sources.excerpt import make_excerpt
 
-    parameters = _load(config, set_)
+    parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)
     pose = None if initial_pose is None else parse_initial_pose(initial_pose)
+    outputs = RunOutputs(
+        bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
+    )
     topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = _open(recordings, parameters, calibration, topics)
+    source = open_source(recordings, parameters, calibration, topics)
     placed = choose_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
     truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
     for line in source.info.decisions:
@@ -168,8 +177,7 @@ def run(
             frame=placed,
             starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
-            bag=bag,
-            world=world,
+            outputs=outputs,
             compare_smoothing=compare_smoothing,
             on_progress=both(show, check),
         )
@@ -178,26 +186,26 @@ def run(
 
 @app.command("check")
 def check_(
-    recordings: _Recordings,
-    config: _ConfigFile = None,
-    set_: _Settings = None,
+    recordings: Recordings,
+    config: ConfigFile = None,
+    set_: Settings = None,
     frame: Annotated[
         str, typer.Option(metavar="NAME", help="The robot's own frame in tf.")
     ] = "base_link",
-    calibration: _CalibrationFiles = None,
-    left: _Left = None,
-    right: _Right = None,
-    color: _Color = None,
-    depth: _Depth = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
     as_json: _AsJson = False,
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.checkup import check_recording, format_checkup
     from gvo.run_inputs import count_calibration_changes, read_transforms
 
-    parameters = _load(config, set_)
+    parameters = load(config, set_)
     topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = _open(recordings, parameters, calibration, topics)
+    source = open_source(recordings, parameters, calibration, topics)
     with interruptible():
         checkup = check_recording(
             source,
@@ -221,7 +229,7 @@ def smooth(
             metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    out: Out,
     topic: Annotated[
         list[str] | None,
         typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
@@ -238,8 +246,8 @@ def smooth(
     keyframes: Annotated[
         _KeyframePolicy, typer.Option(help="What keeps poses in the window.")
     ] = _KeyframePolicy.DISTANCE,
-    config: _ConfigFile = None,
-    set_: _Settings = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
     compare_smoothing: _Compare = False,
 ) -> None:
     """Smooth the edges or poses of any front-end."""
@@ -247,7 +255,7 @@ def smooth(
     from gvo.smoothing import configuration_for, smooth_edges
     from gvo.sources.edge_inputs import open_edges, parse_sigma
 
-    parameters = _load(config, set_)
+    parameters = load(config, set_)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
     if "-" in inputs:
         _refuse_with_lines(inputs, topic=topic, sigma=sigma, compare=compare_smoothing)
@@ -320,10 +328,15 @@ def compare(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")
     ] = None,
+    report_file: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE", help="Write a page, .html.")
+    ] = None,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
+    ] = None,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
     from gvo.evaluation import evaluate
-    from gvo.outputs.plots import plot_trajectories
     from gvo.outputs.tables import evaluations_json, format_evaluations
     from gvo.run_inputs import read_compared
 
@@ -346,33 +359,41 @@ def compare(
     else:
         typer.echo(format_evaluations(evaluations), nl=False)
     if plot is not None:
+        from gvo.outputs.plots import plot_trajectories
+
         plot_trajectories(plot, truth, trajectories, align=align.value)
+    if report_file is not None or plots is not None:
+        from gvo.outputs.report import write_comparison_report
+
+        write_comparison_report(
+            report_file, truth, trajectories, evaluations, align=align.value, plots=plots
+        )
 
 
 @app.command()
 def convert(
-    recordings: _Recordings,
+    recordings: Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
         _Layout | None, typer.Option(help="Of the folder; a data set's for a bag, else a bag's.")
     ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
-    calibration: _CalibrationFiles = None,
-    left: _Left = None,
-    right: _Right = None,
-    color: _Color = None,
-    depth: _Depth = None,
-    config: _ConfigFile = None,
-    set_: _Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.outputs.converting import convert_recording
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}
-    settings = _load(config, set_)
-    source = _open(recordings, settings, calibration, topics)
+    settings = load(config, set_)
+    source = open_source(recordings, settings, calibration, topics)
     with interruptible() as check:
         written = convert_recording(
             source,
@@ -389,17 +410,11 @@ def convert(
 
 
 @app.command("config")
-def config_(config: _ConfigFile = None, set_: _Settings = None) -> None:
+def config_(config: ConfigFile = None, set_: Settings = None) -> None:
     """Print all parameters with units, ranges and meaning."""
     from gvo.config import describe_configuration
 
-    typer.echo(describe_configuration(_load(config, set_)), nl=False)
-
-
-def _load(path: Path | None, settings: list[str] | None) -> Config:
-    from gvo.config import load_configuration
-
-    return load_configuration(path, settings or [])
+    typer.echo(describe_configuration(load(config, set_)), nl=False)
 
 
 def _parse_lengths(text: str) -> list[float]:
@@ -414,16 +429,7 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
-def _open(
-    recordings: Sequence[Path],
-    config: Config,
-    calibration: Sequence[Path] | None,
-    topics: Mapping[str, str | None],
-) -> Source:
-    from gvo.sources.opening import RecordingOptions, open_recording
-
-    options = RecordingOptions(calibration=tuple(calibration or ()), **topics)
-    return open_recording(recordings, config=config, options=options)
+cli_seeing.add_commands(app)
 
 
 def main() -> None:

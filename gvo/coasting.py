@@ -60,6 +60,10 @@ class StatusClock:
         self._lost_after_s = lost_after_s
         self._coasting_since_ns: int | None = None
 
+    def reconfigure(self, lost_after_s: float) -> None:
+        """Take another limit from the next frame on."""
+        self._lost_after_s = lost_after_s
+
     def next(self, stamp_ns: int, *, is_tied: bool) -> Status:
         """Return the status of the next frame.
 

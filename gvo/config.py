@@ -166,6 +166,9 @@ class StereoConfig(Section):
     max_distance: float = _parameter(
         0.3, "largest descriptor distance, as a share of the largest possible", gt=0, le=1
     )
+    max_ratio: float = _parameter(
+        1.0, "largest ratio of the best to the second best descriptor distance; 1: any", gt=0, le=1
+    )
     subpixel: Literal["parabola", "none"] = _parameter(
         "parabola", "fit over the patch differences, or the difference of the keypoints"
     )
@@ -187,6 +190,9 @@ class TemporalConfig(Section):
     )
     max_distance: float = _parameter(
         0.25, "largest descriptor distance, as a share of the largest possible", gt=0, le=1
+    )
+    max_ratio: float = _parameter(
+        1.0, "largest ratio of the best to the second best descriptor distance; 1: any", gt=0, le=1
     )
 
 

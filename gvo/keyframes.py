@@ -52,8 +52,13 @@ class Keyframes(Generic[ObservationsT]):
         """Return the number of kept frames."""
         return len(self._kept)
 
+    def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
+        """Score with another camera or configuration from now on; what is kept stays."""
+        self._camera = camera
+        self._config = config
+
     def add(self, observations: ObservationsT) -> None:
-        """Keep a frame."""
+        """Keep a frame; of one that is kept already, other observations of it."""
         self._kept[observations.stamp_ns] = observations
         points = getattr(observations, "points_cam", None)
         self._samples[observations.stamp_ns] = None if points is None else _sample(points)

@@ -16,7 +16,7 @@ from gvo.chain import RawChain, RawStep
 from gvo.config import Config, WindowConfig
 from gvo.frame_links import FrameLink, LinkKind, judge_links
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.factory import make_frontend
+from gvo.frontend.factory import find_change, frame_of, make_frontend, renew_frontend
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Frontend, Stamped, register_checked
 from gvo.geometry import se3
@@ -110,17 +110,21 @@ class Odometry:
         frontend: Frontend[Any] | None = None,
         log: MeasurementLog | None = None,
     ) -> None:
-        self._config = config or Config()
+        self._config = self._next_config = config or Config()
         self._frontend = _choose_frontend(camera, self._config, frontend)
-        view = getattr(self._frontend, "camera", None)
-        if not isinstance(view, StereoCamera | PinholeCamera):
-            view = camera
+        self._camera = camera
+        self._is_own = frontend is not None
+        # The last frame and the last registered one, in case that they are extracted again.
+        self._frames: dict[int, Stamped] = {}
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window, log=log)
-        self._keyframes: Keyframes[Any] = Keyframes(
-            None if view is None else as_stereo(view, self._config), self._config.window
-        )
+        self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
+
+    @property
+    def config(self) -> Config:
+        """The configuration of the next frame."""
+        return self._next_config
 
     @property
     def window(self) -> SlidingWindow:
@@ -132,6 +136,45 @@ class Odometry:
         """What is learnt of a stereo rig; None where nothing is."""
         offsets = getattr(self._frontend, "rig_offsets", None)
         return offsets if isinstance(offsets, RigOffsets) and offsets.is_learning else None
+
+    def reconfigure(self, config: Config) -> None:
+        """Go on with another configuration from the next frame on.
+
+        Poses, velocity and the window go on. What takes effect, by section:
+
+        - `temporal`, `ransac`, `registration`: with the next registration.
+        - `window`: with the next update, see `SlidingWindow.reconfigure`; edges that are in keep
+          their kernel.
+        - `frontend`, `klt` or `features`, `stereo` or `depth`, whichever the sensor and the kind
+          of front-end use: the last frame is extracted again, so that the next one is registered
+          against what the new parameters find in it. Keyframes stay where they can be registered
+          with new frames. They cannot after another `frontend.kind`,
+          `depth.virtual_baseline_m`, or `kind`, `n_octaves`, `scale_factor` or `upright` of
+          `features` (descriptor): then those of the front-end of tracks, which holds their
+          images, are extracted again, and those of descriptors are released.
+        - `stereo`: the offsets of the rig are learnt anew; else they go on.
+        - `runtime`: with the next frame.
+        - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
+
+        A front-end of one's own is told at once by its method `reconfigure(config)`, where it
+        has one; it must go on with the observations that it gave before.
+
+        Parameters
+        ----------
+        config : Config
+            One that equals the present one changes nothing.
+
+        Raises
+        ------
+        ValueError
+            When it is no Config.
+        """
+        if not isinstance(config, Config):
+            raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
+        tell = getattr(self._frontend, "reconfigure", None) if self._is_own else None
+        if callable(tell) and config != self._next_config:
+            tell(config)
+        self._next_config = config
 
     def track(self, frame: Stamped) -> FrameResult:
         """Take the next frame and return its poses.
@@ -148,6 +191,8 @@ class Odometry:
         """
         watch = Stopwatch()
         with watch.stage("extract"):
+            if self._next_config is not self._config:
+                self._apply(self._next_config)
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(observations)
@@ -158,6 +203,8 @@ class Odometry:
             causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges)
             self._update_keyframes(observations, scores, causal)
             self._hold_anchor()
+        if not self._is_own:
+            self._hold_frame(frame)
         n_points = _count_points(observations)
         return FrameResult(
             raw=replace(step.estimate, frame_id=frame.stamp_ns),
@@ -179,6 +226,56 @@ class Odometry:
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
         return tuple(self._window.finish())
+
+    def _view(self) -> StereoCamera | None:
+        """Return the camera that tells which points of a keyframe are in view."""
+        view = getattr(self._frontend, "camera", None)
+        if not isinstance(view, StereoCamera | PinholeCamera):
+            view = self._camera
+        return None if view is None else as_stereo(view, self._config)
+
+    def _apply(self, config: Config) -> None:
+        """Take over another configuration, before a frame."""
+        former, self._config = self._config, config
+        if config == former:
+            return
+        extracted = {} if self._is_own else self._renew_frontend(former)
+        self._window.reconfigure(config.window)
+        self._keyframes.reconfigure(self._view(), config.window)
+        self._chain.reconfigure(self._frontend, config.window, extracted)
+
+    def _renew_frontend(self, former: Config) -> dict[int, Any]:
+        """Return what a new front-end keeps of the last frames, where that has changed."""
+        camera = self._camera
+        if camera is None:
+            return {}
+        is_stereo = isinstance(camera, StereoCamera)
+        change = find_change(former, self._config, is_stereo=is_stereo)
+        if change.is_any:
+            self._frontend = renew_frontend(
+                self._frontend, camera, self._config, keeps_offsets=not change.is_of_rig
+            )
+        extracted = {}
+        if change.is_of_extraction:
+            frames = sorted(self._frames.items())
+            extracted = {ns: self._frontend.extract(frame) for ns, frame in frames}
+        if change.is_of_kind:
+            self._renew_keyframes(extracted)
+        return extracted
+
+    def _renew_keyframes(self, extracted: dict[int, Any]) -> None:
+        """Extract keyframes again, and release those of which the frames are not at hand."""
+        for stamp_ns in self._keyframes.stamps_ns:
+            observations = extracted.get(stamp_ns)
+            frame = frame_of(self._keyframes[stamp_ns])
+            if observations is None and frame is not None:
+                observations = self._frontend.extract(frame)
+            if observations is not None:
+                self._keyframes.add(observations)
+                continue
+            self._keyframes.drop(stamp_ns)
+            if stamp_ns in self._window:
+                self._window.release(stamp_ns)
 
     def _edges(
         self,
@@ -253,6 +350,11 @@ class Odometry:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
+
+    def _hold_frame(self, frame: Stamped) -> None:
+        held = {**self._frames, frame.stamp_ns: frame}
+        needed = self._anchor_ns, frame.stamp_ns
+        self._frames = {stamp_ns: held[stamp_ns] for stamp_ns in held if stamp_ns in needed}
 
 
 def _edge_of(step: RawStep) -> Edge:

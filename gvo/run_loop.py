@@ -11,10 +11,9 @@ from typing import Protocol
 import cv2
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import RecordingError
 from gvo.odometry import FrameResult, Odometry
 from gvo.output_frame import OutputFrame
-from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.run_tally import Progress, RunTally
 from gvo.sources.excerpt import Excerpt
@@ -52,6 +51,8 @@ class RunLoop:
         Is given all that is measured and smoothed, of the camera.
     first_pose : callable, optional
         Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
+    items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
+        The frames in another order than that of the recording.
 
     Attributes
     ----------
@@ -68,6 +69,7 @@ class RunLoop:
         excerpt: Excerpt | None = None,
         comparison: SmoothingComparison | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
+        items: Iterable[Frame | FaultyFrame] | None = None,
     ) -> None:
         self.source = source
         self.config = config
@@ -76,7 +78,9 @@ class RunLoop:
         self.tally = RunTally()
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
+        self._items = items
         self._read_ms = 0.0
+        self._first_ns: int | None = None
         log = None if comparison is None else comparison.log
         self._odometry = Odometry(source.info.camera, config, log=log)
 
@@ -98,13 +102,12 @@ class RunLoop:
             Called after each frame.
         """
         outputs = tuple(outputs)
-        n_images = self._excerpt.n_expected(self.source.info.n_images)
         with one_opencv_thread():
             try:
                 for item in self._read():
                     self._take(item, outputs)
                     if on_progress is not None:
-                        on_progress(self.tally.progress(n_images))
+                        on_progress(self.tally.progress(self._n_expected(item.stamp_ns)))
             finally:
                 finished = self._placed(self._odometry.finish())
                 for output in outputs:
@@ -115,8 +118,22 @@ class RunLoop:
         self.tally.n_guessed = self.frame.n_guessed
         self.tally.mount_travel_m = self.frame.mount_travel_m
 
+    def _n_expected(self, stamp_ns: int) -> int:
+        """Estimate how many images are to come in all, from the stamps so far."""
+        n_images, n_done = self.source.info.n_images, self.tally.n_frames + self.tally.n_unpaired
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        if n_done < 2:
+            return self._excerpt.n_expected(n_images)
+        period_s = 1e-9 * (stamp_ns - self._first_ns) / (n_done - 1) / self._excerpt.every
+        length_s = max(period_s, 0.0) * n_images
+        return self._excerpt.n_expected(n_images, length_s=length_s or None)
+
     def _read(self) -> Iterator[Frame | FaultyFrame]:
-        iterator = frames(self.source, self.config, self._excerpt)
+        items = self._items
+        if items is None:
+            items = frames(self.source, self.config, self._excerpt)
+        iterator = iter(items)
         while True:
             start = time.perf_counter()
             try:
@@ -157,39 +174,6 @@ class RunLoop:
         if self.comparison is not None:
             self.comparison.add(estimates)
         return tuple(self.frame.apply(estimate) for estimate in estimates)
-
-
-def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
-    """Name the frames of a run for a bag.
-
-    Parameters
-    ----------
-    source : Source
-        The recording.
-    frame : OutputFrame
-        Whose poses are written.
-    is_placed : bool
-        The first pose was asked for: the world is not that of the first frame.
-    world : str
-        The fixed frame.
-
-    Raises
-    ------
-    ConfigurationError
-        When a name cannot be one.
-    """
-    try:
-        return _named(source, frame, is_placed=is_placed, world=world)
-    except ValueError as error:
-        raise ConfigurationError(f"--world {world}: {error}") from error
-
-
-def _named(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
-    camera = source.info.frame_id
-    if frame.is_camera:
-        return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
-    mount = frame.T_frame_cam if frame.fixed_mount is None else frame.fixed_mount
-    return RunFrames(world=world, camera=camera, tracked=frame.name, T_tracked_cam=mount)
 
 
 @contextmanager

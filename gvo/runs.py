@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gvo import __version__
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.evaluation import Evaluation
 from gvo.output_frame import OutputFrame
-from gvo.outputs.plots import plot_trajectories
-from gvo.outputs.run_bag import RunBag
-from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
+from gvo.outputs.run_folder import PICTURE, REPORT, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
-from gvo.outputs.tables import evaluations_json
 from gvo.run_inputs import initial_pose, own_truth
-from gvo.run_loop import Output, RunLoop, name_frames
+from gvo.run_loop import RunLoop
+from gvo.run_outputs import RunOutputs
+from gvo.run_summary import summarize
 from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
@@ -33,7 +29,7 @@ from gvo.trajectory import Trajectory
 from gvo.trajectory_alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory_files import read_trajectory
 from gvo.truth_comparison import TruthComparison
-from gvo.types import Failure, Status
+from gvo.types import Failure
 
 EXIT_COMPLETE = 0
 EXIT_PARTLY = 3
@@ -53,12 +49,15 @@ class RunResult:
         0 complete, 3 partly.
     warnings : tuple of str
         What was skipped or broke off, a line each.
+    report : Path or None
+        The page that shows it, where one was written.
     """
 
     summary: dict[str, Any]
     evaluations: tuple[Evaluation, ...]
     exit_code: int
     warnings: tuple[str, ...]
+    report: Path | None = None
 
 
 def run_recording(
@@ -70,8 +69,7 @@ def run_recording(
     frame: OutputFrame | None = None,
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
-    bag: str | Path | None = None,
-    world: str = "world",
+    outputs: RunOutputs | None = None,
     compare_smoothing: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
@@ -82,7 +80,7 @@ def run_recording(
     source : Source
         From `open_recording`, or a rendered one.
     out : str or Path
-        Folder for the trajectories, covariances, table of frames, summary and picture.
+        Folder for the trajectories, covariances, tables, summary and report.
     config : Config, optional
     ground_truth : Trajectory or FramedTruth, optional
         Poses of the frame asked for; the recording's own where omitted.
@@ -93,10 +91,8 @@ def run_recording(
         Take the first true pose for the initial one.
     excerpt : Excerpt, optional
         Which frames are read; all where omitted.
-    bag : str or Path, optional
-        A `.mcap` or `.bag` to write as well: transforms, odometry, paths, points, overlays.
-    world : str
-        The fixed frame in that bag.
+    outputs : RunOutputs, optional
+        What is written besides; the report where omitted.
     compare_smoothing : bool
         Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
         all of them in memory.
@@ -123,19 +119,21 @@ def run_recording(
         comparison=SmoothingComparison() if compare_smoothing else None,
         first_pose=partial(initial_pose, truth) if starts_at_truth else None,
     )
+    outputs = outputs or RunOutputs()
     with ExitStack() as stack:
-        outputs: list[Output] = []
-        if bag is not None:
-            is_placed = frame.is_placed or starts_at_truth
-            names = name_frames(source, frame, is_placed=is_placed, world=world)
-            outputs.append(stack.enter_context(RunBag(bag, names)))
+        is_placed = frame.is_placed or starts_at_truth
+        others = outputs.open(source, frame, stack, config=config, is_placed=is_placed)
         folder = stack.enter_context(RunFolder(Path(out)))
-        loop.run([folder, *outputs], on_progress)
+        loop.run([folder, *others], on_progress)
     if loop.tally.n_with_pose == 0:
         raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     compared = _compare(truth, folder, loop, estimates)
-    return _conclude(loop, folder, compared, estimates, is_asked=ground_truth is not None)
+    result = _conclude(loop, folder, compared, is_asked=ground_truth is not None)
+    if not outputs.report:
+        return result
+    _draw(folder, compared, estimates, plots=outputs.plots)
+    return replace(result, report=folder.path / REPORT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,28 +173,25 @@ def _conclude(
     loop: RunLoop,
     folder: RunFolder,
     compared: TruthComparison | Failure,
-    estimates: dict[str, Trajectory],
     *,
     is_asked: bool,
 ) -> RunResult:
-    """Write summary and picture."""
+    """Write truth and summary."""
     warnings = loop.tally.warnings()
     found = compared if isinstance(compared, TruthComparison) else None
     if found is not None:
         warnings += [f"ground truth: {text}" for text in found.warnings()]
     elif isinstance(compared, _Fault):
         warnings.append(f"not compared with the ground truth: {compared.reason}")
-    summary = _summary(loop, compared, warnings)
+    summary = summarize(loop, compared, warnings)
     if loop.comparison is not None:
         measure = None if found is None else found.measure
         summary["smoothing"] = loop.comparison.conclude(
             folder.path, measure=measure, place=loop.frame.place
         )
+    if found is not None:
+        folder.write_truth(found.truth.trajectory)
     folder.write_summary(summary)
-    if found is None:
-        plot_trajectories(folder.path / PICTURE, None, estimates)
-    else:
-        plot_trajectories(folder.path / PICTURE, found.truth.trajectory, found.estimates)
     is_partly = loop.tally.is_partly or (is_asked and found is None)
     return RunResult(
         summary=summary,
@@ -204,6 +199,25 @@ def _conclude(
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
+
+
+def _draw(
+    folder: RunFolder,
+    compared: TruthComparison | Failure,
+    estimates: dict[str, Trajectory],
+    *,
+    plots: Path | None,
+) -> None:
+    """Draw the picture and write the report."""
+    from gvo.outputs.plots import plot_trajectories
+    from gvo.outputs.report import write_run_report
+    from gvo.outputs.run_record import read_run
+
+    if isinstance(compared, TruthComparison):
+        plot_trajectories(folder.path / PICTURE, compared.truth.trajectory, compared.estimates)
+    else:
+        plot_trajectories(folder.path / PICTURE, None, estimates)
+    write_run_report(folder.path / REPORT, read_run(folder.path), plots=plots)
 
 
 def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth:
@@ -217,47 +231,3 @@ def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth
         start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
         trajectory = trajectory.select(slice(int(start), int(end)))
     return replace(truth, trajectory=trajectory)
-
-
-def _frame_text(frame: OutputFrame) -> str:
-    return ", ".join(text for text in (frame.name or "camera", frame.origin) if text)
-
-
-def _summary(
-    loop: RunLoop, compared: TruthComparison | Failure, warnings: list[str]
-) -> dict[str, Any]:
-    info, tally = loop.source.info, loop.tally
-    evaluations: tuple[Evaluation, ...] = ()
-    if isinstance(compared, Failure):
-        truth = f"none: {compared.reason}"
-    else:
-        truth, evaluations = compared.truth.decision, compared.evaluations
-    medians = {stage: durations.median() for stage, durations in tally.stages.items()}
-    return {
-        "gvo_version": __version__,
-        "recording": info.name,
-        "sensor": info.sensor,
-        "decisions": list(info.decisions),
-        "frame": _frame_text(loop.frame),
-        "ground_truth": truth,
-        "frames": tally.n_frames,
-        "tracked": tally.n_tracked,
-        "coverage": tally.n_with_pose / tally.n_frames,
-        "status_counts": {status.value: tally.statuses[status] for status in Status},
-        "unpaired_images": tally.n_unpaired,
-        "window": asdict(tally.window),
-        "polish": None if tally.polish is None else tally.polish.as_json(),
-        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
-        "median_ms": medians,
-        "peak_memory_mb": round(peak_memory_mb(), 1),
-        "errors": evaluations_json(evaluations)["estimates"],
-        "warnings": warnings,
-        "configuration": loop.config.model_dump(),
-    }
-
-
-def peak_memory_mb() -> float:
-    """Return the largest resident memory of this process so far, in 10^6 bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    unit = 1 if sys.platform == "darwin" else 1024
-    return peak * unit / 1e6

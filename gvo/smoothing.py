@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gvo import __version__
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.edge_chain import EdgeChain
@@ -20,13 +19,15 @@ from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.outputs.tables import evaluations_json
+from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
-from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult, peak_memory_mb
+from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.sources.edges import EdgeEvent, EdgeSource, Event, PoseEvent
 from gvo.sources.pose_graphs import PoseGraphSource
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_trajectory
 from gvo.types import Estimate, Rejected, Status
+from gvo.version import __version__
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""

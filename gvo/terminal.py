@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from gvo.run_tally import Progress
     from gvo.runs import RunResult
 
+# By how much the total of a progress bar may be off.
+_MAX_OFF = 0.02
 _EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
@@ -35,7 +37,8 @@ def report(result: RunResult, out: Path) -> NoReturn:
             f"sigma {offsets['disparity_sigma_px']:.3f}; rows of the right image too large by "
             f"{offsets['row_px']:.3f} px"
         )
-    typer.echo(f"{tracked} of {frames} frames tracked; {out / 'trajectories.png'}")
+    where = out if result.report is None else result.report
+    typer.echo(f"{tracked} of {frames} frames tracked; {where}")
     warn(result.warnings)
     raise typer.Exit(result.exit_code)
 
@@ -103,11 +106,14 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
 
         def update(progress: Progress) -> None:
             bar.start_task(task)
+            shown = bar.tasks[0]
+            # Another total makes rich forget the rate, and with it the time left.
+            if abs(progress.n_total - (shown.total or 0)) > _MAX_OFF * progress.n_total:
+                bar.update(task, total=progress.n_total)
             bar.update(
                 task,
                 completed=progress.n_done,
-                total=progress.n_total,
-                rate=progress.n_done / (bar.tasks[0].elapsed or 1e-9),
+                rate=shown.speed or 0.0,
                 tracked=progress.n_tracked / max(progress.n_done, 1),
             )
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
+from gvo.representations.values import trajectory_html
 from gvo.types import Estimate, FloatArray, IntArray
 
 StampsFrom = Literal["file", "times", "rows", "topic"]
@@ -114,6 +115,16 @@ class Trajectory:
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.stamps_ns)
+
+    def _repr_html_(self) -> str:
+        """Return a table and the path from above, for notebooks."""
+        return trajectory_html(
+            self.stamps_ns,
+            self.T_world_cam,
+            has_rotations=self.has_rotations,
+            has_covariances=self.covariances is not None,
+            stamps_from=self.stamps_from,
+        )
 
     @property
     def positions(self) -> FloatArray:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import Kernel
+from gvo.representations.values import estimate_html
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -432,3 +433,9 @@ class Estimate:
     def __post_init__(self) -> None:
         """Copy the arrays."""
         _freeze(self, "T_world_cam", "covariance")
+
+    def _repr_html_(self) -> str:
+        """Return a table and the ellipse of the position from above, for notebooks."""
+        return estimate_html(
+            self.stamp_ns, self.T_world_cam, self.covariance, status=self.status.value
+        )

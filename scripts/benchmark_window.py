@@ -25,7 +25,7 @@ import numpy as np
 import gvo
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.runs import peak_memory_mb
+from gvo.run_summary import peak_memory_mb
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
 STEP_NS = 100_000_000

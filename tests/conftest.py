@@ -6,11 +6,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from hypothesis import settings
 
 import gvo
 from gvo.cli import main
 from gvo.sources.synthetic import SyntheticRecording
+from tests.browser import browser as browser
 from tests.rendered_walk import Walk
+
+# How long an example takes says something of the machine, nothing of the code.
+settings.register_profile("gvo", deadline=None)
+settings.load_profile("gvo")
 
 
 class Answer(NamedTuple):

@@ -55,8 +55,12 @@ def test_run_writes_its_files_and_prints_the_errors(
         *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
         *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
         "frames.csv",
+        "edges.csv",
+        "timings.csv",
+        "ground_truth.txt",
         "summary.json",
         "trajectories.png",
+        "report.html",
     }
 
 

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.odometry import FrameResult
 from gvo.output_frame import OutputFrame
-from gvo.run_loop import RunLoop, name_frames
+from gvo.run_loop import RunLoop
 from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
@@ -192,19 +192,3 @@ def test_opencv_gets_its_threads_back(walk: Rendered) -> None:
         assert (n_inside, cv2.getNumThreads()) == (1, 2)
     finally:
         cv2.setNumThreads(n_before)
-
-
-def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk: Rendered) -> None:
-    camera = name_frames(walk, OutputFrame(CAMERA), is_placed=False, world="odom")
-    assert (camera.world, camera.tracked, camera.is_world_optical) == ("odom", CAMERA, True)
-    placed = name_frames(walk, OutputFrame(CAMERA), is_placed=True, world="odom")
-    assert not placed.is_world_optical
-    base = name_frames(walk, OutputFrame("base_link", T_BASE_CAM), is_placed=False, world="odom")
-    assert (base.tracked, base.camera, base.is_world_optical) == ("base_link", CAMERA, False)
-    np.testing.assert_allclose(base.mount(0), T_BASE_CAM, atol=1e-12)
-    moving = name_frames(
-        walk, OutputFrame("base_link", lambda _: (T_BASE_CAM, False)), is_placed=False, world="odom"
-    )
-    np.testing.assert_allclose(moving.mount(0), T_BASE_CAM, atol=1e-12)
-    with pytest.raises(ConfigurationError, match=r"^--world : "):
-        name_frames(walk, OutputFrame(CAMERA), is_placed=False, world="")

@@ -23,6 +23,10 @@ class Motion:
         self._step: tuple[FloatArray, FloatArray, float] | None = None
         self.last: Estimate | None = None
 
+    def reconfigure(self, config: WindowConfig) -> None:
+        """Take other sigmas; the motion goes on."""
+        self._config = config
+
     @property
     def measured_id(self) -> FrameId:
         """The last frame that a measurement tied; None before the first."""

@@ -48,6 +48,8 @@ Keeping = Literal["manual", "distance"]
 
 _LOGGER = logging.getLogger(__name__)
 
+# Of poses that a smaller window lets go: what they cost together grows with the cube.
+_MAX_LEAVING = 32
 # Of a first pose without a prior, which defines the world: radians and metres.
 _ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
 # Of a first pose of which the position alone is known: radians, and metres beside its prior.
@@ -56,12 +58,15 @@ _UNKNOWN_SIGMAS = np.repeat([1.0, 1e4], 3)
 
 @dataclass(slots=True, kw_only=True)
 class _Member:
-    """A pose of the window, with what was measured of it."""
+    """A pose of the window, with what was measured of it.
+
+    Each measurement comes with what made its factor, and so knows its kernel.
+    """
 
     key: int
     stamp_ns: int
-    edges: list[Edge]
-    priors: list[Prior]
+    edges: list[tuple[Edge, Factors]]
+    priors: list[tuple[Prior, Factors]]
     is_kept: bool = False
     status: Status = Status.OK
     causal: Estimate | None = None
@@ -133,11 +138,12 @@ class SlidingWindow:
     ) -> None:
         if keyframes not in get_args(Keeping):
             raise ValueError(f"keyframes must be one of {get_args(Keeping)}, got {keyframes!r}")
-        if config is not None and not isinstance(config, WindowConfig):
-            raise ValueError(f"config must be a gvo.WindowConfig, got {type(config).__name__}")
+        if config is not None:
+            _check_config(config)
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
         self._factors = Factors(self._config)
+        self._is_whole = self._config.size is None
         self._graph = self._new_graph()
         self._members: dict[FrameId, _Member] = {}
         self._finished: list[Estimate] = []
@@ -170,6 +176,48 @@ class SlidingWindow:
     def polish(self) -> Polish | None:
         """What `finish` gained by Levenberg-Marquardt, where the window kept everything."""
         return self._polish
+
+    def reconfigure(self, config: WindowConfig) -> None:
+        """Go on with another configuration; what is in the window stays as it went in.
+
+        Parameters
+        ----------
+        config : WindowConfig
+            Kernel and gate are those of what comes from now on. With a smaller size poses leave
+            with the next updates, up to 32 at a time. With `size: null` nothing leaves from now
+            on; what left before stays where it is, so that `finish` has nothing to polish.
+
+        Raises
+        ------
+        ValueError
+            When it is no WindowConfig.
+        """
+        _check_config(config)
+        if config == self._config:
+            return
+        former, self._config = self._config, config
+        if (config.kernel, config.kernel_threshold) != (former.kernel, former.kernel_threshold):
+            self._factors = Factors(config)
+        self._clock.reconfigure(config.lost_after_s)
+        self._motion.reconfigure(config)
+        if not self._members:
+            self._is_whole = config.size is None
+            self._graph = self._new_graph()
+        elif self._is_whole and config.size is not None:
+            self._prepare_to_leave()
+
+    def _prepare_to_leave(self) -> None:
+        """Go on with a graph that poses can leave."""
+        self._is_whole = False
+        graph = self._new_graph()
+        try:
+            with graph.restored_on_error():
+                graph.update(self._graph.factors(), self._graph.values())
+        except SmoothingError as error:
+            # It can still be made anew from the poses, where the next update fails.
+            _LOGGER.warning("the graph stays as it is: %s", first_line(error))
+        else:
+            self._graph = graph
 
     def add_pose(
         self,
@@ -244,7 +292,7 @@ class SlidingWindow:
             frame_id, self._factors.between(reference_key, member.key, edge), edge=edge
         )
         if isinstance(answer, Estimate):
-            member.edges.append(edge)
+            member.edges.append((edge, self._factors))
             self._ledger.add(n_edges=1)
         return answer
 
@@ -269,7 +317,7 @@ class SlidingWindow:
         member = self._members[frame_id]
         answer = self._extend(frame_id, self._factors.prior(member.key, prior))
         if isinstance(answer, Estimate):
-            member.priors.append(prior)
+            member.priors.append((prior, self._factors))
             self._ledger.add(n_priors=1)
         return answer
 
@@ -303,7 +351,7 @@ class SlidingWindow:
         Empty where it is not in the window.
         """
         member = self._members.get(frame_id)
-        return () if member is None else tuple(member.edges)
+        return () if member is None else tuple(edge for edge, _ in member.edges)
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
@@ -347,15 +395,13 @@ class SlidingWindow:
         found = []
         for frame_id, member in self._members.items():
             found += [
-                self._factors.residual_of_edge(
-                    edge, frame_id, poses[edge.reference_id], poses[frame_id]
-                )
-                for edge in member.edges
+                factors.residual_of_edge(edge, frame_id, poses[edge.reference_id], poses[frame_id])
+                for edge, factors in member.edges
                 if edge.reference_id in poses
             ]
             found += [
-                self._factors.residual_of_prior(prior, frame_id, poses[frame_id])
-                for prior in member.priors
+                factors.residual_of_prior(prior, frame_id, poses[frame_id])
+                for prior, factors in member.priors
             ]
         return found
 
@@ -391,11 +437,12 @@ class SlidingWindow:
         for another first pose.
         """
         self._polish = None
-        if self._config.size is None and self._members:
+        if self._is_whole and self._members:
             self._finished += self._polished()
         else:
             self._finished += [self._final_estimate(frame_id) for frame_id in self._members]
         self._members = {}
+        self._is_whole = self._config.size is None
         self._graph = self._new_graph()
         self._motion = Motion(self._config)
         self._clock = StatusClock(self._config.lost_after_s)
@@ -622,7 +669,7 @@ class SlidingWindow:
         return prediction or (_ORIGIN.T_world_frame, _ORIGIN.covariance)
 
     def _new_graph(self) -> PoseGraph:
-        return PoseGraph(is_whole=self._config.size is None)
+        return PoseGraph(is_whole=self._is_whole)
 
     def _harden(self, _: _Arrival) -> None:
         """Go on with a graph that takes worse conditioned measurements."""
@@ -637,7 +684,7 @@ class SlidingWindow:
 
     def _rebuild_for(self, arrival: _Arrival) -> None:
         """Make the graph anew from its poses and what is known of each; nobody leaves."""
-        graph = PoseGraph(is_whole=self._config.size is None, is_hardened=True)
+        graph = PoseGraph(is_whole=self._is_whole, is_hardened=True)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for frame_id, member in self._members.items():
             estimate = self._final_estimate(frame_id)
@@ -687,8 +734,8 @@ class SlidingWindow:
         self._members[arrival.frame_id] = _Member(
             key=arrival.key,
             stamp_ns=arrival.stamp_ns,
-            edges=arrival.edges,
-            priors=arrival.priors,
+            edges=[(edge, self._factors) for edge in arrival.edges],
+            priors=[(prior, self._factors) for prior in arrival.priors],
         )
         return pose
 
@@ -727,7 +774,7 @@ class SlidingWindow:
 
     def _check_others(self) -> None:
         """Raise where an update sent a pose to infinity; a whole graph is too large to look at."""
-        if self._config.size is not None and (fault := place_fault(self._graph.positions())):
+        if not self._is_whole and (fault := place_fault(self._graph.positions())):
             raise SmoothingError(f"GTSAM: {fault}")
 
     def _leaving(self) -> list[FrameId]:
@@ -736,14 +783,14 @@ class SlidingWindow:
             return []
         n_old = max(len(self._members) + 1 - self._config.size, 0)
         old = list(self._members.items())[:n_old]
-        return [frame_id for frame_id, member in old if not member.is_kept]
+        return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
 
     def _forget(self, leaving: Sequence[FrameId]) -> None:
         for frame_id in leaving:
             del self._members[frame_id]
         gone = set(leaving)
         for member in self._members.values():
-            member.edges = [edge for edge in member.edges if edge.reference_id not in gone]
+            member.edges = [tie for tie in member.edges if tie[0].reference_id not in gone]
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))
@@ -810,6 +857,11 @@ def _as_edges(frame_id: FrameId, edges: Sequence[Edge]) -> tuple[Edge, ...]:
     if isinstance(edges, Sequence) and all(isinstance(edge, Edge) for edge in edges):
         return tuple(edges)
     raise ValueError(f"edges of {frame_id!r} must be a sequence of Edge values")
+
+
+def _check_config(config: WindowConfig) -> None:
+    if not isinstance(config, WindowConfig):
+        raise ValueError(f"config must be a gvo.WindowConfig, got {type(config).__name__}")
 
 
 def _check_prior(frame_id: FrameId, prior: Prior) -> None:

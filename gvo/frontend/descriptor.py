@@ -16,6 +16,7 @@ from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparit
 from gvo.frontend.temporal import match_temporal, predict_pixels
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
+from gvo.trace import note
 from gvo.types import (
     Failure,
     FloatArray,
@@ -72,12 +73,22 @@ class DescriptorFrontend:
             right.keypoints[pairs[:, 1]],
             config,
         )
-        is_valid &= is_in_depth_range(disparities - self._offset_px(), self.camera, config)
+        is_in_range = is_in_depth_range(disparities - self._offset_px(), self.camera, config)
+        note(
+            "descriptor.stereo",
+            features=(left, right),
+            pairs=pairs,
+            disparities=disparities,
+            is_fitted=is_valid,
+            is_in_range=is_in_range,
+        )
+        is_valid &= is_in_range
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
 
     def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
         features = self._extractors[0].extract(frame.image)
         depths, is_valid = sample_depth(frame.depth, features.keypoints, self._config.depth)
+        note("descriptor.depth", features=features, depths=depths, is_valid=is_valid)
         chosen = np.flatnonzero(is_valid)
         disparities = self.camera.depth_to_disparity(depths[chosen])
         pairs = np.stack([chosen, chosen], axis=1)
@@ -146,12 +157,21 @@ class DescriptorFrontend:
         prior: FloatArray | None,
         radius_px: float,
     ) -> RelativePose | Failure:
+        predicted = predict_pixels(reference, prior, self.camera)
+        note(
+            "attempt.matches",
+            prior=prior,
+            radius_px=radius_px,
+            predicted=predicted,
+            pixels=(reference.keypoints, current.keypoints),
+        )
         matches = match_temporal(
             reference,
             current,
-            predict_pixels(reference, prior, self.camera),
+            predicted,
             radius_px=radius_px,
             max_distance=self._config.temporal.max_distance,
+            max_ratio=self._config.temporal.max_ratio,
         )
         correspondences = Correspondences.of(reference, current, matches)
         result = register_correspondences(

@@ -1,11 +1,30 @@
-"""The front-end that the configuration names."""
+"""The front-end that the configuration names, and its successor where that changes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
+from gvo.frontend.klt_observations import KltObservations
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.types import Frame
+
+# What a front-end of `make_frontend` reads; `features` and `temporal` also where corners are
+# tracked: where tracks lead to nothing, descriptors are matched.
+_SECTIONS = (
+    "frontend",
+    "klt",
+    "features",
+    "stereo",
+    "depth",
+    "temporal",
+    "ransac",
+    "registration",
+    "runtime",
+)
 
 
 def make_frontend(
@@ -23,3 +42,88 @@ def make_frontend(
     if config.frontend.kind == "klt":
         return KltFrontend(camera, config)
     return DescriptorFrontend(camera, config)
+
+
+def renew_frontend(
+    former: object,
+    camera: StereoCamera | PinholeCamera,
+    config: Config,
+    *,
+    keeps_offsets: bool,
+) -> DescriptorFrontend | KltFrontend:
+    """Return the front-end of another configuration for the same camera.
+
+    Parameters
+    ----------
+    former : DescriptorFrontend, KltFrontend or another
+        The front-end so far; what another one has learnt is not known.
+    camera : StereoCamera or PinholeCamera
+    config : Config
+    keeps_offsets : bool
+        What was learnt of the rig still holds.
+    """
+    frontend = make_frontend(camera, config)
+    if keeps_offsets and isinstance(former, DescriptorFrontend | KltFrontend):
+        frontend.rig_offsets = former.rig_offsets
+    return frontend
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrontendChange:
+    """What another configuration means for a front-end and what it keeps of frames.
+
+    Parameters
+    ----------
+    is_any : bool
+        A front-end works differently with it.
+    is_of_extraction : bool
+        Other things are kept of a frame.
+    is_of_kind : bool
+        What was kept cannot be registered with what will be.
+    is_of_rig : bool
+        What was learnt of the rig no longer holds.
+    """
+
+    is_any: bool
+    is_of_extraction: bool
+    is_of_kind: bool
+    is_of_rig: bool
+
+
+def find_change(former: Config, config: Config, *, is_stereo: bool) -> FrontendChange:
+    """Tell what a front-end of `make_frontend` makes of another configuration.
+
+    Parameters
+    ----------
+    former, config : Config
+    is_stereo : bool
+        Of a stereo camera the section `depth` plays no role, of others the section `stereo`.
+    """
+    return FrontendChange(
+        is_any=any(getattr(former, name) != getattr(config, name) for name in _SECTIONS),
+        is_of_extraction=_extraction(former, is_stereo) != _extraction(config, is_stereo),
+        is_of_kind=_kind(former, is_stereo) != _kind(config, is_stereo),
+        is_of_rig=former.stereo != config.stereo,
+    )
+
+
+def frame_of(observations: object) -> Frame | None:
+    """Return the frame that observations hold; None where they do not."""
+    return observations.frame if isinstance(observations, KltObservations) else None
+
+
+def _extraction(config: Config, is_stereo: bool) -> tuple[Any, ...]:
+    """Return the sections that decide what is kept of a frame."""
+    is_klt = config.frontend.kind == "klt"
+    points = config.klt if is_klt else config.features
+    return config.frontend, points, config.stereo if is_stereo else config.depth
+
+
+def _kind(config: Config, is_stereo: bool) -> tuple[Any, ...]:
+    """Return what must be equal for two frames' observations to be compared."""
+    baseline_m = None if is_stereo else config.depth.virtual_baseline_m
+    if config.frontend.kind == "klt":
+        return "klt", baseline_m
+    features = config.features
+    described = features.kind, features.n_octaves, features.scale_factor, features.upright
+    return "descriptor", baseline_m, *described

@@ -26,6 +26,7 @@ from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
+from gvo.trace import note
 from gvo.types import (
     BoolArray,
     Failure,
@@ -40,7 +41,7 @@ from gvo.types import (
 
 _MIN_DEPTH_M = 1e-3
 # Steps to the disparity of a corner, from the coarse search, and of a track, from its prediction.
-_N_SEARCH_STEPS = 4
+N_SEARCH_STEPS = 4
 _N_TRACK_STEPS = 3
 # Frames whose descriptors are kept, in case that the next one needs them too.
 _N_DESCRIBED = 3
@@ -99,6 +100,7 @@ class KltFrontend:
             )
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
+        note("klt.corners", corners=corners, disparities=disparities, is_valid=is_valid)
         keypoints, disparities = corners[is_valid], disparities[is_valid]
         return KltCorners(
             keypoints=keypoints,
@@ -183,6 +185,16 @@ class KltFrontend:
             n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
             is_checked=is_wide,
         )
+        note(
+            "attempt.tracks",
+            prior=T_reference_current,
+            is_wide=is_wide,
+            source_uvd=source_uvd,
+            indices=indices,
+            predicted=predicted,
+            pixels=pixels,
+            is_tracked=is_tracked,
+        )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
         if isinstance(current.frame, RgbdFrame):
             disparities, is_valid = self._measure_depth(current.frame, pixels)
@@ -190,6 +202,7 @@ class KltFrontend:
             disparities, is_valid = self._measure_stereo(
                 current.frame, pixels, predicted[:, 2], is_wide=is_wide
             )
+        note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         chosen = indices[is_valid]
         result = register_correspondences(
             self._correspondences(
@@ -249,9 +262,10 @@ class KltFrontend:
             corners,
             rough,
             self._config.stereo,
-            n_steps=_N_SEARCH_STEPS,
+            n_steps=N_SEARCH_STEPS,
             row_offset_px=row_offset_px,
         )
+        note("klt.searched", rough=rough, is_found=is_found, found=disparities, is_at_rest=is_valid)
         is_valid &= is_found
         is_valid[is_valid] = are_alike(
             (frame.left, frame.right),
@@ -260,6 +274,7 @@ class KltFrontend:
             self._config.stereo,
             row_offset_px=row_offset_px,
         )
+        note("klt.compared", is_alike=is_valid)
         return disparities, is_valid
 
     def _measure_stereo(
@@ -286,6 +301,7 @@ class KltFrontend:
                 n_steps=_N_TRACK_STEPS,
                 row_offset_px=row_offset_px,
             )
+        note("klt.followed", disparities=disparities, is_at_rest=is_valid)
         return disparities, is_valid & self._is_in_range(disparities, offset_px)
 
     def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:

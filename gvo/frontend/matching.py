@@ -65,6 +65,45 @@ def mutual_best(pairs: IntArray, distances: FloatArray, n_first: int, n_second: 
     return np.asarray(chosen[np.argsort(pairs[chosen, 0], kind="stable")])
 
 
+def best_ratios(members: IntArray, distances: FloatArray, n_members: int) -> FloatArray:
+    """Return how much better the best candidate of each member is than its second best.
+
+    Where both are about as good, nothing tells which of them is the right one.
+
+    Parameters
+    ----------
+    members : ndarray of int64, shape (k,)
+        Whose candidates these are, below `n_members`.
+    distances : ndarray of float64, shape (k,)
+        Smaller is better.
+    n_members : int
+
+    Returns
+    -------
+    ndarray of float64, shape (n_members,)
+        Best over second best distance, in [0, 1]; 0 with less than two candidates, 1 where
+        both are equal.
+
+    References
+    ----------
+    D. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60(2), 2004,
+    doi:10.1023/B:VISI.0000029664.99615.94.
+    """
+    order = np.lexsort((distances, members))
+    grouped, ascending = members[order], distances[order]
+    is_first = np.ones(len(order), dtype=np.bool_)
+    is_first[1:] = grouped[1:] != grouped[:-1]
+    has_second = np.zeros(len(order), dtype=np.bool_)
+    has_second[:-1] = is_first[:-1] & ~is_first[1:]
+    best = np.flatnonzero(has_second)
+    second = ascending[best + 1]
+    ratios = np.zeros(n_members)
+    ratios[grouped[best]] = np.where(
+        second > 0, ascending[best] / np.where(second > 0, second, 1.0), 1.0
+    )
+    return ratios
+
+
 def expand_ranges(starts: IntArray, stops: IntArray) -> tuple[IntArray, IntArray]:
     """List all (row, position) of half-open ranges of positions, one range a row.
 

@@ -10,6 +10,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
 from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
+from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray, IntArray, RelativePose
 
 # Wrong matches never agree in such numbers by chance: samples could only find the same motion.
@@ -52,8 +53,16 @@ def register_correspondences(
     -------
     RelativePose or Failure
     """
+    note(
+        "registration.begin",
+        correspondences=correspondences,
+        matches=matches,
+        start=start,
+        stamps_ns=stamps_ns,
+    )
     known = _known_consensus(start, correspondences, camera, config)
-    consensus = known or _search_consensus(correspondences, camera, config, stamps_ns)
+    consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
+    note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
         return consensus
     finish = fit_covariance if config.registration.refine == "none" else refine_pose
@@ -65,6 +74,7 @@ def register_correspondences(
         config.registration,
         with_offset=with_offset,
     )
+    note("registration.refined", refined=refined)
     n_inliers = int(np.count_nonzero(consensus.inliers))
     if isinstance(refined, Failure):
         return Failure(reason=refined.reason, n_matches=len(matches), n_inliers=n_inliers)
@@ -88,17 +98,19 @@ def _known_consensus(
     T = se3.invert(start)
     inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
+    note("registration.known", inliers=inliers, n_needed=n_needed)
     if np.count_nonzero(inliers) < n_needed:
         return None
     return Consensus(T_target_source=T, inliers=inliers)
 
 
-def _search_consensus(
+def search_consensus(
     correspondences: Correspondences,
     camera: StereoCamera,
     config: Config,
     stamps_ns: tuple[int, int],
 ) -> Consensus | Failure:
+    """Find the motion that most matches agree with, by samples; as `register_correspondences`."""
     # The generator depends on the two frames alone, so that a run that starts
     # anywhere draws the same samples for them.
     seeds = [config.ransac.seed, *stamps_ns]

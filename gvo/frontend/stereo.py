@@ -8,8 +8,14 @@ from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
-from gvo.frontend.matching import descriptor_distances, expand_ranges, mutual_best
+from gvo.frontend.matching import (
+    best_ratios,
+    descriptor_distances,
+    expand_ranges,
+    mutual_best,
+)
 from gvo.geometry.camera import StereoCamera
+from gvo.trace import note
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 
@@ -60,7 +66,7 @@ def _rows(keypoints: FloatArray) -> IntArray:
 def match_stereo(
     left: Features, right: Features, camera: StereoCamera, config: StereoConfig
 ) -> IntArray:
-    """Match left and right keypoints: epipolar candidates, descriptor distance, reciprocal.
+    """Match left and right keypoints: epipolar candidates, distance, ratio, reciprocal.
 
     Returns
     -------
@@ -71,8 +77,12 @@ def match_stereo(
     octave_steps = left.octaves[pairs[:, 0]] - right.octaves[pairs[:, 1]]
     pairs = pairs[np.abs(octave_steps) <= 1]
     distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
-    is_close = distances <= config.max_distance
-    pairs, distances = pairs[is_close], distances[is_close]
+    is_usable = distances <= config.max_distance
+    note("stereo.candidates", pairs=pairs, distances=distances)
+    if config.max_ratio < 1.0:
+        ratios = best_ratios(pairs[:, 0], distances, len(left))
+        is_usable &= ratios[pairs[:, 0]] <= config.max_ratio
+    pairs, distances = pairs[is_usable], distances[is_usable]
     return np.asarray(pairs[mutual_best(pairs, distances, len(left), len(right))])
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gvo.frontend.matching import descriptor_distances, mutual_best
+from gvo.frontend.matching import best_ratios, descriptor_distances, mutual_best
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.trace import note
 from gvo.types import FloatArray, IntArray, Observations
 
 
@@ -43,8 +44,9 @@ def match_temporal(
     *,
     radius_px: float,
     max_distance: float,
+    max_ratio: float = 1.0,
 ) -> IntArray:
-    """Match observations of two frames: window, left and right descriptors, reciprocal.
+    """Match observations of two frames: window, left and right descriptors, ratio, reciprocal.
 
     Parameters
     ----------
@@ -55,6 +57,8 @@ def match_temporal(
         Search radius around a predicted pixel.
     max_distance : float
         Largest mean descriptor distance over left and right, as a share of the largest.
+    max_ratio : float
+        Largest ratio of a reference's best to its second best distance; 1 takes any.
 
     Returns
     -------
@@ -71,8 +75,11 @@ def match_temporal(
         distances = 0.5 * distances + 0.5 * descriptor_distances(
             reference.descriptors_right, current.descriptors_right, pairs
         )
-    is_close = distances <= max_distance
-    pairs, distances = pairs[is_close], distances[is_close]
+    is_usable = distances <= max_distance
+    note("temporal.candidates", pairs=pairs, distances=distances)
+    if max_ratio < 1.0:
+        is_usable &= best_ratios(pairs[:, 0], distances, len(reference))[pairs[:, 0]] <= max_ratio
+    pairs, distances = pairs[is_usable], distances[is_usable]
     return pairs[mutual_best(pairs, distances, len(reference), len(current))]
 
 

@@ -15,6 +15,7 @@ from gvo.config import RansacConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.umeyama import fit_rigid, fit_rigid_triples
+from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 # Hypotheses that are fitted and counted together, so that calls do not cost more than arithmetic.
@@ -76,6 +77,7 @@ def ransac_rigid(
         )
     near = _near(correspondences, config)
     samples = near[draw_samples(len(near), config.n_hypotheses, rng)]
+    note("ransac.samples", samples=samples, near=near)
     best = _search(samples, correspondences, camera, config, near=near)
     if best is None:
         return Failure(reason=f"{n} points lie on a line", n_matches=n)
@@ -100,11 +102,13 @@ def _search(
         if not is_valid.any():
             continue
         inliers = find_inliers(T[is_valid], correspondences, camera, config)
-        found = inliers[np.count_nonzero(inliers, axis=1).argmax()]
+        counts = np.count_nonzero(inliers, axis=1)
+        found = inliers[counts.argmax()]
         if best is None or np.count_nonzero(found) > np.count_nonzero(best):
             best = found
         # Samples are drawn of near points: the share of inliers among those is what counts.
         share = np.count_nonzero(best[near]) / len(near)
+        note("ransac.block", n_before=n_before, is_valid=is_valid, counts=counts, share=share)
         if (1.0 - share**3) ** (n_before + len(block)) < _MISS_PROBABILITY:
             break
     return best

@@ -27,6 +27,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.disparity_offset import DisparityOffset, estimate_disparity_offset
 from gvo.geometry.residuals import Linearization, StereoResiduals
+from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray
 
 # A step of three hundredths of a sigma no longer matters; this is its square.
@@ -110,6 +111,7 @@ def refine_pose(
         A failure where the residuals leave a direction of motion open.
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
+    note("refinement.begin", residuals=residuals)
     n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
     # Where directions are open, steps go anywhere: not finite is an answer like another.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -119,6 +121,7 @@ def refine_pose(
         chosen = residuals.within(rough.T, config.gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
+        note("refinement.gated", T_target_source=rough.T, inliers=chosen)
         residuals = residuals.select(chosen)
         descent = _gauss_newton(rough.T, residuals, n_iterations=config.n_iterations)
         if isinstance(descent, Failure):
@@ -142,6 +145,7 @@ def fit_covariance(
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
+    note("refinement.begin", residuals=residuals)
     unmoved = _Descent(T=T_target_source, last=None)
     return _with_covariance(unmoved, residuals.select(inliers), inliers, with_offset=with_offset)
 
@@ -167,6 +171,7 @@ def _gauss_newton(
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
+        note("refinement.step", T_target_source=T, step=step)
         if step @ at.g < _CONVERGED:
             return _Descent(T=T, last=at)
     return _Descent(T=T, last=None)

@@ -1,26 +1,48 @@
-"""Pictures of what a front-end matched, drawn over the image."""
+"""Pictures of what a front-end matched, drawn over the image, and of the frame as a whole."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import Final
 
 import cv2
 import numpy as np
 
-from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.odometry import FrameResult
+from gvo.outputs.depth_colours import DepthScale, in_groups, paint_depth, table
+from gvo.outputs.overlay_layout import Layout, write_footer, write_header
+from gvo.outputs.palette import INLIERS, OUTLIERS
+from gvo.outputs.strokes import (
+    BLACK,
+    WHITE,
+    bgr,
+    draw_crosses,
+    draw_dots,
+    draw_segments,
+    write_lines,
+)
+from gvo.types import (
+    BoolArray,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    ImageArray,
+    RelativePose,
+    RgbdFrame,
+    Status,
+    StereoFrame,
+)
 
-# Okabe and Ito's sky blue and orange, as BGR: colour-blind readers tell them apart, also on grey.
-INLIER_COLOUR: Final = (233, 180, 86)
-OUTLIER_COLOUR: Final = (0, 159, 230)
-_TEXT_COLOUR: Final = (255, 255, 255)
-_BITS: Final = 4  # of a pixel's fraction, in OpenCV's drawing
-_RADIUS_PX: Final = 1.5
-_MAX_PX: Final = 20_000  # keeps OpenCV's integers from running over
-_LINE_PX: Final = 16
-_MARGIN_PX: Final = 5
-_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
-_FONT_SCALE: Final = 0.45
+INLIER_COLOUR: Final = bgr(INLIERS)
+OUTLIER_COLOUR: Final = bgr(OUTLIERS)
+MAX_WIDTH_PX: Final = 1280
+"""Of a composed picture, where nothing else is asked for."""
+
+_CHARACTER_PX = 10  # wider than the mean
+_DIMMED = 0.4  # of the grey image below coloured lines
+_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 def draw_matches(
@@ -67,46 +89,151 @@ def draw_matches(
     flow = np.stack([pixels_reference, pixels_current], axis=1)
     is_finite = np.isfinite(flow).all(axis=(1, 2))
     kept, refused = flow[is_finite & inliers], flow[is_finite & ~inliers]
-    _draw_segments(canvas, kept, INLIER_COLOUR)
-    _draw_dots(canvas, kept[:, 1], INLIER_COLOUR)
-    _draw_segments(canvas, refused, OUTLIER_COLOUR)
-    _draw_crosses(canvas, refused[:, 1], OUTLIER_COLOUR)
-    _write_lines(canvas, lines)
+    draw_segments(canvas, kept, INLIER_COLOUR)
+    draw_dots(canvas, kept[:, 1], INLIER_COLOUR)
+    draw_segments(canvas, refused, OUTLIER_COLOUR)
+    draw_crosses(canvas, refused[:, 1], OUTLIER_COLOUR)
+    write_lines(canvas, lines)
     return canvas
 
 
-def _fixed_point(pixels: FloatArray) -> IntArray:
-    scaled = np.rint(np.clip(pixels, -_MAX_PX, _MAX_PX) * 2**_BITS)
-    return np.asarray(scaled, dtype=np.int64)
+def compose_overlay(
+    frame: Frame,
+    result: FrameResult,
+    camera: PinholeCamera,
+    *,
+    index: int | None = None,
+    rate_hz: float | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw what one frame gave: status, flow and depth.
+
+    The flow since the frame that the raw chain goes on from is drawn by `draw_matches`. The
+    second part, below for wide images and at the right for others, shows the depth of the same
+    points: for a stereo camera a line from where a point is in the left image to where it is in
+    the right one, in the colour of its depth; for an RGB-D camera the depth image in colours,
+    unknown depth dark, and the points.
+
+    Parameters
+    ----------
+    frame : StereoFrame or RgbdFrame
+    result : FrameResult
+        What it gave.
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    index : int, optional
+        Number of the frame, to be told.
+    rate_hz : float, optional
+        Frames per second, to be told; from the milliseconds of the frame where omitted.
+    max_width : int
+        Most pixels in a row; at least 640.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR, of one even size for all frames of a camera.
+
+    Raises
+    ------
+    ValueError
+        When a stereo frame comes with a camera without a baseline, or images of another size.
+    """
+    image = frame.left if isinstance(frame, StereoFrame) else frame.image
+    if image.shape != (camera.height, camera.width):
+        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
+    layout = Layout.of(camera, max_width)
+    found = result.registration or _NOTHING
+    n_told = min(len(found.pixels_current), len(found.points_current))
+    pixels = layout.scaled(found.pixels_current[:n_told])
+    canvas = layout.empty()
+    small = _resized(image, layout.panel)
+    first, second = layout.panels(canvas)
+    first[:] = draw_matches(
+        small,
+        layout.scaled(found.pixels_reference[:n_told]),
+        pixels,
+        found.inliers[:n_told],
+        lines=["flow"],
+    )
+    depths = found.points_current[:n_told, 2]
+    if isinstance(frame, StereoFrame):
+        second[:] = _disparity_picture(small, pixels, depths, camera, layout)
+    else:
+        second[:] = _depth_picture(frame, pixels, camera, layout)
+    write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
+    write_footer(canvas, layout, camera, result.reason)
+    return canvas
 
 
-def _draw_segments(canvas: ImageArray, segments: FloatArray, colour: Sequence[float]) -> None:
-    """Draw straight lines between pairs of pixels, shape (n, 2, 2)."""
-    points = list(_fixed_point(segments).astype(np.int32))
-    cv2.polylines(canvas, points, False, colour, 1, cv2.LINE_AA, _BITS)
+def compose_faulty(
+    frame: FaultyFrame,
+    camera: PinholeCamera,
+    *,
+    index: int | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw a frame that cannot be used: dark, with the reason.
+
+    Parameters
+    ----------
+    frame : FaultyFrame
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    index : int, optional
+        Number of the frame, to be told.
+    max_width : int
+        Most pixels in a row; at least 640.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR, of the size of the other frames of the camera.
+    """
+    layout = Layout.of(camera, max_width)
+    canvas = layout.empty()
+    write_header(canvas, layout, frame, index=index)
+    write_footer(canvas, layout, camera, "")
+    texts = textwrap.wrap(frame.reason, layout.panel[0] // _CHARACTER_PX)
+    write_lines(layout.panels(canvas)[0], [f"{Status.SKIPPED}: no pose", *texts])
+    return canvas
 
 
-def _draw_dots(canvas: ImageArray, pixels: FloatArray, colour: Sequence[float]) -> None:
-    radius = round(_RADIUS_PX * 2**_BITS)
-    for u, v in _fixed_point(pixels).tolist():
-        cv2.circle(canvas, (u, v), radius, colour, cv2.FILLED, cv2.LINE_8, _BITS)
+def _resized(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    is_smaller = size[0] < image.shape[1]
+    mode = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size, interpolation=mode), dtype=np.uint8)
 
 
-def _draw_crosses(canvas: ImageArray, pixels: FloatArray, colour: Sequence[float]) -> None:
-    arm = 2.0 * _RADIUS_PX
-    for step in ((arm, arm), (arm, -arm)):
-        ends = np.stack([pixels - step, pixels + step], axis=1)
-        _draw_segments(canvas, ends, colour)
+def _disparity_picture(
+    image: ImageArray,
+    pixels: FloatArray,
+    depths: FloatArray,
+    camera: PinholeCamera,
+    layout: Layout,
+) -> ImageArray:
+    if not isinstance(camera, StereoCamera):
+        raise ValueError("a stereo frame needs a camera with a baseline")
+    dimmed = cv2.convertScaleAbs(image, alpha=_DIMMED)
+    canvas = np.asarray(cv2.cvtColor(dimmed, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    is_known = np.isfinite(pixels).all(axis=1) & (depths > 0.0)
+    left, depths = pixels[is_known], depths[is_known]
+    right = left.copy()
+    right[:, 0] -= layout.scale * camera.depth_to_disparity(depths)
+    segments = np.stack([left, right], axis=1)
+    levels = DepthScale.of(camera).levels(depths)
+    for indices, colour in in_groups(levels):
+        draw_segments(canvas, segments[indices], colour)
+    draw_dots(canvas, left, table()[levels])
+    write_lines(canvas, ["disparity: from left to right"])
+    return canvas
 
 
-def _write_lines(canvas: ImageArray, lines: Sequence[str]) -> None:
-    """Write text over a darkened strip of the picture."""
-    texts = [line.encode("ascii", "replace").decode() for line in lines]
-    if not texts:
-        return
-    widths = [cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)[0][0] for text in texts]
-    strip = canvas[: _LINE_PX * len(texts) + _MARGIN_PX, : max(widths) + 2 * _MARGIN_PX]
-    strip //= 4
-    for row, text in enumerate(texts, start=1):
-        corner = (_MARGIN_PX, _LINE_PX * row - 2)
-        cv2.putText(canvas, text, corner, _FONT, _FONT_SCALE, _TEXT_COLOUR, 1, cv2.LINE_AA)
+def _depth_picture(
+    frame: RgbdFrame, pixels: FloatArray, camera: PinholeCamera, layout: Layout
+) -> ImageArray:
+    canvas = paint_depth(frame.depth, DepthScale.of(camera), layout.panel)
+    known = pixels[np.isfinite(pixels).all(axis=1)]
+    draw_dots(canvas, known, BLACK, radius=2.3)
+    draw_dots(canvas, known, WHITE, radius=1.0)
+    write_lines(canvas, ["depth, and the matched points"])
+    return canvas

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.errors import ConfigurationError, TrajectoryError
+from gvo.errors import ConfigurationError
+from gvo.outputs.drawing import METADATA, broken, ground_plane, plain, save_figure
+from gvo.outputs.palette import REFERENCE_STYLE, Style, styles_of
 from gvo.trajectory import Trajectory
 from gvo.trajectory_alignment import AlignMode, alignment, pair
 from gvo.types import FloatArray, IntArray
@@ -21,21 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which colour-blind readers tell apart; black is the reference's
-_FIXED_COLOURS = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
-_FREE_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
-_LINE_STYLES = ("-", "-.", ":")
-_FLAT = 0.05
 _SIZE_INCHES = (11.0, 5.5)
-# a line ends where the next pose is later than so many median steps
-_GAP = 10.0
 _LEGEND_CHARACTERS = 135
-# equal input gives equal files: no dates, no versions
-_METADATA: dict[str, dict[str, str | None]] = {
-    ".png": {"Software": None},
-    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-    ".svg": {"Date": None, "Creator": None},
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,19 +33,6 @@ class _Curve:
     trajectory: Trajectory
     stamps_ns: IntArray
     errors_m: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Style:
-    """How all the lines of one estimate look."""
-
-    color: str
-    linestyle: str
-    linewidth: float = 1.2
-    zorder: float = 2.0
-
-
-_REFERENCE_STYLE = _Style(color="black", linestyle="--", zorder=3.0)
 
 
 def plot_trajectories(
@@ -94,37 +68,25 @@ def plot_trajectories(
         Where there is no estimate, or one without poses.
     """
     path = Path(path)
-    if path.suffix.lower() not in _METADATA:
+    if path.suffix.lower() not in METADATA:
         raise ConfigurationError(
             f"{path}: the plot's file name ends in {path.suffix!r}, "
-            f"expected one of {', '.join(_METADATA)}"
+            f"expected one of {', '.join(METADATA)}"
         )
     if not estimates or any(len(estimate) == 0 for estimate in estimates.values()):
         raise ValueError("expected at least one estimate, and poses in each")
-    styles = _styles(estimates)
+    styles = styles_of(estimates)
     if reference is None:
         figure = _figure_of_positions(estimates, styles)
     else:
         figure = _figure_of_errors(reference, estimates, styles, align)
-    _save(figure, path)
-
-
-def _styles(names: Iterable[str]) -> list[_Style]:
-    """Return a style per name: the fixed colour of its word, once, or the next free one."""
-    left = dict(_FIXED_COLOURS)
-    free = itertools.cycle(itertools.product(_LINE_STYLES, _FREE_COLOURS))
-    styles = []
-    for name in names:
-        word = next((w for w in re.findall("[a-z]+", name.lower()) if w in left), None)
-        linestyle, color = ("-", left.pop(word)) if word else next(free)
-        styles.append(_Style(color=color, linestyle=linestyle))
-    return styles
+    save_figure(figure, path)
 
 
 def _figure_of_errors(
     reference: Trajectory,
     estimates: Mapping[str, Trajectory],
-    styles: Sequence[_Style],
+    styles: Sequence[Style],
     align: AlignMode,
 ) -> Figure:
     curves = [_aligned(reference, name, estimate, align) for name, estimate in estimates.items()]
@@ -133,8 +95,8 @@ def _figure_of_errors(
     shown = _around(reference, first_ns, last_ns)
     figure = _new_figure()
     view, errors = figure.subplots(1, 2)
-    plane = _plane(reference)
-    _draw_path(view, shown, plane, _REFERENCE_STYLE, "reference")
+    plane = ground_plane(reference)
+    _draw_path(view, shown, plane, REFERENCE_STYLE, "reference")
     for curve, style in zip(curves, styles, strict=True):
         _draw_path(view, curve.trajectory, plane, style, curve.label)
         _draw(errors, _elapsed(curve.stamps_ns, shown), curve.errors_m, style)
@@ -146,13 +108,13 @@ def _figure_of_errors(
     return figure
 
 
-def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[_Style]) -> Figure:
+def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[Style]) -> Figure:
     start = min(estimates.values(), key=lambda estimate: int(estimate.stamps_ns[0]))
     figure = _new_figure()
     axes = figure.subplot_mosaic([["view", axis] for axis in "xyz"])
     view, panels = axes["view"], [axes[axis] for axis in "xyz"]
     for (name, estimate), style in zip(estimates.items(), styles, strict=True):
-        _draw_path(view, estimate, (0, 2), style, _plain(name))
+        _draw_path(view, estimate, (0, 2), style, plain(name))
         elapsed = _elapsed(estimate.stamps_ns, start)
         for axis, panel in enumerate(panels):
             _draw(panel, elapsed, estimate.positions[:, axis], style)
@@ -173,7 +135,7 @@ def _aligned(reference: Trajectory, name: str, estimate: Trajectory, align: Alig
     moved = similarity.apply(estimate)
     errors_m = np.linalg.norm(ref.positions - similarity.apply(est).positions, axis=1)
     rmse = np.sqrt(np.mean(errors_m**2))
-    label = f"{_plain(name)} (ATE {rmse:.3g} m)"
+    label = f"{plain(name)} (ATE {rmse:.3g} m)"
     return _Curve(label=label, trajectory=moved, stamps_ns=ref.stamps_ns, errors_m=errors_m)
 
 
@@ -184,23 +146,6 @@ def _around(reference: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
     return reference.select(slice(max(start, 0), end + 1))
 
 
-def _plane(reference: Trajectory) -> tuple[int, int]:
-    """Return the axes to look at: x and z of a camera's world, else the two of most motion.
-
-    A world that begins with the identity is a camera's, unless it is as flat along z as that of a
-    robot with z upwards. Positions without rotations begin no world of a camera.
-    """
-    extents = np.ptp(reference.positions, axis=0)
-    is_camera = reference.has_rotations and np.allclose(
-        reference.T_world_cam[0], np.eye(4), atol=1e-3
-    )
-    if is_camera and extents[2] >= _FLAT * extents[1]:
-        return 0, 2
-    least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds
-    horizontal, vertical = (axis for axis in range(3) if axis != least)
-    return horizontal, vertical
-
-
 def _new_figure() -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -209,23 +154,14 @@ def _new_figure() -> Figure:
 
 
 def _draw_path(
-    view: Axes, trajectory: Trajectory, plane: tuple[int, int], style: _Style, label: str
+    view: Axes, trajectory: Trajectory, plane: tuple[int, int], style: Style, label: str
 ) -> None:
-    horizontal, vertical = _broken(trajectory.stamps_ns / 1e9, trajectory.positions[:, plane]).T
+    horizontal, vertical = broken(trajectory.stamps_ns / 1e9, trajectory.positions[:, plane]).T
     view.plot(horizontal, vertical, label=label, **asdict(style))
 
 
-def _draw(axes: Axes, elapsed: FloatArray, values: FloatArray, style: _Style) -> None:
-    axes.plot(*_broken(elapsed, np.column_stack([elapsed, values])).T, **asdict(style))
-
-
-def _broken(seconds: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the points with rows of NaN where poses are missing: lines end there."""
-    steps = np.diff(seconds)
-    if len(steps) == 0:
-        return points
-    gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1
-    return np.insert(points, gaps, np.nan, axis=0)
+def _draw(axes: Axes, elapsed: FloatArray, values: FloatArray, style: Style) -> None:
+    axes.plot(*broken(elapsed, np.column_stack([elapsed, values])).T, **asdict(style))
 
 
 def _finish_view(view: Axes, start: Trajectory, plane: tuple[int, int]) -> None:
@@ -248,12 +184,6 @@ def _stamp_label(trajectory: Trajectory) -> str:
     return "row" if trajectory.stamps_from == "rows" else "elapsed [s]"
 
 
-def _plain(name: str) -> str:
-    """Return a name without what a legend takes for markup: dollars, a leading underscore."""
-    text = name.replace("$", r"\$")
-    return f" {text}" if text.startswith("_") else text
-
-
 def _add_legend(figure: Figure, view: Axes) -> None:
     handles, labels = view.get_legend_handles_labels()
     n_fitting = max(1, _LEGEND_CHARACTERS // (max(map(len, labels)) + 8))
@@ -265,15 +195,3 @@ def _add_legend(figure: Figure, view: Axes) -> None:
         ncols=math.ceil(len(labels) / n_rows),
         frameon=False,
     )
-
-
-def _save(figure: Figure, path: Path) -> None:
-    from matplotlib import rc_context
-
-    suffix = path.suffix.lower()
-    try:
-        # the salt of the ids in SVG is random by default; the setting ends with the block
-        with rc_context({"svg.hashsalt": "gvo"}):
-            figure.savefig(path, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error

@@ -15,10 +15,20 @@ import numpy as np
 
 from gvo.errors import RecordingError
 from gvo.odometry import FrameResult
-from gvo.trajectory_files import COVARIANCE_HEADER, format_covariance_line, format_tum_line
+from gvo.trajectory import Trajectory
+from gvo.trajectory_files import (
+    COVARIANCE_HEADER,
+    format_covariance_line,
+    format_tum_line,
+    write_tum,
+)
 from gvo.types import Estimate, FaultyFrame, IntArray, Status
 
 PICTURE = "trajectories.png"
+REPORT = "report.html"
+TRUTH = "ground_truth.txt"
+TRUE_POSITIONS = "ground_truth_positions.csv"
+POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
 TRAJECTORIES = ("raw", "causal", "smoothed")
 FRAMES_HEADER = (
     "stamp_ns",
@@ -32,6 +42,16 @@ FRAMES_HEADER = (
 )
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
+
+_OF_EARLIER_RUNS = (
+    "summary.json",
+    "edges.csv",
+    "timings.csv",
+    PICTURE,
+    REPORT,
+    TRUTH,
+    TRUE_POSITIONS,
+)
 
 
 class RunFolder:
@@ -68,7 +88,7 @@ class RunFolder:
         self._files: dict[str, TextIO] = {}
         with self._refused_on_error():
             path.mkdir(parents=True, exist_ok=True)
-            for name in ("summary.json", PICTURE):
+            for name in _OF_EARLIER_RUNS:
                 (path / name).unlink(missing_ok=True)
             for name in TRAJECTORIES:
                 self._open(f"{name}.txt", "")
@@ -140,6 +160,20 @@ class RunFolder:
         """Return the stamps of all frames of the table, shape (n,), also of faulty ones."""
         with (self.path / "frames.csv").open(encoding="utf-8", newline="") as file:
             return np.array([int(row["stamp_ns"]) for row in csv.DictReader(file)], dtype=np.int64)
+
+    def write_truth(self, truth: Trajectory) -> None:
+        """Write the true poses that the estimates were compared with.
+
+        Positions without rotations become a table of their own: as poses they would claim more
+        than is known.
+        """
+        if truth.has_rotations:
+            write_tum(self.path / TRUTH, truth)
+            return
+        rows = zip(truth.stamps_ns.tolist(), *truth.positions.T.tolist(), strict=True)
+        lines = [_csv_line(POSITIONS_HEADER), *map(_csv_line, rows)]
+        with self._refused_on_error():
+            (self.path / TRUE_POSITIONS).write_text("".join(lines), encoding="utf-8")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write `summary.json`."""

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.frontend.matching import descriptor_distances, expand_ranges, mutual_best
+from gvo.frontend.matching import (
+    best_ratios,
+    descriptor_distances,
+    expand_ranges,
+    mutual_best,
+)
 from gvo.types import FloatArray, IntArray
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -122,3 +127,15 @@ def test_no_pairs_have_no_distances(dtype: type) -> None:
     descriptors: Any = np.zeros((3, 32), dtype=dtype)
     none = np.zeros((0, 2), dtype=np.int64)
     assert descriptor_distances(descriptors, descriptors[:0], none).shape == (0,)
+
+
+@given(st.integers(0, 30), st.integers(1, 6), st.integers(0, 2**16))
+def test_the_ratio_is_that_of_the_two_best_candidates(k: int, n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    members = rng.integers(n, size=k)
+    distances = rng.integers(4, size=k) / 4.0
+    ratios = best_ratios(members, distances, n)
+    for member in range(n):
+        two = sorted(distances[members == member].tolist())[:2]
+        expected = 0.0 if len(two) < 2 else 1.0 if two[1] == 0 else two[0] / two[1]
+        assert ratios[member] == expected

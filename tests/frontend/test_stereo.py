@@ -263,3 +263,15 @@ def test_curves_without_an_inner_minimum_are_told() -> None:
     )
     assert parabola_minimum(curves)[1].tolist() == [False, False, False, True]
     assert parabola_minimum(curves[:0])[0].shape == (0,)
+
+
+@pytest.mark.parametrize(("max_ratio", "is_found"), [(1.0, True), (0.51, True), (0.49, False)])
+def test_a_match_must_stand_out_from_the_second_best(max_ratio: float, is_found: bool) -> None:
+    code = np.zeros((1, 32), np.uint8)
+    best, second = code.copy(), code.copy()
+    best[0, 0], second[0, 0] = 0b11, 0b1111  # two bits and four: a ratio of a half
+    left = features(np.array([[40.0, 10.0]]), code)
+    right = features(np.array([[30.0, 10.0], [35.0, 10.0]]), np.concatenate([best, second]))
+    config = SETTINGS.model_copy(update={"max_ratio": max_ratio})
+    expected = [[0, 0]] if is_found else []
+    assert match_stereo(left, right, CAMERA, config).tolist() == expected

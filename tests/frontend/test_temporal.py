@@ -191,3 +191,21 @@ def test_matches_of_a_prediction_keep_the_indices_of_the_reference() -> None:
     predicted = predict_pixels(reference, T_reference_current, CAMERA)
     matches = match_temporal(reference, current, predicted, radius_px=2.0, max_distance=0.25)
     assert matches.tolist() == [[1, 0], [2, 1]]
+
+
+@pytest.mark.parametrize(("max_ratio", "is_found"), [(1.0, True), (0.51, True), (0.49, False)])
+def test_a_match_must_stand_out_from_the_second_best(max_ratio: float, is_found: bool) -> None:
+    rng = np.random.default_rng(0)
+    code = random_codes(rng, 1)
+    reference = observe(np.array([[100.0, 50.0]]), code)
+    codes = np.concatenate([flip(code, 10, rng), flip(code, 20, rng)])
+    current = observe(np.array([[101.0, 50.0], [102.0, 50.0]]), codes)
+    found = match_temporal(
+        reference,
+        current,
+        predict_pixels(reference, None, CAMERA),
+        radius_px=10.0,
+        max_distance=0.25,
+        max_ratio=max_ratio,
+    )
+    assert found.tolist() == ([[0, 0]] if is_found else [])

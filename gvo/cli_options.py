@@ -1,0 +1,61 @@
+"""What several commands take: parameters, recordings, their calibration and topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from gvo.config import Config
+    from gvo.sources.recording import Source
+
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
+]
+Recordings = Annotated[
+    list[Path], typer.Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
+]
+CalibrationFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
+    ),
+]
+Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")]
+Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")]
+Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")]
+Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")]
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")]
+Start = Annotated[float, typer.Option(metavar="S", help="Leave out the first seconds.")]
+Duration = Annotated[
+    float | None, typer.Option(metavar="S", help="Read no more than so many seconds.")
+]
+Every = Annotated[int, typer.Option(metavar="N", help="Take each Nth frame only.")]
+
+
+def load(path: Path | None, settings: list[str] | None) -> Config:
+    """Return the parameters of a file, changed by settings."""
+    from gvo.config import load_configuration
+
+    return load_configuration(path, settings or [])
+
+
+def open_source(
+    recordings: Sequence[Path],
+    config: Config,
+    calibration: Sequence[Path] | None,
+    topics: Mapping[str, str | None],
+) -> Source:
+    """Open what the options name."""
+    from gvo.sources.opening import RecordingOptions, open_recording
+
+    options = RecordingOptions(calibration=tuple(calibration or ()), **topics)
+    return open_recording(recordings, config=config, options=options)

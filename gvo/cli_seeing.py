@@ -1,0 +1,171 @@
+"""The commands that show: one frame explained, the page in the browser, there and back."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gvo.cli_options import (
+    CalibrationFiles,
+    Color,
+    ConfigFile,
+    Depth,
+    Duration,
+    Every,
+    Left,
+    Out,
+    Recordings,
+    Right,
+    Settings,
+    Start,
+    load,
+    open_source,
+)
+from gvo.errors import GvoError
+from gvo.terminal import both, interruptible, progress, warn
+
+if TYPE_CHECKING:
+    from gvo.config import Config
+    from gvo.sources.recording import Source
+    from gvo.trajectory import Trajectory
+
+_DEFAULT_PORT = 8080
+# How often the page looks for signals.
+_SIGNALS_S = 0.1
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands to the `gvo` command."""
+    for command in (explain, view, shuttle):
+        app.command()(command)
+
+
+def explain(
+    recordings: Recordings,
+    out: Out,
+    frame: Annotated[
+        int, typer.Option("--frame", min=0, metavar="N", help="Which frame; 0 is the first.")
+    ],
+    start: Start = 0.0,
+    every: Every = 1,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Show one frame from image to pose, step by step, as pictures."""
+    from gvo.explain import explain_frame
+    from gvo.outputs.explanation import write_explanation
+    from gvo.sources.excerpt import make_excerpt
+
+    parameters = load(config, set_)
+    excerpt = make_excerpt(start, None, every)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    with interruptible() as check:
+        explanation = explain_frame(
+            source,
+            frame,
+            config=parameters,
+            excerpt=excerpt,
+            on_progress=lambda n_done, n_to_do: check(None),
+        )
+        written = write_explanation(explanation, out)
+    for path in written:
+        typer.echo(path)
+
+
+def view(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
+    ],
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = (
+        _DEFAULT_PORT
+    ),
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Watch odometry in the browser, with its parameters as controls."""
+    from gvo.view import serve
+    from gvo.view.player import Player
+
+    with interruptible() as check, ExitStack() as stack:
+        shown: Player | Path = recordings[0]
+        truth: Trajectory | None = None
+        if len(recordings) > 1 or not (recordings[0] / "frames.csv").is_file():
+            topics = {"left": left, "right": right, "color": color, "depth": depth}
+
+            def open_again(config: Config) -> Source:
+                return open_source(recordings, config, calibration, topics)
+
+            parameters = load(config, set_)
+            truth = _find_truth(open_again(parameters))
+            shown = stack.enter_context(Player(open_again, parameters))
+        server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
+        warn([server.note] if server.note else [])
+        typer.echo(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
+        while not server.wait(_SIGNALS_S):
+            check(None)
+
+
+def _find_truth(source: Source) -> Trajectory | None:
+    """Return what the recording itself names its ground truth; it is not needed to watch."""
+    from gvo.run_inputs import own_truth
+    from gvo.types import Failure
+
+    try:
+        truth = own_truth(source)
+    except GvoError as error:
+        warn([f"no ground truth: {error}"])
+        return None
+    return None if isinstance(truth, Failure) else truth.trajectory
+
+
+def shuttle(
+    recordings: Recordings,
+    out: Out,
+    start: Start = 0.0,
+    duration: Duration = None,
+    every: Every = 1,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Drive a recording there and back: the drift without a ground truth."""
+    from gvo.outputs.shuttle_table import format_closings
+    from gvo.shuttle import shuttle as run_shuttle
+    from gvo.sources.excerpt import make_excerpt
+
+    parameters = load(config, set_)
+    excerpt = make_excerpt(start, duration, every)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    for line in source.info.decisions:
+        typer.echo(line)
+    with interruptible() as check, progress(source.info.name) as show:
+        result = run_shuttle(
+            source, out, config=parameters, excerpt=excerpt, on_progress=both(show, check)
+        )
+    typer.echo(format_closings(result.closings), nl=False)
+    typer.echo(out / "shuttle.png")
+    warn(result.warnings)
+    raise typer.Exit(result.exit_code)

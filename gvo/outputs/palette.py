@@ -1,0 +1,75 @@
+"""The colours of all pictures: one meaning each, told apart by colour-blind readers."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+# Okabe and Ito's colours; black is the reference's
+ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
+"""Of the three trajectories of a run."""
+OTHERS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
+"""Of estimates of any other name, one after another."""
+REFERENCE = "#000000"
+INLIERS, OUTLIERS = "#56B4E9", "#E69F00"
+STATUSES = {
+    "ok": "#BBBBBB",
+    "coasting": "#F0E442",
+    "lost": "#D55E00",
+    "resumed": "#0072B2",
+    "skipped": "#000000",
+}
+"""Of the statuses of frames; they have hatches and rows of their own as well."""
+HATCHES = {"ok": "", "coasting": "////", "lost": "xxxx", "resumed": "....", "skipped": ""}
+LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "standstill": "#999999"}
+"""Of the kinds of edges."""
+REFUSED = "#D55E00"
+STAGES = {
+    "read": "#00224E",
+    "extract": "#35456C",
+    "register": "#7C7B78",
+    "links": "#BCAE6B",
+    "window": "#FDEA45",
+}
+"""Of the stages of a frame, from dark to light: they differ in print too."""
+COUNTS = {"keypoints": "#999999", "points": "#0072B2", "matches": "#CC79A7", "inliers": INLIERS}
+
+_LINE_STYLES = ("-", "-.", ":")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Style:
+    """How all the lines of one trajectory look, in matplotlib's words."""
+
+    color: str
+    linestyle: str = "-"
+    linewidth: float = 1.2
+    zorder: float = 2.0
+
+
+REFERENCE_STYLE = Style(color="black", linestyle="--", zorder=3.0)
+
+
+def styles_of(names: Iterable[str]) -> list[Style]:
+    """Return a style per name: the fixed colour of its word, once, or the next free one.
+
+    Parameters
+    ----------
+    names : iterable of str
+        "raw", "causal" and "smoothed", also as a word within the name, have fixed colours.
+
+    Examples
+    --------
+    >>> [style.color for style in styles_of(["out/raw", "mine"])]
+    ['#E69F00', '#0072B2']
+    """
+    left = dict(ESTIMATES)
+    free = itertools.cycle(itertools.product(_LINE_STYLES, OTHERS))
+    styles = []
+    for name in names:
+        word = next((w for w in re.findall("[a-z]+", name.lower()) if w in left), None)
+        linestyle, color = ("-", left.pop(word)) if word else next(free)
+        styles.append(Style(color=color, linestyle=linestyle))
+    return styles

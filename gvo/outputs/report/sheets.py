@@ -1,0 +1,262 @@
+"""A plot of the report: figure, words, and its file forms."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvo.errors import ConfigurationError
+from gvo.outputs.drawing import METADATA, gaps_before, plain, save_figure
+from gvo.outputs.palette import Style
+from gvo.outputs.report.decimation import N_COLUMNS, kept_of_curve
+from gvo.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDE = 11.0
+"""Inches of a plot over the whole page."""
+HALF = 6.4
+"""Inches of a plot of which two stand side by side."""
+
+_MARGINS_INCHES = {"left": 0.78, "right": 0.2, "bottom": 0.52, "top": 0.12}
+_LEGEND_ROW_INCHES = 0.24
+_INCHES_PER_CHARACTER = 0.072
+_MAX_LABEL = 60
+_SETTINGS: dict[str, Any] = {
+    "font.family": ["sans-serif"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "path.simplify": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "gvo",
+}
+
+_NUMBER = re.compile(r"-?\d+\.\d{3,}")
+_TAG = re.compile("<[^>]*>")
+_ID = re.compile(r' id="([^"]*)"')
+_REFERENCE = re.compile(r'(?:url\(#|href="#)([^)"]+)')
+_FAMILY = re.compile(r"font(?:-family)?: ?(?:(\d[\d.]*px) )?'[^;\"]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plot:
+    """A plot of the report, or why there is none.
+
+    Parameters
+    ----------
+    slug : str
+        What its files are called by.
+    title : str
+    text : str
+        What it shows and what a good one looks like; where there is no figure, why.
+    figure : Figure or None
+    is_half : bool
+        Two of them fit side by side.
+    """
+
+    slug: str
+    title: str
+    text: str
+    figure: Figure | None = None
+    is_half: bool = False
+
+    def svg(self) -> str:
+        """Return the figure as SVG that can stand within a page beside others."""
+        if self.figure is None:
+            raise ValueError(f"{self.slug} has no figure")
+        buffer = io.StringIO()
+        self.figure.savefig(buffer, format="svg", metadata=METADATA[".svg"])
+        return _inlined(buffer.getvalue(), self.slug, self.title)
+
+
+@contextmanager
+def settings() -> Iterator[None]:
+    """Let figures that are made and written in the context look as those of the report."""
+    from matplotlib import rc_context
+
+    with rc_context(_SETTINGS):  # type: ignore[arg-type,unused-ignore]
+        yield
+
+
+def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:
+    """Write each figure as PNG and PDF.
+
+    Parameters
+    ----------
+    plots : sequence of Plot
+        Numbered as they stand in the report; those without a figure keep their number.
+    folder : Path
+        Made where it is missing.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    ConfigurationError
+        When the folder cannot be made.
+    TrajectoryError
+        When a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(
+            f"--plots {folder}: cannot be made: {error.strerror}; give a folder to write into"
+        ) from error
+    paths = []
+    for number, plot in enumerate(plots, start=1):
+        if plot.figure is None:
+            continue
+        for suffix in (".png", ".pdf"):
+            paths.append(folder / f"{number:02d}_{plot.slug}{suffix}")
+            save_figure(plot.figure, paths[-1])
+    return paths
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height))
+
+
+def arrange(figure: Figure, axes: Axes | None = None, *, left: float | None = None) -> None:
+    """Lay out a figure, with the legend of some axes above its plots.
+
+    Parameters
+    ----------
+    figure : Figure
+    axes : Axes, optional
+        Whose labels go into the legend; no legend where omitted.
+    left : float, optional
+        Inches left of the plots.
+    """
+    width, height = figure.get_size_inches()
+    margins = dict(_MARGINS_INCHES)
+    if left is not None:
+        margins["left"] = left
+    handles, labels = ([], []) if axes is None else axes.get_legend_handles_labels()
+    if labels:
+        labels = [_shortened(label) for label in labels]
+        n_rows = _legend_rows(labels, width)
+        margins["top"] += n_rows * _LEGEND_ROW_INCHES
+        figure.legend(
+            handles,
+            labels,
+            loc="upper center",
+            ncols=math.ceil(len(labels) / n_rows),
+            frameon=False,
+            borderaxespad=0.1,
+        )
+    figure.subplots_adjust(
+        left=margins["left"] / width,
+        right=1.0 - margins["right"] / width,
+        bottom=margins["bottom"] / height,
+        top=1.0 - min(margins["top"], 0.5 * height) / height,
+    )
+
+
+def _legend_rows(labels: Sequence[str], width: float) -> int:
+    columns = [(len(label) + 6) * _INCHES_PER_CHARACTER for label in labels]
+    if sum(columns) < width - 0.2:
+        return 1
+    return math.ceil(len(labels) / max(1, int((width - 0.2) / max(columns))))
+
+
+def plain_decades(axis: Any) -> None:  # noqa: ANN401 - of any axes
+    """Label a logarithmic axis by plain numbers: powers would cost more than all else."""
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda *_: "")
+
+
+def draw_curve(
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    style: Style,
+    *,
+    seconds: FloatArray | None = None,
+    label: str = "",
+    n_columns: int = N_COLUMNS,
+) -> None:
+    """Draw a curve with what its pixels can show; it ends where poses are missing.
+
+    Parameters
+    ----------
+    axes : Axes
+    x, y : ndarray of float64, shape (n,)
+        x increases.
+    style : Style
+    seconds : ndarray of float64, shape (n,), optional
+        By which poses are missing; x where omitted.
+    label : str
+        In the legend; none where empty.
+    n_columns : int
+        Of pixels.
+    """
+    gaps = gaps_before(x if seconds is None else seconds)
+    x, y = np.insert(x, gaps, x[gaps]), np.insert(y, gaps, np.nan)
+    kept = kept_of_curve(x, y, n_columns=n_columns)
+    x, y = x[kept], y[kept]
+    axes.plot(x, y, label=plain(label) if label else "_", **asdict(style))
+    # a point between two gaps has no line
+    is_gap = np.isnan(np.concatenate([[np.nan], y, [np.nan]]))
+    lone = np.flatnonzero(is_gap[:-2] & ~is_gap[1:-1] & is_gap[2:])
+    if len(lone) > 0:
+        looks: dict[str, Any] = {
+            "marker": ".",
+            "markersize": 5.0,
+            "linestyle": "",
+            "zorder": style.zorder,
+        }
+        axes.plot(x[lone], y[lone], color=style.color, **looks)
+
+
+def elapsed(stamps_ns: IntArray, first_ns: int) -> FloatArray:
+    """Return seconds since a stamp."""
+    return np.asarray((stamps_ns - first_ns) / 1e9, dtype=np.float64)
+
+
+def _shortened(label: str) -> str:
+    if len(label) <= _MAX_LABEL:
+        return label
+    half = _MAX_LABEL // 2 - 1
+    return f"{label[:half]}...{label[-half:]}"
+
+
+def _rounded(number: re.Match[str]) -> str:
+    return f"{float(number[0]):.2f}"
+
+
+def _inlined(svg: str, slug: str, title: str) -> str:
+    """Return SVG without prolog, metadata and foreign names; its ids begin with the slug."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
+    svg = _FAMILY.sub(lambda match: f"font-size: {match[1]}" if match[1] else "", svg)
+    used = set(_REFERENCE.findall(svg))
+    svg = _ID.sub(lambda match: f' id="{slug}-{match[1]}"' if match[1] in used else "", svg)
+    svg = re.sub(r"(url\(#|href=\"#)", rf"\g<1>{slug}-", svg)
+    svg = _TAG.sub(lambda tag: _NUMBER.sub(_rounded, tag[0]), svg)
+    svg = re.sub(r"\n\s*", "\n", svg)
+    svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" @>', svg, count=1)
+    return svg.replace("@", f'role="img" aria-label="{title}"', 1).strip()

@@ -1,0 +1,153 @@
+"""A run as a film: matches, depth, status and rate of each frame."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Final, TypeAlias
+
+from gvo.geometry.camera import PinholeCamera
+from gvo.odometry import FrameResult
+from gvo.outputs.overlay_layout import MIN_WIDTH_PX, Layout
+from gvo.outputs.overlays import compose_faulty, compose_overlay
+from gvo.outputs.video import open_sink
+from gvo.types import Estimate, FaultyFrame, Frame
+
+_MAX_WIDTH_PX: Final = 960
+_MAX_PIXELS: Final = 420_000  # of which each costs, at every frame
+
+_N_WAITING = 4  # frames; each holds its images
+_Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
+
+
+class RunOverlay:
+    """A film of a run, open inside a `with` block: one picture per frame, also of faulty ones.
+
+    A thread draws and encodes; the run waits for it only where it is four frames behind. The film
+    is written under another name in the same folder and takes its own when it is closed, also
+    where the run is interrupted. Without a single frame no file is left.
+
+    Parameters
+    ----------
+    path : Path
+        `.webm`: VP8, for browsers; `.mp4`: MPEG-4, for players; without a suffix: a folder of
+        PNG files, as where OpenCV has no encoder (see `decisions`).
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    rate_hz : float, optional
+        Pictures per second of the film; that of the first stamps where omitted, so that it
+        plays as fast as it was recorded.
+    max_width : int, optional
+        Most pixels in a row, at least 640; as many as are encoded quickly where omitted.
+
+    Attributes
+    ----------
+    decisions : tuple of str
+        What was decided about the files, a line each.
+
+    Raises
+    ------
+    ConfigurationError
+        When the path ends otherwise.
+    RecordingError
+        When the path exists or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        camera: PinholeCamera,
+        *,
+        rate_hz: float | None = None,
+        max_width: int | None = None,
+    ) -> None:
+        self._camera = camera
+        self._max_width = film_width(camera) if max_width is None else max_width
+        self._sink = open_sink(Path(path), rate_hz)
+        self.decisions = self._sink.decisions
+        self._n = 0
+        self._is_open = True
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="overlay")
+        self._waiting: deque[Future[None]] = deque()
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Take one frame and what it gave.
+
+        Raises
+        ------
+        RecordingError
+            When an earlier one could not be written.
+        """
+        self._put((frame, result))
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Take a frame without a pose: its picture tells the reason.
+
+        Raises
+        ------
+        RecordingError
+            When an earlier one could not be written.
+        """
+        self._put(frame)
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Take smoothed poses, which the film does not show."""
+
+    def close(self) -> None:
+        """Write what waits and finish the film; again: nothing.
+
+        Raises
+        ------
+        RecordingError
+            When it cannot be written.
+        """
+        if not self._is_open:
+            return
+        self._is_open = False
+        try:
+            while self._waiting:
+                self._waiting.popleft().result()
+        finally:
+            self._worker.shutdown(cancel_futures=True)
+            self._sink.close()
+
+    def __enter__(self) -> RunOverlay:
+        """Return the film, open for writing."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Finish the film, also where the run was interrupted."""
+        self.close()
+
+    def _put(self, item: _Item) -> None:
+        if len(self._waiting) == _N_WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._worker.submit(self._write, item, self._n))
+        self._n += 1
+
+    def _write(self, item: _Item, index: int) -> None:
+        width = self._max_width
+        if isinstance(item, FaultyFrame):
+            picture = compose_faulty(item, self._camera, index=index, max_width=width)
+            self._sink.add(picture, item.stamp_ns)
+            return
+        frame, result = item
+        picture = compose_overlay(frame, result, self._camera, index=index, max_width=width)
+        self._sink.add(picture, frame.stamp_ns)
+
+
+def film_width(camera: PinholeCamera) -> int:
+    """Return the most pixels in a row of a film that is encoded quickly."""
+    for width in range(_MAX_WIDTH_PX, MIN_WIDTH_PX, -16):
+        columns, rows = Layout.of(camera, width).size
+        if columns * rows <= _MAX_PIXELS:
+            return width
+    return MIN_WIDTH_PX

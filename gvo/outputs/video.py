@@ -1,0 +1,272 @@
+"""Pictures as a film, encoded by OpenCV, or as numbered PNG files."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, Protocol
+
+import cv2
+import numpy as np
+
+from gvo.errors import ConfigurationError, RecordingError
+from gvo.outputs.image_files import encode_png
+from gvo.outputs.webm import PERIOD_NS, finish_webm
+from gvo.types import ImageArray
+
+CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
+"""By suffix: VP8 plays in browsers, MPEG-4 Part 2 in players."""
+
+_N_PERIODS = 8  # that tell the rate
+_FALLBACK_HZ = 10.0
+_SLOWEST_HZ, _FASTEST_HZ = 0.1, 240.0
+# OpenCV takes no option of the encoder. libvpx encodes five times as fast, about as well, where
+# a frame is shown for no less than the time that FFmpeg grants it to encode one: a second.
+_VP8_HZ = 1e9 / PERIOD_NS
+# As WebM, OpenCV complains on the error stream that VP80 is no name of a codec there.
+_CONTAINERS = {".webm": ".mkv", ".mp4": ".mp4"}
+
+
+class PictureSink(Protocol):
+    """What pictures are written to."""
+
+    decisions: tuple[str, ...]
+
+    def add(self, picture: ImageArray, stamp_ns: int) -> None:
+        """Write one more picture, of the size of the first."""
+
+    def close(self) -> None:
+        """Finish what was written."""
+
+
+def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
+    """Choose by its name what a path becomes.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in `.webm` or `.mp4`: a film. Without a suffix, or a folder that is there: a folder
+        of PNG files, as where OpenCV has no encoder, beside the path.
+    rate_hz : float, optional
+        Pictures per second; by the stamps of the first ones where omitted.
+
+    Raises
+    ------
+    ConfigurationError
+        When the path ends otherwise.
+    RecordingError
+        When it exists or cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if not suffix or (path.is_dir() and suffix not in CODECS):
+        return PngFolder(path)
+    if suffix not in CODECS:
+        raise ConfigurationError(
+            f"{path}: expected a name ending in .webm (browsers) or .mp4 (players), or of a folder "
+            f"for PNG files, got {path.name}"
+        )
+    if path.exists():
+        raise RecordingError(f"{path}: exists already; give another path or remove it")
+    if has_encoder(suffix):
+        return Film(path, rate_hz)
+    folder = path.with_name(f"{path.stem}_frames")
+    reason = f"{path}: OpenCV has no encoder for {suffix} here"
+    return PngFolder(folder, decisions=(f"{reason}: PNG files in {folder} instead",))
+
+
+class Film:
+    """A film file, written under another name in its folder until it is closed.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in a suffix of `CODECS`; its folder is made where it is missing.
+    rate_hz : float, optional
+        Pictures per second; by the median of the first periods where omitted.
+
+    Raises
+    ------
+    RecordingError
+        When the folder cannot be written.
+    """
+
+    def __init__(self, path: Path, rate_hz: float | None = None) -> None:
+        self.path = path
+        self.decisions: tuple[str, ...] = ()
+        self._rate_hz = rate_hz
+        self._waiting: list[ImageArray] = []
+        self._stamps_ns: list[int] = []
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+        with _refused_on_error(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
+        self._part = Path(self._folder.name) / f"film{_CONTAINERS[path.suffix.lower()]}"
+
+    def add(self, picture: ImageArray, stamp_ns: int) -> None:
+        """Encode one more picture.
+
+        Parameters
+        ----------
+        picture : ndarray of uint8, shape (height, width, 3)
+            BGR, of the size of the first.
+        stamp_ns : int
+            When it was taken, nanoseconds.
+
+        Raises
+        ------
+        ValueError
+            When it is of another size.
+        RecordingError
+            When the film cannot be written.
+        """
+        picture = _even(picture)
+        size = (picture.shape[1], picture.shape[0])
+        if self._size in ((0, 0), size):
+            self._size = size
+        else:
+            raise ValueError(f"expected a picture of {self._size}, got {size}")
+        if self._writer is not None:
+            self._writer.write(picture)
+            return
+        self._waiting.append(picture)
+        self._stamps_ns.append(stamp_ns)
+        if self._rate_hz is not None or len(self._waiting) > _N_PERIODS:
+            self._begin()
+
+    def close(self) -> None:
+        """Finish the film and give it its name; without pictures no file is left.
+
+        Raises
+        ------
+        RecordingError
+            When it cannot be written.
+        """
+        with self._folder, _refused_on_error(self.path):
+            if self._waiting:
+                self._begin()
+            if self._writer is None:
+                return
+            self._writer.release()
+            if self._part.suffix == ".mkv":
+                finish_webm(self._part, round(1e9 / self._known_rate()))
+            self._part.rename(self.path)
+
+    def _begin(self) -> None:
+        self._rate_hz = self._known_rate()
+        is_vp8 = self._part.suffix == ".mkv"
+        rate_hz = _VP8_HZ if is_vp8 else self._rate_hz
+        writer = _open_writer(self._part, CODECS[self.path.suffix.lower()], rate_hz, self._size)
+        if writer is None:
+            raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
+        for picture in self._waiting:
+            writer.write(picture)
+        self._waiting.clear()
+        self._writer = writer
+
+    def _known_rate(self) -> float:
+        return rate_of(self._stamps_ns) if self._rate_hz is None else self._rate_hz
+
+
+class PngFolder:
+    """A folder of numbered PNG files, each written as it comes.
+
+    Parameters
+    ----------
+    path : Path
+        Is made where it is missing.
+    decisions : tuple of str
+        Why it is used.
+
+    Raises
+    ------
+    RecordingError
+        When the folder holds something already or cannot be written.
+    """
+
+    def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
+        self.path = path
+        self.decisions = decisions or (f"{path}: a PNG file for each frame",)
+        self._n = 0
+        with _refused_on_error(path):
+            path.mkdir(parents=True, exist_ok=True)
+            is_empty = next(path.iterdir(), None) is None
+        if not is_empty:
+            raise RecordingError(f"{path}: is not empty; give another folder or empty it")
+
+    def add(self, picture: ImageArray, stamp_ns: int) -> None:
+        """Write one more picture, shape (height, width, 3), BGR.
+
+        Raises
+        ------
+        RecordingError
+            When it cannot be written.
+        """
+        with _refused_on_error(self.path):
+            (self.path / f"{self._n:06d}.png").write_bytes(encode_png(picture))
+        self._n += 1
+
+    def close(self) -> None:
+        """Leave an empty folder to nobody."""
+        if self._n == 0:
+            with _refused_on_error(self.path):
+                self.path.rmdir()
+
+
+def has_encoder(suffix: str) -> bool:
+    """Tell whether OpenCV can write films of a suffix of `CODECS`."""
+    with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
+        path = Path(folder) / f"film{_CONTAINERS[suffix]}"
+        writer = _open_writer(path, CODECS[suffix], _VP8_HZ, (64, 64))
+        if writer is None:
+            return False
+        writer.release()
+    return True
+
+
+def rate_of(stamps_ns: Sequence[int]) -> float:
+    """Return frames per second by the median period of stamps, within what films hold."""
+    periods_ns = np.diff(stamps_ns)
+    periods_ns = periods_ns[periods_ns > 0]
+    if len(periods_ns) == 0:
+        return _FALLBACK_HZ
+    return float(np.clip(1e9 / np.median(periods_ns), _SLOWEST_HZ, _FASTEST_HZ))
+
+
+def _even(picture: ImageArray) -> ImageArray:
+    """Return a picture without an odd last row or column; encoders halve colours."""
+    height, width = picture.shape[:2]
+    return np.ascontiguousarray(picture[: height & ~1, : width & ~1])
+
+
+def _open_writer(
+    path: Path, codec: str, rate_hz: float, size: tuple[int, int]
+) -> cv2.VideoWriter | None:
+    with _quiet_opencv():
+        fourcc = cv2.VideoWriter.fourcc(*codec)
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size)
+    return writer if writer.isOpened() else None
+
+
+@contextmanager
+def _quiet_opencv() -> Iterator[None]:
+    """Keep OpenCV from telling on the error stream what is told by a value."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+@contextmanager
+def _refused_on_error(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        detail = error.strerror or error
+        raise RecordingError(f"{path}: cannot be written: {detail}") from error
+    except ValueError as error:
+        raise RecordingError(f"{path}: was not written whole: {error}") from error

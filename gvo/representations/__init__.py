@@ -1,0 +1,1 @@
+"""What notebooks show of values: HTML with small drawings, as strings."""

@@ -1,0 +1,216 @@
+"""Trajectories and estimates as HTML: a table, and a drawing beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.representations.drawings import ellipse_drawing, path_drawing
+
+_FloatArray = NDArray[np.float64]
+
+_FLAT = 0.05
+_LARGE = 1e9  # written with an exponent from here
+_STYLE = (
+    "display:flex;flex-wrap:wrap;gap:1.5em;align-items:center;font-variant-numeric:tabular-nums"
+)
+_CELL = "text-align:left;padding:0.1em 0.8em 0.1em 0"
+
+
+def trajectory_html(
+    stamps_ns: NDArray[np.int64],
+    poses: _FloatArray,
+    *,
+    has_rotations: bool,
+    has_covariances: bool,
+    stamps_from: str,
+) -> str:
+    """Return what a notebook shows of a trajectory.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n,)
+        Nanoseconds.
+    poses : ndarray of float64, shape (n, 4, 4)
+        T_world_cam, metres.
+    has_rotations, has_covariances : bool
+        What is known beside the positions.
+    stamps_from : str
+        Where the stamps come from; those of "rows" tell no rate.
+
+    Returns
+    -------
+    str
+        HTML: a table, and the path from above.
+    """
+    n, positions = len(stamps_ns), poses[:, :3, 3]
+    rows = [("poses", f"{n:,}" if has_rotations else f"{n:,}, positions only")]
+    if n == 0:
+        return card("Trajectory", rows)
+    if stamps_from != "rows":
+        rows += _rows_of_stamps(int(stamps_ns[0]), int(stamps_ns[-1]), n)
+    with np.errstate(over="ignore"):
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        extents = np.ptp(positions, axis=0)
+        rows.append(("path length", metres(float(np.sum(steps)))))
+    rows.append(("extent x, y, z", ", ".join(metres(float(extent)) for extent in extents)))
+    rows.append(("covariances", "yes" if has_covariances else "none"))
+    is_camera = has_rotations and np.allclose(poses[0], np.eye(4), atol=1e-3)
+    horizontal, vertical = _seen_axes(extents, is_camera=is_camera)
+    axes = ("xyz"[horizontal], "xyz"[vertical])
+    drawing = path_drawing(positions[:, [horizontal, vertical]], axes=axes)
+    return card("Trajectory", rows, drawing)
+
+
+def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, status: str) -> str:
+    """Return what a notebook shows of an estimate.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Nanoseconds.
+    pose : ndarray of float64, shape (4, 4)
+        T_world_cam, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+    status : str
+        What ties the pose to others.
+
+    Returns
+    -------
+    str
+        HTML: a table, and the ellipses of the position along x and z of the world.
+    """
+    rows = [("status", status), ("stamp", f"{_seconds(stamp_ns)} s")]
+    if pose.shape != (4, 4) or covariance.shape != (6, 6):
+        return card("Estimate", rows)
+    R, positions = pose[:3, :3], pose[:3, 3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        covariance_world = R @ covariance[3:, 3:] @ R.T
+        position_sigmas = np.sqrt(np.diag(covariance_world))
+        rotation_sigmas = np.degrees(np.sqrt(np.diag(covariance)[:3]))
+    rows += [
+        ("position x, y, z [m]", vector(positions, position_sigmas)),
+        ("rotation vector [deg]", vector(_rotation_vector_deg(R), rotation_sigmas)),
+    ]
+    ground = covariance_world[np.ix_([0, 2], [0, 2])]
+    return card("Estimate", rows, ellipse_drawing(ground, axes=("x", "z")))
+
+
+def card(title: str, rows: Iterable[tuple[str, str]], drawing: str = "") -> str:
+    """Return a title, a table of names and values, and a drawing beside it.
+
+    Parameters
+    ----------
+    title : str
+    rows : iterable of (str, str)
+        Names and values as text; escaped here.
+    drawing : str
+        An SVG element; nothing where empty.
+
+    Returns
+    -------
+    str
+        One HTML element, also well-formed as XML.
+
+    Examples
+    --------
+    >>> "a &lt; b" in card("a < b", [])
+    True
+    """
+    lines = "".join(
+        f'<tr><th style="{_CELL};font-weight:normal;opacity:0.7">{escape(name)}</th>'
+        f'<td style="{_CELL}">{escape(value)}</td></tr>'
+        for name, value in rows
+    )
+    table = f'<table style="color:inherit">{lines}</table>' if lines else ""
+    heading = f"<strong>{escape(title)}</strong>"
+    return f'<div style="{_STYLE}"><div>{heading}{table}</div>{drawing}</div>'
+
+
+def metres(value: float) -> str:
+    """Return a length with a unit that suits it.
+
+    Examples
+    --------
+    >>> metres(0.00123), metres(12.3456), metres(float("nan"))
+    ('1.23 mm', '12.35 m', 'unknown')
+    """
+    if not math.isfinite(value):
+        return "unknown"
+    if abs(value) >= 1000.0:
+        return f"{value / 1000.0:,.3f} km" if abs(value) < 1e9 else f"{value:.3g} m"
+    if abs(value) >= 1.0:
+        return f"{value:.2f} m"
+    return f"{1000.0 * value:.3g} mm"
+
+
+def vector(values: Sequence[float] | _FloatArray, sigmas: Sequence[float] | _FloatArray) -> str:
+    """Return numbers with their standard deviations.
+
+    Examples
+    --------
+    >>> vector([1.0, -2.0], [0.1, float("nan")])
+    '1.00 ± 0.10, -2'
+    """
+    return ", ".join(
+        _with_sigma(float(value), float(sigma)) for value, sigma in zip(values, sigmas, strict=True)
+    )
+
+
+def _rows_of_stamps(first_ns: int, last_ns: int, n: int) -> list[tuple[str, str]]:
+    duration_s = (last_ns - first_ns) / 1e9
+    rows = [
+        ("from", f"{_seconds(first_ns)} s"),
+        ("to", f"{_seconds(last_ns)} s"),
+        ("duration", f"{duration_s:,.3f} s"),
+    ]
+    if n > 1:
+        rows.append(("mean rate", f"{(n - 1) / duration_s:.3g} Hz"))
+    return rows
+
+
+def _seconds(stamp_ns: int) -> str:
+    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
+
+
+def _seen_axes(extents: _FloatArray, *, is_camera: bool) -> tuple[int, int]:
+    """Return the axes to look at: x and z of a camera's world, else the two of most motion.
+
+    A world as flat along z as that of a robot is none of a camera, wherever it begins.
+    """
+    if is_camera and extents[2] >= _FLAT * extents[1]:
+        return 0, 2
+    least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds
+    horizontal, vertical = (axis for axis in range(3) if axis != least)
+    return horizontal, vertical
+
+
+def _rotation_vector_deg(R: _FloatArray) -> _FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    if not np.all(np.abs(R) < 2.0):  # far from a rotation, or not finite
+        return np.full(3, np.nan)
+    try:
+        return np.degrees(np.asarray(Rotation.from_matrix(R).as_rotvec()))
+    except (ValueError, np.linalg.LinAlgError):  # no rotation
+        return np.full(3, np.nan)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "unknown"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Round to two digits of the standard deviation."""
+    if not (math.isfinite(value) and 0.0 < sigma < math.inf):
+        return _number(value)
+    n_decimals = min(max(1 - math.floor(math.log10(sigma)), 0), 9)
+    if max(abs(value), sigma) >= _LARGE or sigma < 1e-8:
+        return f"{_number(value)} ± {sigma:.2g}"
+    return f"{value:.{n_decimals}f} ± {sigma:.{n_decimals}f}"

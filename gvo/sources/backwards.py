@@ -1,0 +1,187 @@
+"""A recording there and back: its frames, then the same ones from the last to the first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import Any
+
+from numpy.typing import NDArray
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.sources.excerpt import Excerpt
+from gvo.sources.frames import frames, pair_limit_key
+from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.trajectory import Trajectory
+from gvo.types import FaultyFrame, Frame, StereoFrame
+
+MAX_PIECE_BYTES = 256_000_000
+
+
+class ThereAndBack:
+    """The frames of a recording in their order, then in the opposite one with mirrored stamps.
+
+    The frame at the turn, the last sound one, is given once. What is faulty on the way there is
+    faulty on the way back.
+
+    Parameters
+    ----------
+    source : Source
+        The recording; is read again, piece by piece from its end, where it is long.
+    config : Config
+        As of `frames`.
+    excerpt : Excerpt, optional
+        The part that is wanted; the whole where omitted.
+    max_bytes : int
+        Of images that are held at a time; at least one frame is.
+
+    Attributes
+    ----------
+    turn_ns : int or None
+        Stamp of the frame at the turn, known when that is passed; None where no frame is sound.
+
+    Notes
+    -----
+    The last piece is kept while the recording is read, so a short recording is read once. Each
+    of the others is one more reading from the start to the end of the piece, in which images
+    outside of the piece are paired but not decoded.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        excerpt: Excerpt | None = None,
+        *,
+        max_bytes: int = MAX_PIECE_BYTES,
+    ) -> None:
+        self._source = source
+        self._config = config
+        self._excerpt = excerpt
+        self._max_bytes = max_bytes
+        self.turn_ns: int | None = None
+
+    def __iter__(self) -> Iterator[Frame | FaultyFrame]:
+        """Yield the frames.
+
+        Yields
+        ------
+        StereoFrame, RgbdFrame or FaultyFrame
+            On the way back with stamp' = 2 * turn - stamp, nanoseconds.
+
+        Raises
+        ------
+        RecordingError
+            When the recording cannot be read on; what was read before is yielded first, there
+            and back.
+        """
+        log = _Log(self._max_bytes)
+        fault: RecordingError | None = None
+        try:
+            for item in frames(self._source, self._config, self._excerpt):
+                log.add(item)
+                yield item
+        except RecordingError as error:
+            fault = error  # what was read before it counts
+        self.turn_ns = log.turn_ns
+        if log.turn_ns is not None:
+            for item in self._backwards(log):
+                yield replace(item, stamp_ns=2 * log.turn_ns - item.stamp_ns)
+        if fault is not None:
+            raise fault
+
+    def _backwards(self, log: _Log) -> Iterator[Frame | FaultyFrame]:
+        """Yield what lies before the turn, from there to the start."""
+        while log.pieces:
+            piece = log.pieces.pop()
+            n_wanted = log.n_to_turn - 1 - piece.first
+            if n_wanted <= 0:
+                log.held.clear()
+                continue
+            held = log.held or self._read(piece)
+            log.held = []
+            del held[n_wanted:]
+            while held:
+                yield held.pop()
+
+    def _read(self, piece: _Piece) -> list[Frame | FaultyFrame]:
+        key = pair_limit_key(self._source.info.sensor)
+        margin_ns = round(float(getattr(self._config.sync, key)) * 1e6)
+        least_ns, greatest_ns = piece.stamps_ns
+        source = _Windowed(self._source, (least_ns - margin_ns, greatest_ns + margin_ns))
+        items = frames(source, self._config, self._excerpt)
+        return list(islice(items, piece.first, piece.end))
+
+
+@dataclass(slots=True, kw_only=True)
+class _Piece:
+    """Frames that follow one another: those of the indices [first, end)."""
+
+    first: int
+    end: int
+    n_bytes: int = 0
+    stamps_ns: tuple[int, int] = (0, 0)  # least and greatest
+
+
+@dataclass(slots=True)
+class _Log:
+    """What was read on the way there, in pieces; the frames of the last one are held."""
+
+    max_bytes: int
+    pieces: list[_Piece] = field(default_factory=lambda: [_Piece(first=0, end=0)])
+    held: list[Frame | FaultyFrame] = field(default_factory=list)
+    turn_ns: int | None = None
+    n_to_turn: int = 0  # items up to the frame at the turn
+
+    def add(self, item: Frame | FaultyFrame) -> None:
+        piece, n_bytes = self.pieces[-1], _size(item)
+        if piece.n_bytes and piece.n_bytes + n_bytes > self.max_bytes:
+            piece = _Piece(first=piece.end, end=piece.end)
+            self.pieces.append(piece)
+            self.held = []
+        self.held.append(item)
+        known = piece.stamps_ns if piece.end > piece.first else ()
+        piece.stamps_ns = min((item.stamp_ns, *known)), max((item.stamp_ns, *known))
+        piece.end += 1
+        piece.n_bytes += n_bytes
+        if not isinstance(item, FaultyFrame):
+            self.turn_ns = item.stamp_ns
+            self.n_to_turn = piece.end
+
+
+class _Windowed:
+    """A recording whose images can be loaded between two stamps only: so they cost nothing."""
+
+    def __init__(self, source: Source, window_ns: tuple[int, int]) -> None:
+        self._source = source
+        self._window_ns = window_ns
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What is known before the first image."""
+        return self._source.info
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield all images; those outside of the window are faulty."""
+        for image in self._source.images():
+            yield image if self._holds(image.stamp_ns) else replace(image, load=_not_loaded)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return what the recording holds."""
+        return self._source.ground_truth()
+
+    def _holds(self, stamp_ns: int) -> bool:
+        return self._window_ns[0] <= stamp_ns <= self._window_ns[1]
+
+
+def _not_loaded() -> NDArray[Any]:
+    raise RecordingError("outside of the piece that is read")
+
+
+def _size(item: Frame | FaultyFrame) -> int:
+    if isinstance(item, FaultyFrame):
+        return 0
+    images = (item.left, item.right) if isinstance(item, StereoFrame) else (item.image, item.depth)
+    return sum(image.nbytes for image in images)

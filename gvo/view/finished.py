@@ -1,0 +1,183 @@
+"""The page of a finished run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from gvo.errors import RecordingError, TrajectoryError
+from gvo.outputs.run_record import RunRecord, read_run
+from gvo.trajectory import Trajectory
+from gvo.trajectory_alignment import alignment, pair
+from gvo.types import FloatArray
+from gvo.view.layers import COLOURS
+from gvo.view.numbers import frame_rows, legend_html, numbers_html, pose_rows
+from gvo.view.panels import UP, ViewPoint, add_frame_panel, add_layer_switches, grid_cell
+from gvo.view.playback import Painter, Playback
+from gvo.view.run_player import RunPlayer
+from gvo.view.scene import Scene, Up
+from gvo.view.server import ViewServer, open_server
+
+N_ELLIPSOIDS = 60
+"""How many covariances are drawn at most along the path."""
+
+_RATE_HZ = 15.0
+_PATHS = ("raw", "causal", "smoothed")
+
+
+def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewServer:
+    """Serve the page of a run folder; see `gvo.view.serve_run`."""
+    record = read_run(folder)
+    if len(record.frames.stamps_ns) == 0:
+        raise RecordingError(f"{folder}: holds no frames: there is nothing to show; run again")
+    view = open_server(host, port, title=f"gvo {name or record.name}")
+    page = FinishedPage(view.viser, record)
+    view.on_close(page.close)
+    return view
+
+
+def world_up(record: RunRecord) -> Up:
+    """Return which axis points up: -y where the world is the first camera, else +z."""
+    causal = record.trajectories["causal"]
+    is_first = len(causal) == 0 or np.allclose(causal.T_world_cam[0], np.eye(4), atol=1e-6)
+    return "-y" if is_first and record.summary.get("frame", "camera") == "camera" else "+z"
+
+
+def aligned_truth(record: RunRecord) -> Trajectory | None:
+    """Return the truth in the world of the run, fitted to the smoothed positions."""
+    estimates = record.comparable()
+    estimate = estimates.get("smoothed") or estimates.get("causal")
+    if record.truth is None or estimate is None or len(record.truth) == 0:
+        return None
+    try:
+        truth, paired = pair(record.truth, estimate)
+    except TrajectoryError:
+        return None
+    return alignment(paired, truth, "se3").apply(record.truth)
+
+
+class FinishedPage:
+    """Shows a run frame by frame.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    record : RunRecord
+        Of at least one frame.
+    """
+
+    def __init__(self, server: viser.ViserServer, record: RunRecord) -> None:
+        self._server = server
+        self._record = record
+        self._truth = aligned_truth(record)
+        up = world_up(record)
+        self.scene = Scene(server.scene, up=up)
+        self._add_frame_panel()
+        self.player = RunPlayer(record.frames.stamps_ns, lambda index: self._painter.offer())
+        self.playback = Playback(server.gui, self.player, before=lambda: None)
+        self._view = ViewPoint(server, up, is_following=False)
+        self._sigmas = server.gui.add_slider(
+            "ellipsoid sigmas", 1, 100, 1, 10, hint="Half axes of the ellipsoids"
+        )
+        self._painter = Painter(self.draw, rate_hz=_RATE_HZ)
+        self._sigmas.on_update(lambda _: self._painter.offer())
+        hidden = {"keyframes", "links", "image", "points", "cloud"}
+        hidden |= set() if self._truth is not None else {"truth"}
+        layers = [layer for layer in self.scene.layers if layer not in hidden]
+        add_layer_switches(server.gui, self.scene, layers)
+        self._show_all()
+        self.player.seek(self.player.n_frames - 1)
+
+    def close(self) -> None:
+        """End what runs beside the page."""
+        self.player.close()
+        self._painter.close()
+
+    @property
+    def numbers_text(self) -> str:
+        """The numbers of the frame as they are shown, HTML."""
+        return str(self._numbers.content)
+
+    def settle(self) -> None:
+        """Wait until the frame that was asked for last is drawn."""
+        self._painter.settle()
+
+    def draw(self) -> None:
+        """Show the frame that the player is at."""
+        index = self.player.index
+        stamp_ns = int(self._record.frames.stamps_ns[index])
+        with self.scene.lock, self._server.atomic():
+            self.playback.show(index)
+            self._numbers.content = numbers_html(self._rows(index, stamp_ns))
+            for name in _PATHS:
+                trajectory = self._record.trajectories[name]
+                self.scene.show_path(name, trajectory.positions[trajectory.stamps_ns <= stamp_ns])
+            if self._truth is not None:
+                is_past = self._truth.stamps_ns <= stamp_ns
+                self.scene.show_path("truth", self._truth.positions[is_past])
+            self._draw_ellipsoids(stamp_ns)
+            T_world_cam = self._pose(stamp_ns)
+            if T_world_cam is not None:
+                self.scene.show_pose(T_world_cam)
+                self._view.show_pose(T_world_cam)
+
+    def _add_frame_panel(self) -> None:
+        with add_frame_panel(self._server):
+            self._numbers = self._server.gui.add_html("")
+            names = [*_PATHS, *(["truth"] if self._truth is not None else []), "ellipsoids"]
+            self._server.gui.add_html(legend_html(name for name in COLOURS if name in names))
+
+    def _show_all(self) -> None:
+        """Choose sizes and the view by the whole path."""
+        positions = [t.positions for t in self._record.trajectories.values() if len(t) > 0]
+        if not positions:
+            return
+        points = np.concatenate(positions)
+        reach = max(0.1, float(np.linalg.norm(np.ptp(points, axis=0))))
+        self.scene.set_camera(4, 3, 3.0, size_m=0.04 * reach)
+        lowest = points[np.argmin(points @ UP[self.scene.up])]
+        self.scene.show_ground(lowest - 0.02 * reach * UP[self.scene.up], grid_cell(0.1 * reach))
+        self._view.look_down(points)
+
+    def _rows(self, index: int, stamp_ns: int) -> dict[str, str]:
+        frames = self._record.frames
+        rows = frame_rows(index, self.player.n_frames, stamp_ns, frames.statuses[index])
+        if frames.reasons[index]:
+            rows["reason"] = frames.reasons[index]
+        rows |= {name: f"{counts[index]}" for name, counts in frames.counts.items()}
+        rows |= self._milliseconds(stamp_ns)
+        causal = self._record.trajectories["causal"]
+        row = int(np.searchsorted(causal.stamps_ns, stamp_ns))
+        if row < len(causal) and causal.stamps_ns[row] == stamp_ns:
+            covariance = None if causal.covariances is None else causal.covariances[row]
+            rows |= pose_rows(causal.T_world_cam[row], covariance)
+        return rows
+
+    def _milliseconds(self, stamp_ns: int) -> dict[str, str]:
+        timings = self._record.timings
+        if timings is None:
+            return {}
+        (found,) = np.nonzero(timings.stamps_ns == stamp_ns)
+        stages = {name: float(ms[found[0]]) for name, ms in timings.stages_ms.items() if len(found)}
+        known = {name: ms for name, ms in stages.items() if np.isfinite(ms)}
+        parts = ", ".join(f"{name} {ms:.1f}" for name, ms in known.items())
+        return {"ms": f"{sum(known.values()):.1f} ({parts})"} if known else {}
+
+    def _pose(self, stamp_ns: int) -> FloatArray | None:
+        """Return the causal pose of the newest frame that has one, until a stamp."""
+        causal = self._record.trajectories["causal"]
+        row = int(np.searchsorted(causal.stamps_ns, stamp_ns, side="right")) - 1
+        return causal.T_world_cam[row] if row >= 0 else None
+
+    def _draw_ellipsoids(self, stamp_ns: int) -> None:
+        """Draw covariances along the smoothed path, the same ones whatever frame is shown."""
+        smoothed = self._record.trajectories["smoothed"]
+        every = max(1, -(-len(smoothed) // N_ELLIPSOIDS))
+        thinned = smoothed.select(slice(None, None, every))
+        is_past = thinned.stamps_ns <= stamp_ns
+        if thinned.covariances is not None:
+            self.scene.show_ellipsoids(
+                thinned.T_world_cam[is_past], thinned.covariances[is_past], self._sigmas.value
+            )

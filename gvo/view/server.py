@@ -1,0 +1,198 @@
+"""The web server of the page: where it binds, what it says, how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import ipaddress
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+import viser
+import websockets.asyncio.server as websockets_server
+
+from gvo.errors import ConfigurationError
+
+N_PORTS = 20
+"""How many ports are tried, from the one asked for."""
+
+
+class LocalServer(viser.ViserServer):
+    """A server that stays on this machine: it opens no tunnel to a public address."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse what any client may ask for by a message."""
+        return None
+
+
+class ViewServer:
+    """A page that is being served.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        Already listening.
+    note : str
+        One line on what differs from what was asked for; empty where nothing does.
+    """
+
+    def __init__(self, server: viser.ViserServer, *, note: str = "") -> None:
+        self.viser = server
+        self.note = note
+        self._closing: list[Callable[[], None]] = []
+        self._is_closed = threading.Event()
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        host = self.viser.get_host()
+        shown = "localhost" if host in ("0.0.0.0", "::") else host
+        return f"http://{shown}:{self.viser.get_port()}"
+
+    def on_close(self, action: Callable[[], None]) -> None:
+        """Call this before the server stops."""
+        self._closing.append(action)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the page is closed; return whether it is."""
+        return self._is_closed.wait(timeout_s)
+
+    def close(self) -> None:
+        """Stop serving; again: nothing."""
+        if self._is_closed.is_set():
+            return
+        try:
+            for action in reversed(self._closing):
+                action()
+        finally:
+            with _silence():
+                self.viser.stop()
+            self._is_closed.set()
+
+    def __enter__(self) -> ViewServer:
+        """Return the page."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Stop serving."""
+        self.close()
+
+
+def open_server(host: str, port: int, *, title: str) -> ViewServer:
+    """Bind and listen.
+
+    Raises
+    ------
+    ConfigurationError
+        Where the address is none of this machine's, or no port near is free.
+    """
+    free = find_port(host, port)
+    with _silence(), _refusing_strangers(is_local=_is_loopback(host)):
+        server = LocalServer(host=host, port=free, label=title, verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    is_moved = port not in (0, free)
+    note = f"port {port} of {host} is taken: serving on {free}" if is_moved else ""
+    return ViewServer(server, note=note)
+
+
+def is_own_page(origin: str | None, host: str, *, is_local: bool) -> bool:
+    """Tell whether a connection comes from this page, not from another one in the browser.
+
+    A browser lets any page of the net connect to this machine, and says from where it is.
+
+    Parameters
+    ----------
+    origin : str or None
+        What the browser says; None: it is no browser.
+    host : str
+        Name and port that were asked for.
+    is_local : bool
+        Only names of this machine count: another one may be made to lead here.
+    """
+    if origin is None:
+        return True
+    page = urlsplit(origin)
+    return page.netloc == host and (not is_local or _is_loopback(page.hostname or ""))
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@contextlib.contextmanager
+def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
+    """Let a server that starts meanwhile refuse other pages; viser itself takes all."""
+    serve = websockets_server.serve
+
+    def guarded(*args: Any, process_request: Any, **options: Any) -> Any:  # noqa: ANN401
+        def check(connection: Any, request: Any) -> Any:  # noqa: ANN401 - as websockets has it
+            origin, host = request.headers.get("Origin"), request.headers.get("Host", "")
+            if not is_own_page(origin, host, is_local=is_local):
+                return connection.respond(403, "gvo: not from another page\n")
+            return process_request(connection, request)
+
+        return serve(*args, process_request=check, **options)
+
+    with _replaced(websockets_server, "serve", guarded):
+        yield
+
+
+@contextlib.contextmanager
+def _replaced(module: Any, name: str, value: object) -> Iterator[None]:  # noqa: ANN401
+    former = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, former)
+
+
+def find_port(host: str, port: int) -> int:
+    """Return the first free port from the given one; 0 stands for any.
+
+    Raises
+    ------
+    ConfigurationError
+        As for `open_server`.
+    """
+    last = min(port + N_PORTS, 65536)
+    for candidate in range(port, last):
+        problem = _try_port(host, candidate)
+        if problem is None:
+            return candidate
+        if isinstance(problem, socket.gaierror) or "assign" in str(problem):
+            raise ConfigurationError(
+                f"--host {host}: no address of this machine ({problem.strerror}); "
+                "127.0.0.1 is only for this machine, 0.0.0.0 for everyone on the network"
+            )
+    raise ConfigurationError(
+        f"no free port from {port} to {last - 1} on {host}; give another one, --port 0 for any"
+    )
+
+
+def _try_port(host: str, port: int) -> OSError | None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind((host, port))
+        except OSError as error:
+            return error
+    return None
+
+
+def _silence() -> contextlib.AbstractContextManager[object]:
+    """Swallow what viser prints of itself."""
+    return contextlib.redirect_stdout(io.StringIO())

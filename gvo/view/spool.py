@@ -1,0 +1,50 @@
+"""Values of frames, kept on disk instead of in memory."""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+import weakref
+from threading import Lock
+from typing import Any
+
+
+class Spool:
+    """A list that grows in an unnamed temporary file; it is gone with the object.
+
+    It reads back what it wrote itself, and nothing else.
+    """
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the object
+        weakref.finalize(self, self._file.close)
+        self._ends = [0]
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        """Return the number of values."""
+        return len(self._ends) - 1
+
+    def append(self, value: object) -> None:
+        """Write a value at the end."""
+        content = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+        with self._lock:
+            self._file.seek(self._ends[-1])
+            self._file.write(content)
+            self._ends.append(self._ends[-1] + len(content))
+
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401 - whatever was written
+        """Read a value.
+
+        Raises
+        ------
+        IndexError
+            When there is none.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"{index} is not among {len(self)} values")
+        with self._lock:
+            start, end = self._ends[index : index + 2]
+            self._file.seek(start)
+            content = self._file.read(end - start)
+        return pickle.loads(content)

@@ -1,0 +1,214 @@
+"""What is explained is what happened in a run."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from gvo.config import Config, load_configuration
+from gvo.errors import GvoError
+from gvo.explain import FrameExplanation, explain_frame
+from gvo.geometry import se3
+from gvo.keyframe_policy import choose_links
+from gvo.keyframes import Keyframes
+from gvo.odometry import FrameResult, Odometry
+from gvo.sources.frames import frames
+from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.sources.synthetic import SyntheticRecording
+from gvo.trajectory import Trajectory
+from gvo.types import FaultyFrame
+
+KINDS = ("klt", "descriptor")
+SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
+LAST = 4
+BLACK = 2
+
+
+class Spoiled:
+    """A rendered recording with a black frame, or one whose images cannot be read."""
+
+    def __init__(self, inner: SyntheticRecording, *, is_faulty: bool = False) -> None:
+        self._inner = inner
+        self._is_faulty = is_faulty
+
+    @property
+    def info(self) -> RecordingInfo:
+        return self._inner.info
+
+    def images(self) -> Iterator[StampedImage]:
+        for index, image in enumerate(self._inner.images()):
+            if index // 2 != BLACK:
+                yield image
+            elif self._is_faulty:
+                yield replace(image, load=lambda: np.zeros((3, 3), np.uint8))
+            else:
+                black = np.zeros_like(image.load())
+                yield replace(image, load=partial(np.copy, black))
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+def configuration(kind: str) -> Config:
+    return load_configuration(settings=[f"frontend.kind={kind}"])
+
+
+@cache
+def recording(sensor: Sensor) -> SyntheticRecording:
+    return SyntheticRecording("handheld", sensor, n_frames=LAST + 1, scale=0.5)
+
+
+def run(source: Source, config: Config) -> list[FrameResult]:
+    odometry = Odometry(source.info.camera, config)
+    return [
+        odometry.track(frame)
+        for frame in frames(source, config)
+        if not isinstance(frame, FaultyFrame)
+    ]
+
+
+@cache
+def explained(kind: str, sensor: Sensor, index: int = LAST) -> FrameExplanation:
+    return explain_frame(recording(sensor), index, config=configuration(kind))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sensor: Sensor) -> None:
+    explanation = explained(kind, sensor)
+    expected = run(recording(sensor), configuration(kind))[LAST]
+    registration, refinement = expected.registration, explanation.refinement
+    assert registration is not None
+    assert refinement is not None
+    assert explanation.temporal is not None
+    assert explanation.consensus is not None
+    kept = explanation.temporal.sorting.are_kept
+    T_end = refinement.T_target_source[2]
+    assert np.array_equal(se3.invert(T_end), registration.T_reference_current)
+    assert explanation.result.registration is not None
+    for name in (
+        "T_reference_current",
+        "covariance",
+        "inliers",
+        "matches",
+        "pixels_reference",
+        "pixels_current",
+    ):
+        shown = getattr(explanation.result.registration, name)
+        assert np.array_equal(shown, getattr(registration, name)), name
+    assert np.array_equal(refinement.inliers[1], registration.inliers)
+    assert np.array_equal(explanation.temporal.found[kept], registration.pixels_current)
+    assert np.array_equal(
+        explanation.temporal.reference_pixels[kept], registration.pixels_reference
+    )
+    assert np.array_equal(explanation.result.causal.T_world_cam, expected.causal.T_world_cam)
+    assert np.array_equal(explanation.result.raw.covariance, expected.raw.covariance)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
+    kind: str, sensor: Sensor
+) -> None:
+    explanation = explained(kind, sensor)
+    step = explanation.stereo if sensor == "stereo" else explanation.depth
+    assert step is not None
+    counts = step.sorting.counts()
+    assert sum(counts.values()) == explanation.result.n_keypoints == len(explanation.keypoints.kept)
+    assert counts["kept"] == explanation.result.n_points
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_kept_keypoints_were_detected(kind: str, sensor: Sensor) -> None:
+    step = explained(kind, sensor).keypoints
+    detected = {tuple(pixel) for pixel in step.detected.tolist()}
+    assert {tuple(pixel) for pixel in step.kept.tolist()} <= detected
+    assert len(step.kept) <= step.budget
+
+
+def test_the_steps_to_the_fraction_of_a_pixel_end_where_the_front_end_ended() -> None:
+    step = explained("klt", "stereo").subpixel
+    assert step is not None
+    assert step.iterates[-1] == step.disparity
+    assert abs(step.columns[step.ssd.argmin()] - step.disparity) < 1.0
+
+
+def test_the_parabola_s_columns_are_around_the_match() -> None:
+    step = explained("descriptor", "stereo").subpixel
+    assert step is not None
+    assert abs(step.columns[step.ssd.argmin()] - step.disparity) <= 0.5 + 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dict[int, float]] = []
+    original = Keyframes.scores
+
+    def scores(self: Keyframes, T: dict) -> dict[int, float]:  # type: ignore[type-arg]
+        seen.append(original(self, T))
+        return seen[-1]
+
+    monkeypatch.setattr(Keyframes, "scores", scores)
+    explanation = explain_frame(recording("stereo"), LAST, config=configuration(kind))
+    chosen_by, shown = seen[-2:]
+    assert chosen_by == shown
+    linked = {link.reference_ns for link in explanation.links if link.kind == "keyframe"}
+    reference_ns = explanation.reference.stamp_ns if explanation.reference else None
+    assert linked == set(choose_links(shown, explanation.config.window, exclude=reference_ns))
+
+
+def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> None:
+    step = explained("klt", "stereo").consensus
+    assert step is not None
+    assert len(step.search.counts) > 0
+    assert step.search.inliers is not None
+    if step.is_known:
+        assert step.n_agreeing is not None
+        assert step.n_agreeing >= step.n_needed
+
+
+def test_a_first_frame_is_explained_without_a_motion() -> None:
+    explanation = explained("klt", "stereo", 0)
+    assert explanation.reference is None
+    assert explanation.links == ()
+    assert explanation.temporal is None
+    assert explanation.refinement is None
+    assert explanation.stereo is not None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_black_frame_and_the_one_after_are_explained_as_far_as_they_got(kind: str) -> None:
+    source = Spoiled(recording("stereo"))
+    black = explain_frame(source, BLACK, config=configuration(kind))
+    assert black.result.registration is None
+    assert black.result.reason
+    assert black.refinement is None
+    assert black.attempts
+    after = explain_frame(source, BLACK + 1, config=configuration(kind))
+    assert after.result.registration is not None
+    assert after.reference_index == BLACK - 1
+
+
+def test_a_faulty_frame_is_refused_in_one_line_and_counts() -> None:
+    source = Spoiled(recording("stereo"), is_faulty=True)
+    with pytest.raises(GvoError, match=f"frame {BLACK} is faulty") as error:
+        explain_frame(source, BLACK)
+    assert "\n" not in str(error.value)
+    after = explain_frame(source, BLACK + 1)
+    assert after.index == BLACK + 1
+    assert after.reference_index == BLACK - 1
+
+
+def test_a_frame_beyond_the_recording_is_refused_with_the_last_one() -> None:
+    with pytest.raises(GvoError, match=f"no frame {LAST + 1}.*up to {LAST}"):
+        explain_frame(recording("stereo"), LAST + 1)
+
+
+def test_a_negative_index_is_misuse() -> None:
+    with pytest.raises(ValueError, match="0 or more"):
+        explain_frame(recording("stereo"), -1)

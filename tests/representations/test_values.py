@@ -1,0 +1,175 @@
+"""What notebooks show: well-formed whatever the numbers, and the right numbers."""
+
+import math
+import re
+import warnings
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from gvo.representations.drawings import MAX_POINTS, ellipse_drawing, path_drawing
+from gvo.representations.values import card
+from gvo.trajectory import Trajectory
+from gvo.types import Estimate, FloatArray, Status
+
+_any_number = st.floats(allow_nan=True, allow_infinity=True)
+_finite = st.floats(-1e307, 1e307)
+
+
+def parsed(html: str) -> ElementTree.Element:
+    """Return the element; fail where it is not well-formed, or asks for something elsewhere."""
+    root = ElementTree.fromstring(html)
+    HTMLParser().feed(html)
+    for element in root.iter():
+        assert not {"href", "src", "onload"} & set(element.attrib)
+    numbers = " ".join(
+        element.get(name, "") for element in root.iter() for name in ("points", "cx", "cy", "d")
+    )
+    assert "nan" not in numbers
+    assert "inf" not in numbers
+    return root
+
+
+def cells(html: str) -> dict[str, str]:
+    """Return the table."""
+    found = {}
+    for row in parsed(html).iter("tr"):
+        name, value = ("".join(cell.itertext()) for cell in row)
+        found[name] = value
+    return found
+
+
+def points_of(html: str, tag: str) -> list[FloatArray]:
+    return [
+        np.array([[float(number) for number in pair.split(",")] for pair in points.split()])
+        for points in (element.get("points", "") for element in parsed(html).iter(tag))
+    ]
+
+
+def moving(positions: FloatArray, *, rate_hz: float = 10.0) -> Trajectory:
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    stamps_ns = np.round(1e9 / rate_hz * np.arange(len(positions))).astype(np.int64)
+    return Trajectory(stamps_ns=stamps_ns, T_world_cam=poses)
+
+
+@given(
+    positions=st.integers(0, 12).flatmap(lambda n: arrays(np.float64, (n, 3), elements=_finite)),
+    is_of_positions=st.booleans(),
+)
+def test_any_trajectory_is_well_formed(positions: FloatArray, is_of_positions: bool) -> None:
+    trajectory = moving(positions)
+    if is_of_positions:
+        trajectory = Trajectory.of_positions(trajectory.stamps_ns, positions)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cells(trajectory._repr_html_())["poses"].startswith(str(len(positions)))
+
+
+@given(
+    pose=arrays(np.float64, (4, 4), elements=_any_number),
+    covariance=arrays(np.float64, (6, 6), elements=_any_number),
+    is_rigid=st.booleans(),
+)
+def test_any_estimate_is_well_formed(
+    pose: FloatArray, covariance: FloatArray, is_rigid: bool
+) -> None:
+    estimate = Estimate(
+        stamp_ns=5, T_world_cam=np.eye(4) if is_rigid else pose, covariance=covariance
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cells(estimate._repr_html_())["stamp"] == "0.000000005 s"
+
+
+@pytest.mark.parametrize("shape", [(), (3, 3)])
+def test_an_estimate_of_the_wrong_shape_shows_its_status(shape: tuple[int, ...]) -> None:
+    estimate = Estimate(
+        stamp_ns=0, T_world_cam=np.zeros(shape), covariance=np.zeros(shape), status=Status.LOST
+    )
+    assert cells(estimate._repr_html_())["status"] == "lost"
+
+
+def test_the_numbers_are_those_of_the_trajectory() -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 1001)
+    circle = np.column_stack([50.0 * np.cos(turns) - 50.0, 0.0 * turns, 50.0 * np.sin(turns)])
+    html = moving(circle, rate_hz=20.0)._repr_html_()
+    shown = cells(html)
+    assert shown["path length"] == f"{100.0 * math.pi:.2f} m"
+    assert shown["extent x, y, z"] == "100.00 m, 0 mm, 100.00 m"
+    assert (shown["duration"], shown["mean rate"]) == ("50.000 s", "20 Hz")
+    assert shown["covariances"] == "none"
+    (line,) = points_of(html, "polyline")
+    assert len(line) <= MAX_POINTS
+    # a circle stays one: one scale for both axes
+    middle = 0.5 * (line.min(axis=0) + line.max(axis=0))
+    radii = np.linalg.norm(line - middle, axis=1)
+    assert np.ptp(radii) < 0.2
+    # z goes up, and the bar is as long as it says
+    assert line[len(line) // 4, 1] < line[0, 1]
+    bar = re.search(r"M([\d.]+),[\d.]+ V[\d.]+ H([\d.]+)", html)
+    label = re.search(r">(\d+) m<", html)
+    assert bar is not None
+    assert label is not None
+    length_px = float(bar[2]) - float(bar[1])
+    assert length_px / float(label[1]) == pytest.approx(radii.mean() / 50.0, rel=0.01)
+
+
+def test_the_path_of_a_robot_is_seen_along_its_vertical_axis() -> None:
+    ahead = np.column_stack([np.arange(5.0), 0.3 * np.arange(5.0), np.zeros(5)])
+    assert "x →, y ↑" in moving(ahead)._repr_html_()
+    assert "x →, z ↑" in moving(ahead[:, [1, 2, 0]])._repr_html_()
+
+
+@given(
+    sigmas=st.tuples(*[st.floats(0.2, 1.0)] * 2),
+    angle=st.floats(-3.0, 3.0),
+)
+def test_the_ellipses_are_one_and_three_standard_deviations(
+    sigmas: tuple[float, float], angle: float
+) -> None:
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    covariance = turn @ np.diag(np.square(sigmas)) @ turn.T
+    html = ellipse_drawing(covariance, axes=("x", "z"))
+    outer, inner = points_of(html, "polygon")
+    centre = 0.5 * (outer.min(axis=0) + outer.max(axis=0))
+    ratio = np.ptp(outer, axis=0) / np.ptp(inner, axis=0)
+    assert ratio == pytest.approx(3.0, rel=0.05, abs=0.3)
+    # the extent along an axis is the standard deviation along it
+    extents = np.ptp(outer, axis=0)
+    expected = np.sqrt(np.diag(covariance))
+    assert extents[0] * expected[1] == pytest.approx(extents[1] * expected[0], rel=0.02, abs=0.5)
+    # and they lean as the covariance does: what goes to the right goes up where it is positive
+    offsets = (outer - centre) * [1.0, -1.0]
+    lean = np.mean(offsets[:-1, 0] * offsets[:-1, 1])
+    if abs(covariance[0, 1]) > 0.05 * expected[0] * expected[1]:
+        assert lean * covariance[0, 1] > 0
+
+
+def test_an_estimate_shows_its_position_along_the_axes_of_the_world() -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]).as_matrix()
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+    # uncertain ahead of the camera, which looks along x of the world
+    covariance = np.diag(np.square([0.01, 0.02, 0.03, 0.1, 0.1, 0.5]))
+    shown = cells(Estimate(stamp_ns=0, T_world_cam=pose, covariance=covariance)._repr_html_())
+    assert shown["position x, y, z [m]"] == "1.00 ± 0.50, 2.00 ± 0.10, 3.00 ± 0.10"
+    assert shown["rotation vector [deg]"].startswith("0.00 ± 0.57, 90.0 ± 1.1, 0.0 ± 1.7")
+
+
+@given(st.text(st.characters(exclude_categories=["Cs", "Cc"])))
+def test_text_is_escaped(text: str) -> None:
+    root = parsed(card(text, [(text, text)]))
+    assert "".join(root.itertext()) == 3 * text
+
+
+def test_points_that_are_not_finite_are_left_out() -> None:
+    points = np.array([[0.0, 0.0], [np.nan, 1.0], [2.0, np.inf], [3.0, 3.0]])
+    (line,) = points_of(path_drawing(points, axes=("x", "z")), "polyline")
+    assert len(line) == 2

@@ -1,0 +1,507 @@
+"""The commands that show: what they write, what they refuse, how they end."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Any
+
+import cv2
+import numpy as np
+import pytest
+
+import gvo
+
+Command = Callable[..., Any]
+GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+COMMANDS = (
+    *("demo", "run", "check", "smooth", "compare", "convert", "config"),
+    *("explain", "view", "shuttle"),
+)
+TABLES = (
+    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
+    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+    "frames.csv",
+    "edges.csv",
+)
+FILE_STARTS = {".png": b"\x89PNG\r\n\x1a\n", ".pdf": b"%PDF-", ".rrd": b"RRF"}
+# Of rendered recordings.
+FIRST_NS = 1_700_000_000_000_000_000
+WEBM_START = b"\x1a\x45\xdf\xa3"
+# From reading a URL to drawing or fetching it; xmlns names and links in text do not ask for it.
+OUTSIDE = re.compile(r"""(?:src|href)\s*=\s*["']?\s*(?:https?:)?//|url\(\s*["']?https?:|@import""")
+
+
+def is_one_line(text: str) -> bool:
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def starts_rightly(path: Path) -> bool:
+    return path.read_bytes().startswith(FILE_STARTS[path.suffix])
+
+
+def names_of(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def count_rows(table: Path) -> int:
+    return table.read_text().count("\n") - 1
+
+
+def film_frames(path: Path) -> list[np.ndarray[Any, Any]]:
+    film = cv2.VideoCapture(str(path))
+    frames = []
+    while (answer := film.read())[0]:
+        frames.append(answer[1])
+    film.release()
+    return frames
+
+
+def test_help_names_all_commands_on_a_screen(command: Command) -> None:
+    answer = command("--help")
+    assert len(answer.out.splitlines()) <= 24
+    listed = re.findall(r"^│ ([a-z]+) +[A-Z]", answer.out, re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
+
+
+# gvo run and gvo compare
+
+
+@pytest.fixture(scope="module")
+def drawn(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of which all is drawn that can be."""
+    out = tmp_path_factory.mktemp("drawn")
+    options = [
+        *("--overlay", out / "film.webm"),
+        *("--rerun", out / "run.rrd"),
+        *("--plots", out / "plots"),
+    ]
+    arguments = ["run", drive_bag, "--out", out, "--duration", "0.6", *options]
+    done = subprocess.run(
+        [*GVO, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False
+    )
+    # Standard error is a pipe: no bar, and there is nothing to warn of.
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"6 of 6 frames tracked; {out / 'report.html'}" in done.stdout
+    return out
+
+
+def test_drawing_changes_nothing_of_the_run(
+    command: Command, drive_bag: Path, drawn: Path, tmp_path: Path
+) -> None:
+    arguments = ["run", drive_bag, "--out", tmp_path, "--duration", "0.6", "--no-report"]
+    answer = command(*arguments)
+    assert (answer.code, answer.err) == (0, "")
+    for name in TABLES:
+        assert (tmp_path / name).read_bytes() == (drawn / name).read_bytes(), name
+    drawings = {"trajectories.png", "report.html", "film.webm", "run.rrd", "plots"}
+    assert names_of(drawn) - names_of(tmp_path) == drawings
+
+
+def test_the_report_is_one_file_with_the_plots_beside_it(drawn: Path) -> None:
+    page = (drawn / "report.html").read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert not OUTSIDE.search(page)
+    for key in ("window.link_sigma_factor", "ransac.min_inliers"):
+        assert key.partition(".")[2] in page
+    plots = sorted((drawn / "plots").iterdir())
+    assert {path.stem for path in plots if path.suffix == ".png"} == {path.stem for path in plots}
+    assert {path.stem for path in plots if path.suffix == ".pdf"} == {path.stem for path in plots}
+    assert "01_above" in {path.stem for path in plots}
+    assert all(starts_rightly(path) for path in plots)
+
+
+def test_the_film_shows_each_frame_and_the_stream_is_of_rerun(drawn: Path) -> None:
+    start = (drawn / "film.webm").read_bytes()[:4096]
+    assert start.startswith(WEBM_START)
+    assert b"V_VP8" in start
+    frames = film_frames(drawn / "film.webm")
+    assert len(frames) == count_rows(drawn / "frames.csv") == 6
+    assert all(frame.std() > 10.0 for frame in frames)
+    assert all(np.any(one != other) for one, other in pairwise(frames))
+    assert starts_rightly(drawn / "run.rrd")
+
+
+def test_a_film_is_a_player_s_or_a_folder_of_pictures_where_it_is_asked_for(
+    command: Command, drive_bag: Path, tmp_path: Path
+) -> None:
+    options = ["--out", tmp_path / "out", "--duration", "0.2", "--no-report"]
+    for name in ("film.mp4", "pictures"):
+        answer = command("run", drive_bag, *options, "--overlay", tmp_path / name)
+        assert (answer.code, answer.err) == (0, "")
+    start = (tmp_path / "film.mp4").read_bytes()
+    assert start[4:8] == b"ftyp"
+    assert b"mp4v" in start
+    assert len(film_frames(tmp_path / "film.mp4")) == 2
+    pictures = sorted((tmp_path / "pictures").iterdir())
+    assert len(pictures) == 2
+    assert all(starts_rightly(path) for path in pictures)
+
+
+def poses(path: Path, *, factor: float = 1.0) -> Path:
+    rows = (f"{i} {factor * i * i} {0.1 * (i % 3)} {i} 0 0 0 1\n" for i in range(20))
+    path.write_text("".join(rows))
+    return path
+
+
+def test_compare_reports_what_it_prints(command: Command, tmp_path: Path) -> None:
+    truth, estimate = poses(tmp_path / "truth.txt"), poses(tmp_path / "estimate.txt", factor=1.01)
+    page, plots = tmp_path / "new/page.html", tmp_path / "new/plots"
+    answer = command("compare", truth, estimate, "--json", "--report", page, "--plots", plots)
+    assert (answer.code, answer.err) == (0, "")
+    errors = json.loads(answer.out)["estimates"][0]
+    text = page.read_text(encoding="utf-8")
+    assert not OUTSIDE.search(text)
+    for key in ("ate_m", "rpe_m", "t_pct"):
+        assert f">{errors[key]:.4g}<" in text, key
+    stems = {path.stem for path in plots.iterdir()}
+    assert names_of(plots) == {f"{stem}{suffix}" for stem in stems for suffix in (".png", ".pdf")}
+    assert "01_above" in stems
+
+
+def test_the_report_of_a_comparison_is_not_written_unless_asked_for(
+    command: Command, tmp_path: Path
+) -> None:
+    truth = poses(tmp_path / "truth.txt")
+    command("compare", truth, truth)
+    assert names_of(tmp_path) == {"truth.txt"}
+
+
+def test_nothing_computed_is_lost_where_the_plots_cannot_be_written(
+    command: Command, drive_bag: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "taken").write_text("a file\n")
+    out = tmp_path / "out"
+    options = ["--out", out, "--duration", "0.3", "--plots", tmp_path / "taken"]
+    answer = command("run", drive_bag, *options)
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    assert "--plots" in answer.err
+    assert "taken" in answer.err
+    for name in ("raw", "causal", "smoothed"):
+        assert len(gvo.read_trajectory(out / f"{name}.txt")) == 3
+    assert json.loads((out / "summary.json").read_text())["tracked"] == 3
+
+
+def test_errors_are_printed_where_the_page_cannot_be_written(
+    command: Command, tmp_path: Path
+) -> None:
+    truth = poses(tmp_path / "truth.txt")
+    for options in (["--report", truth / "page.html"], ["--plots", truth]):
+        answer = command("compare", truth, truth, *options)
+        assert answer.code == 2
+        assert is_one_line(answer.err), answer.err
+        assert "truth.txt" in answer.err
+        assert "ATE" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
+)
+def test_a_film_that_is_broken_off_shows_all_frames_until_then(
+    drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    options = ["--overlay", tmp_path / "film.webm", "--rerun", tmp_path / "run.rrd"]
+    process = start("run", drive_bag, "--out", tmp_path, *options)
+    frames = tmp_path / "frames.csv"
+    wait_for(lambda: frames.exists() and count_rows(frames) >= 3)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (code, "")
+    assert len(film_frames(tmp_path / "film.webm")) == count_rows(frames) < 20
+    assert starts_rightly(tmp_path / "run.rrd")
+    assert not (tmp_path / "report.html").exists()
+
+
+# gvo explain
+
+
+STEREO_PICTURES = {
+    "01_keypoints",
+    "02_stereo",
+    "03_subpixel",
+    "04_disparity_and_depth",
+    "05_matches",
+    "06_consensus",
+    "07_residuals",
+    "08_pose",
+    "09_links",
+}
+DEPTH_PICTURES = STEREO_PICTURES - {"02_stereo", "03_subpixel"} | {
+    "02_depth",
+    "03_depth_keypoints",
+}
+
+
+def check_explanation(answer: Any, out: Path, pictures: set[str]) -> dict[str, Any]:
+    """Check what both kinds of camera have in common; return the numbers."""
+    assert (answer.code, answer.err) == (0, "")
+    names = {*(f"{name}.png" for name in pictures), "explanation.html", "explanation.json"}
+    assert names_of(out) == names
+    assert {Path(line) for line in answer.out.splitlines()} == {out / name for name in names}
+    assert all(starts_rightly(path) for path in out.glob("*.png"))
+    page = (out / "explanation.html").read_text(encoding="utf-8")
+    assert not OUTSIDE.search(page)
+    assert page.count("<img") >= len(pictures)
+    numbers: dict[str, Any] = json.loads((out / "explanation.json").read_text())
+    return numbers
+
+
+def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
+    command: Command, drive_bag: Path, drawn: Path, tmp_path: Path
+) -> None:
+    answer = command("explain", drive_bag, "--frame", "4", "--out", tmp_path / "out")
+    numbers = check_explanation(answer, tmp_path / "out", STEREO_PICTURES)
+    row = (drawn / "frames.csv").read_text().splitlines()[1 + 4].split(",")
+    assert numbers["frame"] == 4
+    assert numbers["status"] == row[1]
+    stereo, relative = numbers["stereo"], numbers["relative_pose"]
+    told = [numbers["stamp_ns"], stereo["n"], stereo["kept"]]
+    assert [*told, relative["n_matches"], relative["n_inliers"]] == [
+        int(row[k]) for k in (0, 2, 3, 4, 5)
+    ]
+    # Each keypoint is kept, or counted once under the test it failed.
+    assert sum(stereo.values()) == 2 * stereo["n"]
+    position = np.loadtxt(drawn / "raw.txt")[4, 1:4]
+    np.testing.assert_allclose(np.array(numbers["raw"]["T_world_cam"])[:3, 3], position, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_frame_with_depth_is_explained_by_its_depth(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    options = ["--frame", "2", "--every", "2", "--set", "frontend.kind=descriptor"]
+    answer = command("explain", room_bag, *options, "--out", tmp_path)
+    numbers = check_explanation(answer, tmp_path, DEPTH_PICTURES)
+    assert numbers["configuration"]["frontend"]["kind"] == "descriptor"
+    assert numbers["stamp_ns"] - FIRST_NS == pytest.approx(2 * 2 * 1e9 / 30.0, abs=1.0)
+    assert numbers["stereo"] is None
+
+
+# gvo shuttle
+
+
+def test_a_shuttle_closes_by_the_poses_that_it_writes(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    answer = command("shuttle", room_bag, "--out", out, "--duration", "0.19")
+    assert (answer.code, answer.err) == (0, "")
+    assert starts_rightly(out / "shuttle.png")
+    assert set(TABLES) < names_of(out)
+    told = json.loads((out / "summary.json").read_text())["shuttle"]["estimates"]
+    for name in ("raw", "causal", "smoothed"):
+        rows = np.loadtxt(out / f"{name}.txt")
+        assert len(rows) == 2 * 6 - 1
+        closing_m = np.linalg.norm(rows[-1, 1:4] - rows[0, 1:4])
+        assert told[name]["closing_m"] == pytest.approx(closing_m, rel=1e-3, abs=1e-8)
+        assert np.isfinite([told[name][key] for key in ("closing_pct", "closing_deg")]).all()
+        assert f"{closing_m:.4f}" in answer.out
+
+
+def test_a_recording_that_breaks_off_is_driven_back_from_there(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes(room_bag.read_bytes()[: room_bag.stat().st_size // 3])
+    answer = command("shuttle", cut, "--out", tmp_path / "out")
+    assert answer.code == 3
+    assert answer.err.startswith("gvo: warning: ")
+    assert "cut.bag" in answer.err
+    n_rows = count_rows(tmp_path / "out/frames.csv")
+    assert n_rows % 2 == 1
+    assert 2 < n_rows < 2 * 20 - 1
+
+
+# gvo view
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*GVO, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@contextmanager
+def viewing(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Start `gvo view`; give the process and the port of the address that it prints."""
+    process = start("view", *arguments)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.match(r"http://127\.0\.0\.1:(\d+)\b", line)
+        assert found, f"no address in {line!r}; {rest(process.stderr, line)}"
+        yield process, int(found[1])
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def rest(stream: IO[str] | None, line: str) -> str:
+    """Return what a process that said nothing wrote to standard error."""
+    return stream.read() if stream is not None and not line else ""
+
+
+def listening(process: subprocess.Popen[str]) -> dict[int, str]:
+    """Return port and local address of the sockets of a process that listen, by the kernel."""
+    links = [path.readlink() for path in Path(f"/proc/{process.pid}/fd").iterdir()]
+    mine = {str(link)[8:-1] for link in links if str(link).startswith("socket:[")}
+    found = {}
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{process.pid}/net/{table}").read_text().splitlines()[1:]:
+            cells = line.split()
+            if cells[3] == "0A" and cells[9] in mine:
+                address, port = cells[1].split(":")
+                found[int(port, 16)] = address
+    return found
+
+
+def fetch(port: int) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as answer:
+        assert answer.status == 200
+        return str(answer.read().decode())
+
+
+def end(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, str, str]:
+    process.send_signal(number)
+    out, errors = process.communicate(timeout=10)
+    return process.returncode, out, errors
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_recording_is_served_to_this_machine_alone_until_ctrl_c(drive_bag: Path) -> None:
+    with viewing(drive_bag, "--port", "0") as (process, port):
+        assert "<html" in fetch(port)
+        assert listening(process) == {port: "0100007F"}
+        # 127.0.0.2 is this machine too, but not the address that was promised.
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.2", port), timeout=5).close()
+        assert end(process, signal.SIGINT) == (130, "", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(drawn: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        taken = holder.getsockname()[1]
+        with viewing(drawn, "--port", taken) as (process, port):
+            assert port != taken
+            assert "<html" in fetch(port)
+            assert set(listening(process).values()) == {"0100007F"}
+            code, out, errors = end(process, signal.SIGTERM)
+    assert (code, out) == (143, "")
+    assert errors.startswith("gvo: warning: ")
+    assert errors.count("\n") == 1
+    assert str(taken) in errors
+
+
+# Wrong use
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["explain", "missing.bag", "--frame", "1", "--out", "out"], ["missing.bag"]),
+        (["explain", "text.txt", "--frame", "1", "--out", "out"], ["text.txt"]),
+        (["explain", "{bag}", "--frame", "99", "--out", "out"], ["99", "20"]),
+        (["explain", "{bag}", "--frame", "0", "--out", "text.txt"], ["text.txt"]),
+        (["explain", "{bag}", "--frame", "1", "--out", "o", "--every", "0"], ["--every"]),
+        (["explain", "{bag}", "--frame", "1", "--out", "o", "--set", "klt.x=1"], ["klt.x"]),
+        (["shuttle", "missing.bag", "--out", "out"], ["missing.bag"]),
+        (["shuttle", "{bag}", "--out", "text.txt"], ["text.txt"]),
+        (["shuttle", "{bag}", "--out", "out", "--duration", "0.02"], ["2 or more"]),
+        (["view", "missing.bag"], ["missing.bag"]),
+        (["view", "."], ["recording"]),
+        (["view", "text.txt"], ["text.txt"]),
+        (["view", "{bag}", "--set", "window.n_link=3"], ["window.n_links"]),
+        (["view", "{bag}", "--port", "0", "--host", "203.0.113.7"], ["203.0.113.7"]),
+        (["view", "{bag}", "--color", "/nothing"], ["/nothing"]),
+        (["run", "{bag}", "--out", "out", "--overlay", "film.avi"], ["film.avi", ".webm"]),
+        (["run", "{bag}", "--out", "out", "--overlay", "text.txt/film.webm"], ["text.txt"]),
+        (["run", "{bag}", "--out", "out", "--rerun", "run.rr"], ["run.rr", ".rrd"]),
+        (["run", "{bag}", "--out", "out", "--rerun", "text.txt/run.rrd"], ["text.txt"]),
+        (["run", "{bag}", "--out", "out", "--no-report", "--plots", "p"], ["--plots"]),
+    ],
+)
+def test_wrong_use_gets_one_line_and_exit_code_2(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    room_bag: Path,
+    tmp_path: Path,
+    *,
+    arguments: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.txt").write_text("no recording at all\n")
+    answer = command(*(argument.format(bag=room_bag) for argument in arguments))
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    for word in words:
+        assert word in answer.err
+    assert Path("text.txt").read_text() == "no recording at all\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["explain", "{bag}", "--frame", "-1", "--out", "out"],
+        ["explain", "{bag}", "--frame", "one", "--out", "out"],
+        ["explain", "{bag}", "--out", "out"],
+        ["explain", "{bag}", "--frame", "1"],
+        ["shuttle", "{bag}"],
+        ["view"],
+        ["view", "{bag}", "--port", "70000"],
+    ],
+)
+def test_a_missing_or_impossible_option_is_exit_code_2(
+    command: Command, room_bag: Path, *, arguments: list[str]
+) -> None:
+    answer = command(*(argument.format(bag=room_bag) for argument in arguments))
+    assert answer.code == 2
+    assert "Traceback" not in answer.err
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "extra"),
+    [
+        ("viser", ["view", "{bag}", "--port", "0"], "gvo[view]"),
+        ("rerun", ["run", "{bag}", "--out", "out", "--rerun", "run.rrd"], "gvo[rerun]"),
+    ],
+)
+def test_an_extra_that_is_not_installed_is_named(
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    room_bag: Path,
+    tmp_path: Path,
+    *,
+    module: str,
+    arguments: list[str],
+    extra: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in sys.modules if name.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    answer = command(*(argument.format(bag=room_bag) for argument in arguments))
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    assert extra in answer.err
+    assert names_of(tmp_path) == set()
