@@ -24,10 +24,12 @@ from gvo.cli_options import (
     load,
     open_source,
 )
-from gvo.errors import GvoError
+from gvo.errors import ConfigurationError, GvoError
 from gvo.terminal import both, interruptible, progress, warn
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from gvo.config import Config
     from gvo.sources.recording import Source
     from gvo.trajectory import Trajectory
@@ -61,20 +63,25 @@ def explain(
 ) -> None:
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.explain import explain_frame
-    from gvo.outputs.explanation import write_explanation
+    from gvo.outputs.explanation import open_folder, write_explanation
+    from gvo.run_tally import Progress
     from gvo.sources.excerpt import make_excerpt
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, None, every)
     topics = {"left": left, "right": right, "color": color, "depth": depth}
     source = open_source(recordings, parameters, calibration, topics)
-    with interruptible() as check:
+    open_folder(out)
+    with interruptible() as check, progress(source.info.name) as show:
+        told = both(show, check)
         explanation = explain_frame(
             source,
             frame,
             config=parameters,
             excerpt=excerpt,
-            on_progress=lambda n_done, n_to_do: check(None),
+            on_progress=lambda n_done, n_to_do, n_tracked: told(
+                Progress(n_done=n_done, n_total=n_to_do, n_tracked=n_tracked)
+            ),
         )
         written = write_explanation(explanation, out)
     for path in written:
@@ -107,8 +114,11 @@ def view(
     with interruptible() as check, ExitStack() as stack:
         shown: Player | Path = recordings[0]
         truth: Trajectory | None = None
-        if len(recordings) > 1 or not (recordings[0] / "frames.csv").is_file():
-            topics = {"left": left, "right": right, "color": color, "depth": depth}
+        topics = {"left": left, "right": right, "color": color, "depth": depth}
+        if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
+            given = {"config": config, "set": set_, "calibration": calibration, **topics}
+            _refuse_for_a_run(recordings[0], given)
+        else:
 
             def open_again(config: Config) -> Source:
                 return open_source(recordings, config, calibration, topics)
@@ -121,6 +131,15 @@ def view(
         typer.echo(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):
             check(None)
+
+
+def _refuse_for_a_run(folder: Path, given: Mapping[str, object]) -> None:
+    for name, value in given.items():
+        if value:
+            raise ConfigurationError(
+                f"--{name}: {folder} is a finished run, which is shown as it was made; "
+                "give the recording itself"
+            )
 
 
 def _find_truth(source: Source) -> Trajectory | None:

@@ -111,7 +111,7 @@ def close(
     is_there = trajectory.stamps_ns[there] <= turn_ns
     there, back = there[is_there], back[is_there]
     if len(there) < 2:
-        return Failure(reason=f"{len(there)} frames have a pose both ways, expected 2 or more")
+        return Failure(reason=f"frames with a pose both ways: {len(there)}, expected 2 or more")
     if there[0] != 0 or back[0] != len(trajectory) - 1:
         return Failure(reason="the way back does not end at the frame where the way there begins")
     poses = trajectory.T_world_cam

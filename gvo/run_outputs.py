@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, RecordingError
 from gvo.output_frame import OutputFrame
 from gvo.outputs.run_frames import RunFrames
 from gvo.run_loop import Output
@@ -54,7 +54,7 @@ class RunOutputs:
         *,
         config: Config,
         is_placed: bool,
-    ) -> list[Output]:
+    ) -> tuple[list[Output], list[str]]:
         """Open what is written as the run goes.
 
         Parameters
@@ -70,6 +70,12 @@ class RunOutputs:
         is_placed : bool
             The first pose was asked for: the world is not that of the first frame.
 
+        Returns
+        -------
+        outputs : list of Output
+        warnings : list of str
+            What is written otherwise than asked for, a line each.
+
         Raises
         ------
         ConfigurationError
@@ -78,6 +84,9 @@ class RunOutputs:
             When a file cannot be written.
         """
         outputs: list[Output] = []
+        warnings: list[str] = []
+        if self.plots is not None:
+            _make_folder(self.plots)
         if self.bag is not None:
             from gvo.outputs.run_bag import RunBag
 
@@ -86,14 +95,24 @@ class RunOutputs:
         if self.overlay is not None:
             from gvo.outputs.run_overlay import RunOverlay
 
-            outputs.append(stack.enter_context(RunOverlay(self.overlay, source.info.camera)))
+            film = RunOverlay(self.overlay, source.info.camera)
+            warnings += film.decisions
+            outputs.append(stack.enter_context(film))
         if self.rerun is not None:
             from gvo.outputs.run_rerun import RunRerun
 
             names = name_frames(source, frame, is_placed=is_placed, world=self.world)
             rerun = RunRerun(self.rerun, source.info.camera, names, config=config)
             outputs.append(stack.enter_context(rerun))
-        return outputs
+        return outputs, warnings
+
+
+def _make_folder(path: Path) -> None:
+    """Make a folder before the work that is to fill it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:

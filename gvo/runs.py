@@ -122,18 +122,23 @@ def run_recording(
     outputs = outputs or RunOutputs()
     with ExitStack() as stack:
         is_placed = frame.is_placed or starts_at_truth
-        others = outputs.open(source, frame, stack, config=config, is_placed=is_placed)
+        others, notes = outputs.open(source, frame, stack, config=config, is_placed=is_placed)
         folder = stack.enter_context(RunFolder(Path(out)))
         loop.run([folder, *others], on_progress)
     if loop.tally.n_with_pose == 0:
         raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     compared = _compare(truth, folder, loop, estimates)
-    result = _conclude(loop, folder, compared, is_asked=ground_truth is not None)
+    result = _conclude(loop, folder, compared, notes, is_asked=ground_truth is not None)
     if not outputs.report:
         return result
-    _draw(folder, compared, estimates, plots=outputs.plots)
-    return replace(result, report=folder.path / REPORT)
+    try:
+        _draw(folder, compared, estimates, plots=outputs.plots)
+    except GvoError as error:
+        warnings = (*result.warnings, f"not all was drawn: {error}")
+        result = replace(result, exit_code=EXIT_PARTLY, warnings=warnings)
+    page = folder.path / REPORT
+    return replace(result, report=page if page.exists() else None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,11 +178,12 @@ def _conclude(
     loop: RunLoop,
     folder: RunFolder,
     compared: TruthComparison | Failure,
+    notes: list[str],
     *,
     is_asked: bool,
 ) -> RunResult:
     """Write truth and summary."""
-    warnings = loop.tally.warnings()
+    warnings = loop.tally.warnings() + notes
     found = compared if isinstance(compared, TruthComparison) else None
     if found is not None:
         warnings += [f"ground truth: {text}" for text in found.warnings()]

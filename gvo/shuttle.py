@@ -11,7 +11,7 @@ from gvo.closing import Closing, close
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.output_frame import OutputFrame
-from gvo.outputs.run_folder import TRAJECTORIES, RunFolder
+from gvo.outputs.run_folder import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.shuttle_plot import plot_shuttle
 from gvo.run_loop import RunLoop
 from gvo.run_summary import summarize
@@ -23,7 +23,6 @@ from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_covariances, read_trajectory
 from gvo.types import Failure
 
-PICTURE = "shuttle.png"
 EXIT_COMPLETE = 0
 EXIT_PARTLY = 3
 
@@ -108,7 +107,6 @@ def shuttle(
     Failures", ICPR 2010, doi:10.1109/ICPR.2010.675.
     """
     config = config or Config()
-    (Path(out) / PICTURE).unlink(missing_ok=True)
     way = ThereAndBack(source, config, excerpt)
     frame = OutputFrame(source.info.frame_id)
     loop = RunLoop(source, config, frame, excerpt=excerpt, items=way)
@@ -121,7 +119,7 @@ def shuttle(
     warnings = loop.tally.warnings()
     summary = _summary(loop, warnings, turn_ns, closings)
     folder.write_summary(summary)
-    plot_shuttle(folder.path / PICTURE, closings)
+    plot_shuttle(folder.path / SHUTTLE_PICTURE, closings)
     return ShuttleResult(
         summary=summary,
         closings=closings,

@@ -27,7 +27,7 @@ from gvo.demo import write_demo_bag
 from gvo.errors import GvoError, RecordingError
 from gvo.explain import explain_frame
 from gvo.odometry import Odometry
-from gvo.outputs.explanation import write_explanation
+from gvo.outputs.explanation.extraction import draw_stereo
 from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.report import write_run_report
 from gvo.outputs.run_record import read_run
@@ -99,8 +99,10 @@ def explain(task: Task) -> Picture:
     """Return the stereo matches of a frame explained."""
     source = gvo.open_recording(task.bag)
     explanation = explain_frame(source, task.frame, config=Config())
-    written = write_explanation(explanation, task.folder / "explained")
-    return scaled(read(written[1]), 860)
+    if explanation.stereo is None:
+        raise RecordingError(f"{task.bag}: expected a stereo recording, got {source.info.sensor}")
+    drawn = draw_stereo(explanation, explanation.stereo)
+    return scaled(decoded(drawn.png or b""), 860)
 
 
 def report(task: Task) -> Picture:
@@ -122,7 +124,7 @@ def overlay(task: Task) -> Picture:
         result = odometry.track(frame)
         if index >= task.frame:
             return compose_overlay(frame, result, source.info.camera, index=index, max_width=940)
-    raise RecordingError(f"{task.bag}: expected a usable frame {task.frame}, got {index + 1}")
+    raise RecordingError(f"{task.bag}: no usable frame from {task.frame} on")
 
 
 def view(task: Task) -> Picture | None:

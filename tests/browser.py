@@ -52,7 +52,7 @@ FLAGS = (
 )
 INSTALL = "apt-get install -y --no-install-recommends chromium chromium-driver"
 # Asked by chromium itself after a minute, whatever it shows; a page that asked would be in the log.
-BROWSERS_OWN = "update.googleapis.com"
+BROWSERS_OWN = ("update.googleapis.com", "gvt1.com")
 LOCAL_SCHEMES = {"file", "data", "blob", "about", "chrome", "chrome-extension", "devtools"}
 LOCAL_HOSTS = {"127.0.0.1", "localhost", "::1"}
 
@@ -109,7 +109,9 @@ class Browser:
 
     def requests_leaving(self) -> list[str]:
         """List the addresses asked for that are not on this machine."""
-        refused = [request for request in self._refused if BROWSERS_OWN not in request]
+        refused = [
+            request for request in self._refused if not any(own in request for own in BROWSERS_OWN)
+        ]
         return [url for url in self.requests() if leaves_the_machine(url)] + refused
 
     def wait(

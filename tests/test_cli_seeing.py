@@ -154,7 +154,7 @@ def poses(path: Path, *, factor: float = 1.0) -> Path:
 
 def test_compare_reports_what_it_prints(command: Command, tmp_path: Path) -> None:
     truth, estimate = poses(tmp_path / "truth.txt"), poses(tmp_path / "estimate.txt", factor=1.01)
-    page, plots = tmp_path / "new/page.html", tmp_path / "new/plots"
+    page, plots = tmp_path / "page.html", tmp_path / "new/plots"
     answer = command("compare", truth, estimate, "--json", "--report", page, "--plots", plots)
     assert (answer.code, answer.err) == (0, "")
     errors = json.loads(answer.out)["estimates"][0]
@@ -175,20 +175,23 @@ def test_the_report_of_a_comparison_is_not_written_unless_asked_for(
     assert names_of(tmp_path) == {"truth.txt"}
 
 
-def test_nothing_computed_is_lost_where_the_plots_cannot_be_written(
+def test_nothing_computed_is_lost_where_a_plot_cannot_be_written(
     command: Command, drive_bag: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "taken").write_text("a file\n")
+    # A folder in the place of a file: it shows only when the plot is written, after the run.
+    (tmp_path / "plots/01_above.png").mkdir(parents=True)
     out = tmp_path / "out"
-    options = ["--out", out, "--duration", "0.3", "--plots", tmp_path / "taken"]
+    options = ["--out", out, "--duration", "0.3", "--plots", tmp_path / "plots"]
     answer = command("run", drive_bag, *options)
-    assert answer.code == 2
-    assert is_one_line(answer.err), answer.err
-    assert "--plots" in answer.err
-    assert "taken" in answer.err
+    assert answer.code == 3
+    assert answer.err.startswith("gvo: warning: ")
+    assert answer.err.count("\n") == 1
+    assert "01_above.png" in answer.err
+    assert "ATE" in answer.out
     for name in ("raw", "causal", "smoothed"):
         assert len(gvo.read_trajectory(out / f"{name}.txt")) == 3
     assert json.loads((out / "summary.json").read_text())["tracked"] == 3
+    assert (out / "report.html").is_file()
 
 
 def test_errors_are_printed_where_the_page_cannot_be_written(
@@ -256,11 +259,13 @@ def check_explanation(answer: Any, out: Path, pictures: set[str]) -> dict[str, A
 
 
 def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
-    command: Command, drive_bag: Path, drawn: Path, tmp_path: Path
+    command: Command, drive_bag: Path, tmp_path: Path
 ) -> None:
+    run = tmp_path / "run"
+    command("run", drive_bag, "--out", run, "--duration", "0.5", "--no-report")
     answer = command("explain", drive_bag, "--frame", "4", "--out", tmp_path / "out")
     numbers = check_explanation(answer, tmp_path / "out", STEREO_PICTURES)
-    row = (drawn / "frames.csv").read_text().splitlines()[1 + 4].split(",")
+    row = (run / "frames.csv").read_text().splitlines()[1 + 4].split(",")
     assert numbers["frame"] == 4
     assert numbers["status"] == row[1]
     stereo, relative = numbers["stereo"], numbers["relative_pose"]
@@ -270,7 +275,7 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
     ]
     # Each keypoint is kept, or counted once under the test it failed.
     assert sum(stereo.values()) == 2 * stereo["n"]
-    position = np.loadtxt(drawn / "raw.txt")[4, 1:4]
+    position = np.loadtxt(run / "raw.txt")[4, 1:4]
     np.testing.assert_allclose(np.array(numbers["raw"]["T_world_cam"])[:3, 3], position, atol=1e-8)
 
 
@@ -398,10 +403,13 @@ def test_a_recording_is_served_to_this_machine_alone_until_ctrl_c(drive_bag: Pat
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(drawn: Path) -> None:
+def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    command("run", room_bag, "--out", tmp_path, "--duration", "0.2", "--no-report")
     with socket.create_server(("127.0.0.1", 0)) as holder:
         taken = holder.getsockname()[1]
-        with viewing(drawn, "--port", taken) as (process, port):
+        with viewing(tmp_path, "--port", taken) as (process, port):
             assert port != taken
             assert "<html" in fetch(port)
             assert set(listening(process).values()) == {"0100007F"}
@@ -438,6 +446,7 @@ def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(drawn: Path) -> N
         (["run", "{bag}", "--out", "out", "--rerun", "run.rr"], ["run.rr", ".rrd"]),
         (["run", "{bag}", "--out", "out", "--rerun", "text.txt/run.rrd"], ["text.txt"]),
         (["run", "{bag}", "--out", "out", "--no-report", "--plots", "p"], ["--plots"]),
+        (["run", "{bag}", "--out", "out", "--every", "9", "--plots", "text.txt"], ["text.txt"]),
     ],
 )
 def test_wrong_use_gets_one_line_and_exit_code_2(

@@ -87,6 +87,13 @@ def test_python_in_the_documentation_runs(workplace: Path, page: str, code: str)
     exec(compile(code, page, "exec"), {})
 
 
+@pytest.fixture
+def page_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `gvo view` end where it would wait for its reader."""
+    monkeypatch.setattr("gvo.view.server.ViewServer.wait", lambda *_: True)
+
+
+@pytest.mark.usefixtures("page_that_ends")
 @pytest.mark.parametrize(("page", "text"), blocks("sh"))
 def test_commands_in_the_documentation_run(
     workplace: Path, command: Callable[..., Any], page: str, text: str

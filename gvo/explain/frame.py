@@ -21,9 +21,9 @@ from gvo.odometry import FrameResult, Odometry
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames
 from gvo.sources.recording import Source
-from gvo.types import FaultyFrame, Frame
+from gvo.types import FaultyFrame, Frame, Status
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int, int], None]
 
 
 def explain_frame(
@@ -47,7 +47,8 @@ def explain_frame(
     excerpt : Excerpt, optional
         Which frames are read; the index counts those.
     on_progress : callable, optional
-        Called after each frame with the number of frames done and of those to do.
+        Called after each frame with the number of frames done, of those to do, and of those
+        that a registration tied to earlier ones.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def explain_frame(
         raise ValueError(f"index must be 0 or more, got {index}")
     config = config or Config()
     drive = _Drive(source, config)
-    n = 0
+    n = n_tracked = 0
     for item in _counted(source, config, excerpt):
         if isinstance(item, FaultyFrame):
             if n == index:
@@ -74,10 +75,10 @@ def explain_frame(
         elif n == index:
             return drive.explain(item, index)
         else:
-            drive.track(item, n)
+            n_tracked += drive.track(item, n).status in (Status.OK, Status.RESUMED)
         n += 1
         if on_progress is not None:
-            on_progress(n, index + 1)
+            on_progress(n, index + 1, n_tracked)
     raise RecordingError(
         f"{source.info.name}: there is no frame {index}: "
         + (f"there are {n}, counted from 0; choose one up to {n - 1}" if n else "no frame was read")

@@ -87,6 +87,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
     suffix = path.suffix.lower()
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         # the salt of the ids in SVG is random by default; the setting ends with the block
         with rc_context({"svg.hashsalt": "gvo"}):
             figure.savefig(path, format=suffix[1:], dpi=150, metadata=METADATA[suffix])

@@ -178,16 +178,18 @@ class RerunWriter:
 
     def _add_numbers(self, result: FrameResult) -> None:
         counts = (result.n_matches, result.n_inliers, result.n_points)
-        for (name, colour), count in zip(scene.COUNT_COLOURS.items(), counts, strict=True):
-            self._add_number(f"{place.COUNTS}/{name}", name, count, colour)
+        for name, count in zip(scene.COUNT_COLOURS, counts, strict=True):
+            self._add_number(f"{place.COUNTS}/{name}", name, count, scene.COUNT_COLOURS[name])
         for stage, ms in result.stage_ms.items():
-            self._add_number(f"{place.MILLISECONDS}/{stage}", f"{stage} [ms]", ms)
+            colour = scene.STAGE_COLOURS.get(stage)
+            self._add_number(f"{place.MILLISECONDS}/{stage}", f"{stage} [ms]", ms, colour)
         chi2: dict[str, list[float]] = {}
         for link in result.links:
             if link.is_accepted and link.chi2 is not None:
                 chi2.setdefault(link.kind, []).append(link.chi2)
         for kind, values in chi2.items():
-            self._add_number(f"{place.CHI2}/{kind}", kind, float(np.mean(values)))
+            colour = scene.LINK_COLOURS.get(kind)
+            self._add_number(f"{place.CHI2}/{kind}", kind, float(np.mean(values)), colour)
 
     def _add_number(
         self, path: str, name: str, value: float, colour: scene.Colour | None = None

@@ -55,6 +55,8 @@ COLOURS: Final[Mapping[str, Colour]] = {
 COUNT_COLOURS: Final = {
     name: colour_of(palette.COUNTS[name]) for name in ("matches", "inliers", "points")
 }
+STAGE_COLOURS: Final = {name: colour_of(code) for name, code in palette.STAGES.items()}
+LINK_COLOURS: Final = {kind: colour_of(code) for kind, code in palette.LINKS.items()}
 _INLIER, _OUTLIER = colour_of(palette.INLIERS), colour_of(palette.OUTLIERS)
 
 

@@ -26,6 +26,7 @@ from gvo.types import Estimate, FaultyFrame, IntArray, Status
 
 PICTURE = "trajectories.png"
 REPORT = "report.html"
+SHUTTLE_PICTURE = "shuttle.png"
 TRUTH = "ground_truth.txt"
 TRUE_POSITIONS = "ground_truth_positions.csv"
 POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
@@ -49,6 +50,7 @@ _OF_EARLIER_RUNS = (
     "timings.csv",
     PICTURE,
     REPORT,
+    SHUTTLE_PICTURE,
     TRUTH,
     TRUE_POSITIONS,
 )

@@ -46,7 +46,7 @@ class RunOverlay:
     Attributes
     ----------
     decisions : tuple of str
-        What was decided about the files, a line each.
+        What is written otherwise than asked for, a line each.
 
     Raises
     ------

@@ -178,7 +178,7 @@ class PngFolder:
     path : Path
         Is made where it is missing.
     decisions : tuple of str
-        Why it is used.
+        Why it is used, where it was not asked for.
 
     Raises
     ------
@@ -188,7 +188,7 @@ class PngFolder:
 
     def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
         self.path = path
-        self.decisions = decisions or (f"{path}: a PNG file for each frame",)
+        self.decisions = decisions
         self._n = 0
         with _refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,9 @@ N_ELLIPSOIDS = 60
 """How many covariances are drawn at most along the path."""
 
 _RATE_HZ = 15.0
+_MAX_START_SIGMAS = 10
+# Of the extent of the path, the largest half axis at first.
+_ELLIPSOID_SHARE = 0.07
 _PATHS = ("raw", "causal", "smoothed")
 
 
@@ -58,6 +61,17 @@ def aligned_truth(record: RunRecord) -> Trajectory | None:
     return alignment(paired, truth, "se3").apply(record.truth)
 
 
+def start_sigmas(record: RunRecord) -> int:
+    """Return how many sigmas make ellipsoids that can be seen and do not hide the path."""
+    smoothed = record.trajectories["smoothed"]
+    if smoothed.covariances is None or len(smoothed) == 0:
+        return _MAX_START_SIGMAS
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(smoothed.covariances[:, 3:, 3:]).max()))
+    reach_m = float(np.linalg.norm(np.ptp(smoothed.positions, axis=0)))
+    n_sigmas = _ELLIPSOID_SHARE * reach_m / max(sigma_m, 1e-9)
+    return int(np.clip(n_sigmas, 1, _MAX_START_SIGMAS))
+
+
 class FinishedPage:
     """Shows a run frame by frame.
 
@@ -79,7 +93,7 @@ class FinishedPage:
         self.playback = Playback(server.gui, self.player, before=lambda: None)
         self._view = ViewPoint(server, up, is_following=False)
         self._sigmas = server.gui.add_slider(
-            "ellipsoid sigmas", 1, 100, 1, 10, hint="Half axes of the ellipsoids"
+            "ellipsoid sigmas", 1, 100, 1, start_sigmas(record), hint="Half axes of the ellipsoids"
         )
         self._painter = Painter(self.draw, rate_hz=_RATE_HZ)
         self._sigmas.on_update(lambda _: self._painter.offer())

@@ -13,8 +13,8 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray
 from gvo.view.controls import ParameterControls
-from gvo.view.history import Moment
 from gvo.view.layers import COLOURS
+from gvo.view.moments import Moment
 from gvo.view.numbers import (
     frame_rows,
     legend_html,

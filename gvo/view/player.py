@@ -17,7 +17,8 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.run_loop import one_opencv_thread
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import RecordingInfo
-from gvo.view.history import History, Moment
+from gvo.view.history import History
+from gvo.view.moments import Moment
 from gvo.view.tracking import OpenSource, Tracking
 
 Subscriber: TypeAlias = Callable[[Moment], None]

@@ -15,7 +15,7 @@ from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, StereoFrame
 from gvo.view.clouds import empty_cloud, frame_cloud
-from gvo.view.history import Entry
+from gvo.view.moments import Entry
 from gvo.view.pictures import draw_fault, small_picture
 from gvo.view.reading import is_read_differently, read_frames
 

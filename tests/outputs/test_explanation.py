@@ -9,10 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from gvo.config import Config, RegistrationConfig
 from gvo.errors import ConfigurationError
 from gvo.explain import FrameExplanation, explain_frame
-from gvo.outputs.explanation import write_explanation
+from gvo.outputs.explanation import open_folder, write_explanation
+from gvo.outputs.explanation.motion import draw_residuals
 from gvo.outputs.explanation.pose import position_covariance
+from gvo.outputs.explanation.sheet import close_sheet, open_sheet
 from gvo.sources.recording import Sensor
 from gvo.sources.synthetic import SyntheticRecording
 
@@ -65,6 +68,37 @@ def test_a_folder_that_is_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be written") as error:
         write_explanation(explained("stereo", 0), tmp_path / "out")
     assert "\n" not in str(error.value)
+    with pytest.raises(ConfigurationError, match="give a folder to write into"):
+        open_folder(tmp_path / "out")
+    open_folder(tmp_path / "in" / "here")
+    assert list((tmp_path / "in" / "here").iterdir()) == []
+
+
+@pytest.mark.parametrize("word", ["WWMM", "moved", "ill,"])
+def test_no_line_of_a_caption_leaves_the_picture(word: str) -> None:
+    caption = " ".join([word] * 120)
+    picture = close_sheet(open_sheet(1.0, "Title", caption), "name", "Title", caption)
+    assert picture.png is not None
+    image = cv2.imdecode(np.frombuffer(picture.png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    inked = np.flatnonzero((image < 255).any(axis=0))
+    assert inked[-1] < image.shape[1] - inked[0] + 1
+    assert inked[-1] > 0.5 * image.shape[1]
+
+
+def test_the_caption_says_when_the_gate_would_leave_too_few() -> None:
+    source = SyntheticRecording("handheld", "stereo", n_frames=3, scale=0.4)
+    for gate, words in ((3.0, "chooses the matches again"), (0.05, "less than half")):
+        config = Config().model_copy(
+            update={"registration": RegistrationConfig(gate=gate, huber=0.3)}
+        )
+        step = explain_frame(source, 2, config=config).refinement
+        assert step is not None
+        assert step.n_within is not None
+        n_before, n_after = (int(each.sum()) for each in step.inliers)
+        is_kept = step.n_within < n_before // 2
+        assert n_after == (n_before if is_kept else step.n_within)
+        assert words in draw_residuals(explained("stereo", 2), step).caption
 
 
 def test_the_ellipse_is_turned_into_the_frame_of_the_picture() -> None:

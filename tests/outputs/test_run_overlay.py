@@ -126,7 +126,7 @@ def test_frames_become_numbered_files_where_a_folder_is_named(room: _Run, tmp_pa
     with RunOverlay(tmp_path / "frames", camera) as output:
         for frame, result in pairs:
             output.add_frame(frame, result)
-    assert output.decisions == (f"{tmp_path / 'frames'}: a PNG file for each frame",)
+    assert output.decisions == ()
     files = sorted((tmp_path / "frames").iterdir())
     assert len(files) == _N_FRAMES
     frame, result = pairs[-1]

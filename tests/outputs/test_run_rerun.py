@@ -32,6 +32,7 @@ from gvo.geometry.se3 import exp, make_transform
 from gvo.odometry import FrameResult
 from gvo.output_frame import OutputFrame
 from gvo.outputs import rerun_run
+from gvo.outputs.palette import COUNTS, LINKS, STAGES
 from gvo.outputs.run_folder import RunFolder
 from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.run_rerun import RunRerun
@@ -326,6 +327,17 @@ def test_numbers_are_those_of_the_tables(any_run: _Run) -> None:
         drawn = any_run.read.numbers(f"/milliseconds/{stage}")
         values = [float(row[f"{stage}_ms"]) for row in timed]
         np.testing.assert_allclose(list(drawn.values()), values, atol=1e-3)
+
+
+def test_lines_have_the_colours_that_the_report_gives_them(any_run: _Run) -> None:
+    expected = {
+        **{f"/counts/{name}": COUNTS[name] for name in ("matches", "inliers", "points")},
+        **{f"/milliseconds/{stage}": code for stage, code in STAGES.items()},
+        "/chi2/keyframe": LINKS["keyframe"],
+    }
+    for entity, code in expected.items():
+        (drawn,) = any_run.read.fixed[entity]["SeriesLines:colors"]
+        assert f"{drawn:08x}" == f"{code[1:].lower()}ff", entity
 
 
 def test_chi2_is_the_mean_of_the_accepted_edges_of_a_kind(any_run: _Run) -> None:

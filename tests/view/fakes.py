@@ -13,7 +13,7 @@ from gvo.frame_links import FrameLink
 from gvo.geometry.camera import PinholeCamera
 from gvo.odometry import FrameResult
 from gvo.types import Estimate, FloatArray, IntArray, Status
-from gvo.view.history import Moment
+from gvo.view.moments import Moment
 
 PERIOD_NS = 100_000_000
 CAMERA = PinholeCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from gvo.outputs.run_record import RunRecord, read_run
 from gvo.trajectory import Trajectory
 from gvo.types import FaultyFrame
 from gvo.view import serve, serve_run
-from gvo.view.finished import FinishedPage, aligned_truth, world_up
+from gvo.view.finished import FinishedPage, aligned_truth, start_sigmas, world_up
 from gvo.view.server import ViewServer
 from tests.view.fakes import pose_of, result_of, stamps_of
 
@@ -120,3 +121,18 @@ def test_a_folder_is_served_by_either_name(folder: Path) -> None:
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GvoError, match="is no run folder"):
         serve_run(tmp_path, port=0)
+
+
+@pytest.mark.parametrize(
+    ("factor", "n_sigmas"),
+    # 0.07 of 11 m by the largest sigma: that of the last frame, 0.03 m times the root of 12
+    [(1.0, 7), (1e-4, 10), (1e4, 1), (4.0, 3)],
+)
+def test_ellipsoids_do_not_hide_the_path_at_first(
+    record: RunRecord, factor: float, n_sigmas: int
+) -> None:
+    smoothed = record.trajectories["smoothed"]
+    assert smoothed.covariances is not None
+    wider = replace(smoothed, covariances=factor * smoothed.covariances)
+    trajectories = {**record.trajectories, "smoothed": wider}
+    assert start_sigmas(replace(record, trajectories=trajectories)) == n_sigmas

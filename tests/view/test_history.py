@@ -16,7 +16,8 @@ from gvo.odometry import FrameResult
 from gvo.types import Estimate, FloatArray, RelativePose, RgbdFrame, Status, StereoFrame
 from gvo.view import clouds
 from gvo.view.clouds import Cloud, KeyframeClouds, frame_cloud, put_together, thin
-from gvo.view.history import Entry, History
+from gvo.view.history import History
+from gvo.view.moments import Entry
 from gvo.view.spool import Spool
 
 CAMERA = PinholeCamera(fx=100.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -93,6 +94,21 @@ def test_the_camera_stands_at_the_pose(page: Page, player: FakePlayer, view: Vie
     show(page, player, 12)
     (camera,) = [node for node in nodes(view, "/camera") if node.name == "/camera"]
     np.testing.assert_allclose(camera.position, [0.0, 0.0, 12.0])
+
+
+def test_a_frame_without_points_sends_no_cloud(
+    page: Page, player: FakePlayer, view: ViewServer
+) -> None:
+    """Browsers complain of an empty one."""
+    empty: dict[str, Any] = {
+        "cloud_cam": np.zeros((0, 3), np.float32),
+        "colours": np.zeros((0, 3), np.uint8),
+    }
+    for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
+        moment = moment_of(index)
+        player.show(moment if n_clouds else replace(moment, **empty))
+        page.settle()
+        assert len(nodes(view, "/camera/points")) == n_clouds
 
 
 def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer, view: ViewServer) -> None:

@@ -17,7 +17,7 @@ from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory import Trajectory
 from gvo.types import Estimate, RgbdFrame
-from gvo.view.history import Moment
+from gvo.view.moments import Moment
 from gvo.view.player import Player
 
 N_FRAMES = 12

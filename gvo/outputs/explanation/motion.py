@@ -310,11 +310,14 @@ def _gate_text(step: RefinementStep) -> str:
         return f"Pose and matches stay as they are, {after} (registration.refine none)."
     gate = f"The gate of {step.gate:g} sigma (registration.gate)"
     if step.n_within == after:
-        return f"{gate} chooses the matches again after the first steps: {before} before, {after} after."
+        return (
+            f"{gate} chooses the matches again after the first steps: {before} before, "
+            f"{after} after."
+        )
     return (
         f"{gate} would leave {step.n_within} matches after the first steps, less than half: the "
-        f"{before} from before stay, those beyond it with little weight. The stated sigmas are too "
-        "small here."
+        f"{before} from before stay, those far off with less weight. The residuals are larger than "
+        "the stated sigmas here."
     )
 
 

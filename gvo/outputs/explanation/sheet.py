@@ -126,7 +126,8 @@ def _width_inches(line: str) -> float:
     from matplotlib.backends.backend_agg import RendererAgg
     from matplotlib.font_manager import FontProperties
 
-    renderer = RendererAgg(1, 1, _DPI)
+    make_renderer: Any = RendererAgg  # has no types
+    renderer = make_renderer(1, 1, _DPI)
     font = FontProperties(size=_FONT_SIZE)
     width, _, _ = renderer.get_text_width_height_descent(line, font, ismath=False)
     return float(width) / _DPI

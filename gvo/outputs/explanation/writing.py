@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from gvo.errors import ConfigurationError
 from gvo.explain.values import FrameExplanation
@@ -46,13 +47,31 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     numbers = json.dumps(explanation_json(explanation), indent=2, allow_nan=False)
     files["explanation.json"] = numbers.encode()
     files["explanation.html"] = explanation_page(explanation, pictures).encode()
+    open_folder(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             (out / name).write_bytes(content)
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written: {error.strerror}") from error
     return [out / name for name in files]
+
+
+def open_folder(out: Path) -> None:
+    """Make the folder, before much is computed for what it cannot hold.
+
+    Raises
+    ------
+    ConfigurationError
+        When it cannot be written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ConfigurationError(
+            f"{out}: cannot be written: {error.strerror}; give a folder to write into"
+        ) from error
 
 
 def draw_pictures(explanation: FrameExplanation) -> list[Picture]:

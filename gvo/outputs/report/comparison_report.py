@@ -76,8 +76,6 @@ def write_comparison_report(
             *error_plots(compared, align),
             drift_plot(compared, asked_m=asked_m),
         ]
-        if plots is not None:
-            write_plots(sheets, Path(plots))
         if path is not None:
             names = ", ".join(trajectories)
             facts = {"Estimates": names, "Poses of the reference": str(len(truth))}
@@ -89,6 +87,8 @@ def write_comparison_report(
                 *plots_html(sheets, lines, world),
             ]
             write_page(Path(path), f"Comparison: {names}", body)
+        if plots is not None:
+            write_plots(sheets, Path(plots))
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:

@@ -11,8 +11,10 @@ from gvo.types import FloatArray, IntArray
 N_COLUMNS = 1000
 """Columns of a plot over the whole width, about the pixels that it has."""
 _MAX_PATH_POINTS = 3000
-# of the diagonal of a path: less than half a pixel
+# of the diagonal of a view of the path: less than half a pixel
 _PATH_TOLERANCE = 1.0 / 3000.0
+# of the diagonal in space: no view is taken for smaller, as that along a straight line is
+_MIN_VIEW = 0.02
 
 
 def kept_of_curve(x: FloatArray, y: FloatArray, *, n_columns: int = N_COLUMNS) -> IntArray:
@@ -85,13 +87,16 @@ def kept_of_dots(x: FloatArray, y: FloatArray, *, n_columns: int, n_rows: int) -
 def display_path(trajectory: Trajectory) -> FloatArray:
     """Return the positions that show the path, shape (m, 3), metres; rows of NaN are gaps.
 
-    No position lies off the path shown by more than a three-thousandth of its diagonal; of paths
-    that need more than a few thousand points even so, by a little more.
+    No position lies off the path shown by more than a three-thousandth of the diagonal of its
+    smallest view, which is that from above where the path climbs; of paths that need more than a
+    few thousand points even so, by more.
     """
     positions = trajectory.positions
     if len(trajectory) == 0:
         return positions
-    tolerance = _PATH_TOLERANCE * float(np.linalg.norm(np.ptp(positions, axis=0)))
+    extents = np.sort(np.ptp(positions, axis=0))
+    smallest = max(np.linalg.norm(extents[:2]), _MIN_VIEW * np.linalg.norm(extents))
+    tolerance = _PATH_TOLERANCE * float(smallest)
     gaps = gaps_before(trajectory.stamps_ns / 1e9)
     pieces = np.split(positions, gaps)
     shown = _within_limit(pieces, tolerance)

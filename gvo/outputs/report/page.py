@@ -12,6 +12,7 @@ from gvo.errors import ConfigurationError
 from gvo.outputs.report.paths import Line, World, scene_json
 from gvo.outputs.report.sheets import Plot
 
+_SUFFIXES = (".html", ".htm")
 _DASHES = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
 
 
@@ -29,8 +30,12 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
     Raises
     ------
     ConfigurationError
-        When the file cannot be written.
+        When the name is not that of a page, or the file cannot be written.
     """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ConfigurationError(
+            f"{path}: expected a name ending in .html, got {path.suffix or 'no ending'}"
+        )
     page = "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -44,6 +49,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
         ]
     )
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(page, encoding="utf-8", newline="\n")
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from gvo.outputs.drawing import is_of_camera, plain
 from gvo.outputs.palette import REFERENCE_STYLE, Style, styles_of
 from gvo.outputs.report.decimation import display_path
-from gvo.outputs.report.sheets import HALF, Plot, arrange, new_figure
+from gvo.outputs.report.sheets import HALF, Plot, arrange, fit_left, new_figure
 from gvo.trajectory import Trajectory
 from gvo.types import FloatArray
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _HEIGHT = 4.8
 _MIN_EXTENT_M = 1e-3
+_MAX_SHOWN_M = 1e4
 # a long box, seen from a corner, must not leave its axes
 _SPACE_LABEL_PAD = 9.0  # points; numbers of four signs stand between the axis and its label
 _SPACE_ZOOM = 0.78
@@ -89,43 +90,65 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
         else "Without truth look for jumps and for a path that cannot be what was driven."
     )
     points = np.concatenate([line.points for line in lines])
-    extents = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
+    low = np.nanmin(points, axis=0)
+    extents = np.nanmax(points, axis=0) - low
+    # Numbers of a map grid would not have room on the axes.
+    origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
+    near = _Views(
+        lines=[replace(line, points=line.points - origin) for line in lines],
+        labels=[_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)],
+    )
     along = max(world.ground, key=lambda axis: extents[axis])
     return [
         Plot(
             slug="above",
             title="From above",
             text=f"{world.words} {about} {good}",
-            figure=_view(lines, world.ground, is_flipped=False),
+            figure=_view(near, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
             title="From the side",
             text=f"{about} Odometry drifts in height first: look for a slow climb or sink.",
-            figure=_view(lines, (along, world.up), is_flipped=world.is_up_negative),
+            figure=_view(near, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
         Plot(
             slug="space",
             title="In space",
             text="The same lines; all three axes have one scale.",
-            figure=_space(lines, world),
+            figure=_space(near, world),
         ),
     ]
 
 
-def _view(lines: Sequence[Line], plane: tuple[int, int], *, is_flipped: bool) -> Any:  # noqa: ANN401
-    figure = new_figure(HALF, _HEIGHT)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Views:
+    """What is drawn, in metres from where the axes begin, and the labels of the axes."""
+
+    lines: Sequence[Line]
+    labels: Sequence[str]
+
+
+def _label(axis: str, origin: float) -> str:
+    if origin == 0.0:
+        return f"{axis} [m]"
+    return f"{axis} {'-' if origin > 0 else '+'} {abs(origin):.0f} [m]"
+
+
+def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Any:  # noqa: ANN401
+    figure, lines = new_figure(HALF, _HEIGHT), views.lines
     axes = figure.subplots()
     for line in lines:
         axes.plot(*line.points[:, plane].T, label=plain(line.name), **asdict(line.style))
     _mark_start(axes, lines[0].points[:1, plane].T)
-    axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
+    axes.set(xlabel=views.labels[plane[0]], ylabel=views.labels[plane[1]])
     arrange(figure, axes)
     _set_equal(axes, figure.get_size_inches() * axes.get_position().size)
     if is_flipped:
         axes.invert_yaxis()
+    fit_left(figure)
     return figure
 
 
@@ -143,8 +166,8 @@ def _set_equal(axes: Axes, size: FloatArray) -> None:
     axes.set_aspect("equal", adjustable="box")
 
 
-def _space(lines: Sequence[Line], world: World) -> Any:  # noqa: ANN401
-    figure = new_figure(HALF * 1.2, HALF)
+def _space(views: _Views, world: World) -> Any:  # noqa: ANN401
+    figure, lines = new_figure(HALF * 1.2, HALF), views.lines
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
     for line in lines:
@@ -159,7 +182,7 @@ def _space(lines: Sequence[Line], world: World) -> Any:  # noqa: ANN401
         (axes.set_xlim, axes.set_ylim, axes.set_zlim), limits, strict=True
     ):
         setter(centre - reach, centre + reach)
-    names = [f"{'xyz'[axis]} [m]" for axis in order]
+    names = [views.labels[axis] for axis in order]
     axes.set(xlabel=names[0], ylabel=names[1], zlabel=names[2])
     axes.locator_params(nbins=5)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):

@@ -83,10 +83,11 @@ def write_run_report(
             timing_plot(record.timings),
             *edge_plots(record.edges, _first_ns(record), _link_factor(record.summary)),
         ]
-        if plots is not None:
-            write_plots(sheets, Path(plots))
+        # The page first: it shall be there where the folder cannot be written.
         body = [*_head(record), *plots_html(sheets, lines, world), *_tail(record)]
         write_page(Path(path), f"gvo: {record.name}", body)
+        if plots is not None:
+            write_plots(sheets, Path(plots))
 
 
 def _compare(

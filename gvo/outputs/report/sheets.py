@@ -31,6 +31,8 @@ HALF = 6.4
 _MARGINS_INCHES = {"left": 0.78, "right": 0.2, "bottom": 0.52, "top": 0.12}
 _LEGEND_ROW_INCHES = 0.24
 _INCHES_PER_CHARACTER = 0.072
+_LABEL_INCHES = 0.34
+_INCHES_PER_DIGIT = 0.08
 _MAX_LABEL = 60
 _SETTINGS: dict[str, Any] = {
     "font.family": ["sans-serif"],
@@ -151,8 +153,7 @@ def arrange(figure: Figure, axes: Axes | None = None, *, left: float | None = No
     """
     width, height = figure.get_size_inches()
     margins = dict(_MARGINS_INCHES)
-    if left is not None:
-        margins["left"] = left
+    margins["left"] = left or _left_inches(figure)
     handles, labels = ([], []) if axes is None else axes.get_legend_handles_labels()
     if labels:
         labels = [_shortened(label) for label in labels]
@@ -172,6 +173,23 @@ def arrange(figure: Figure, axes: Axes | None = None, *, left: float | None = No
         bottom=margins["bottom"] / height,
         top=1.0 - min(margins["top"], 0.5 * height) / height,
     )
+
+
+def fit_left(figure: Figure) -> None:
+    """Make room for the numbers left of the plots, where the limits changed after `arrange`."""
+    figure.subplots_adjust(left=_left_inches(figure) / figure.get_size_inches()[0])
+
+
+def _left_inches(figure: Figure) -> float:
+    """Return the margin that the longest number left of the plots needs, with its label."""
+    n_longest = 0
+    for axes in figure.axes:
+        spec = axes.get_subplotspec()
+        if spec is not None and spec.is_first_col():
+            ticks = axes.yaxis.get_majorticklocs().tolist()
+            texts = axes.yaxis.get_major_formatter().format_ticks(ticks)
+            n_longest = max([n_longest, *map(len, texts)])
+    return max(_MARGINS_INCHES["left"], _LABEL_INCHES + _INCHES_PER_DIGIT * n_longest)
 
 
 def _legend_rows(labels: Sequence[str], width: float) -> int:

@@ -98,3 +98,12 @@ def test_each_dot_lies_near_one_that_is_drawn(seed: int) -> None:
     near_x = np.abs(x[:, np.newaxis] - x[kept]) <= np.ptp(x) / 20 + 1e-12
     near_y = np.abs(y[:, np.newaxis] - y[kept]) <= np.ptp(y) / 10 + 1e-12
     assert np.all(np.any(near_x & near_y, axis=1))
+
+
+def test_a_climb_seen_from_above_keeps_its_bends() -> None:
+    heights = np.linspace(0.0, 100.0, 400)
+    positions = np.stack([np.sin(heights / 5.0), np.cos(heights / 7.0), heights], axis=1)
+    shown = display_path(path_of(positions, np.arange(400.0) * 1e8))
+    for axis in (0, 1):
+        drawn = np.interp(heights, shown[:, 2], shown[:, axis])
+        np.testing.assert_allclose(drawn, positions[:, axis], atol=2.0 / 500)

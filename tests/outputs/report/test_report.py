@@ -265,5 +265,26 @@ def test_what_cannot_be_written_is_refused(folder: Path, tmp_path: Path) -> None
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match="cannot be made"):
         write_run_report(tmp_path / "page.html", record, plots=tmp_path / "file")
+    with pytest.raises(ConfigurationError, match=r"ending in \.html, got \.txt"):
+        write_run_report(tmp_path / "page.txt", record)
     with pytest.raises(ValueError, match="at least one"):
         write_comparison_report(tmp_path / "page.html", straight(3), {}, [], align="se3")
+
+
+def test_the_page_is_there_though_its_plots_cannot_be_written(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="--plots"):
+        write_run_report(tmp_path / "run.html", read_run(folder), plots=tmp_path / "file")
+    assert "</html>" in (tmp_path / "run.html").read_text()
+    truth, names = straight(9), {"one": straight(9, bend=0.01)}
+    measured = [evaluate(truth, names["one"], name="one")]
+    with pytest.raises(ConfigurationError, match="--plots"):
+        write_comparison_report(
+            tmp_path / "compared.html",
+            truth,
+            names,
+            measured,
+            align="se3",
+            plots=tmp_path / "file",
+        )
+    assert "</html>" in (tmp_path / "compared.html").read_text()
