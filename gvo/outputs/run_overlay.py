@@ -17,7 +17,7 @@ from gvo.outputs.video import open_sink
 from gvo.types import Estimate, FaultyFrame, Frame
 
 _MAX_WIDTH_PX: Final = 960
-_MAX_PIXELS: Final = 420_000  # of which each costs, at every frame
+_MAX_PIXELS: Final = 300_000  # of which each costs, at every frame
 
 _N_WAITING = 4  # frames; each holds its images
 _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
