@@ -67,7 +67,7 @@ def test_run_writes_its_files_and_prints_the_errors(
 def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("window: {size: 4}\nfeatures: {n_features: 300}\n")
     settings = ["--config", tmp_path / "c.yaml", "--set", "features.n_features=400"]
-    command("run", room_bag, "--out", tmp_path / "out", *settings)
+    command("run", "--no-report", room_bag, "--out", tmp_path / "out", *settings)
     configuration = json.loads((tmp_path / "out/summary.json").read_text())["configuration"]
     assert configuration["window"]["size"] == 4
     assert configuration["features"]["n_features"] == 400
@@ -76,7 +76,7 @@ def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path
 
 
 def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
-    command("run", room_bag, "--out", tmp_path)
+    command("run", "--no-report", room_bag, "--out", tmp_path)
     answer = command("compare", room_bag, tmp_path / "raw.txt", tmp_path / "smoothed.txt", "--json")
     estimates = json.loads(answer.out)["estimates"]
     errors = json.loads((tmp_path / "summary.json").read_text())["errors"]

@@ -87,7 +87,9 @@ def test_a_run_in_the_frame_of_the_robot_lies_on_its_truth(
     command: Command, robot_bag: Path, walk_run: Path, tmp_path: Path
 ) -> None:
     options = ["--frame", "base_link", "--ground-truth", "tf:map:base_link"]
-    answer = command("run", robot_bag, "--out", tmp_path, *options, "--initial-pose", "truth")
+    answer = command(
+        "run", "--no-report", robot_bag, "--out", tmp_path, *options, "--initial-pose", "truth"
+    )
     assert (answer.code, answer.err) == (0, "")
     assert "frame: base_link" in answer.out
     assert "ground truth: tf map -> base_link" in answer.out
@@ -106,7 +108,7 @@ def test_a_run_in_the_frame_of_the_robot_lies_on_its_truth(
 
 
 def test_wheel_odometry_is_no_truth(command: Command, robot_bag: Path, tmp_path: Path) -> None:
-    answer = command("run", robot_bag, "--out", tmp_path)
+    answer = command("run", "--no-report", robot_bag, "--out", tmp_path)
     assert answer.code == 0
     assert "ground truth: none: no frame and no topic is named as ground truth" in answer.out
     assert json.loads((tmp_path / "summary.json").read_text())["errors"] == []
@@ -119,7 +121,7 @@ def test_an_obvious_truth_is_found_and_told(
     stamps_ns = truth_stamps()
     for stamp_ns, T in zip(stamps_ns.tolist(), true_poses(stamps_ns), strict=True):
         bag.pose("/vicon/camera/odom", ODOMETRY, stamp_ns, T, child=CAMERA)
-    answer = command("run", walk_bag, bag.write(), "--out", tmp_path / "out")
+    answer = command("run", "--no-report", walk_bag, bag.write(), "--out", tmp_path / "out")
     assert (answer.code, answer.err) == (0, "")
     assert "ground truth: /vicon/camera/odom (nav_msgs/msg/Odometry)" in answer.out
     assert_same_bytes(tmp_path / "out", walk_run)
@@ -134,7 +136,7 @@ def test_the_initial_pose_moves_all_poses(
 ) -> None:
     quaternion_xyzw = [0.1, -0.2, 0.3, 0.9273618495495704]
     numbers = ",".join(map(str, [4.0, -5.0, 6.0, *quaternion_xyzw]))
-    answer = command("run", walk_bag, "--out", tmp_path, "--initial-pose", numbers)
+    answer = command("run", "--no-report", walk_bag, "--out", tmp_path, "--initial-pose", numbers)
     assert answer.code == 0, answer.err
     R = np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix())
     T_initial = make_transform(R, np.array([4.0, -5.0, 6.0]))
@@ -176,7 +178,7 @@ def test_only_the_excerpt_is_run(
         assert command("convert", walk_bag, recording, "--layout", "euroc").code == 0
     options = ["--start", start_s, "--every", every]
     options += [] if duration_s is None else ["--duration", duration_s]
-    answer = command("run", recording, "--out", tmp_path / "out", *options)
+    answer = command("run", "--no-report", recording, "--out", tmp_path / "out", *options)
     assert answer.code == 0, answer.err
     assert frame_stamps(tmp_path / "out") == chosen_stamps(start_s, duration_s, every)
     np.testing.assert_allclose(poses(tmp_path / "out", "raw")[0], np.eye(4), atol=1e-9)
@@ -220,7 +222,7 @@ def test_nonsense_gets_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     Path("taken.mcap").write_text("mine")
     given = [option.format(robot=robot_bag) for option in options]
-    answer = command("run", robot_bag, "--out", "out", *given)
+    answer = command("run", "--no-report", robot_bag, "--out", "out", *given)
     assert answer.code == 2
     assert is_one_line(answer.err), answer.err
     for word in words:
@@ -234,7 +236,10 @@ def test_a_taken_bag_is_refused_before_anything_is_written(
 ) -> None:
     (tmp_path / "run.mcap").write_text("mine")
     out = tmp_path / "out"
-    assert command("run", walk_bag, "--out", out, "--bag", tmp_path / "run.mcap").code == 2
+    assert (
+        command("run", "--no-report", walk_bag, "--out", out, "--bag", tmp_path / "run.mcap").code
+        == 2
+    )
     assert not out.exists()
 
 
@@ -263,7 +268,7 @@ def test_split_bags_give_the_same_bytes_as_the_whole(
     split: Callable[[Path, Path], Sequence[Path]],
 ) -> None:
     parts = split(walk_bag, tmp_path)
-    answer = command("run", *parts, "--out", tmp_path / "out")
+    answer = command("run", "--no-report", *parts, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     assert_same_bytes(tmp_path / "out", walk_run)
 
@@ -272,7 +277,7 @@ def test_a_bag_and_a_folder_are_not_one_recording(
     command: Command, walk_bag: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "folder").mkdir()
-    answer = command("run", walk_bag, tmp_path / "folder", "--out", tmp_path / "out")
+    answer = command("run", "--no-report", walk_bag, tmp_path / "folder", "--out", tmp_path / "out")
     assert answer.code == 2
     assert is_one_line(answer.err)
     assert "only several bags can be one recording" in answer.err
@@ -286,7 +291,9 @@ def test_of_a_cut_bag_what_can_be_read_is_run(
     gvo.convert(Walk(), path)
     content = path.read_bytes()
     path.write_bytes(content[: int(0.7 * len(content))])
-    answer = command("run", path, "--out", tmp_path / "out", "--bag", tmp_path / "out.mcap")
+    answer = command(
+        "run", "--no-report", path, "--out", tmp_path / "out", "--bag", tmp_path / "out.mcap"
+    )
     assert answer.code == 3, answer.err
     assert all(line.startswith("gvo: warning: ") for line in answer.err.splitlines())
     assert f"cut{suffix}" in answer.err
@@ -306,7 +313,7 @@ def test_the_bag_of_a_run_holds_the_poses_of_its_files(
 ) -> None:
     path, out = tmp_path / f"run{suffix}", tmp_path / "out"
     options = [] if frame is None else ["--frame", frame]
-    answer = command("run", robot_bag, "--out", out, "--bag", path, *options)
+    answer = command("run", "--no-report", robot_bag, "--out", out, "--bag", path, *options)
     assert (answer.code, answer.err) == (0, "")
     messages = read_bag(path)
     for name in TRAJECTORIES:
@@ -338,7 +345,7 @@ def matrix(pose: Any) -> FloatArray:
 def test_a_signal_leaves_a_bag_that_can_be_read(walk_bag: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "out"
     process = subprocess.Popen(
-        [*GVO, "run", str(walk_bag), "--out", str(out), "--bag", str(path)],
+        [*GVO, "run", "--no-report", str(walk_bag), "--out", str(out), "--bag", str(path)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         env={**os.environ, "COLUMNS": "80"},
@@ -468,7 +475,7 @@ def test_the_body_of_euroc_has_the_errors_of_its_camera(
     folder = gvo_data / "euroc_mh01_start"
     errors = {}
     for name, options in (("cam", []), ("body", ["--frame", "body"])):
-        answer = command("run", folder, "--out", tmp_path / name, *options)
+        answer = command("run", "--no-report", folder, "--out", tmp_path / name, *options)
         assert (answer.code, answer.err) == (0, "")
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         errors[name] = summary["errors"]

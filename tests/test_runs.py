@@ -36,6 +36,8 @@ from tests.rendered_walk import (
 )
 from tests.sources.pose_bags import PoseBag
 
+NO_REPORT = gvo.RunOutputs(report=False)
+
 
 class FaultySource:
     """A source of which some images cannot be read, or which breaks off."""
@@ -137,7 +139,7 @@ def test_a_picture_is_drawn(run_dir: Path) -> None:
 def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, threads: int) -> None:
     config = gvo.load_configuration(settings=[f"runtime.threads={threads}"])
     for out in (tmp_path / "a", tmp_path / "b"):
-        gvo.run_recording(gvo.open_recording(room_bag), out, config=config)
+        gvo.run_recording(gvo.open_recording(room_bag), out, outputs=NO_REPORT, config=config)
         config = gvo.Config()
     names = {path.name for path in (tmp_path / "a").glob("*.[tc][xs][tv]")} - {"timings.csv"}
     assert len(names) == 9
@@ -196,7 +198,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 def test_a_truth_of_another_time_is_a_warning(room: SyntheticRecording, tmp_path: Path) -> None:
     truth = room.ground_truth()
     late = Trajectory(stamps_ns=truth.stamps_ns + 10**12, T_world_cam=truth.T_world_cam)
-    result = gvo.run_recording(room, tmp_path, ground_truth=late)
+    result = gvo.run_recording(room, tmp_path, outputs=NO_REPORT, ground_truth=late)
     assert result.evaluations == ()
     assert "not compared" in result.warnings[0]
 
@@ -207,8 +209,10 @@ def test_the_errors_do_not_depend_on_the_frame_of_the_truth(
     truth = room.ground_truth()
     T_map_world = se3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
     moved = Trajectory(stamps_ns=truth.stamps_ns, T_world_cam=T_map_world @ truth.T_world_cam)
-    first = gvo.run_recording(room, tmp_path / "a").evaluations
-    second = gvo.run_recording(room, tmp_path / "b", ground_truth=moved).evaluations
+    first = gvo.run_recording(room, tmp_path / "a", outputs=NO_REPORT).evaluations
+    second = gvo.run_recording(
+        room, tmp_path / "b", outputs=NO_REPORT, ground_truth=moved
+    ).evaluations
     for a, b in zip(first, second, strict=True):
         assert a.ate_m == pytest.approx(b.ate_m, abs=1e-9)
 
@@ -241,14 +245,14 @@ def test_a_malformed_truth_of_the_recording_is_a_warning(
 
 def test_a_left_image_without_a_right_one_is_a_loss(tmp_path: Path) -> None:
     drive = SyntheticRecording("driving", "stereo", n_frames=8, scale=0.4)
-    result = gvo.run_recording(OneEyedSource(drive, faulty={2, 5}), tmp_path)
+    result = gvo.run_recording(OneEyedSource(drive, faulty={2, 5}), tmp_path, outputs=NO_REPORT)
     assert result.exit_code == 3
     assert result.summary["status_counts"]["skipped"] == 2
     assert result.summary["coverage"] == 0.75
 
 
 def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:
-    result = gvo.run_recording(OneEyedSource(room, faulty={2, 5}), tmp_path)
+    result = gvo.run_recording(OneEyedSource(room, faulty={2, 5}), tmp_path, outputs=NO_REPORT)
     assert result.exit_code == 0
     assert result.summary["frames"] == 10
     assert result.summary["unpaired_images"] == 2
@@ -271,11 +275,15 @@ def test_poses_without_stamps_belong_to_the_frames_in_their_order(
 ) -> None:
     truth = room.ground_truth()
     write_kitti(tmp_path / "poses.txt", truth)
-    expected = gvo.run_recording(room, tmp_path / "a").evaluations
+    expected = gvo.run_recording(room, tmp_path / "a", outputs=NO_REPORT).evaluations
     poses = gvo.read_trajectory(tmp_path / "poses.txt")
-    found = gvo.run_recording(room, tmp_path / "b", ground_truth=poses).evaluations
+    found = gvo.run_recording(
+        room, tmp_path / "b", outputs=NO_REPORT, ground_truth=poses
+    ).evaluations
     assert found[0].ate_m == pytest.approx(expected[0].ate_m, abs=1e-9)
-    short = gvo.run_recording(room, tmp_path / "c", ground_truth=poses.select(slice(0, 9)))
+    short = gvo.run_recording(
+        room, tmp_path / "c", outputs=NO_REPORT, ground_truth=poses.select(slice(0, 9))
+    )
     assert short.exit_code == 3
     assert "not compared" in short.warnings[0]
 
@@ -331,7 +339,9 @@ def test_poses_and_covariances_of_the_base_follow_from_those_of_the_camera(
     walk_bag: Path, walk_run: Path, tmp_path: Path
 ) -> None:
     source = gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
-    result = gvo.run_recording(source, tmp_path / "out", frame=choose_frame(source, "base_link"))
+    result = gvo.run_recording(
+        source, tmp_path / "out", outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+    )
     assert result.summary["frame"] == "base_link"
     assert result.exit_code == 0
     _assert_moved(tmp_path / "out", walk_run, T_BASE_CAM)
@@ -359,7 +369,9 @@ def test_a_camera_on_a_head_that_turns_is_placed_at_each_stamp(
     bag = _on_a_head(tmp_path / "tf.mcap", truth_stamps(rate_hz=20))
     source = gvo.open_recording([walk_bag, bag.write()])
     out = tmp_path / "out"
-    result = gvo.run_recording(source, out, frame=choose_frame(source, "base_link"))
+    result = gvo.run_recording(
+        source, out, outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+    )
     assert result.warnings == ()
     _assert_moved(out, walk_run, _panned(STAMPS_NS))
 
@@ -370,7 +382,9 @@ def test_a_head_of_which_tf_tells_too_late_is_guessed_with_a_warning(
     bag = _on_a_head(tmp_path / "tf.mcap", STAMPS_NS[3:])
     source = gvo.open_recording([walk_bag, bag.write()])
     out = tmp_path / "out"
-    result = gvo.run_recording(source, out, frame=choose_frame(source, "base_link"))
+    result = gvo.run_recording(
+        source, out, outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+    )
     assert result.warnings[0].startswith("tf does not say where the camera is")
     assert "at 3 stamps" in result.warnings[0]
     _assert_moved(out, walk_run, _panned(np.maximum(STAMPS_NS, STAMPS_NS[3])))
@@ -414,7 +428,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
         bag.fix(stamp_ns, place)
     source = gvo.open_recording([walk_bag, bag.write()])
     truth = asked_truth(source, "/fix")
-    result = gvo.run_recording(source, tmp_path / "out", ground_truth=truth)
+    result = gvo.run_recording(source, tmp_path / "out", outputs=NO_REPORT, ground_truth=truth)
     assert result.warnings == ()
     exact = true_poses(STAMPS_NS)
     points = exact[:, :3, :3] @ p_cam + exact[:, :3, 3]

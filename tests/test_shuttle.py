@@ -177,7 +177,7 @@ def test_fewer_than_two_frames_cannot_be_driven(
 ) -> None:
     (tmp_path / "shuttle.png").write_text("of an earlier drive")
     drive.faulty = set(range(n_sound, _N_FRAMES))
-    with pytest.raises(RecordingError, match="cut off" if n_sound == 0 else "1 frames have a pose"):
+    with pytest.raises(RecordingError, match="cut off" if n_sound == 0 else "pose both ways: 1,"):
         shuttle(drive, tmp_path)
     assert not (tmp_path / "shuttle.png").exists()
 

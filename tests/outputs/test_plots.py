@@ -135,8 +135,9 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     for name in ("plot.bmp", "plot"):
         with pytest.raises(ConfigurationError, match=r"expected one of \.png, \.pdf, \.svg"):
             plot_trajectories(tmp_path / name, None, {"raw": curve(0)})
+    (tmp_path / "file").write_text("")
     with pytest.raises(TrajectoryError, match="cannot be written"):
-        plot_trajectories(tmp_path / "nowhere" / "plot.png", None, {"raw": curve(0)})
+        plot_trajectories(tmp_path / "file" / "plot.png", None, {"raw": curve(0)})
 
 
 def test_nothing_to_draw_is_refused(tmp_path: Path) -> None:

@@ -159,15 +159,15 @@ def test_other_names_are_refused_before_anything_is_read(drive: _Run, tmp_path: 
 
 @pytest.mark.slow
 def test_the_overlay_benchmark_prints_a_table(drive_bag: Path, tmp_path: Path) -> None:
-    root = Path(gvo.__file__).parent.parent
-    script = root / "scripts" / "benchmark_overlay.py"
+    package = Path(gvo.__file__).parent.parent
+    script = Path(__file__).parents[2] / "scripts" / "benchmark_overlay.py"
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, str(script), *map(str, arguments)],
             capture_output=True,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(root)},
+            env={**os.environ, "PYTHONPATH": str(package)},
             check=False,
         )
 
