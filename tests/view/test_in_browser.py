@@ -20,7 +20,7 @@ N_FRAMES = 20
 
 def _long_recording(config: Config) -> SyntheticRecording:
     """Return so many frames that a pause comes before the end; they are rendered as asked for."""
-    return SyntheticRecording("driving", "stereo", n_frames=10 * N_FRAMES, scale=0.5)
+    return SyntheticRecording("driving", "stereo", n_frames=100 * N_FRAMES, scale=0.5)
 
 
 @pytest.fixture
