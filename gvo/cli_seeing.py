@@ -123,9 +123,8 @@ def view(
             def open_again(config: Config) -> Source:
                 return open_source(recordings, config, calibration, topics)
 
-            parameters = load(config, set_)
-            truth = _find_truth(open_again(parameters))
-            shown = stack.enter_context(Player(open_again, parameters))
+            player = stack.enter_context(Player(open_again, load(config, set_)))
+            shown, truth = player, _find_truth(player.source)
         server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])
         typer.echo(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")

@@ -87,10 +87,11 @@ class RunOutputs:
         warnings: list[str] = []
         if self.plots is not None:
             _make_folder(self.plots)
+        if self.bag is not None or self.rerun is not None:
+            names = name_frames(source, frame, is_placed=is_placed, world=self.world)
         if self.bag is not None:
             from gvo.outputs.run_bag import RunBag
 
-            names = name_frames(source, frame, is_placed=is_placed, world=self.world)
             outputs.append(stack.enter_context(RunBag(self.bag, names)))
         if self.overlay is not None:
             from gvo.outputs.run_overlay import RunOverlay
@@ -101,7 +102,6 @@ class RunOutputs:
         if self.rerun is not None:
             from gvo.outputs.run_rerun import RunRerun
 
-            names = name_frames(source, frame, is_placed=is_placed, world=self.world)
             rerun = RunRerun(self.rerun, source.info.camera, names, config=config)
             outputs.append(stack.enter_context(rerun))
         return outputs, warnings

@@ -16,15 +16,13 @@ from gvo.outputs.shuttle_plot import plot_shuttle
 from gvo.run_loop import RunLoop
 from gvo.run_summary import summarize
 from gvo.run_tally import Progress
+from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 from gvo.sources.backwards import ThereAndBack
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import read_covariances, read_trajectory
 from gvo.types import Failure
-
-EXIT_COMPLETE = 0
-EXIT_PARTLY = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -36,13 +36,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 import numpy as np
 from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
+from gvo.closable import Closable
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.odometry import FrameResult
@@ -77,7 +77,7 @@ _SECOND_NS: Final = 10**9
 _NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
-class RunBag:
+class RunBag(Closable):
     """A bag of what a run computes, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
@@ -181,19 +181,6 @@ class RunBag:
                 self._bag.__exit__(None, None, None)
             if self._first_ns is not None:
                 self._bag.result.rename(self.path)
-
-    def __enter__(self) -> RunBag:
-        """Return the bag, open for writing."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Finish the file, also where the run was interrupted."""
-        self.close()
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:

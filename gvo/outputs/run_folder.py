@@ -8,11 +8,11 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
 
+from gvo.closable import Closable
 from gvo.errors import RecordingError
 from gvo.odometry import FrameResult
 from gvo.trajectory import Trajectory
@@ -56,7 +56,7 @@ _OF_EARLIER_RUNS = (
 )
 
 
-class RunFolder:
+class RunFolder(Closable):
     """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` puts them in the
@@ -190,19 +190,6 @@ class RunFolder:
                 file.close()
             _sort_lines(self.path / "smoothed.txt", n_header=0)
             _sort_lines(self.path / "smoothed_covariance.csv", n_header=1)
-
-    def __enter__(self) -> RunFolder:
-        """Return the folder, open for writing."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the files, also where the run was interrupted."""
-        self.close()
 
 
 def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:

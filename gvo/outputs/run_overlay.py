@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Final, TypeAlias
 
+from gvo.closable import Closable
 from gvo.geometry.camera import PinholeCamera
 from gvo.odometry import FrameResult
 from gvo.outputs.overlay_layout import MIN_WIDTH_PX, Layout
@@ -23,7 +23,7 @@ _N_WAITING = 4  # frames; each holds its images
 _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
 
 
-class RunOverlay:
+class RunOverlay(Closable):
     """A film of a run, open inside a `with` block: one picture per frame, also of faulty ones.
 
     A thread draws and encodes; the run waits for it only where it is four frames behind. The film
@@ -113,19 +113,6 @@ class RunOverlay:
         finally:
             self._worker.shutdown(cancel_futures=True)
             self._sink.close()
-
-    def __enter__(self) -> RunOverlay:
-        """Return the film, open for writing."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Finish the film, also where the run was interrupted."""
-        self.close()
 
     def _put(self, item: _Item) -> None:
         if len(self._waiting) == _N_WAITING:

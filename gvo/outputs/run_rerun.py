@@ -36,9 +36,9 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
+from gvo.closable import Closable
 from gvo.config import Config, describe_configuration
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry.camera import PinholeCamera
@@ -54,7 +54,7 @@ N_FRAMES_HELD: Final = 20
 """Frames after which what was logged must be in the file."""
 
 
-class RunRerun:
+class RunRerun(Closable):
     """A Rerun file of what a run computes, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
@@ -159,19 +159,6 @@ class RunRerun:
                 self._writer.stream.close()
             if self._n_frames > 0:
                 (Path(self._folder.name) / self.path.name).rename(self.path)
-
-    def __enter__(self) -> RunRerun:
-        """Return the file, open for writing."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Finish the file, also where the run was interrupted."""
-        self.close()
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:

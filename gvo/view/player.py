@@ -8,15 +8,15 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
 from typing import TypeAlias
 
+from gvo.closable import Closable
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.run_loop import one_opencv_thread
 from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import RecordingInfo
+from gvo.sources.recording import RecordingInfo, Source
 from gvo.view.history import History
 from gvo.view.moments import Moment
 from gvo.view.tracking import OpenSource, Tracking
@@ -29,7 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 _MAX_GAP_S = 1.0
 
 
-class Player:
+class Player(Closable):
     """Runs odometry over a recording on a thread of its own, as it is told.
 
     Nothing is computed before `play`, `step` or `seek`. What was computed is kept, and shown
@@ -84,19 +84,6 @@ class Player:
         self._subscribers: list[Subscriber] = []
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> Player:
-        """Return the player, to be closed at the end."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the player."""
-        self.close()
 
     # What it is told
 
@@ -283,6 +270,11 @@ class Player:
     def config(self) -> Config:
         """What the next frame is computed with."""
         return self._config
+
+    @property
+    def source(self) -> Source:
+        """The recording, as odometry began with it."""
+        return self._tracking.source
 
     @property
     def info(self) -> RecordingInfo:

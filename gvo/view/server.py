@@ -8,13 +8,13 @@ import ipaddress
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server as websockets_server
 
+from gvo.closable import Closable
 from gvo.errors import ConfigurationError
 
 N_PORTS = 20
@@ -29,7 +29,7 @@ class LocalServer(viser.ViserServer):
         return None
 
 
-class ViewServer:
+class ViewServer(Closable):
     """A page that is being served.
 
     Parameters
@@ -72,19 +72,6 @@ class ViewServer:
             with _silence():
                 self.viser.stop()
             self._is_closed.set()
-
-    def __enter__(self) -> ViewServer:
-        """Return the page."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Stop serving."""
-        self.close()
 
 
 def open_server(host: str, port: int, *, title: str) -> ViewServer:

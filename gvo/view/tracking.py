@@ -64,7 +64,7 @@ class Tracking:
         self._excerpt = excerpt
         self.config = config
         self.is_finished = False
-        source = open_source(config)
+        source = self.source = open_source(config)
         self.info = source.info
         self.camera = source.info.camera
         self._odometry = Odometry(self.camera, config)
