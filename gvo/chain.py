@@ -8,9 +8,10 @@ from typing import Generic
 
 import numpy as np
 
-from gvo.coasting import predict_step
+from gvo.coasting import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
+from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.types import Estimate, Failure, FloatArray, RelativePose, Status
 
@@ -147,12 +148,18 @@ class RawChain(Generic[ObservationsT]):
         self, link: _Link[ObservationsT], current: ObservationsT, T_world_predicted: FloatArray
     ) -> RelativePose | Failure:
         """Search around the predicted pixels, then around the previous ones."""
-        if self._velocity is not None:
+        if self._velocity is not None and self._is_foretold(current.stamp_ns):
             prior = se3.invert(link.T_world_frame) @ T_world_predicted
             result = register_checked(self._frontend, link.observations, current, prior)
-            if isinstance(result, RelativePose):
+            # What speaks against the prediction would be taken for true without it.
+            if isinstance(result, RelativePose | Contradiction):
                 return result
         return register_checked(self._frontend, link.observations, current, None)
+
+    def _is_foretold(self, stamp_ns: int) -> bool:
+        """Tell whether the last velocity still says where a frame should be."""
+        anchor_ns = self.anchor_ns
+        return anchor_ns is None or 1e-9 * (stamp_ns - anchor_ns) <= MAX_EXTRAPOLATION_S
 
     def _begin(self, current: ObservationsT) -> RawStep:
         step = RawStep(

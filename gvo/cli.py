@@ -27,8 +27,16 @@ from gvo.cli_options import (
     load,
     open_source,
 )
-from gvo.errors import ConfigurationError, GvoError
-from gvo.terminal import both, interruptible, progress, report, report_smoothed, warn
+from gvo.errors import ConfigurationError, GvoError, OutputError
+from gvo.terminal import (
+    both,
+    interruptible,
+    progress,
+    report,
+    report_smoothed,
+    told_how_to_go_on,
+    warn,
+)
 from gvo.version import __version__
 
 if TYPE_CHECKING:
@@ -49,6 +57,8 @@ _Compare = Annotated[
 ]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 EXIT_FAULTS = 1
+EXIT_UNUSABLE = 2
+EXIT_PARTLY = 3
 
 
 class _KeyframePolicy(StrEnum):
@@ -148,6 +158,9 @@ def run(
     color: Color = None,
     depth: Depth = None,
     compare_smoothing: _Compare = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where a run into DIR was interrupted.")
+    ] = False,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.output_frame import parse_initial_pose
@@ -168,7 +181,11 @@ def run(
     truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
     for line in source.info.decisions:
         typer.echo(line)
-    with interruptible() as check, progress(source.info.name) as show:
+    with (
+        interruptible() as check,
+        told_how_to_go_on(out),
+        progress(source.info.name) as show,
+    ):
         result = run_recording(
             source,
             out,
@@ -179,6 +196,7 @@ def run(
             excerpt=excerpt,
             outputs=outputs,
             compare_smoothing=compare_smoothing,
+            resume=resume,
             on_progress=both(show, check),
         )
     report(result, out)
@@ -389,7 +407,7 @@ def convert(
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.outputs.converting import convert_recording
-    from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
+    from gvo.runs import EXIT_COMPLETE
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}
     settings = load(config, set_)
@@ -438,4 +456,5 @@ def main() -> None:
         app()
     except GvoError as error:
         typer.echo(f"gvo: error: {error}", err=True)
-        raise SystemExit(2) from None
+        is_partly = isinstance(error, OutputError) and error.is_partly
+        raise SystemExit(EXIT_PARTLY if is_partly else EXIT_UNUSABLE) from None

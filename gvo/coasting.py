@@ -9,7 +9,7 @@ from gvo.geometry import se3
 from gvo.types import FloatArray, Status
 
 # After a longer gap the last velocity says nothing about where the camera is.
-_MAX_EXTRAPOLATION_S = 1.0
+MAX_EXTRAPOLATION_S = 1.0
 _MIN_ELAPSED_S = 1e-3
 # Sigma of an angle that is not known at all, and of a place.
 _ANY_TURN = np.pi / np.sqrt(3.0)
@@ -39,7 +39,7 @@ def predict_step(
         Steps of it add up to sigmas in proportion to the whole time without a measurement,
         however short they are: a velocity that is wrong stays wrong.
     """
-    T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, _MAX_EXTRAPOLATION_S))
+    T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, MAX_EXTRAPOLATION_S))
     elapsed_s = max(elapsed_s, _MIN_ELAPSED_S)
     grown_s = np.sqrt(elapsed_s * (elapsed_s + 2.0 * coasted_s))  # (t + dt)^2 - t^2
     turn = min(np.radians(config.coasting_sigma_deg_per_s) * grown_s, _ANY_TURN)
@@ -53,12 +53,14 @@ class StatusClock:
     Parameters
     ----------
     lost_after_s : float
-        Coasting longer is called lost.
+        Without a measurement for longer the camera is lost, be it that frames cannot be
+        registered or that there are none.
     """
 
     def __init__(self, lost_after_s: float) -> None:
         self._lost_after_s = lost_after_s
-        self._coasting_since_ns: int | None = None
+        self._tied_ns: int | None = None
+        self._is_loose = False
 
     def reconfigure(self, lost_after_s: float) -> None:
         """Take another limit from the next frame on."""
@@ -74,9 +76,10 @@ class StatusClock:
         is_tied : bool
             Whether a measurement ties it to earlier frames or to the world.
         """
-        since, self._coasting_since_ns = self._coasting_since_ns, None
+        was_loose, self._is_loose = self._is_loose, not is_tied
         if is_tied:
-            return Status.OK if since is None else Status.RESUMED
-        self._coasting_since_ns = stamp_ns if since is None else since
-        coasting_s = 1e-9 * (stamp_ns - self._coasting_since_ns)
+            self._tied_ns = stamp_ns
+            return Status.RESUMED if was_loose else Status.OK
+        self._tied_ns = stamp_ns if self._tied_ns is None else self._tied_ns
+        coasting_s = 1e-9 * (stamp_ns - self._tied_ns)
         return Status.LOST if coasting_s > self._lost_after_s else Status.COASTING

@@ -14,7 +14,9 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from gvo.bounded_text import MAX_SHOWN, cut, read_text, shortened
 from gvo.errors import ConfigurationError
+from gvo.yaml_text import MAX_CHARACTERS, YamlError, load_yaml
 
 
 def _parameter(
@@ -57,6 +59,11 @@ class SyncConfig(Section):
     )
     age_penalty: float = _parameter(
         0.1, "how much nearer, as a share, a later partner must be than an earlier one", ge=0
+    )
+    repeated_images: Literal["skip", "keep"] = _parameter(
+        "skip",
+        "an image that is, pixel by pixel, the one before: no frame, or one that stands still "
+        "(keep: simulated cameras without noise)",
     )
 
 
@@ -271,7 +278,12 @@ class WindowConfig(Section):
     coasting_sigma_m_per_s: float = _parameter(
         3.0, "translation sigma of a step without registration, by its duration", "m/s", gt=0
     )
-    lost_after_s: float = _parameter(2.0, "coasting longer is called lost", "s", gt=0)
+    lost_after_s: float = _parameter(
+        2.0, "without a registration for longer the camera is lost: a segment begins", "s", gt=0
+    )
+    relocalize: bool = _parameter(
+        True, "after that, look for the keyframes of earlier segments, to join them"
+    )
     zero_motion: bool = _parameter(
         False, "at standstill, tie a frame to its predecessor by an edge without motion"
     )
@@ -402,7 +414,8 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
         section, dot, name = key.strip().partition(".")
         if not separator or not dot:
             raise ConfigurationError(
-                f"--set {setting}: expected section.key=value, for example window.n_links=3"
+                f"--set {cut(setting, MAX_SHOWN)}: expected section.key=value, for example "
+                "window.n_links=3"
             )
         values.setdefault(section, {})[name] = _parse_value(setting, text)
     return _validate(values)
@@ -410,27 +423,29 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
 
 def _parse_value(setting: str, text: str) -> object:
     try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2024-99-99
-        raise ConfigurationError(f"--set {setting}: the value is no YAML") from error
+        return load_yaml(text)
+    except YamlError as error:
+        raise ConfigurationError(
+            f"--set {cut(setting, MAX_SHOWN)}: the value is no YAML ({error})"
+        ) from error
 
 
 def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = load_yaml(read_text(path, max_bytes=MAX_CHARACTERS))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: cannot be read: {error}") from error
-    except (yaml.YAMLError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}" if mark else f"{error}".splitlines()[0]
-        raise ConfigurationError(f"{path}: no YAML ({place})") from error
+    except YamlError as error:
+        raise ConfigurationError(f"{path}: no YAML ({error})") from error
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigurationError(f"{path}: expected sections with keys, see `gvo config`")
     for section, keys in content.items():
         if not isinstance(keys, dict):
-            raise ConfigurationError(f"{path}: {section} must hold keys, see `gvo config`")
+            raise ConfigurationError(
+                f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config`"
+            )
     return content
 
 
@@ -456,9 +471,9 @@ def _validate(values: Mapping[str, object]) -> Config:
 
 def _explain(error: ValidationError) -> str:
     first = error.errors()[0]
-    name = ".".join(str(part) for part in first["loc"])
+    name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
-        return f"{name}={first['input']!r}: {first['msg'].lower()}; see `gvo config`"
+        return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config`"
     known = _known_keys() if "." in name else list(_sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config` lists all"

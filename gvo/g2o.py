@@ -18,6 +18,7 @@ doi:10.1109/ICRA.2011.5979949.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -25,6 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
+from gvo.trajectory_rows import MAX_POSITION_M
 from gvo.types import FloatArray
 
 _UPPER = np.triu_indices(6)
@@ -137,10 +139,14 @@ def _id(text: str) -> int:
 
 def _transform(numbers: FloatArray) -> FloatArray:
     """Return the pose of x, y, z and a quaternion (x, y, z, w), or roll, pitch, yaw."""
+    if np.any(np.abs(numbers) > MAX_POSITION_M):
+        raise ValueError(f"a number of the pose is beyond {MAX_POSITION_M:g}")
     if len(numbers) == 6:
+        if not np.all(np.isfinite(numbers[3:])):
+            raise ValueError("an angle is not finite")
         R = Rotation.from_euler("xyz", numbers[3:]).as_matrix()
         return se3.make_transform(np.asarray(R), numbers[:3])
-    norm = float(np.linalg.norm(numbers[3:]))
+    norm = math.hypot(*numbers[3:])
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise ValueError(f"the quaternion is of length {norm:.4g}, expected 1")
     return se3.make_transform(np.asarray(Rotation.from_quat(numbers[3:]).as_matrix()), numbers[:3])

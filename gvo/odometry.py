@@ -18,17 +18,19 @@ from gvo.frame_links import FrameLink, LinkKind, judge_links
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend, renew_frontend
 from gvo.frontend.offset import RigOffsets
-from gvo.frontend.protocol import Frontend, Stamped, register_checked
+from gvo.frontend.protocol import Frontend, Stamped, register_checked, relocalize_checked
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.keyframe_policy import choose_links, choose_released, is_needed
 from gvo.keyframes import Keyframes
+from gvo.segments import Segments, Sighting
 from gvo.types import (
     Edge,
     Estimate,
     Failure,
     FloatArray,
     RelativePose,
+    SegmentJoin,
     Status,
 )
 
@@ -57,6 +59,10 @@ class FrameResult:
         The edges that were offered to the window with the frame.
     keyframes_ns : tuple of int
         Stamps of the kept frames, oldest first; of this one too, where it became one.
+    segment : int
+        Counted from 0; another one begins when the camera is lost.
+    joins : tuple of SegmentJoin
+        Segments that found their place among earlier ones with this frame.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -74,6 +80,8 @@ class FrameResult:
     registration: RelativePose | None = None
     links: tuple[FrameLink, ...] = ()
     keyframes_ns: tuple[int, ...] = ()
+    segment: int = 0
+    joins: tuple[SegmentJoin, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -120,6 +128,7 @@ class Odometry:
         self._window = SlidingWindow(self._config.window, log=log)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
+        self._segments = Segments()
 
     @property
     def config(self) -> Config:
@@ -198,9 +207,14 @@ class Odometry:
             step = self._chain.advance(observations)
         with watch.stage("links"):
             offered, scores = self._edges(observations, step)
+            found = self._look_around(observations, step)
+            if found is not None:
+                offered.append(("keyframe", found))
         with watch.stage("window"):
             edges = [edge for _, edge in offered]
-            causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges)
+            status = None if found is None else Status.RESUMED
+            causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges, status=status)
+            joins = self._note_segments(step, causal)
             self._update_keyframes(observations, scores, causal)
             self._hold_anchor()
         if not self._is_own:
@@ -220,6 +234,8 @@ class Odometry:
             registration=step.registration,
             links=judge_links(offered, frame.stamp_ns, self._window),
             keyframes_ns=tuple(self._keyframes.stamps_ns),
+            segment=self._segments.current,
+            joins=joins,
             stage_ms=watch.stage_ms,
         )
 
@@ -292,10 +308,11 @@ class Odometry:
         if step.reference_ns not in self._window:  # not even alone would it go in
             return first, {}
         T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
+        apart = self._apart()
         T_frame_keyframes = {
             stamp_ns: se3.invert(T_world_frame) @ self._window.pose(stamp_ns)
             for stamp_ns in self._keyframes.stamps_ns
-            if stamp_ns in self._window
+            if stamp_ns in self._window and stamp_ns not in apart
         }
         scores = self._keyframes.scores(T_frame_keyframes)
         chosen = choose_links(scores, self._config.window, exclude=step.reference_ns)
@@ -314,13 +331,52 @@ class Odometry:
     ) -> Edge | None:
         keyframe = self._keyframes[stamp_ns]
         result = register_checked(self._frontend, keyframe, observations, prior)
-        if isinstance(result, Failure):
-            return None
+        return None if isinstance(result, Failure) else self._link_edge(stamp_ns, result)
+
+    def _link_edge(self, stamp_ns: int, result: RelativePose) -> Edge:
         return Edge(
             reference_id=stamp_ns,
             T_reference_frame=result.T_reference_current,
             covariance=self._config.window.link_sigma_factor**2 * result.covariance,
         )
+
+    def _apart(self) -> list[int]:
+        """Return the keyframes of earlier segments, which wait to be seen again."""
+        return self._segments.apart(self._keyframes.stamps_ns)
+
+    def _look_around(
+        self,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        step: RawStep,
+    ) -> Edge | None:
+        """Look for keyframes of earlier segments; return an edge to one that is there for sure."""
+        segments = self._segments
+        if not self._config.window.relocalize:
+            return None
+        held_ns = [ns for ns in self._apart() if ns in self._window]
+        reference_ns = step.reference_ns if step.is_registered else None
+        for stamp_ns in segments.to_look_for(held_ns):
+            result = relocalize_checked(self._frontend, self._keyframes[stamp_ns], observations)
+            if isinstance(result, Failure):
+                continue
+            edge = self._link_edge(stamp_ns, result)
+            before = segments.sighting
+            seen_ns = None if before is None else before.edge.reference_id
+            known = self._window.relative_pose(seen_ns, stamp_ns) if seen_ns in held_ns else None
+            if segments.confirms(edge, step.estimate, reference_ns, known):
+                return edge
+            segments.sighting = Sighting(raw=step.estimate, edge=edge)
+            return None
+        return None
+
+    def _note_segments(self, step: RawStep, causal: Estimate) -> tuple[SegmentJoin, ...]:
+        """Take what the window made of the frame; return the segments that it joins."""
+        stamp_ns = causal.stamp_ns
+        reference_ns = step.reference_ns if step.is_registered else None
+        self._segments.note_frame(stamp_ns, reference_ns, causal.status)
+        ties_ns = [int(edge.reference_id) for edge in self._window.edges(stamp_ns)]  # type: ignore[call-overload]
+        joins = [self._segments.join(stamp_ns, tie_ns) for tie_ns in ties_ns]
+        return tuple(join for join in joins if join is not None)
 
     def _update_keyframes(
         self,
@@ -336,7 +392,11 @@ class Odometry:
         if config.n_keyframes > 0 and is_needed(scores, config):
             self._keyframes.add(observations)
             self._window.keep(observations.stamp_ns)
-        for stamp_ns in choose_released(scores, config, n_kept=len(self._keyframes)):
+            self._segments.note_keyframe()
+        apart = self._apart()
+        n_kept = len(self._keyframes) - len(apart)
+        released = choose_released(scores, config, n_kept=n_kept)
+        for stamp_ns in released + apart[: max(len(apart) - config.n_keyframes, 0)]:
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)
         for stamp_ns in self._keyframes.stamps_ns:

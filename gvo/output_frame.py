@@ -138,6 +138,11 @@ class OutputFrame:
         return self._T_initial is not None
 
     @property
+    def T_initial(self) -> FloatArray | None:  # noqa: N802 - the field's name
+        """T_world_frame of the first frame that was asked for, shape (4, 4), metres."""
+        return self._T_initial
+
+    @property
     def fixed_mount(self) -> FloatArray | None:
         """T_frame_cam, shape (4, 4), metres; None for the camera, and where it moves."""
         return None if self._is_camera else self._T_frame_cam

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo.bounded_text import exists
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.output_frame import OutputFrame
 from gvo.sources.bag import BagSource
@@ -196,7 +197,7 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     path = Path(path)
     if (path / "groundtruth.txt").is_file():
         return read_trajectory(path / "groundtruth.txt")
-    if path.is_file() or not path.exists():
+    if path.is_file() or not exists(path):
         return read_trajectory(path)
     truth = open_recording(path).ground_truth()
     if truth is None:

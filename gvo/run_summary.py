@@ -10,6 +10,7 @@ from typing import Any
 from gvo.evaluation import Evaluation
 from gvo.output_frame import OutputFrame
 from gvo.outputs.tables import evaluations_json
+from gvo.resuming.beginning import State
 from gvo.run_loop import RunLoop
 from gvo.truth_comparison import TruthComparison
 from gvo.types import Failure, Status
@@ -17,18 +18,24 @@ from gvo.version import __version__
 
 
 def summarize(
-    loop: RunLoop, compared: TruthComparison | Failure, warnings: list[str]
+    loop: RunLoop,
+    compared: TruthComparison | Failure,
+    warnings: list[str],
+    *,
+    state: State = "complete",
 ) -> dict[str, Any]:
     """Return what `summary.json` holds of a run.
 
     Parameters
     ----------
     loop : RunLoop
-        After its run.
+        After its run, or in the middle of it.
     compared : TruthComparison or Failure
         The errors, or why there are none.
     warnings : list of str
         A line each.
+    state : {"running", "interrupted", "complete"}
+        How far the run is.
     """
     info, tally = loop.source.info, loop.tally
     evaluations: tuple[Evaluation, ...] = ()
@@ -43,6 +50,7 @@ def summarize(
     medians = {stage: durations.median() for stage, durations in tally.stages.items()}
     return {
         "gvo_version": __version__,
+        "state": state,
         "recording": info.name,
         "sensor": info.sensor,
         "decisions": list(info.decisions),
@@ -52,7 +60,8 @@ def summarize(
         "ground_truth_stamps_from": stamps_from,
         "frames": tally.n_frames,
         "tracked": tally.n_tracked,
-        "coverage": tally.n_with_pose / tally.n_frames,
+        "coverage_percent": tally.coverage_percent,
+        "segments": tally.segments_json(),
         "status_counts": {status.value: tally.statuses[status] for status in Status},
         "unpaired_images": tally.n_unpaired,
         "window": asdict(tally.window),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from gvo.backend.ledger import WindowCounts
 from gvo.backend.polish import Polish
 from gvo.frontend.offset import RigOffsets
 from gvo.odometry import FrameResult
-from gvo.types import FaultyFrame, Status
+from gvo.types import FaultyFrame, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
 # With more poses that only continue a velocity, a trajectory is in parts made up.
@@ -55,6 +56,33 @@ class _Durations:
 
 
 @dataclass(slots=True, kw_only=True)
+class Segment:
+    """A part of a run that holds together.
+
+    Parameters
+    ----------
+    id : int
+        Counted from 0.
+    first_stamp_ns, last_stamp_ns : int
+        Of its frames, nanoseconds.
+    n_frames, n_tracked : int
+        All of them, and those tied to earlier ones by a registration.
+    joined_to : int or None
+        Which other one a measurement ties it to; None where none does.
+    joined_at_ns : int or None
+        Stamp of the frame that was measured.
+    """
+
+    id: int
+    first_stamp_ns: int
+    last_stamp_ns: int
+    n_frames: int = 0
+    n_tracked: int = 0
+    joined_to: int | None = None
+    joined_at_ns: int | None = None
+
+
+@dataclass(slots=True, kw_only=True)
 class RunTally:
     """Counts and times over the frames of a run."""
 
@@ -70,6 +98,8 @@ class RunTally:
     polish: Polish | None = None
     rig_offsets: RigOffsets | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
+    segments: dict[int, Segment] = field(default_factory=dict)
+    n_unknown: int = 0
 
     @property
     def n_frames(self) -> int:
@@ -92,6 +122,25 @@ class RunTally:
         return self.statuses[Status.SKIPPED]
 
     @property
+    def coverage_percent(self) -> float:
+        """Share of the frames that are tied to others, or bridge a short gap between such."""
+        n_bridged = self.n_tracked + self.statuses[Status.COASTING]
+        return round(100.0 * n_bridged / max(self.n_frames, 1), 3)
+
+    @property
+    def unjoined(self) -> list[Segment]:
+        """The segments with a measured motion that nothing ties to an earlier one."""
+        return [
+            segment
+            for segment in self.segments.values()
+            if segment.joined_to is None and segment.n_tracked > 0
+        ]
+
+    def segments_json(self) -> list[dict[str, Any]]:
+        """Return all segments as plain values."""
+        return [asdict(segment) for segment in self.segments.values()]
+
+    @property
     def is_partly(self) -> bool:
         """Tell whether frames are missing, or poses not tied to the others."""
         is_loose = self.n_with_pose > 1 and self.n_tracked < 2
@@ -107,9 +156,36 @@ class RunTally:
     def add_result(self, result: FrameResult) -> None:
         """Count a frame."""
         self.statuses[result.status] += 1
+        self._add_to_segment(result)
+        for join in result.joins:
+            self._join(join)
         self.first_untied = self.first_untied or result.reason
         for stage, elapsed_ms in result.stage_ms.items():
             self.add_duration(stage, elapsed_ms)
+
+    def _add_to_segment(self, result: FrameResult) -> None:
+        stamp_ns = result.stamp_ns
+        new = Segment(id=result.segment, first_stamp_ns=stamp_ns, last_stamp_ns=stamp_ns)
+        segment = self.segments.setdefault(result.segment, new)
+        segment.last_stamp_ns = stamp_ns
+        segment.n_frames += 1
+        segment.n_tracked += result.status in (Status.OK, Status.RESUMED)
+
+    def _join(self, join: SegmentJoin) -> None:
+        """Let the later one of two groups of segments point to the earlier one."""
+        first, second = self._root(join.segment), self._root(join.to_segment)
+        if first is second:
+            return
+        is_later = first.id > second.id
+        later = first if is_later else second
+        later.joined_to = join.to_segment if is_later else join.segment
+        later.joined_at_ns = join.stamp_ns
+
+    def _root(self, number: int) -> Segment:
+        segment = self.segments[number]
+        while segment.joined_to is not None:
+            segment = self.segments[segment.joined_to]
+        return segment
 
     def add_duration(self, stage: str, elapsed_ms: float) -> None:
         """Count what one frame took in a stage, milliseconds."""
@@ -146,7 +222,12 @@ class RunTally:
                 f"{self.n_unpaired} images have no partner and make no frame "
                 "(sync.max_difference_ms)"
             )
-        return [*warnings, *self._warnings_of_poses(), *self._warnings_of_window()]
+        return [
+            *warnings,
+            *self._warnings_of_poses(),
+            *self._warnings_of_segments(),
+            *self._warnings_of_window(),
+        ]
 
     def _warnings_of_poses(self) -> list[str]:
         warnings = []
@@ -175,8 +256,32 @@ class RunTally:
             )
         return warnings
 
+    def _warnings_of_segments(self) -> list[str]:
+        warnings = []
+        joined = [segment for segment in self.segments.values() if segment.joined_to is not None]
+        if joined:
+            text = ", ".join(f"{segment.id} to {segment.joined_to}" for segment in joined)
+            warnings.append(
+                f"the camera was lost; where a kept keyframe was seen again, segments were joined "
+                f"({text}): before that, raw and causal poses of a joined one are of a guessed "
+                "place (frames.csv: segment)"
+            )
+        if len(self.unjoined) > 1:
+            warnings.append(
+                f"the camera was lost; {len(self.unjoined)} segments are not joined: nothing ties "
+                "one to the other, and errors over several of them mean little (frames.csv: "
+                "segment)"
+            )
+        return warnings
+
     def _warnings_of_window(self) -> list[str]:
         warnings = []
+        if self.n_unknown:
+            warnings.append(
+                f"{self.n_unknown} registrations were asked for when the run was resumed that had "
+                "not been made before: this machine computes otherwise; later poses differ a "
+                "little from those of a run without interruption"
+            )
         if self.window.n_restored:
             warnings.append(
                 f"{self.window.n_restored} updates of the window failed and were done again with "

@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError
+from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.evaluation import Evaluation
 from gvo.output_frame import OutputFrame
-from gvo.outputs.run_folder import PICTURE, REPORT, TRAJECTORIES, RunFolder
+from gvo.outputs.run_folder import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
+from gvo.resuming.beginning import Beginning, Complete, begin, identity
+from gvo.resuming.header import describe_run
 from gvo.run_inputs import initial_pose, own_truth
-from gvo.run_loop import RunLoop
+from gvo.run_loop import Output, RunLoop
 from gvo.run_outputs import RunOutputs
+from gvo.run_progress import RunningSummary
 from gvo.run_summary import summarize
 from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
@@ -51,6 +54,8 @@ class RunResult:
         What was skipped or broke off, a line each.
     report : Path or None
         The page that shows it, where one was written.
+    notes : tuple of str
+        What became of the wish to resume a run, a line each.
     """
 
     summary: dict[str, Any]
@@ -58,6 +63,7 @@ class RunResult:
     exit_code: int
     warnings: tuple[str, ...]
     report: Path | None = None
+    notes: tuple[str, ...] = ()
 
 
 def run_recording(
@@ -71,6 +77,7 @@ def run_recording(
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
     compare_smoothing: bool = False,
+    resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Run odometry over a recording and write a run folder.
@@ -96,6 +103,9 @@ def run_recording(
     compare_smoothing : bool
         Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
         all of them in memory.
+    resume : bool
+        Go on where a run in the folder was interrupted, see `docs/resume.md`; where there is
+        none, begin, and where it is complete, leave it as it is. Else it is replaced.
     on_progress : callable, optional
         Called after each frame.
 
@@ -106,39 +116,95 @@ def run_recording(
     Raises
     ------
     RecordingError
-        When no frame is usable, or what is to be written cannot be.
+        When no frame is usable.
+    OutputError
+        When something cannot be written; what was written before stands.
+    ResumeError
+        When the folder holds another run than the one that is to go on.
     """
     config = config or Config()
     frame = frame or OutputFrame(source.info.frame_id)
     truth = _find_truth(source, ground_truth, frame)
-    loop = RunLoop(
-        source,
-        config,
-        frame,
-        excerpt=excerpt,
-        comparison=SmoothingComparison() if compare_smoothing else None,
-        first_pose=partial(initial_pose, truth) if starts_at_truth else None,
-    )
     outputs = outputs or RunOutputs()
-    with ExitStack() as stack:
+    if resume:
+        _refuse_unresumable(outputs)
+    start = truth.trajectory if starts_at_truth and isinstance(truth, FramedTruth) else None
+    header = describe_run(source, config, frame, excerpt, start=start)
+    with ExitStack() as stack, ExitStack() as files:
         is_placed = frame.is_placed or starts_at_truth
-        others, notes = outputs.open(source, frame, stack, config=config, is_placed=is_placed)
-        folder = stack.enter_context(RunFolder(Path(out)))
-        loop.run([folder, *others], on_progress)
-    if loop.tally.n_with_pose == 0:
-        raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
-    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    compared = _compare(truth, folder, loop, estimates)
-    result = _conclude(loop, folder, compared, notes, is_asked=ground_truth is not None)
+        others, notes = outputs.open(source, frame, files, config=config, is_placed=is_placed)
+        begun = begin(Path(out), header, resume=resume)
+        if isinstance(begun, Complete):
+            return _already_complete(begun, Path(out))
+        stack.enter_context(begun.journal)
+        folder = files.enter_context(begun.folder)
+        loop = RunLoop(
+            source,
+            config,
+            frame,
+            excerpt=excerpt,
+            comparison=SmoothingComparison() if compare_smoothing else None,
+            first_pose=partial(initial_pose, truth) if starts_at_truth else None,
+            journal=begun.journal,
+        )
+        _track(loop, begun, others, files, on_progress)
+        estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+        compared = _compare(truth, folder, loop, estimates)
+        result = _conclude(loop, begun, compared, notes, is_asked=ground_truth is not None)
+        begun.journal.remove()
+    if resume:
+        result = replace(result, notes=(_resumed_words(loop),))
     if not outputs.report:
         return result
-    try:
-        _draw(folder, compared, estimates, plots=outputs.plots)
-    except GvoError as error:
-        warnings = (*result.warnings, f"not all was drawn: {error}")
-        result = replace(result, exit_code=EXIT_PARTLY, warnings=warnings)
-    page = folder.path / REPORT
-    return replace(result, report=page if page.exists() else None)
+    return _drawn(result, folder, compared, estimates, plots=outputs.plots)
+
+
+def _track(
+    loop: RunLoop,
+    begun: Beginning,
+    others: list[Output],
+    files: ExitStack,
+    on_progress: Callable[[Progress], None] | None,
+) -> None:
+    """Take all frames and complete the files."""
+    summary = RunningSummary(loop, begun, on_progress)
+    with summary.told():
+        loop.run([begun.folder, *others], summary, on_repeated=begun.folder.settle)
+        files.close()
+    if loop.tally.n_with_pose == 0:
+        begun.journal.remove()
+        (begun.folder.path / SUMMARY).unlink(missing_ok=True)
+        name = loop.source.info.name
+        raise RecordingError(f"{name}: no usable frame: {loop.tally.reason()}")
+
+
+def _refuse_unresumable(outputs: RunOutputs) -> None:
+    """Refuse what is written as a whole: it cannot go on in the middle."""
+    given = {"--bag": outputs.bag, "--overlay": outputs.overlay, "--rerun": outputs.rerun}
+    names = [name for name, path in given.items() if path is not None]
+    if names:
+        raise ConfigurationError(
+            f"--resume does not go with {', '.join(names)}: a part of the run would be missing; "
+            "resume without, or run anew with it"
+        )
+
+
+def _already_complete(found: Complete, out: Path) -> RunResult:
+    summary, page = found.summary, out / REPORT
+    return RunResult(
+        summary=summary,
+        evaluations=(),
+        exit_code=int(summary.get("exit_code", EXIT_COMPLETE)),
+        warnings=tuple(summary.get("warnings", ())),
+        report=page if page.exists() else None,
+        notes=(f"{out} holds this run, complete: nothing was left to do",),
+    )
+
+
+def _resumed_words(loop: RunLoop) -> str:
+    if loop.n_repeated == 0:
+        return "there was no interrupted run to resume: began with the first frame"
+    return f"resumed after {loop.n_repeated} frames"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,13 +242,14 @@ def _compare(
 
 def _conclude(
     loop: RunLoop,
-    folder: RunFolder,
+    begun: Beginning,
     compared: TruthComparison | Failure,
     notes: list[str],
     *,
     is_asked: bool,
 ) -> RunResult:
     """Write truth and summary."""
+    folder = begun.folder
     warnings = loop.tally.warnings() + notes
     found = compared if isinstance(compared, TruthComparison) else None
     if found is not None:
@@ -197,14 +264,34 @@ def _conclude(
         )
     if found is not None:
         folder.write_truth(found.truth.trajectory)
-    folder.write_summary(summary)
     is_partly = loop.tally.is_partly or (is_asked and found is None)
+    exit_code = EXIT_PARTLY if is_partly else EXIT_COMPLETE
+    summary |= {"exit_code": exit_code, "run": identity(begun.journal.header)}
+    folder.write_summary(summary)
     return RunResult(
         summary=summary,
         evaluations=() if found is None else found.evaluations,
-        exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
+        exit_code=exit_code,
         warnings=tuple(warnings),
     )
+
+
+def _drawn(
+    result: RunResult,
+    folder: RunFolder,
+    compared: TruthComparison | Failure,
+    estimates: dict[str, Trajectory],
+    *,
+    plots: Path | None,
+) -> RunResult:
+    """Draw; what cannot be drawn takes nothing from what was computed and written."""
+    try:
+        _draw(folder, compared, estimates, plots=plots)
+    except (GvoError, OSError) as error:
+        warnings = (*result.warnings, f"not all was drawn: {error}")
+        result = replace(result, exit_code=EXIT_PARTLY, warnings=warnings)
+    page = folder.path / REPORT
+    return replace(result, report=page if page.exists() else None)
 
 
 def _draw(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
@@ -24,6 +24,8 @@ def report(result: RunResult, out: Path) -> NoReturn:
     """Print what a run of odometry gave, and end with its exit code."""
     from gvo.outputs.tables import format_evaluations
 
+    for note in result.notes:
+        typer.echo(note)
     for key in ("frame", "ground_truth"):
         typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
@@ -38,7 +40,9 @@ def report(result: RunResult, out: Path) -> NoReturn:
             f"{offsets['row_px']:.3f} px"
         )
     where = out if result.report is None else result.report
-    typer.echo(f"{tracked} of {frames} frames tracked; {where}")
+    covered = f"coverage {result.summary['coverage_percent']:.1f} %"
+    segments = _segment_words(result.summary["segments"])
+    typer.echo(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
     warn(result.warnings)
     raise typer.Exit(result.exit_code)
 
@@ -68,6 +72,14 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
     raise typer.Exit(result.exit_code)
+
+
+def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
+    """Tell how many segments there are, where there is more than one."""
+    if len(segments) < 2:
+        return ""
+    n_joined = sum(segment["joined_to"] is not None for segment in segments)
+    return f", {len(segments)} segments, {n_joined} of them joined to another"
 
 
 def _print_smoothings(result: RunResult) -> None:
@@ -157,3 +169,17 @@ def interruptible() -> Iterator[Callable[[object], None]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def told_how_to_go_on(out: Path) -> Iterator[None]:
+    """Say, where a run is interrupted, what stands and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(
+            f"gvo: interrupted; what was done stands in {out}: the same command with --resume "
+            "goes on (without --bag, --overlay and --rerun)",
+            err=True,
+        )
+        raise

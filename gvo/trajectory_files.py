@@ -27,6 +27,7 @@ _FORMATS = (
     "or 17 (EuRoC state)"
 )
 _SCALAR_FIRST = re.compile(r"q\w*w\b.*q\w*x\b")
+_MAX_HEADER = 2000  # characters; the search takes the square of it
 _UPPER = np.triu_indices(6)
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # text files round: four decimals in TUM's ground truths, seven digits in KITTI's
@@ -71,7 +72,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
     n_columns = len(rows[0].fields)
-    if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(header)):
+    if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(header[:_MAX_HEADER])):
         return _read_euroc(rows)
     if n_columns == 12:
         return _read_kitti(path, rows)

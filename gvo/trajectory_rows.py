@@ -7,9 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo.bounded_text import cut, read_text
 from gvo.errors import TrajectoryError
 from gvo.trajectory import parse_stamp
 from gvo.types import BoolArray, FloatArray, IntArray
+
+MAX_POSITION_M = 1e12
+"""Metres: a hundred times as far as the planets; farther, and squares would overflow."""
+
+_MAX_REASON = 300  # characters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +38,7 @@ class Row:
 
     def error(self, text: str) -> TrajectoryError:
         """Return an error of this text that names the line."""
-        return TrajectoryError(f"{self.path}:{self.number}: {text}")
+        return TrajectoryError(f"{self.path}:{self.number}: {cut(text, _MAX_REASON)}")
 
 
 def read_rows(path: Path, *, of: str) -> tuple[str, list[Row]]:
@@ -58,7 +64,7 @@ def read_rows(path: Path, *, of: str) -> tuple[str, list[Row]]:
         When the file cannot be read.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_text(path, encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise TrajectoryError(
             f"{path}: cannot be read: {error.strerror}; give a file of {of}"
@@ -111,6 +117,8 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
             raise row.error(f"{error}; expected {n_columns} numbers") from None
     array = np.array(values).reshape(len(rows), len(range(n_columns)[columns]))
     refuse(rows, ~np.isfinite(array).all(axis=1), "a number is not finite; remove the row")
+    is_absurd = (np.abs(array) > MAX_POSITION_M).any(axis=1)
+    refuse(rows, is_absurd, f"a number is beyond {MAX_POSITION_M:g}; remove the row")
     return array
 
 

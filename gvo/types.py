@@ -76,6 +76,24 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SegmentJoin:
+    """A segment found its place among earlier ones: a kept keyframe was seen again.
+
+    Parameters
+    ----------
+    segment, to_segment : int
+        Which one was joined to which earlier one.
+    stamp_ns, reference_ns : int
+        Of the frame that saw the keyframe, and of that keyframe, nanoseconds.
+    """
+
+    segment: int
+    to_segment: int
+    stamp_ns: int
+    reference_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
     """An answer that the data do not hold; falsy, so that `if result:` reads well.
 

@@ -186,6 +186,29 @@ def test_a_pair_of_the_rpe_spans_delta_poses() -> None:
     errors, turns = relative_errors(straight(10, 1.0), straight(10, 1.1), delta=4)
     np.testing.assert_allclose(errors, [0.4] * 6, atol=1e-12)
     np.testing.assert_array_equal(turns, [0.0] * 6)
+    np.testing.assert_allclose(relative_errors(straight(10, 1.0), straight(10, 1.1))[0], [0.1] * 9)
+
+
+def test_the_segments_of_kitti_are_for_paths_as_long_as_the_longest_of_them() -> None:
+    for n, lengths, n_starts in [
+        (801, tuple(100.0 * k for k in range(1, 9)), 81),
+        (800, (20.0, 50.0), 800),
+    ]:
+        evaluation = evaluate(straight(n, 1.0), straight(n, 1.0), name="e")
+        assert evaluation.segments_m == lengths
+        starts = range(0, n, 10 if n_starts == 81 else 1)
+        fitting = [sum(start + length + 1 < n for start in starts) for length in lengths]
+        assert evaluation.n_segments == sum(fitting)
+
+
+def test_an_estimate_that_stands_is_measured_and_a_reference_that_stands_gives_no_ratio() -> None:
+    moving, standing = straight(30, 1.0), straight(30, 0.0)
+    assert evaluate(moving, standing, name="e", align="origin").path_ratio == 0.0
+    assert evaluate(standing, moving, name="e", align="origin").path_ratio is None
+    assert evaluate(straight(11, 2e-7), straight(11, 1e-7), name="e").path_ratio == pytest.approx(
+        0.5
+    )
+    assert evaluate(straight(11, 0.9e-7), straight(11, 1e-7), name="e").path_ratio is None
 
 
 def test_what_cannot_be_measured_is_none() -> None:

@@ -299,8 +299,38 @@ def test_coasting_for_long_is_called_lost_until_it_resumes() -> None:
     config = configure(lost_after_s=0.12)
     results, _ = run(with_blanks(range(3, 8), 10), config)
     assert [result.status for result in results[3:]] == (
-        [Status.COASTING] * 3 + [Status.LOST] * 2 + [Status.RESUMED, Status.OK]
+        [Status.COASTING] * 2 + [Status.LOST] * 3 + [Status.RESUMED, Status.OK]
     )
+    # The light comes on where it went out: the last registered frame is seen again.
+    assert [result.segment for result in results] == [0] * 5 + [1] * 5
+    assert [len(result.joins) for result in results] == [0] * 8 + [1, 0]
+
+
+def test_a_camera_that_turned_in_the_dark_is_found_again() -> None:
+    turned = se3.exp(np.array([0.0, 0.4, 0.0, 0.2, 0.0, 0.0]))
+
+    def pose(index: int) -> FloatArray:
+        return np.asarray(true_pose(index) if index < 9 else turned @ true_pose(index))
+
+    def frame(index: int) -> Frame:
+        if 4 <= index < 9:
+            return blank(index)
+        to_right = np.eye(4)
+        to_right[0, 3] = CAMERA.baseline
+        images = [render(pose(index) @ T)[0] for T in (np.eye(4), to_right)]
+        return StereoFrame(stamp_ns=index * STEP_NS, left=images[0], right=images[1])
+
+    results, _ = run(map(frame, range(13)), configure(lost_after_s=0.12))
+    assert [len(result.joins) for result in results[:10]] == [0] * 10
+    joined = [n for n, result in enumerate(results) if result.joins]
+    assert joined
+    assert joined[0] <= 11
+    errors = [
+        np.linalg.norm((result.causal.T_world_cam - pose(n))[:3, 3])
+        for n, result in enumerate(results)
+    ]
+    assert errors[joined[0] - 1] > 0.1
+    assert max(errors[joined[0] :]) < 0.06
 
 
 def test_nothing_but_blank_images_gives_finite_poses() -> None:

@@ -110,7 +110,7 @@ def test_frames_table_has_a_row_for_each_frame(run_dir: Path) -> None:
 def test_summary_tells_frames_times_errors_and_configuration(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["frames"] == summary["tracked"] == 20
-    assert summary["coverage"] == 1.0
+    assert summary["coverage_percent"] == 100.0
     assert summary["status_counts"]["ok"] == 20
     assert {"read", "extract", "register", "links", "window"} <= set(summary["median_ms"])
     assert [entry["name"] for entry in summary["errors"]] == list(TRAJECTORIES)
@@ -248,7 +248,7 @@ def test_a_left_image_without_a_right_one_is_a_loss(tmp_path: Path) -> None:
     result = gvo.run_recording(OneEyedSource(drive, faulty={2, 5}), tmp_path, outputs=NO_REPORT)
     assert result.exit_code == 3
     assert result.summary["status_counts"]["skipped"] == 2
-    assert result.summary["coverage"] == 0.75
+    assert result.summary["coverage_percent"] == 75.0
 
 
 def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:

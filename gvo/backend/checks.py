@@ -125,20 +125,6 @@ def _are_plain(covariances: FloatArray) -> bool:
     )
 
 
-def _are_covariances(covariances: FloatArray) -> bool:
-    if not np.abs(covariances).max() <= _MAX_SIGMA**2:
-        return False
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    if variances.min() < _MIN_SIGMA**2:
-        return False
-    # Of correlations: rounding leaves elements that should be zero at any ratio.
-    scales = 1.0 / np.sqrt(variances)
-    correlations = covariances * scales[:, :, np.newaxis] * scales[:, np.newaxis, :]
-    if np.abs(correlations - correlations.transpose(0, 2, 1)).max() > _MAX_SKEW:
-        return False
-    return bool(np.linalg.eigvalsh(correlations).min() > _MIN_EIGENVALUE)
-
-
 def transform_fault(T: FloatArray) -> str:
     """Return why a matrix is no rigid transform, or empty."""
     if not np.isfinite(T).all():
@@ -162,7 +148,8 @@ def covariance_fault(covariance: FloatArray) -> str:
     if sigmas.min() < _MIN_SIGMA or sigmas.max() > _MAX_SIGMA:
         wrong = sigmas.min() if sigmas.min() < _MIN_SIGMA else sigmas.max()
         return f"its sigma {wrong:.3g} is outside {_MIN_SIGMA:.0e} to {_MAX_SIGMA:.0e}"
+    # Of correlations: rounding leaves elements that should be zero at any ratio.
     correlations = covariance / np.outer(sigmas, sigmas)
     if np.abs(correlations - correlations.T).max() > _MAX_SKEW:
         return "its covariance is not symmetric"
-    return "" if _are_covariances(covariance[np.newaxis]) else _NOT_DEFINITE
+    return "" if np.linalg.eigvalsh(correlations).min() > _MIN_EIGENVALUE else _NOT_DEFINITE

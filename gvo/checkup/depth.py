@@ -11,6 +11,8 @@ from gvo.checkup.misregistration import estimate_misregistration
 from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
+from gvo.frontend.corners import detect_corners
+from gvo.frontend.rgbd import sample_depth
 from gvo.types import DepthArray, Failure, RgbdFrame
 
 # Values within this of the median tell the step there.
@@ -40,6 +42,7 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
         text=f"{share_unknown:.1%} of the pixels",
         fix="sunlight, dark or shiny surfaces, or too near: depth is missing there",
     )
+    yield _check_corners(frames, config)
     yield from _check_levels(depths, check)
     yield from _check_frozen(samples, check)
     yield _check_registration(frames, check)
@@ -72,6 +75,22 @@ def _check_range(depths: Sequence[DepthArray], config: Config) -> Iterator[Findi
         unit="%",
         text=f"{share:.1%} of the known depth within {low:g} .. {high:g} m",
         fix="check depth.scale, then depth.min_depth_m and depth.max_depth_m",
+    )
+
+
+def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
+    """Count what odometry can use: corners whose depth is known, in range and without a break."""
+    counts = []
+    for frame in frames:
+        corners = detect_corners(frame.image, config.klt)
+        counts.append(int(np.count_nonzero(sample_depth(frame.depth, corners, config.depth)[1])))
+    return measured(
+        "depth: corners with depth",
+        float(np.median(counts)),
+        Limits(low=config.check.min_stereo_matches, fault_low=config.ransac.min_inliers),
+        text=f"{np.median(counts):.0f} per frame (median)",
+        fix="more light or texture, nearer things; depth that is noisy, full of holes, out of "
+        "range or not registered to colour is of no use at corners",
     )
 
 

@@ -14,9 +14,11 @@ from gvo.checkup.sampling import Survey, survey
 from gvo.checkup.stereo import check_stereo
 from gvo.checkup.timing import check_timing
 from gvo.config import Config
-from gvo.geometry.camera import StereoCamera
+from gvo.errors import CalibrationError
+from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.sources.recording import RecordingInfo, Source
 from gvo.sources.tf import TfBuffer
+from gvo.types import Failure
 
 # Cameras with eyes closer or wider than that exist, but are mostly a unit gone wrong.
 _BASELINES_M = (0.01, 3.0)
@@ -65,16 +67,18 @@ def check_recording(
     """
     found = survey(source, config, n_samples=n_samples or config.check.n_samples)
     info = source.info
+    camera = _find_camera(info)
     findings = [
         *_describe(info, found),
+        *_describe_camera(camera),
         *check_timing(found, info, config),
         *check_usable(found.samples, config.check),
         *check_images(found.samples, config),
     ]
-    if info.sensor == "stereo":
-        findings += check_stereo(found.samples, info.camera, config)
-    else:
+    if info.sensor == "rgbd":
         findings += check_depth(found.samples, config)
+    elif not isinstance(camera, Failure):
+        findings += check_stereo(found.samples, camera, config)
     if calibration_changes is not None:
         findings.append(_check_changes(calibration_changes))
     if transforms is not None:
@@ -102,13 +106,13 @@ def _check_changes(changes: Mapping[str, int]) -> Finding:
 
 def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
     """Yield what is in the recording and what odometry will use."""
-    camera = info.camera
+    first = info.calibrations[0]
     stamps_ns = found.streams[0].stamps_ns
     duration_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0
     yield Finding(
         name="recording",
         value=f"{info.sensor}, {' + '.join(str(len(s.stamps_ns)) for s in found.streams)} images "
-        f"of {camera.width}x{camera.height}, {duration_s:.1f} s",
+        f"of {first.width}x{first.height}, {duration_s:.1f} s",
     )
     for number, decision in enumerate(info.decisions, start=1):
         yield Finding(name=f"source {number}", value=decision)
@@ -120,6 +124,25 @@ def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
         otherwise="fault",
         fix="what was read is usable; repair a copy of the file or record anew",
     )
+
+
+def _find_camera(info: RecordingInfo) -> PinholeCamera | Failure:
+    try:
+        return info.camera
+    except CalibrationError as error:
+        return Failure(reason=str(error))
+
+
+def _describe_camera(camera: PinholeCamera | Failure) -> Iterator[Finding]:
+    if isinstance(camera, Failure):
+        yield Finding(
+            name="calibration",
+            value=camera.reason,
+            threshold="one camera, or a pair of one size and focal length",
+            verdict="fault",
+            fix="give the right one by --calibration FILE",
+        )
+        return
     yield Finding(
         name="focal length",
         value=f"{camera.fx:.1f} px, view of {_view_deg(camera.fx, camera.width):.0f} deg",

@@ -178,6 +178,9 @@ class _Chosen:
 
 
 def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tuple[Sample, ...]:
+    # Repeated images are looked for by a check of its own, which needs to see them.
+    sync = config.sync.model_copy(update={"repeated_images": "keep"})
+    config = config.model_copy(update={"sync": sync})
     loaded = frames(_Chosen(info=info, pairs=[pair for run in chosen for pair in run]), config)
     return tuple(
         Sample(first=next(loaded), second=next(loaded) if len(run) > 1 else None) for run in chosen

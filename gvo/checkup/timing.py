@@ -22,6 +22,8 @@ _MIN_PER_STRETCH = 3
 _MIN_STRETCHES = 4
 # A drift counts where it is that many times what the scatter of the offsets explains.
 _DRIFT_SIGMAS = 4.0
+# Cameras are slower and faster than that, but mostly it is a unit gone wrong.
+_PERIODS_MS = (0.5, 10_000.0)
 
 
 def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
@@ -65,7 +67,17 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
 
 def _check_rate(name: str, steps_s: FloatArray, n: int, config: Config) -> Iterator[Finding]:
     period_s = float(np.median(steps_s))
-    yield Finding(name=f"{name}: period", value=f"{1e3 * period_s:.2f} ms ({1 / period_s:.2f} Hz)")
+    low_ms, high_ms = _PERIODS_MS
+    yield measured(
+        f"{name}: period",
+        1e3 * period_s,
+        Limits(low=low_ms, high=high_ms),
+        unit="ms",
+        text=f"{1e3 * period_s:.3g} ms ({1 / period_s:.4g} Hz)"
+        if period_s < 1e-3
+        else f"{1e3 * period_s:.2f} ms ({1 / period_s:.2f} Hz)",
+        fix="stamps are in another unit than seconds and nanoseconds: mend the driver",
+    )
     regular = steps_s[steps_s < 1.5 * period_s]
     jitter_s = float(np.percentile(np.abs(regular - period_s), 95))
     yield measured(

@@ -74,7 +74,8 @@ def n_chain_calls(calls: Sequence[Registration], registration: RelativePose | No
     found = [
         n
         for n, call in enumerate(calls, start=1)
-        if (call.prior is None if registration is None else call.result is registration)
+        if not call.is_relocalization
+        and (call.prior is None if registration is None else call.result is registration)
     ]
     return found[-1] if found else 0
 

@@ -8,6 +8,7 @@ from typing import Any
 from gvo.config import Config
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.offset import RigOffsets
+from gvo.frontend.protocol import Stamped
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.trace import Event, watched
 from gvo.types import Failure, FloatArray, Frame, RelativePose
@@ -15,7 +16,7 @@ from gvo.types import Failure, FloatArray, Frame, RelativePose
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """One call of a front-end's `register`.
+    """One call of a front-end's `register`, or `relocalize`.
 
     Parameters
     ----------
@@ -26,12 +27,15 @@ class Registration:
     result : RelativePose or Failure
     events : list of Event
         What happened inside.
+    is_relocalization : bool
+        Asked of a keyframe of an earlier segment.
     """
 
     reference_ns: int
     prior: FloatArray | None
     result: RelativePose | Failure
     events: list[Event]
+    is_relocalization: bool = False
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -122,12 +126,35 @@ class WatchedFrontend:
         """Register as the front-end does."""
         with watched() as events:
             result = self._frontend.register(reference, current, prior)
+        self._append(reference, prior, result, events)
+        return result
+
+    def relocalize(
+        self,
+        reference: Any,  # noqa: ANN401 - the front-end's own
+        current: Any,  # noqa: ANN401
+    ) -> RelativePose | Failure:
+        """Look for a place again as the front-end does."""
+        with watched() as events:
+            result = self._frontend.relocalize(reference, current)
+        self._append(reference, None, result, events, is_relocalization=True)
+        return result
+
+    def _append(
+        self,
+        reference: Stamped,
+        prior: FloatArray | None,
+        result: RelativePose | Failure,
+        events: list[Event],
+        *,
+        is_relocalization: bool = False,
+    ) -> None:
         self.latest.registrations.append(
             Registration(
                 reference_ns=reference.stamp_ns,
                 prior=prior,
                 result=result,
                 events=events if self.is_watching else [],
+                is_relocalization=is_relocalization,
             )
         )
-        return result

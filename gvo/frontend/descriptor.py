@@ -11,9 +11,11 @@ from gvo.config import Config
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
+from gvo.frontend.relocalization import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparities
 from gvo.frontend.temporal import match_temporal, predict_pixels
+from gvo.frontend.verification import Contradiction
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.trace import note
@@ -45,6 +47,11 @@ class DescriptorFrontend:
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
+
+    @property
+    def learners(self) -> tuple[RigOffsets, ...]:
+        """All that is learnt on the way."""
+        return (self.rig_offsets,)
 
     def extract(self, frame: Frame) -> Observations:
         """Return the points of a frame that are seen and measured in 3-D.
@@ -140,12 +147,33 @@ class DescriptorFrontend:
         RelativePose or Failure
         """
         narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
-        if prior is None:
-            return self._register_within(reference, current, None, wide)
-        result = self._register_within(reference, current, prior, narrow)
-        if isinstance(result, Failure):
-            result = self._register_within(reference, current, prior, wide)
-        return result
+        if prior is not None:
+            result = self._register_within(reference, current, prior, narrow)
+            if isinstance(result, RelativePose | Contradiction):
+                return result
+        rough = self._register_within(reference, current, prior, wide)
+        if isinstance(rough, Failure):
+            return rough
+        # Nothing foretold it: what else it predicts must be there too.
+        return self._check_view(reference, current, rough)
+
+    def relocalize(self, reference: Observations, current: Observations) -> RelativePose | Failure:
+        """Estimate the motion between frames that may be far apart, see `match_anywhere`."""
+        rough = relocalize_observations(
+            reference, current, self.camera, self._config, offset_px=self._offset_px()
+        )
+        if isinstance(rough, Failure):
+            return rough
+        return self._check_view(reference, current, rough)
+
+    def _check_view(
+        self, reference: Observations, current: Observations, rough: RelativePose
+    ) -> RelativePose | Failure:
+        """Match again around what a motion predicts; refuse it where too little is there."""
+        result = self._register_within(
+            reference, current, rough.T_reference_current, self._config.temporal.radius_px
+        )
+        return check_view(result, reference.points_cam, self.camera)
 
     def _offset_px(self) -> float:
         return self.rig_offsets.disparity.value_px

@@ -31,6 +31,8 @@ _MAX_LAST_STEP_PX = 0.3
 # share, and the noise of the pixels, grey values squared.
 _MAX_UNLIKE = 0.2
 _UNLIKE_NOISE = 18.0
+# A rival disparity counts where the patch differs from it by hardly more than from the one found.
+_MAX_RIVALRY = 2.0
 # Fewer say nothing of the rows.
 _MIN_ROW_SHIFTS = 50
 
@@ -156,17 +158,65 @@ def are_alike(
     -------
     ndarray of bool, shape (n,)
     """
+    unlike, limits = _unlikeness(images, pixels, disparities, config, row_offset_px)
+    return np.asarray(unlike <= limits)
+
+
+def are_rivalled(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    disparities: tuple[FloatArray, FloatArray],
+    config: StereoConfig,
+    *,
+    row_offset_px: float = 0.0,
+) -> BoolArray:
+    """Tell at which pixels another disparity shows the same as well as the one found.
+
+    Windows of a house are all alike, and where the rows show one beside the other, nothing tells
+    which one the other camera saw: the depth is any of several, and mostly wrong.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+        Rectified left and right.
+    pixels : ndarray of float64, shape (n, 2)
+        In the left image.
+    disparities : tuple of two ndarrays of float64, shape (n,)
+        What was found, and its rival; not a number where there is none.
+    config : StereoConfig
+        Size of the patches.
+    row_offset_px : float
+        By how much rows of the right image are larger.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    (found, _), (rival, limits) = (
+        _unlikeness(images, pixels, each, config, row_offset_px) for each in disparities
+    )
+    return np.asarray((rival <= limits) & (rival <= _MAX_RIVALRY * found + _UNLIKE_NOISE))
+
+
+def _unlikeness(
+    images: tuple[ImageArray, ImageArray],
+    pixels: FloatArray,
+    disparities: FloatArray,
+    config: StereoConfig,
+    row_offset_px: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variances of the differences of patches, and what alike ones may have."""
     radius = config.patch_radius_px
-    is_alike = np.isfinite(disparities)
-    chosen = np.flatnonzero(is_alike)
-    if len(chosen) == 0:
-        return is_alike
-    u, v = pixels[chosen].T
-    left = _sample(images[0], u, v, radius, radius)
-    right = _sample(images[1], u - disparities[chosen], v + row_offset_px, radius, radius)
-    limits = _MAX_UNLIKE * left.var(axis=(1, 2)) + _UNLIKE_NOISE
-    is_alike[chosen] = (right - left).var(axis=(1, 2)) <= limits
-    return is_alike
+    unlike, limits = np.full((2, len(pixels)), np.inf)
+    limits[:] = 0.0
+    chosen = np.flatnonzero(np.isfinite(disparities))
+    if len(chosen) > 0:
+        u, v = pixels[chosen].T
+        left = _sample(images[0], u, v, radius, radius)
+        right = _sample(images[1], u - disparities[chosen], v + row_offset_px, radius, radius)
+        limits[chosen] = _MAX_UNLIKE * left.var(axis=(1, 2)) + _UNLIKE_NOISE
+        unlike[chosen] = (right - left).var(axis=(1, 2))
+    return unlike, limits
 
 
 def measure_row_shift(

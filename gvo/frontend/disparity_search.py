@@ -16,6 +16,10 @@ _N_HALVINGS = 2
 _REDUCTION = 2**_N_HALVINGS
 _COARSE_RADIUS_PX = 2
 _MIN_CORRELATION = 0.7
+# Steps on either side that belong to the same peak of correlation; and by how much less another
+# one may correlate and still be looked at: so much do equal things differ in the small images.
+_PEAK_STEPS = 2
+_MAX_GAP = 0.25
 # Grey values squared, over a patch: below this it is flat, and correlates with anything.
 _MIN_ENERGY = 50.0
 # What the search leaves open on either side, in pixels of the full image.
@@ -42,6 +46,28 @@ def search_disparities(
         Right to `COARSE_ERROR_PX`.
     is_found : ndarray of bool, shape (n,)
     """
+    disparities, _, is_found = search_with_rivals(images, pixels, max_disparity)
+    return disparities, is_found
+
+
+def search_with_rivals(
+    images: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Find the disparities of pixels as `search_disparities`, and the next best ones elsewhere.
+
+    Parameters
+    ----------
+    images, pixels, max_disparity
+        See `search_disparities`.
+
+    Returns
+    -------
+    disparities : ndarray of float64, shape (n,)
+        Right to `COARSE_ERROR_PX`.
+    rivals : ndarray of float64, shape (n,)
+        A disparity farther away that is nearly as good here; not a number where there is none.
+    is_found : ndarray of bool, shape (n,)
+    """
     left, right = (_reduce(image) for image in images)
     n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
     columns, rows = (pixels // _REDUCTION).astype(np.int64).T
@@ -54,7 +80,24 @@ def search_disparities(
     is_found = correlations[np.arange(len(best)), best] > _MIN_CORRELATION
     between, is_between = parabola_minimum(-correlations)
     steps = n_steps - np.where(is_between, between, best)
-    return float(_REDUCTION) * steps, is_found
+    rivals, is_rivalled = _find_rivals(correlations, best, n_steps)
+    rivals[~is_rivalled] = np.nan
+    return float(_REDUCTION) * steps, float(_REDUCTION) * rivals, is_found
+
+
+def _find_rivals(
+    correlations: NDArray[np.float32], best: IntArray, n_steps: int
+) -> tuple[FloatArray, BoolArray]:
+    """Return the best steps away from the best, and where these are nearly as good."""
+    rows = np.arange(len(best))
+    elsewhere = correlations.copy()
+    for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):
+        elsewhere[rows, np.clip(best + offset, 0, n_steps)] = -1.0
+    second = np.argmax(elsewhere, axis=1)
+    between, is_between = parabola_minimum(-elsewhere)
+    steps = n_steps - np.where(is_between, between, second).astype(np.float64)
+    gaps = correlations[rows, best] - elsewhere[rows, second]
+    return steps, np.asarray(gaps < _MAX_GAP)
 
 
 def _reduce(image: ImageArray) -> NDArray[np.float32]:

@@ -9,20 +9,24 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.corners import detect_corners
+from gvo.frontend.depth_consistency import check_depths
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.disparity import (
     are_alike,
+    are_rivalled,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
 )
-from gvo.frontend.disparity_search import search_disparities
+from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_with_rivals
 from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
+from gvo.frontend.relocalization import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import is_in_depth_range
 from gvo.frontend.tracking import track_pixels
+from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -69,6 +73,11 @@ class KltFrontend:
         self._descriptors = DescriptorFrontend(camera, config)
         self._described: dict[int, Observations] = {}
         self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
+
+    @property
+    def learners(self) -> tuple[RigOffsets, ...]:
+        """All that is learnt on the way: that of the tracks, and of the descriptors beside them."""
+        return self.rig_offsets, *self._descriptors.learners
 
     def extract(self, frame: Frame) -> KltObservations:
         """Return a frame with its corners that are measured in 3-D.
@@ -136,28 +145,68 @@ class KltFrontend:
         result: RelativePose | Failure | None = None
         if prior is not None:
             result = self._register_from(prior, reference, current)
-        if not result:
+        if not result and not isinstance(result, Contradiction):
             start = np.eye(4) if prior is None else prior
             rough = self._register_from(start, reference, current, is_wide=True)
-            if isinstance(rough, Failure) and prior is None:
+            is_open = isinstance(rough, Failure) and not isinstance(rough, Contradiction)
+            if is_open and prior is None:
                 rough = self._register_descriptors(reference, current)
             if isinstance(rough, Failure):
                 return rough
             result = self._register_from(rough.T_reference_current, reference, current)
+            # Nothing foretold it: what else it predicts must be there too.
+            result = check_view(result, reference.points_cam, self.camera)
+        result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
             row_shift_px = reference.find_corners().row_shift_px
             self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
         return result
 
+    def relocalize(
+        self, reference: KltObservations, current: KltObservations
+    ) -> RelativePose | Failure:
+        """Estimate the motion between frames that may be far apart, by descriptors and tracks."""
+        rough = relocalize_observations(
+            self._describe(reference),
+            self._describe(current),
+            self.camera,
+            self._config,
+            offset_px=self._offsets_px()[0],
+        )
+        self._forget_described()
+        if isinstance(rough, Failure):
+            return rough
+        result = self._register_from(rough.T_reference_current, reference, current)
+        result = check_view(result, reference.points_cam, self.camera)
+        return self._check_depth(reference, current, result)
+
+    def _check_depth(
+        self,
+        reference: KltObservations,
+        current: KltObservations,
+        result: RelativePose | Failure,
+    ) -> RelativePose | Failure:
+        """Refuse a motion that the depth images of an RGB-D camera contradict."""
+        frames = reference.frame, current.frame
+        if isinstance(result, Failure) or isinstance(frames[0], StereoFrame):
+            return result
+        if isinstance(frames[1], StereoFrame):
+            return result
+        depths = frames[0].depth, frames[1].depth
+        return check_depths(result, depths, self.camera, self._config.depth)
+
     def _register_descriptors(
         self, reference: KltObservations, current: KltObservations
     ) -> RelativePose | Failure:
         """Register by descriptors, which find corners again that moved too far for a track."""
         result = self._descriptors.register(self._describe(reference), self._describe(current))
+        self._forget_described()
+        return result
+
+    def _forget_described(self) -> None:
         for stamp_ns in sorted(self._described)[:-_N_DESCRIBED]:
             del self._described[stamp_ns]
-        return result
 
     def _describe(self, observations: KltObservations) -> Observations:
         stamp_ns = observations.stamp_ns
@@ -256,7 +305,7 @@ class KltFrontend:
         self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
     ) -> tuple[FloatArray, BoolArray]:
         farthest = float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
-        rough, is_found = search_disparities((frame.left, frame.right), corners, farthest)
+        rough, rivals, is_found = search_with_rivals((frame.left, frame.right), corners, farthest)
         disparities, is_valid = follow_disparities(
             (frame.left, frame.right),
             corners,
@@ -274,8 +323,31 @@ class KltFrontend:
             self._config.stereo,
             row_offset_px=row_offset_px,
         )
+        doubtful = np.flatnonzero(is_valid & np.isfinite(rivals))
+        is_valid[doubtful] = ~self._are_rivalled(
+            frame, corners[doubtful], (disparities[doubtful], rivals[doubtful]), row_offset_px
+        )
         note("klt.compared", is_alike=is_valid)
         return disparities, is_valid
+
+    def _are_rivalled(
+        self,
+        frame: StereoFrame,
+        corners: FloatArray,
+        disparities: tuple[FloatArray, FloatArray],
+        row_offset_px: float,
+    ) -> BoolArray:
+        """Tell the corners that the right image shows a second time."""
+        images, config = (frame.left, frame.right), self._config.stereo
+        found, rough = disparities
+        rivals, is_at_rest = follow_disparities(
+            images, corners, rough, config, n_steps=N_SEARCH_STEPS, row_offset_px=row_offset_px
+        )
+        is_alike = are_rivalled(
+            images, corners, (found, rivals), config, row_offset_px=row_offset_px
+        )
+        # Those that come back to the disparity found were none.
+        return np.asarray(is_at_rest & is_alike & (np.abs(rivals - found) > COARSE_ERROR_PX))
 
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool

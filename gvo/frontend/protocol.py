@@ -35,6 +35,10 @@ class Frontend(Protocol[ObservationsT]):
     keyframes are chosen by the share of these points in view; else by distance and angle.
     Where they have a length or `n_keypoints`, these are reported with each frame.
 
+    A front-end may have a third method, `relocalize(reference, current)`: what `register` does,
+    of frames that may be far apart in time and place, so that a lost camera is found again. It
+    should be right rather than successful. Without it, `register` is asked, with no prior.
+
     `gvo.testing.check_frontend` tests the contract.
     """
 
@@ -81,10 +85,23 @@ def register_checked(
     ValueError
         When the front-end returns something else.
     """
-    result = frontend.register(reference, current, prior)
+    return _checked(frontend, "register", frontend.register(reference, current, prior))
+
+
+def relocalize_checked(
+    frontend: Frontend[ObservationsT], reference: ObservationsT, current: ObservationsT
+) -> RelativePose | Failure:
+    """Register two frames that nothing is known of; as `register_checked`."""
+    relocalize = getattr(frontend, "relocalize", None)
+    if relocalize is None:
+        return register_checked(frontend, reference, current, None)
+    return _checked(frontend, "relocalize", relocalize(reference, current))
+
+
+def _checked(frontend: object, method: str, result: object) -> RelativePose | Failure:
     if not isinstance(result, RelativePose | Failure):
         raise ValueError(
-            f"register of {type(frontend).__name__} must return RelativePose or Failure, "
+            f"{method} of {type(frontend).__name__} must return RelativePose or Failure, "
             f"got {type(result).__name__}"
         )
     fault = find_fault(result) if isinstance(result, RelativePose) else ""

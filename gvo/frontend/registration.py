@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.verification import verify_motion
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -75,9 +78,20 @@ def register_correspondences(
         with_offset=with_offset,
     )
     note("registration.refined", refined=refined)
+    if not isinstance(refined, Failure) and config.registration.refine != "none":
+        refined = verify_motion(
+            refined,
+            correspondences,
+            camera,
+            config,
+            T_target_predicted=None if start is None else se3.invert(start),
+            rng=_rng(config, stamps_ns),
+            with_offset=with_offset,
+        )
+        note("registration.verified", refined=refined)
     n_inliers = int(np.count_nonzero(consensus.inliers))
     if isinstance(refined, Failure):
-        return Failure(reason=refined.reason, n_matches=len(matches), n_inliers=n_inliers)
+        return replace(refined, n_matches=len(matches), n_inliers=n_inliers)
     n_inliers = int(np.count_nonzero(refined.inliers))
     if n_inliers < config.ransac.min_inliers:
         return Failure(
@@ -111,16 +125,20 @@ def search_consensus(
     stamps_ns: tuple[int, int],
 ) -> Consensus | Failure:
     """Find the motion that most matches agree with, by samples; as `register_correspondences`."""
-    # The generator depends on the two frames alone, so that a run that starts
-    # anywhere draws the same samples for them.
-    seeds = [config.ransac.seed, *stamps_ns]
     return ransac_rigid(
         correspondences,
         camera,
         config.ransac,
         weights=_weights(correspondences, config),
-        rng=np.random.default_rng([abs(seed) for seed in seeds]),
+        rng=_rng(config, stamps_ns),
     )
+
+
+def _rng(config: Config, stamps_ns: tuple[int, int]) -> np.random.Generator:
+    # The generator depends on the two frames alone, so that a run that starts
+    # anywhere draws the same samples for them.
+    seeds = [config.ransac.seed, *stamps_ns]
+    return np.random.default_rng([abs(seed) for seed in seeds])
 
 
 def _relative_pose(

@@ -64,6 +64,8 @@ class Refinement:
         The matches that the pose rests on.
     scale : float
         Root of the weighted mean square of the whitened residuals; one where the sigmas fit.
+    residuals : StereoResiduals
+        Of all matches, whitened around the start value.
     offset : DisparityOffset or None
         What the inliers tell of a constant offset of the disparities, where it was asked for
         and they tell of it.
@@ -73,6 +75,7 @@ class Refinement:
     covariance: FloatArray
     inliers: BoolArray
     scale: float
+    residuals: StereoResiduals
     offset: DisparityOffset | None = None
 
 
@@ -122,13 +125,31 @@ def refine_pose(
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
         note("refinement.gated", T_target_source=rough.T, inliers=chosen)
-        residuals = residuals.select(chosen)
+        every, residuals = residuals, residuals.select(chosen)
         descent = _gauss_newton(rough.T, residuals, n_iterations=config.n_iterations)
         if isinstance(descent, Failure):
             return descent
         # Many motions are multiplied up from this one: it shall be a rotation to the last digit.
         descent = replace(descent, T=se3.normalize(descent.T))
-        return _with_covariance(descent, residuals, chosen, with_offset=with_offset)
+        return _with_covariance(descent, residuals, (chosen, every), with_offset=with_offset)
+
+
+def descend(
+    T_target_source: FloatArray, residuals: StereoResiduals, *, n_iterations: int
+) -> FloatArray | None:
+    """Return where a few steps lead that minimize the cost of some residuals; None where nowhere.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+        Start value.
+    residuals : StereoResiduals
+    n_iterations : int
+        At most.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        descent = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
+    return None if isinstance(descent, Failure) else descent.T
 
 
 def fit_covariance(
@@ -147,7 +168,8 @@ def fit_covariance(
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
     unmoved = _Descent(T=T_target_source, last=None)
-    return _with_covariance(unmoved, residuals.select(inliers), inliers, with_offset=with_offset)
+    chosen = residuals.select(inliers)
+    return _with_covariance(unmoved, chosen, (inliers, residuals), with_offset=with_offset)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -178,8 +200,13 @@ def _gauss_newton(
 
 
 def _with_covariance(
-    descent: _Descent, residuals: StereoResiduals, inliers: BoolArray, *, with_offset: bool
+    descent: _Descent,
+    residuals: StereoResiduals,
+    inliers: tuple[BoolArray, StereoResiduals],
+    *,
+    with_offset: bool,
 ) -> Refinement | Failure:
+    """Finish a descent; `inliers` are chosen of all matches, whose residuals come with them."""
     T, at = descent.T, descent.last
     last = residuals.linearize(T) if at is None else at
     if isinstance(last, Failure):
@@ -198,8 +225,9 @@ def _with_covariance(
     return Refinement(
         T_target_source=T,
         covariance=0.5 * (covariance + covariance.T),
-        inliers=inliers,
+        inliers=inliers[0],
         scale=scale,
+        residuals=inliers[1],
         offset=offset,
     )
 

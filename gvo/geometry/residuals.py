@@ -207,11 +207,15 @@ class StereoResiduals:
 
     def within(self, T: FloatArray, gate: float) -> BoolArray:
         """Tell which residuals are shorter than the gate, in sigmas; none behind the camera."""
+        return np.asarray(self.squared(T) < gate**2)
+
+    def squared(self, T: FloatArray) -> FloatArray:
+        """Return the squared lengths of the residuals, in sigmas; infinite behind the camera."""
         points = T[:3, :3] @ self.columns[:3] + T[:3, 3:]
         is_in_front = points[2] > _MIN_DEPTH_M
         points[2, ~is_in_front] = 1.0
         _, squared = self._whitened(points)
-        return np.asarray(is_in_front & (squared < gate**2))
+        return np.where(is_in_front, squared, np.inf)
 
     def _whitened(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return whitened residuals (3, n) and their squared norms (n,)."""

@@ -6,15 +6,16 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from gvo.closable import Closable
-from gvo.errors import RecordingError
+from gvo.errors import OutputError
 from gvo.odometry import FrameResult
+from gvo.outputs.line_file import LineFile, RewrittenFile, replace_text
 from gvo.trajectory import Trajectory
 from gvo.trajectory_files import (
     COVARIANCE_HEADER,
@@ -24,6 +25,8 @@ from gvo.trajectory_files import (
 )
 from gvo.types import Estimate, FaultyFrame, IntArray, Status
 
+SUMMARY = "summary.json"
+JOURNAL = "journal.bin"
 PICTURE = "trajectories.png"
 REPORT = "report.html"
 SHUTTLE_PICTURE = "shuttle.png"
@@ -34,6 +37,7 @@ TRAJECTORIES = ("raw", "causal", "smoothed")
 FRAMES_HEADER = (
     "stamp_ns",
     "status",
+    "segment",
     "n_keypoints",
     "n_points",
     "n_matches",
@@ -44,8 +48,10 @@ FRAMES_HEADER = (
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
 
+# The journal first: what is left of the others without it is no run that could go on.
 _OF_EARLIER_RUNS = (
-    "summary.json",
+    JOURNAL,
+    SUMMARY,
     "edges.csv",
     "timings.csv",
     PICTURE,
@@ -60,7 +66,8 @@ class RunFolder(Closable):
     """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` puts them in the
-    order of their stamps.
+    order of their stamps. At any moment the files hold whole lines, whatever happens to the
+    process; a line that was cut off by the end of the power is cut out where the run goes on.
 
     Parameters
     ----------
@@ -71,11 +78,21 @@ class RunFolder(Closable):
         Of the table of frames; the first is `stamp_ns`.
     watch : callable, optional
         Is given the smoothed poses too.
+    goes_on : bool
+        The run in the folder was interrupted and goes on: what it wrote is given once more from
+        its start, and the lines that are there stand. `settle` is to be called after that.
+
+    Attributes
+    ----------
+    is_settled : bool
+        All was given once more that had been written before an interruption.
 
     Raises
     ------
-    RecordingError
+    OutputError
         When the folder cannot be written.
+    ResumeError
+        When its tables are not those of the run that goes on.
     """
 
     def __init__(
@@ -84,43 +101,65 @@ class RunFolder(Closable):
         *,
         columns: Sequence[str] = FRAMES_HEADER,
         watch: Callable[[Iterable[Estimate]], None] | None = None,
+        goes_on: bool = False,
     ) -> None:
         self.path = path
         self._watch = watch
-        self._files: dict[str, TextIO] = {}
-        with self._refused_on_error():
+        self._goes_on = goes_on
+        self.is_settled = not goes_on
+        self._is_writable = True
+        self._files: dict[str, LineFile] = {}
+        with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
-            for name in _OF_EARLIER_RUNS:
+            for name in () if goes_on else _OF_EARLIER_RUNS:
                 (path / name).unlink(missing_ok=True)
-            for name in TRAJECTORIES:
-                self._open(f"{name}.txt", "")
-                self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
-            self._open("frames.csv", _csv_line(columns))
-            if columns is FRAMES_HEADER:
-                self._open("edges.csv", _csv_line(EDGES_HEADER))
-                self._open("timings.csv", _csv_line(TIMINGS_HEADER))
+            stack.callback(self._close_files)
+            self._open_all(columns)
+            stack.pop_all()
+
+    def _open_all(self, columns: Sequence[str]) -> None:
+        for name in TRAJECTORIES:
+            self._open(f"{name}.txt", "")
+            self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
+        self._open("frames.csv", _csv_line(columns))
+        if columns is FRAMES_HEADER:
+            self._open("edges.csv", _csv_line(EDGES_HEADER))
+            self._open("timings.csv", _csv_line(TIMINGS_HEADER))
 
     @contextmanager
-    def _refused_on_error(self) -> Iterator[None]:
+    def _refused_on_error(self, path: Path) -> Iterator[None]:
         try:
             yield
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be written: {error.strerror}") from error
+            self._is_writable = False
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
     def _open(self, name: str, header: str) -> None:
-        file = (self.path / name).open("w", encoding="utf-8", newline="\n", buffering=1)
-        self._files[name] = file
-        file.write(header)
+        path = self.path / name
+        if self._goes_on and name.startswith("smoothed"):
+            # An interruption wrote preliminary poses too, and all in the order of their stamps.
+            self._files[name] = RewrittenFile(path, header)
+        else:
+            self._files[name] = LineFile(path, header, goes_on=self._goes_on)
 
-    def _write(self, name: str, line: str) -> None:
-        with self._refused_on_error():
-            self._files[name].write(line)
+    def _write(self, name: str, lines: str) -> None:
+        file = self._files[name]
+        with self._refused_on_error(file.path):
+            file.write(lines)
+
+    def settle(self) -> None:
+        """Take that all was given once more that had been written before the interruption."""
+        for file in self._files.values() if self._goes_on else ():
+            with self._refused_on_error(file.path):
+                file.settle()
+        self.is_settled = True
 
     def add_frame(self, frame: object, result: FrameResult) -> None:
         """Write what one frame gave; its images are not needed."""
         row = (
             result.stamp_ns,
             result.status,
+            result.segment,
             result.n_keypoints,
             result.n_points,
             result.n_matches,
@@ -141,7 +180,7 @@ class RunFolder(Closable):
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a row for a frame without a pose."""
-        row = (frame.stamp_ns, Status.SKIPPED, 0, 0, 0, 0, 0, frame.reason)
+        row = (frame.stamp_ns, Status.SKIPPED, "", 0, 0, 0, 0, 0, frame.reason)
         self._write("frames.csv", _csv_line(row))
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
@@ -174,22 +213,29 @@ class RunFolder(Closable):
             return
         rows = zip(truth.stamps_ns.tolist(), *truth.positions.T.tolist(), strict=True)
         lines = [_csv_line(POSITIONS_HEADER), *map(_csv_line, rows)]
-        with self._refused_on_error():
-            (self.path / TRUE_POSITIONS).write_text("".join(lines), encoding="utf-8")
+        path = self.path / TRUE_POSITIONS
+        with self._refused_on_error(path):
+            path.write_text("".join(lines), encoding="utf-8")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write `summary.json`."""
+        """Write `summary.json`; at any moment the one before or this one is there, whole."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        with self._refused_on_error():
-            (self.path / "summary.json").write_text(text, encoding="utf-8")
+        path = self.path / SUMMARY
+        with self._refused_on_error(path):
+            replace_text(path, text)
 
     def close(self) -> None:
         """Close all files and sort the smoothed poses by stamp."""
-        with self._refused_on_error():
-            for file in self._files.values():
-                file.close()
-            _sort_lines(self.path / "smoothed.txt", n_header=0)
-            _sort_lines(self.path / "smoothed_covariance.csv", n_header=1)
+        self._close_files()
+        if not (self.is_settled and self._is_writable):
+            return
+        for name, n_header in (("smoothed.txt", 0), ("smoothed_covariance.csv", 1)):
+            with self._refused_on_error(self.path / name):
+                _sort_lines(self.path / name, n_header=n_header)
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            file.close()
 
 
 def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
@@ -209,9 +255,7 @@ def _sort_lines(path: Path, *, n_header: int) -> None:
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     header, body = lines[:n_header], lines[n_header:]
     body.sort(key=_stamp_digits)
-    sorted_path = path.with_suffix(path.suffix + ".sorted")
-    sorted_path.write_text("".join(header + body), encoding="utf-8", newline="\n")
-    sorted_path.replace(path)
+    replace_text(path, "".join(header + body))
 
 
 def _stamp_digits(line: str) -> int:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from gvo.bounded_text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.outputs.run_folder import TRAJECTORIES, TRUE_POSITIONS, TRUTH
@@ -24,6 +26,7 @@ COUNTS = ("keypoints", "points", "matches", "inliers", "links", "edges", "reject
 
 _UPPER = np.triu_indices(6)
 _ROUNDING = 1e-2
+_LARGEST_NUMBER = 1e12
 _EXPECTED = "expected a folder that gvo run or gvo smooth wrote"
 
 
@@ -95,7 +98,8 @@ class RunRecord:
     ----------
     folder : Path
     summary : dict
-        As in `summary.json`; empty where the run has not ended.
+        As in `summary.json`; empty where there is none yet. Of a run that goes on or was
+        interrupted that of a few seconds before.
     frames : FrameTable
     edges : EdgeTable or None
         None where the folder holds none, as that of `gvo smooth`.
@@ -124,7 +128,7 @@ class RunRecord:
     @property
     def is_finished(self) -> bool:
         """Tell whether the run came to its end."""
-        return bool(self.summary)
+        return bool(self.summary) and self.summary.get("state", "complete") == "complete"
 
     def comparable(self) -> dict[str, Trajectory]:
         """Return the trajectories that hold poses, as those of what the truth is of."""
@@ -182,18 +186,34 @@ def _read_summary(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        summary = json.loads(read_text(path))
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
     if not isinstance(summary, dict):
         raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
+    if not _is_transform(summary.get("T_frame_truth", np.eye(4).tolist())):
+        raise RecordingError(f"{path}: T_frame_truth is no rigid transform; run again")
     return summary
+
+
+def _is_transform(value: object) -> bool:
+    """Tell whether a summary holds four rows of four numbers of a rigid transform, or none."""
+    if value is None:
+        return True
+    try:
+        T = np.array(cast(ArrayLike, value), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    if T.shape != (4, 4) or not np.all(np.abs(T) < _LARGEST_NUMBER):
+        return False
+    is_rotation = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=_ROUNDING)
+    return bool(is_rotation and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]))
 
 
 def _whole_lines(path: Path) -> list[str]:
     """Return the lines of a file; of one that is being written, without the last half one."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
     return text[: text.rfind("\n") + 1].splitlines()
@@ -205,13 +225,13 @@ def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]] | None:
     if not lines:
         return None
     reader = csv.DictReader(lines, strict=True)
-    absent = [name for name in columns if name not in (reader.fieldnames or ())]
-    if absent:
-        raise RecordingError(f"{path}:1: no column {absent[0]}; {_EXPECTED}")
     try:
-        rows = list(reader)
+        absent = [name for name in columns if name not in (reader.fieldnames or ())]
+        rows = [] if absent else list(reader)
     except csv.Error as error:
         raise RecordingError(f"{path}:{reader.line_num}: {error}; {_EXPECTED}") from error
+    if absent:
+        raise RecordingError(f"{path}:1: no column {absent[0]}; {_EXPECTED}")
     for number, row in enumerate(rows, start=2):
         if None in row.values() or None in row:
             raise RecordingError(f"{path}:{number}: expected {len(reader.fieldnames or ())} fields")

@@ -11,6 +11,7 @@ from array import array
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TypeAlias
@@ -18,13 +19,15 @@ from typing import TypeAlias
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 from rosbags.serde import SerdeError
 
 from gvo.errors import RecordingError
 from gvo.sources.salvage import mcap, ros1
-from gvo.sources.salvage.inflate import inflate_message
+from gvo.sources.salvage.inflate import inflate_message, inflate_whole
 from gvo.sources.salvage.mcap import McapScan
 from gvo.sources.salvage.ros1 import Ros1Scan
 from gvo.sources.salvage.scan import Channel, FoundMessage, Salvage, standard_type
@@ -68,6 +71,24 @@ FAULTS: tuple[type[Exception], ...] = (
 )
 """What rosbags raises where a file or a message is not what it should be."""
 
+
+def _bound_chunks() -> None:
+    """Let rosbags decompress the chunks of a file into bounded memory.
+
+    A thousand bytes of a chunk can become gigabytes, and it has no limit of its own. It looks the
+    functions up in two tables.
+    """
+    for name in ("bz2", "lz4"):
+        decompressors[name] = partial(inflate_whole, compression=name)
+    for name in ("lz4", "zstd"):
+        DECOMPRESSORS[name] = partial(_inflate_to, compression=name)
+
+
+def _inflate_to(data: bytes, size: int, *, compression: str) -> bytes:
+    return inflate_whole(data, compression, limit=size)
+
+
+_bound_chunks()
 
 DAMAGE: tuple[type[Exception], ...] = (DamageError, *FAULTS)
 """What is raised where a file is damaged."""

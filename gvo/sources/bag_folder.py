@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-import yaml
-
+from gvo.bounded_text import read_text
 from gvo.errors import RecordingError
 from gvo.sources.salvage.inflate import inflate_file
+from gvo.yaml_text import YamlError, load_yaml
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _COMPRESSED = ".zstd"
+_MAX_METADATA = 1 << 20  # bytes; thousands of files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,14 +123,13 @@ def _find(name: str, held: list[Path]) -> Path | None:
 def _listed_files(metadata: Path) -> dict[str, str]:
     """Return the names of the files, and for each what is known of its size, as text."""
     try:
-        content = yaml.safe_load(metadata.read_text(encoding="utf-8"))[
-            "rosbag2_bagfile_information"
-        ]
+        text = read_text(metadata, max_bytes=_MAX_METADATA)
+        content = load_yaml(text, max_characters=_MAX_METADATA)["rosbag2_bagfile_information"]
         names = [PurePath(name).name for name in content["relative_file_paths"]]
         files = {
             PurePath(file["path"]).name: f" ({file['message_count']} messages)"
             for file in content.get("files") or []
         }
-    except (yaml.YAMLError, OSError, ValueError, TypeError, LookupError, AttributeError):
+    except (YamlError, OSError, ValueError, TypeError, LookupError, AttributeError):
         return {}
     return {name: files.get(name, "") for name in names}

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gvo.bounded_text import MAX_SHOWN, cut, shortened
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import Calibration
 from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
-from gvo.sources.camera_fields import CameraFields, read_numbers, shortened
+from gvo.sources.camera_fields import CameraFields, read_numbers
 from gvo.sources.image_headers import MAX_PIXELS
 from gvo.types import FloatArray
 
@@ -199,7 +200,8 @@ def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[Distortion
         D = D[:4]
     if D.size not in counts:
         raise CalibrationError(
-            f"{fields.where}: D of {' '.join(fields.model.split())} must hold "
+            f"{fields.where}: D of {cut(' '.join(fields.model.split()), MAX_SHOWN)} must "
+            f"hold "
             f"{_alternatives(counts)} numbers, got {D.size}"
         )
     n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)

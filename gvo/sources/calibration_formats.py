@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from gvo.bounded_text import shortened
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.sources.calibration import is_rotation
 from gvo.sources.calibration_yaml import read_yaml
-from gvo.sources.camera_fields import CameraFields, RegionOfInterest, read_numbers, shortened
+from gvo.sources.camera_fields import CameraFields, RegionOfInterest, read_numbers
 from gvo.types import FloatArray
 
 _FORMATS = (
@@ -29,6 +30,7 @@ _ROS_KEYS = {
     "P": ("projection_matrix", "P", "p"),
 }
 _KALIBR_CAMERA = re.compile(r"cam([0-9]{1,3})")
+_MAX_COUNT = 2**31 - 1
 _SIDES = (("left", "right"), ("LEFT", "RIGHT"))
 
 
@@ -194,7 +196,7 @@ def _region(content: object, where: str) -> RegionOfInterest:
 
 def _count(content: Mapping[Any, Any], key: str, where: str) -> int:
     value = content.get(key, 0)
-    if not isinstance(value, int) or value < 0:
+    if not isinstance(value, int) or not 0 <= value <= _MAX_COUNT:
         raise CalibrationError(
             f"{where}: {key} must be an integer of 0 or more, got {shortened(value)}"
         )
@@ -210,8 +212,10 @@ def _assumed_model(content: Mapping[Any, Any], D: object, where: str) -> str:
 
 
 def _positive(value: object, name: str, where: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
-        raise CalibrationError(f"{where}: {name} must be a positive integer")
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= _MAX_COUNT:
+        raise CalibrationError(
+            f"{where}: {name} must be a positive integer, got {shortened(value)}"
+        )
     return value
 
 

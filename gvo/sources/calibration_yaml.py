@@ -7,20 +7,12 @@ from typing import Any
 
 import yaml
 
+from gvo.bounded_text import read_text
 from gvo.errors import CalibrationError
+from gvo.yaml_text import MAX_CHARACTERS, YamlError, load_yaml
 
 _OPENCV_HEADER = "%YAML:"
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
-
-# Dates that are none, numbers too long and tags that do not fit their values come as these.
-_VALUE_FAULTS = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
 
 
 class _Loader(yaml.SafeLoader):
@@ -53,7 +45,7 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         When it is missing, malformed or holds no keys.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, max_bytes=MAX_CHARACTERS)
     except OSError as error:
         raise CalibrationError(
             f"{path}: the calibration cannot be read: {error.strerror}"
@@ -64,10 +56,9 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         text = text.partition("\n")[2]  # with its colon it is no directive of YAML
     try:
         # Of several documents, as `ros2 topic echo` prints them, the first counts.
-        documents = yaml.load_all(text, Loader=_Loader)
-        content = next((document for document in documents if document is not None), None)
-    except (yaml.YAMLError, *_VALUE_FAULTS) as error:
-        raise CalibrationError(f"{path}: the calibration is no YAML") from error
+        content = load_yaml(text, _Loader)
+    except YamlError as error:
+        raise CalibrationError(f"{path}: the calibration is no YAML ({error})") from error
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: the calibration holds no keys")
     return content

@@ -8,11 +8,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gvo.bounded_text import shortened
 from gvo.errors import CalibrationError
 from gvo.types import FloatArray
 
 _LARGEST_NUMBER = 1e9
-_MAX_SHOWN = 80
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,9 +126,3 @@ def read_numbers(values: object, what: str) -> FloatArray:
     if np.any(np.abs(numbers) > _LARGEST_NUMBER):
         raise CalibrationError(f"{what} holds {np.abs(numbers).max():g}, which no camera has")
     return numbers
-
-
-def shortened(value: object) -> str:
-    """Return a value of a file on one line of a message, cut where it is long."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo.sources.edge_lines import LineFormat
+from gvo.sources.edge_lines import MAX_LINE, LineFormat
 from gvo.trajectory_files import COVARIANCE_HEADER
 from gvo.types import Estimate, Rejected
 
@@ -26,6 +26,8 @@ CSV_HEADER = (
 _UPPER = np.triu_indices(6)
 _CHUNK_BYTES = 65536
 _POLL_SECONDS = 0.2
+# What is cut off here is still longer than what is understood.
+_MAX_LINE_BYTES = 4 * MAX_LINE + 1
 
 
 def format_estimate(
@@ -85,6 +87,7 @@ def read_lines(descriptor: int, check: Callable[[], None]) -> Iterator[str]:
             continue
         chunk = os.read(descriptor, _CHUNK_BYTES)
         *lines, rest = (rest + chunk).split(b"\n")
+        rest = rest[:_MAX_LINE_BYTES]
         for line in lines:
             check()
             yield line.decode("utf-8", errors="replace")

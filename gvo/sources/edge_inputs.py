@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo.bounded_text import exists
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.sources.edges import EdgeSource
 from gvo.sources.opening import BAG_SUFFIXES
@@ -47,7 +48,7 @@ def open_edges(
     """
     inputs = [Path(path) for path in paths]
     for path in inputs:
-        if not path.exists():
+        if not exists(path):
             raise TrajectoryError(f"{path}: does not exist; {_KINDS}")
     bags = [path for path in inputs if _is_bag(path)]
     if topics and not bags:

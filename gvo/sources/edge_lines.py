@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -29,16 +30,22 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gvo.bounded_text import shortened
 from gvo.geometry import se3
 from gvo.sources.pose_streams import StepSigma
+from gvo.trajectory_rows import MAX_POSITION_M
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
 LineFormat: TypeAlias = Literal["csv", "json"]
 
+MAX_LINE = 1 << 20
+"""Characters of a line; an edge with its covariance has a thousandth."""
+
+_MAX_ID = 1000  # characters
 _NORM_TOLERANCE = 1e-2
 # Of a measurement in the world without a stated noise: radians and metres.
 _PRIOR_SIGMAS = np.repeat([0.01, 0.1], 3)
-_STAMP_LIMIT_NS = 2**63
+_STAMP_LIMIT_NS = 2**63 - 1
 _ACTIONS = ("keep", "release")
 _NOISE_KEYS = frozenset({"sigmas", "covariance", "kernel"})
 _EDGE_KEYS = _NOISE_KEYS | {"reference", "pose"}
@@ -93,6 +100,8 @@ def parse_line(line: str, line_format: LineFormat) -> Request:
     ValueError
         Saying what is wrong with the line.
     """
+    if len(line) > MAX_LINE:
+        raise ValueError(f"the line has more than {MAX_LINE} characters")
     return parse_json(line) if line_format == "json" else parse_csv(line)
 
 
@@ -162,25 +171,40 @@ def parse_json(line: str) -> Request:
 def _csv_id(text: str) -> str:
     if not text:
         raise ValueError("the id is empty")
+    _check_id(text, "id")
     return text
 
 
 def _json_id(value: object, name: str) -> str | int:
     if isinstance(value, bool) or not isinstance(value, str | int) or value == "":
-        raise ValueError(f"{name} must be a text or a whole number, got {value!r}")
+        raise ValueError(f"{name} must be a text or a whole number, got {shortened(value)}")
+    _check_id(value, name)
     return value
+
+
+def _check_id(value: str | int, name: str) -> None:
+    """Refuse what cannot be kept and written for each pose."""
+    if isinstance(value, int) and abs(value) >= _STAMP_LIMIT_NS:
+        raise ValueError(f"{name} {shortened(value)} has more than 63 bits")
+    if isinstance(value, str) and (len(value) > _MAX_ID or not _is_writable(value)):
+        raise ValueError(f"{name} {shortened(value)} is no text of at most {_MAX_ID} characters")
+
+
+def _is_writable(text: str) -> bool:
+    """Tell whether a text has no half of a character, as JSON can write it."""
+    return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _csv_stamp(text: str) -> int:
     try:
         return _json_stamp(int(text))
     except ValueError:
-        raise ValueError(f"the stamp {text!r} is no whole number of nanoseconds") from None
+        raise ValueError(f"the stamp {shortened(text)} is no whole number of nanoseconds") from None
 
 
 def _json_stamp(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= _STAMP_LIMIT_NS:
-        raise ValueError(f"the stamp {value!r} is no whole number of nanoseconds")
+        raise ValueError(f"the stamp {shortened(value)} is no whole number of nanoseconds")
     return value
 
 
@@ -190,7 +214,8 @@ def _object(value: object, keys: frozenset[str], what: str) -> dict[str, object]
     unknown = [key for key in value if key not in keys]
     if unknown:
         raise ValueError(
-            f"{what} holds the unknown key {unknown[0]!r}; known: {', '.join(sorted(keys))}"
+            f"{what} holds the unknown key {shortened(unknown[0])}; known: "
+            f"{', '.join(sorted(keys))}"
         )
     return value
 
@@ -293,7 +318,9 @@ def _noise(numbers: FloatArray, size: int) -> FloatArray | None:
 def _pose(numbers: FloatArray) -> FloatArray:
     if len(numbers) != 7:
         raise ValueError(f"a pose needs x y z qx qy qz qw, got {len(numbers)} numbers")
-    norm = float(np.linalg.norm(numbers[3:]))
+    if np.any(np.abs(numbers) > MAX_POSITION_M):
+        raise ValueError(f"a number of the pose is beyond {MAX_POSITION_M:g}")
+    norm = math.hypot(*numbers[3:])
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         raise ValueError(f"the quaternion is of length {norm:.4g}, expected 1")
     return se3.make_transform(np.asarray(Rotation.from_quat(numbers[3:]).as_matrix()), numbers[:3])

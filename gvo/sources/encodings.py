@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.bounded_text import shortened
 from gvo.errors import RecordingError
 
 
@@ -108,7 +109,8 @@ def find_encoding(name: str, encodings: dict[str, Encoding], where: str) -> Enco
     """
     if name not in encodings:
         raise RecordingError(
-            f"{where}: encoding {name!r} is not supported, expected one of {', '.join(encodings)}"
+            f"{where}: encoding {shortened(name)} is not supported, expected one of "
+            f"{', '.join(encodings)}"
         )
     return encodings[name]
 

@@ -18,15 +18,23 @@ from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.sources.depth_registration import DepthRegistration
 from gvo.sources.excerpt import Excerpt, take_excerpt
 from gvo.sources.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
+from gvo.sources.repeats import refuse_repeats
+from gvo.sources.stray_stamps import StrayStamps
 from gvo.sources.sync import Pair, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 # Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
 _N_AHEAD = 2
+# What reading or decoding one image may raise besides, in a source of one's own as well.
+_LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 
 
 def frames(
-    source: Source, config: Config, excerpt: Excerpt | None = None
+    source: Source,
+    config: Config,
+    excerpt: Excerpt | None = None,
+    *,
+    choose: Callable[[Iterator[Pair | FaultyFrame]], Iterator[Pair | FaultyFrame]] | None = None,
 ) -> Iterator[Frame | FaultyFrame]:
     """Read a recording as frames.
 
@@ -40,6 +48,8 @@ def frames(
         number of threads.
     excerpt : Excerpt, optional
         The part that is wanted; the whole where omitted.
+    choose : callable, optional
+        Is given the pairs of that part, not decoded yet, and returns those that are wanted.
 
     Yields
     ------
@@ -54,11 +64,14 @@ def frames(
     pairs = paired(source.images(), source.info.sensor, config.sync)
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)
+    if choose is not None:
+        pairs = choose(pairs)
     preparers = make_preparers(source.info)
-    if config.runtime.threads == 1:
-        yield from _one_by_one(pairs, preparers, source.info)
-    else:
-        yield from _ahead(pairs, preparers, source.info)
+    make = _one_by_one if config.runtime.threads == 1 else _ahead
+    made = make(pairs, preparers, source.info)
+    if config.sync.repeated_images == "skip":
+        made = refuse_repeats(made, source.info.stream_names)
+    yield from made
 
 
 def paired(
@@ -79,16 +92,39 @@ def paired(
     sync : SyncConfig
     limit_ms : float, optional
         Largest difference of the stamps of a pair, in place of the configured one.
+
+    Yields
+    ------
+    pair of StampedImage, or FaultyFrame
+        Also for images of which the stamp alone is wrong, see `StrayStamps`.
+
+    Raises
+    ------
+    RecordingError
+        When the recording cannot be read on.
     """
     key = pair_limit_key(sensor)
     limit = float(getattr(sync, key)) if limit_ms is None else limit_ms
-    return pair_images(
-        images,
+    stamps = StrayStamps(_readable(images))
+    pairs = pair_images(
+        stamps.sound(),
         limit_ns=round(limit * 1e6),
         partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
         queue_size=sync.queue_size,
         age_penalty=sync.age_penalty,
     )
+    for item in pairs:
+        yield from stamps.take_faulty()
+        yield item
+    yield from stamps.take_faulty()
+
+
+def _readable(images: Iterable[StampedImage]) -> Iterator[StampedImage]:
+    """Yield the images; where a disk or a network fails, say so as all sources do."""
+    try:
+        yield from images
+    except (OSError, MemoryError) as error:
+        raise RecordingError(f"it cannot be read on: {_error_text(error)}") from error
 
 
 def pair_limit_key(sensor: Sensor) -> str:
@@ -144,6 +180,7 @@ class ImagePreparer:
         RecordingError
             When size or type are not what the calibration says.
         """
+        _check_pixels(pixels, is_depth=self._is_depth)
         if pixels.shape[:2] != self._size:
             raise RecordingError(
                 f"expected {_size_text(self._size)} pixels by the calibration, got "
@@ -157,7 +194,7 @@ class ImagePreparer:
         if self._maps is not None:
             depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan))
         # a few rows mostly tell, at a sixteenth of the cost
-        if not (np.any(np.isfinite(depth[::16])) or np.any(np.isfinite(depth))):
+        if not (_is_known(depth[::16]) or _is_known(depth)):
             raise RecordingError("no pixel of the depth image is known")
         return np.asarray(depth, dtype=np.float32)
 
@@ -251,8 +288,8 @@ def _prepare(
     """Return the prepared image, or one line on what is wrong with it."""
     try:
         return preparer(image.load())
-    except RecordingError as error:
-        return f"{info.stream_names[image.stream]} image: {error}"
+    except (RecordingError, *_LOAD_ERRORS) as error:
+        return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
 
 
 def _make_frame(
@@ -266,6 +303,36 @@ def _make_frame(
     if sensor == "stereo":
         return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
     return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
+
+
+def _check_pixels(pixels: object, *, is_depth: bool) -> None:
+    """Refuse what would be taken for something else, such as 16 bits cut to 8.
+
+    Raises
+    ------
+    RecordingError
+    """
+    if not isinstance(pixels, np.ndarray):
+        raise RecordingError(f"expected an array of pixels, got {type(pixels).__name__}")
+    if is_depth:
+        expected, is_right = "float (h, w) in metres", pixels.dtype.kind == "f"
+        is_right &= pixels.ndim == 2
+    else:
+        expected, is_right = "uint8 (h, w) or (h, w, 3)", pixels.dtype == np.uint8
+        is_right &= pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if not is_right:
+        raise RecordingError(f"expected pixels of {expected}, got {pixels.dtype} {pixels.shape}")
+
+
+def _is_known(depth: NDArray[Any]) -> bool:
+    """Tell whether any depth is finite and positive."""
+    return bool(np.any((depth > 0) & (depth < np.inf)))
+
+
+def _error_text(error: Exception) -> str:
+    """Return what an error says on one line, with its kind where that is none of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, GvoError) else f"{type(error).__name__}: {text}"
 
 
 def _size_text(shape: tuple[int, ...]) -> str:

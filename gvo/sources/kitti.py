@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo.bounded_text import cut
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -158,7 +159,7 @@ def _read_projections(path: Path) -> dict[str, FloatArray]:
         try:
             projection = np.array([float(field) for field in fields[1:]])
         except ValueError as error:
-            raise CalibrationError(f"{path}, line {number}: {error}") from error
+            raise CalibrationError(f"{path}, line {number}: {cut(str(error), 300)}") from error
         if projection.size != 12 or not np.all(np.isfinite(projection)):
             raise CalibrationError(
                 f"{path}, line {number}: expected 12 finite numbers, got {projection.size}"

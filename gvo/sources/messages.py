@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any, Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gvo.bounded_text import cut
 from gvo.geometry import se3
 from gvo.sources.camera_fields import CameraFields, RegionOfInterest
 from gvo.sources.encodings import (
@@ -32,6 +34,7 @@ from gvo.sources.pixels import (
 )
 from gvo.sources.rvl import decode_rvl
 from gvo.sources.tf_paths import bare
+from gvo.trajectory_rows import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
 _NORM_TOLERANCE = 1e-2  # of quaternions
@@ -96,7 +99,9 @@ def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # no
     quaternion_xyzw = np.array([getattr(rotation, axis) for axis in "xyzw"])
     if not np.all(np.isfinite(t)):
         return Failure(reason="the position is not finite")
-    norm = float(np.linalg.norm(quaternion_xyzw))
+    if np.any(np.abs(t) > MAX_POSITION_M):
+        return Failure(reason=f"the position is beyond {MAX_POSITION_M:g} m")
+    norm = math.hypot(*quaternion_xyzw)
     if not abs(norm - 1.0) <= _NORM_TOLERANCE:
         return Failure(reason=f"the quaternion has the norm {norm:.3g}, expected 1")
     return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
@@ -184,7 +189,7 @@ def decode_compressed(
         When the image is damaged or of another format.
     """
     encoding, _, transport = message.format.partition(";")
-    where_format = f"{where} ({message.format})"
+    where_format = f"{where} ({cut(message.format, 40)})"
     pixels = decode_image(np.asarray(message.data), where_format)
     bayer = BAYER.get(encoding.strip())
     if bayer is not None and bayer.to_bgr is not None and pixels.ndim == 2:
@@ -192,7 +197,7 @@ def decode_compressed(
         pixels = convert_to_bgr(pixels, bayer.to_bgr, where_format)
     elif "compressed rgb" in transport and pixels.ndim == 3 and pixels.shape[2] == 3:
         # Early releases gave RGB to an encoder that expects BGR, and said so.
-        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        pixels = convert_to_bgr(pixels, cv2.COLOR_RGB2BGR, where_format)
     return to_8_bit(pixels, where, grey_range)
 
 
@@ -216,7 +221,7 @@ def decode_compressed_depth(
     RecordingError
         When the image is damaged or no depth.
     """
-    data, where_format = np.asarray(message.data), f"{where} ({message.format})"
+    data, where_format = np.asarray(message.data), f"{where} ({cut(message.format, 40)})"
     if "compressedDepth" not in message.format or is_png(data):
         pixels = decode_image(data, where_format)
         if pixels.dtype == np.float32 and pixels.ndim == 2:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gvo.bounded_text import exists
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.sources.bag import BagSource
@@ -79,7 +80,7 @@ def open_recording(
     config = config or Config()
     options = options or RecordingOptions()
     for one in paths:
-        if not one.exists():
+        if not exists(one):
             raise RecordingError(f"{one}: does not exist; {_KINDS}")
     if all(is_bag(one) for one in paths):
         topics = TopicChoice(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
-from gvo.sources.image_headers import check_size, is_jpeg_complete, read_header
+from gvo.sources.image_headers import (
+    check_density,
+    check_size,
+    is_jpeg_complete,
+    is_png_complete,
+    read_header,
+)
 from gvo.types import DepthArray, ImageArray
 
 _TOO_DARK = 1 << 12
+_COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}
+_MAX_FILE_BYTES = 1 << 30  # more than all pixels that are allowed need
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,8 +147,10 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
             f"begins with {data[:8].tobytes()!r}"
         )
     check_size(header.width, header.height, where)
-    if header.format == "JPEG" and not is_jpeg_complete(data):
-        raise RecordingError(f"{where}: the JPEG image is truncated")
+    check_density(header, len(data), where)
+    is_complete = _COMPLETE.get(header.format)
+    if is_complete is not None and not is_complete(data):
+        raise RecordingError(f"{where}: the {header.format} image is truncated")
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -245,8 +256,15 @@ def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
 
 def _read_bytes(path: Path) -> NDArray[np.uint8]:
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise RecordingError(f"{path}: is no file")  # a device may never end
+        if status.st_size > _MAX_FILE_BYTES:
+            raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
         return np.fromfile(path, dtype=np.uint8)
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: the file is missing") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a zero in a name
+        raise RecordingError(f"{str(path)!r}: is no name of a file") from error

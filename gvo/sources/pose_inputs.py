@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gvo.bounded_text import exists
 from gvo.errors import RecordingError
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.ground_truth import TRUTH_TYPES, BagTruth, read_bag_truth
@@ -53,10 +54,10 @@ class PoseInput:
 
 def is_in_bag(text: str) -> bool:
     """Tell whether the text is `BAG#WHAT`, or a bag. A file or folder of that name wins."""
-    if Path(text).exists():
+    if exists(Path(text)):
         return is_bag(Path(text))
     path, mark, _ = text.partition(_MARK)
-    return bool(mark) and Path(path).exists()
+    return bool(mark) and exists(Path(path))
 
 
 def read_poses(text: str) -> Trajectory:
@@ -96,7 +97,7 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     """
     if not is_in_bag(text):
         return PoseInput(name=Path(text).stem, trajectory=read_trajectory(text))
-    path, _, what = (text, "", "") if Path(text).exists() else text.partition(_MARK)
+    path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
     reader = BagReader(Path(path))
     truth = _read(reader, what, path)
     found = PoseInput(

@@ -10,6 +10,7 @@ from gvo.sources.scene import Scene
 from gvo.sources.visibility import (
     NOTHING,
     IndexArray,
+    Plane,
     SampleArray,
     View,
     find_visible,
@@ -22,7 +23,12 @@ _BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the 
 
 
 def render_image(
-    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, is_antialiased: bool = True
+    scene: Scene,
+    T_map_cam: FloatArray,
+    camera: PinholeCamera,
+    *,
+    is_antialiased: bool = True,
+    beyond: Plane | None = None,
 ) -> SampleArray:
     """Render a grey image without noise.
 
@@ -35,13 +41,15 @@ def render_image(
     camera : PinholeCamera
     is_antialiased : bool
         Four samples for the pixels where surfaces meet; otherwise one for each pixel.
+    beyond : (ndarray of float64, ndarray of float64), optional
+        Point and normal of a plane that cuts away what is before it, see `look`.
 
     Returns
     -------
     ndarray of float32, shape (height, width)
         Grey values, 0 to 255 where the light does not exceed the texture's.
     """
-    view = look(scene, T_map_cam, camera)
+    view = look(scene, T_map_cam, camera, beyond=beyond)
     if not is_antialiased:
         return _shade_rows(view, find_visible(view))
     fine = find_visible(refine(view))
@@ -58,7 +66,9 @@ def render_image(
     return image
 
 
-def render_depth(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> DepthArray:
+def render_depth(
+    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
+) -> DepthArray:
     """Render the exact depth at the centre of each pixel.
 
     Parameters
@@ -68,13 +78,15 @@ def render_depth(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> 
     T_map_cam : ndarray of float64, shape (4, 4)
         Maps camera coordinates to the map, metres.
     camera : PinholeCamera
+    beyond : (ndarray of float64, ndarray of float64), optional
+        Point and normal of a plane that cuts away what is before it, see `look`.
 
     Returns
     -------
     ndarray of float32, shape (height, width)
         Metres along the optical axis, NaN where there is nothing.
     """
-    view = look(scene, T_map_cam, camera)
+    view = look(scene, T_map_cam, camera, beyond=beyond)
     visible = find_visible(view)
     forms = np.vstack([view.inverse_depth, np.full(3, np.nan)])  # the last row: nothing
     a, b, c = forms[visible].transpose(2, 0, 1)

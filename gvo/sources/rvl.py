@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from array import array
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,13 @@ from gvo.errors import RecordingError
 from gvo.sources.image_headers import check_size
 from gvo.types import IntArray
 
+MAX_RVL_PIXELS = 1 << 24
+"""More than any depth camera has; to decode a pixel takes a hundred times its memory."""
+
 _SIZE = struct.Struct("<II")
+_MAX_NUMBERS_PER_PIXEL = 3  # a run of one value, behind none: two lengths and the value
+_MAX_NIBBLES = 64  # of a number; three make a depth
+_BLOCK_WORDS = 1 << 18
 
 
 def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
@@ -47,8 +54,8 @@ def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
     if len(data) < _SIZE.size:
         raise RecordingError(f"{where}: the RVL image has no size")
     width, height = _SIZE.unpack(data[: _SIZE.size].tobytes())
-    check_size(width, height, where)
-    numbers = _numbers(data[_SIZE.size :])
+    check_size(width, height, where, max_pixels=MAX_RVL_PIXELS)
+    numbers = _numbers(data[_SIZE.size :], _MAX_NUMBERS_PER_PIXEL * width * height)
     firsts, starts, lengths = _runs(numbers, width * height, where)
     is_known = np.repeat(np.arange(len(lengths)), lengths)
     steps = np.arange(len(is_known)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
@@ -59,23 +66,40 @@ def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:
     return counts.reshape(height, width)
 
 
-def _numbers(code: NDArray[np.uint8]) -> IntArray:
-    """Return the numbers of the code; those cut off by the end are left out."""
+def _numbers(code: NDArray[np.uint8], n_max: int) -> IntArray:
+    """Return the numbers of the code, no more than are needed; one cut off by the end is left out.
+
+    Block by block: all at once would take a hundred times the memory of the code.
+    """
     words = np.frombuffer(code[: len(code) // 4 * 4].tobytes(), dtype="<u4")
-    nibbles = ((words[:, np.newaxis] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15).ravel()
+    rest = np.zeros(0, dtype=np.uint8)
+    blocks: list[IntArray] = [np.zeros(0, dtype=np.int64)]
+    n_found, start = 0, 0
+    while start < len(words) and n_found < n_max and len(rest) <= _MAX_NIBBLES:
+        block = words[start : start + _BLOCK_WORDS, np.newaxis]
+        nibbles = (block >> np.arange(28, -1, -4, dtype=np.uint32)) & 15
+        numbers, rest = _numbers_of(np.concatenate([rest, nibbles.astype(np.uint8).ravel()]))
+        blocks.append(numbers)
+        n_found += len(numbers)
+        start += _BLOCK_WORDS
+    return np.concatenate(blocks)
+
+
+def _numbers_of(nibbles: NDArray[np.uint8]) -> tuple[IntArray, NDArray[np.uint8]]:
+    """Return the numbers of nibbles, and the nibbles of the one that goes on."""
     ends = np.flatnonzero(nibbles < 8)
     if len(ends) == 0:
-        return np.zeros(0, dtype=np.int64)
-    nibbles = nibbles[: ends[-1] + 1]
+        return np.zeros(0, dtype=np.int64), nibbles
+    whole, rest = np.split(nibbles, [ends[-1] + 1])
     begins = np.concatenate([[0], ends[:-1] + 1])
-    places = np.arange(len(nibbles)) - np.repeat(begins, ends + 1 - begins)
-    bits = (nibbles & 7).astype(np.int64) << np.minimum(3 * places, 60)
-    return np.asarray(np.add.reduceat(bits, begins), dtype=np.int64)
+    places = np.arange(len(whole)) - np.repeat(begins, ends + 1 - begins)
+    bits = (whole & 7).astype(np.int64) << np.minimum(3 * places, 60)
+    return np.asarray(np.add.reduceat(bits, begins), dtype=np.int64), rest
 
 
 def _runs(numbers: IntArray, n_pixels: int, where: str) -> tuple[IntArray, IntArray, IntArray]:
     """Follow the runs: the first number of each, its first pixel, and its length."""
-    runs = []
+    runs = array("q")
     view, position, pixel = numbers.data, 0, 0
     while pixel < n_pixels:
         if position + 2 > len(view):
@@ -85,7 +109,7 @@ def _runs(numbers: IntArray, n_pixels: int, where: str) -> tuple[IntArray, IntAr
         is_sane = zeros >= 0 and length >= 0 and zeros + length > 0
         if not is_sane or pixel + length > n_pixels or position + length > len(view):
             raise RecordingError(f"{where}: the RVL image is damaged at pixel {pixel}")
-        runs.append((position, pixel, length))
+        runs.extend((position, pixel, length))
         pixel, position = pixel + length, position + length
-    firsts, starts, lengths = np.array(runs, dtype=np.int64).T
+    firsts, starts, lengths = np.frombuffer(runs, dtype=np.int64).reshape(-1, 3).T
     return firsts, starts, lengths

@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
-from gvo.sources.rendering import render_depth, render_image, to_uint8
+from gvo.sources.rendering import to_uint8
 from gvo.sources.scene import Scene
 from gvo.sources.sensor_noise import SensorNoise, expose, spoil_depth
+from gvo.sources.stage import Stage
+from gvo.sources.worlds.deceptive_rooms import blank_room, mirror_room, turn_away
+from gvo.sources.worlds.facade import facade, ride
 from gvo.sources.worlds.motion import drive, look_around
 from gvo.sources.worlds.room import room
 from gvo.sources.worlds.street import street
+from gvo.sources.worlds.traffic import traffic, traffic_drive
 from gvo.trajectory import Trajectory
 from gvo.types import DepthArray, FloatArray, ImageArray, IntArray
 
-WorldName: TypeAlias = Literal["driving", "handheld"]
+WorldName: TypeAlias = Literal["driving", "handheld", "traffic", "facade", "mirror", "wall"]
 
 _START_NS = 1_700_000_000_000_000_000
 
@@ -31,7 +35,7 @@ _START_NS = 1_700_000_000_000_000_000
 class _World:
     """A scene, a motion through it, and the cameras that fit."""
 
-    build: Callable[[int], Scene]
+    build: Callable[[int], Scene | Stage]
     move: Callable[[FloatArray], FloatArray]
     camera: PinholeCamera
     baseline: float
@@ -39,25 +43,41 @@ class _World:
     max_depth_m: float
 
 
-_WORLDS = {
-    "driving": _World(
-        build=street,
-        move=drive,
+def _by_car(
+    build: Callable[[int], Scene | Stage], move: Callable[[FloatArray], FloatArray]
+) -> _World:
+    return _World(
+        build=build,
+        move=move,
         camera=PinholeCamera(
             fx=707.0912, fy=707.0912, cx=601.8873, cy=183.1104, width=1226, height=370
         ),
         baseline=0.53715,
         rate_hz=10,
         max_depth_m=80.0,
-    ),
-    "handheld": _World(
-        build=room,
-        move=look_around,
+    )
+
+
+def _by_hand(
+    build: Callable[[int], Scene | Stage], move: Callable[[FloatArray], FloatArray]
+) -> _World:
+    return _World(
+        build=build,
+        move=move,
         camera=PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480),
         baseline=0.11,
         rate_hz=30,
         max_depth_m=8.0,
-    ),
+    )
+
+
+_WORLDS = {
+    "driving": _by_car(street, drive),
+    "handheld": _by_hand(room, look_around),
+    "traffic": _by_car(traffic, traffic_drive),
+    "facade": _by_car(facade, ride),
+    "mirror": _by_hand(mirror_room, look_around),
+    "wall": _by_hand(blank_room, turn_away),
 }
 
 
@@ -69,9 +89,16 @@ class SyntheticRecording:
 
     Parameters
     ----------
-    world : {"driving", "handheld"}
-        A drive around a block of houses with KITTI's cameras at 10 Hz, or a camera held in the
-        hand in a furnished room, 640 x 480 at 30 Hz.
+    world : {"driving", "handheld", "traffic", "facade", "mirror", "wall"}
+        `driving`: around a block of houses with KITTI's cameras at 10 Hz. `handheld`: a camera
+        held in the hand in a furnished room, 640 x 480 at 30 Hz. The others deceive, each with
+        the cameras of one of these. `traffic`: the car halts, and a bus fills two thirds of the
+        image; from 3 to 10 s. `facade`: sideways along a house whose windows repeat exactly, by
+        more than half a window per frame. `mirror`: the room with a large mirror that swings:
+        what is seen in it moves as one. A stereo camera sees the virtual room behind the glass;
+        the depth of an RGB-D camera is that of the glass, as of dusty ones, while its image
+        shows what is reflected. `wall`: the hand turns to a wall of one grey, which fills the
+        image from 3.8 to 7.0 s, and turns back.
     sensor : {"stereo", "rgbd"}
     n_frames : int
         Length; the drive closes its lap of 400 m after about 480 frames.
@@ -113,7 +140,8 @@ class SyntheticRecording:
         frames = np.arange(n_frames, dtype=np.int64)
         self._elapsed_ns: IntArray = frames * 1_000_000_000 // setting.rate_hz
         self._T_map_cam = setting.move(np.asarray(1e-9 * self._elapsed_ns, dtype=np.float64))
-        self._scene = setting.build(seed)
+        built = setting.build(seed)
+        self._stage = built if isinstance(built, Stage) else Stage(scene=built)
 
     @property
     def info(self) -> RecordingInfo:
@@ -157,10 +185,17 @@ class SyntheticRecording:
         Returns
         -------
         ndarray of float32, shape (height, width)
-            Metres along the optical axis at the centre of each pixel.
+            Metres along the optical axis at the centre of each pixel; of a mirror what is seen in
+            it for stereo, its glass for RGB-D.
         """
         T_map_cam, camera = self._view(index, stream)
-        return render_depth(self._scene, T_map_cam, camera)
+        is_reflected = self._sensor == "stereo"
+        return self._stage.render_depth(
+            self._elapsed_s(index), T_map_cam, camera, is_reflected=is_reflected
+        )
+
+    def _elapsed_s(self, index: int) -> float:
+        return 1e-9 * float(self._elapsed_ns[index])
 
     def _view(self, index: int, stream: int) -> tuple[FloatArray, PinholeCamera]:
         """Return pose and camera of a stream; the depth camera is the colour camera."""
@@ -178,8 +213,8 @@ class SyntheticRecording:
 
     def _load_image(self, index: int, stream: int, rng: np.random.Generator) -> ImageArray:
         T_map_cam, camera = self._view(index, stream)
-        grey = render_image(self._scene, T_map_cam, camera)
-        elapsed_s = 1e-9 * float(self._elapsed_ns[index])
+        elapsed_s = self._elapsed_s(index)
+        grey = self._stage.render_image(elapsed_s, T_map_cam, camera)
         return to_uint8(expose(grey, self._noise, rng, stream=stream, elapsed_s=elapsed_s))
 
 

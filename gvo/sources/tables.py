@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gvo.bounded_text import cut, read_text
 from gvo.errors import RecordingError
 from gvo.trajectory import parse_stamp
 
+_MAX_REASON = 300  # characters
 _Row = tuple[int, list[str]]
 
 
@@ -68,12 +70,12 @@ def read_stamp(text: str, where: str, *, unit_ns: int) -> int:
     try:
         return parse_stamp(text, unit_ns=unit_ns)
     except ValueError as error:
-        raise RecordingError(f"{where}: {error}") from None
+        raise RecordingError(f"{where}: {cut(str(error), _MAX_REASON)}") from None
 
 
 def _read_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return read_text(path, encoding="utf-8-sig").splitlines()
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: the file is missing") from error
     except UnicodeDecodeError as error:

@@ -21,6 +21,7 @@ from gvo.sources.tf_paths import (
 )
 from gvo.sources.tf_samples import SampleLog
 from gvo.trajectory import format_stamp
+from gvo.trajectory_rows import MAX_POSITION_M
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 _SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2
@@ -352,6 +353,8 @@ def _fault(parent: str, child: str, pose: tuple[float, ...]) -> str:
         return "a frame cannot be its own parent"
     if not all(map(math.isfinite, pose)):
         return "the numbers are not finite"
+    if any(abs(number) > MAX_POSITION_M for number in pose):
+        return f"a number is beyond {MAX_POSITION_M:g}"
     squared_norm = sum(number * number for number in pose[3:])
     if abs(squared_norm - 1.0) >= _SQUARED_NORM_TOLERANCE:
         return f"the quaternion has the norm {math.sqrt(squared_norm):.3g}, expected 1"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+from gvo.bounded_text import exists
 from gvo.errors import TrajectoryError
 from gvo.sources.tf_paths import bare
 
@@ -74,7 +75,7 @@ def parse_truth(text: str) -> TruthSpec:
     >>> parse_truth("/vicon/drone")
     TopicTruth(name='/vicon/drone')
     """
-    if Path(text).exists():
+    if exists(Path(text)):
         return FileTruth(path=Path(text))
     spec = parse_bag_truth(text) if text.startswith(("tf:", "topic:", "/")) else None
     if spec is None:

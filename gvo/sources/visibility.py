@@ -24,6 +24,7 @@ from gvo.types import BoolArray, FloatArray, IntArray
 
 SampleArray: TypeAlias = NDArray[np.float32]
 IndexArray: TypeAlias = NDArray[np.int16]
+Plane: TypeAlias = tuple[FloatArray, FloatArray]
 
 NOTHING = -1
 _NEAR_M = 0.05
@@ -44,8 +45,8 @@ class View:
         1/z in 1/m.
     texels_s, texels_t : ndarray of float64, shape (n, 3)
         Texture coordinates over z, texels per metre.
-    inside : ndarray of float64, shape (n, 4, 3)
-        All not negative inside of the rectangle.
+    inside : ndarray of float64, shape (n, 4 or 5, 3)
+        All not negative inside of the rectangle, and beyond the plane that cuts the view.
     corners : ndarray of float64, shape (n, 4, 3)
         In the camera frame, metres.
     """
@@ -60,7 +61,13 @@ class View:
     corners: FloatArray
 
 
-def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
+def look(
+    scene: Scene,
+    T_map_cam: FloatArray,
+    camera: PinholeCamera,
+    *,
+    beyond: Plane | None = None,
+) -> View:
     """Keep the rectangles in view and express them as linear forms of the pixel.
 
     Parameters
@@ -71,6 +78,9 @@ def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
         Maps camera coordinates to the map, metres.
     camera : PinholeCamera
         Of the image.
+    beyond : (ndarray of float64, ndarray of float64), optional
+        Point and normal of a plane, `map` frame: only what lies on the side that the normal
+        points to is seen.
 
     Returns
     -------
@@ -94,6 +104,10 @@ def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
         return np.asarray(axes[keep] @ K_inverse - offsets[:, np.newaxis] * inverse_depth)
 
     s, t = coordinate(axes_s), coordinate(axes_t)
+    inside = []
+    if beyond is not None:
+        point, normal = T_cam_map[:3, :3] @ beyond[0] + T_cam_map[:3, 3], R @ beyond[1]
+        inside.append(normal @ K_inverse - (normal @ point) * inverse_depth)
     width, height = scene.sizes[keep].T[..., np.newaxis]
     scale, shift = scene.texels_per_m[keep], scene.texel_offsets[keep]
     return View(
@@ -103,7 +117,9 @@ def look(scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera) -> View:
         inverse_depth=inverse_depth,
         texels_s=scale[:, :1] * s + shift[:, :1] * inverse_depth,
         texels_t=scale[:, 1:] * t + shift[:, 1:] * inverse_depth,
-        inside=np.stack([s, width * inverse_depth - s, t, height * inverse_depth - t], axis=1),
+        inside=np.stack(
+            [s, width * inverse_depth - s, t, height * inverse_depth - t, *inside], axis=1
+        ),
         corners=corners[keep],
     )
 

@@ -12,7 +12,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.types import Estimate, FloatArray, ImageArray, IntArray
+from gvo.frame_links import FrameLink
+from gvo.odometry import FrameResult
+from gvo.types import (
+    Estimate,
+    FloatArray,
+    ImageArray,
+    IntArray,
+    Rejected,
+    RelativePose,
+    SegmentJoin,
+    Status,
+)
 from gvo.view.clouds import Cloud, KeyframeClouds, put_together
 from gvo.view.moments import Entry, Moment
 from gvo.view.spool import Spool
@@ -21,6 +32,8 @@ from gvo.view.spool import Spool
 Path: TypeAlias = tuple[IntArray, FloatArray]
 
 _JPEG_QUALITY = 85
+# What an entry is made of.
+_KINDS = (Entry, Estimate, FrameLink, FrameResult, Rejected, RelativePose, SegmentJoin, Status)
 
 
 class History:
@@ -37,7 +50,7 @@ class History:
     def __init__(self, first_index: int = 0) -> None:
         self.first_index = first_index
         self._shown = first_index - 1
-        self._spool = Spool()
+        self._spool = Spool(_KINDS)
         self._lock = RLock()
         self._stamps_ns: list[int] = []
         self._latest: tuple[int, Entry] | None = None

@@ -50,7 +50,7 @@ class ViewServer(Closable):
     def url(self) -> str:
         """Address of the page."""
         host = self.viser.get_host()
-        shown = "localhost" if host in ("0.0.0.0", "::") else host
+        shown = "localhost" if host in ("0.0.0.0", "::") else host  # noqa: S104 - only shown
         return f"http://{shown}:{self.viser.get_port()}"
 
     def on_close(self, action: Callable[[], None]) -> None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import pickle
 import tempfile
 import weakref
+from collections.abc import Sequence
 from threading import Lock
 from typing import Any
+
+from gvo.view.packing import Packer
 
 
 class Spool:
     """A list that grows in an unnamed temporary file; it is gone with the object.
 
-    It reads back what it wrote itself, and nothing else.
+    Parameters
+    ----------
+    kinds : sequence of type
+        Classes of the values, as for `Packer`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kinds: Sequence[type] = ()) -> None:
+        self._packer = Packer(kinds)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the object
         weakref.finalize(self, self._file.close)
         self._ends = [0]
@@ -26,8 +32,14 @@ class Spool:
         return len(self._ends) - 1
 
     def append(self, value: object) -> None:
-        """Write a value at the end."""
-        content = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+        """Write a value at the end.
+
+        Raises
+        ------
+        ValueError
+            When it holds something of another class.
+        """
+        content = self._packer.pack(value)
         with self._lock:
             self._file.seek(self._ends[-1])
             self._file.write(content)
@@ -47,4 +59,4 @@ class Spool:
             start, end = self._ends[index : index + 2]
             self._file.seek(start)
             content = self._file.read(end - start)
-        return pickle.loads(content)
+        return self._packer.unpack(content)

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.backend.checks import covariance_fault, find_faults, prior_fault, transform_fault
+from gvo.backend.checks import (
+    covariance_fault,
+    find_faults,
+    place_fault,
+    pose_fault,
+    prior_fault,
+    sane_covariance,
+    transform_fault,
+)
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
@@ -114,3 +122,82 @@ def test_a_position_that_is_none_is_refused_with_its_reason(prior: Prior, match:
 def test_a_position_anywhere_on_earth_is_let_through() -> None:
     position = np.array([3.9e6, -1.2e5, 6.3e6])
     assert prior_fault(PositionPrior(position_world=position, covariance=4.0 * np.eye(3))) == ""
+
+
+def assert_both_doors_say(one: Edge, is_good: bool) -> None:
+    """Check that the quick look at all edges and the long one at each agree."""
+    fault = transform_fault(one.T_reference_frame) or covariance_fault(one.covariance)
+    assert [bool(found) for found in find_faults([one])] == [bool(fault)] == [not is_good]
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds, size=st.sampled_from([2e-5, -2e-5]))
+def test_a_rotation_that_is_off_in_any_one_way_is_refused(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    T = se3.exp(rng.normal(size=6))
+    for row in range(3):
+        for column in range(3):
+            # A row too long or too short; two rows that are not square to each other.
+            stretch = np.eye(4)
+            stretch[row, column] += size
+            assert_both_doors_say(edge(stretch @ T, np.eye(6)), is_good=False)
+            stretch[row, column] = float(row == column) + 1e-8
+            assert_both_doors_say(edge(stretch @ T, np.eye(6)), is_good=True)
+        mirror = np.eye(4)
+        mirror[row, row] = -1.0
+        assert_both_doors_say(edge(mirror @ T, np.eye(6)), is_good=False)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds)
+def test_the_bounds_of_what_is_let_in_are_those_that_are_told(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = se3.exp(rng.normal(size=6))
+    axis, sign = int(rng.integers(3)), float(rng.choice([-1.0, 1.0]))
+    for factor, is_good in ((0.999, True), (1.001, False)):
+        far = changed(T, axis, 3, value=sign * factor * 1e8)
+        assert_both_doors_say(edge(far, np.eye(6)), is_good)
+        place = changed(np.zeros(3), axis, value=sign * factor * 1e8)
+        known = PositionPrior(position_world=place, covariance=np.eye(3))
+        assert bool(prior_fault(known)) == (not is_good)
+        for sigma in (1e-8 / factor, 1e6 * factor):
+            variances = changed(np.ones(6), int(rng.integers(6)), value=sigma**2)
+            assert_both_doors_say(edge(T, np.diag(variances)), is_good)
+        # Correlations: of eigenvalues just above and just below what rounding leaves.
+        row, column = rng.choice(6, size=2, replace=False)
+        sigmas = np.diag(10.0 ** rng.uniform(-4, 2, size=6))
+        least = 1e-11 if is_good else -1e-11
+        C = changed(np.eye(6), row, column, value=sign * (1.0 - least))
+        C = changed(C, column, row, value=sign * (1.0 - least))
+        assert_both_doors_say(edge(T, sigmas @ C @ sigmas), is_good)
+        skewed = changed(np.eye(6), row, column, value=0.999e-6 if is_good else 1.001e-6)
+        assert_both_doors_say(edge(T, sigmas @ skewed @ sigmas), is_good)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds)
+def test_a_covariance_that_is_made_up_keeps_the_sigmas_that_can_be_kept(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    good = random_covariance(rng)
+    np.testing.assert_allclose(sane_covariance(good), good, rtol=1e-15)
+    skewed = good + 1e-9 * np.sqrt(np.outer(np.diag(good), np.diag(good))) * rng.normal(size=(6, 6))
+    np.testing.assert_array_equal(sane_covariance(skewed), sane_covariance(skewed).T)
+    bad = np.diag([4.0, np.nan, np.inf, -1.0, 1e-30, 1e30])
+    bad[0, 1] = 7.0
+    order = rng.permutation(6)
+    made_up = sane_covariance(bad[np.ix_(order, order)])
+    assert covariance_fault(made_up) == ""
+    sigmas = np.array([2.0, 1e3, 1e3, 1e-5, 1e-5, 1e3])[order]
+    np.testing.assert_allclose(made_up, np.diag(sigmas**2), rtol=1e-12)
+
+
+def test_a_result_that_is_nowhere_is_told() -> None:
+    T = np.eye(4)
+    # A prior at the border may be moved a little: twice as far is still a place.
+    assert place_fault(np.array([[0.0, -1.99e8, 3.0], [1.0, 2.0, 3.0]])) == ""
+    assert re.search(r"diverged to 2\.01e\+08 m", place_fault(np.array([1.0, -2.01e8, 3.0])))
+    assert pose_fault(T, np.eye(6)) == ""
+    for entry in (np.nan, np.inf):
+        assert "not finite" in pose_fault(changed(T, 1, 1, value=entry), np.eye(6))
+        assert "not finite" in pose_fault(T, changed(np.eye(6), 2, 3, value=entry))
+    assert "diverged" in pose_fault(changed(T, 2, 3, value=-1e9), np.eye(6))

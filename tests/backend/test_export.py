@@ -53,6 +53,20 @@ def test_names_that_are_no_numbers_are_numbered_and_told(tmp_path: Path) -> None
     assert lines[2].startswith("EDGE_SE3:QUAT 0 1 ")
 
 
+@pytest.mark.parametrize("names", [[5, "right", 7], [4, -1], [2.5, 3], [-3, "a"]])
+def test_one_name_that_is_no_number_is_enough_to_number_all(
+    names: list[FrameId], tmp_path: Path
+) -> None:
+    window = fill(names)
+    window.write_g2o(tmp_path / "window.g2o")
+    lines = (tmp_path / "window.g2o").read_text().splitlines()
+    for number, (name, line) in enumerate(zip(names, lines, strict=False)):
+        assert line.startswith(f"VERTEX_SE3:QUAT {number} ")
+        assert line.endswith(f"# {name!r}")
+    _, values = gtsam.readG2o(str(tmp_path / "window.g2o"), True)
+    assert sorted(values.keys()) == list(range(len(names)))
+
+
 def test_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(SmoothingError, match="cannot be written"):
         fill(["a"]).write_g2o(tmp_path / "no such folder" / "window.g2o")

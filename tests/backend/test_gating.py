@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gvo.backend.gating import Verdict, disagreement, judge
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
@@ -144,3 +146,98 @@ def test_a_stretch_of_the_arm_is_not_excused_by_turns_of_the_references(
     window = two_references(T_0_1, axis / np.linalg.norm(axis))
     estimate = window.add_pose(2, 2 * STEP_NS, edges)
     assert [refused.reference_id for refused in estimate.rejected] == [0]
+
+
+# Where to start, by what the edges say together.
+
+
+def random_covariance(rng: np.random.Generator, sigma: float) -> FloatArray:
+    factor = np.eye(6) + 0.5 * rng.normal(size=(6, 6))
+    return np.asarray(sigma**2 * factor @ factor.T)
+
+
+def optimum(edges: list[Edge], references: dict[FrameId, FloatArray], T: FloatArray) -> FloatArray:
+    """Return the least squares of edges from known references, by GTSAM's batch."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(0, gtsam.Pose3(T))
+    for each in edges:
+        noise = gtsam.noiseModel.Gaussian.Covariance(each.covariance)
+        predicted = references[each.reference_id] @ each.T_reference_frame
+        graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(predicted), noise))
+    answer = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.asarray(answer.atPose3(0).matrix())
+
+
+def verdict_of(
+    edges: list[Edge], references: dict[FrameId, FloatArray], *, gate: float | None
+) -> Verdict:
+    return judge(
+        edges,
+        pose_of=lambda frame_id: gtsam.Pose3(references[frame_id]),
+        relative_covariance=lambda *_: np.zeros((6, 6)),
+        motion=lambda: None,
+        gate=gate,
+    )
+
+
+@pytest.mark.parametrize("gate", [None, 1e-3, 10.0])
+@settings(deadline=None, max_examples=10)
+@given(seed=seeds, n=st.integers(3, 6), n_wrong=st.integers(0, 1))
+def test_the_start_is_the_optimum_of_the_edges_that_agree(
+    gate: float | None, seed: int, n: int, n_wrong: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_world_frame = se3.exp(rng.normal(size=6))
+    references: dict[FrameId, FloatArray] = {k: se3.exp(rng.normal(size=6)) for k in range(n)}
+    edges = []
+    for k in range(n):
+        covariance = random_covariance(rng, 1e-4)
+        noise = 0.5 * rng.multivariate_normal(np.zeros(6), covariance)
+        if k >= n - n_wrong:
+            noise[3:] += [0.3, -0.2, 0.4]
+        T = np.linalg.inv(references[k]) @ T_world_frame @ se3.exp(noise)
+        edges.append(edge(k, T, covariance))
+    order = rng.permutation(n)
+    verdict = verdict_of([edges[k] for k in order], references, gate=gate)
+    if gate == 1e-3:
+        # Of edges that all disagree nobody is outvoted: none has more beside it than another.
+        assert verdict.reasons == [""] * n
+    else:
+        wrong = {int(k) for k, reason in zip(order, verdict.reasons, strict=True) if reason}
+        assert wrong == (set(range(n - n_wrong, n)) if gate else set())
+    expected = optimum(edges[: n - n_wrong], references, T_world_frame)
+    # Twists about an outlier, where it comes first, are exact to a part of its distance only.
+    tolerance = 1e-4 if n_wrong else 1e-7
+    np.testing.assert_allclose(verdict.T_world_start.matrix(), expected, atol=tolerance)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_a_disagreement_is_told_in_sigmas_of_both_covariances(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    known, T = random_covariance(rng, 1e-2), se3.exp(rng.normal(size=6))
+    measured = random_covariance(rng, 1e-2)
+    twist = rng.multivariate_normal(np.zeros(6), known + measured)
+    sigmas = float(np.sqrt(twist @ np.linalg.solve(known + measured, twist)))
+    one = edge("a", se3.normalize(T @ se3.exp(twist)), measured)
+    assert disagreement(one, T, known, gate=1.001 * sigmas) == ""
+    reason = disagreement(one, T, known, gate=0.999 * sigmas)
+    assert f"by {sigmas:.3g} sigma" in reason
+    assert f"window.gate: {0.999 * sigmas:g}" in reason
+
+
+def test_what_the_references_have_in_common_is_no_disagreement_of_theirs() -> None:
+    # The same difference, along the motion of the second reference and not.
+    unknown = np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    here: dict[FrameId, FloatArray] = {0: np.eye(4), 1: shifted(0.0, 0.0, 1.0)}
+    for offset, n_refused in ((shifted(2.0, 0.0, 0.0), 0), (shifted(0.0, 2.0, 0.0), 1)):
+        edges = [edge(0, shifted(0.0, 0.0, 2.0), 1e-4 * np.eye(6)) for _ in range(2)]
+        edges.append(edge(1, shifted(0.0, 0.0, 1.0) @ offset, 1e-4 * np.eye(6)))
+        verdict = judge(
+            edges,
+            pose_of=lambda frame_id: gtsam.Pose3(here[frame_id]),
+            relative_covariance=lambda a, b: np.zeros((6, 6)) if a == b else unknown,
+            motion=lambda: None,
+            gate=10.0,
+        )
+        assert [bool(reason) for reason in verdict.reasons] == [False, False, n_refused == 1]

@@ -124,7 +124,7 @@ def test_coasting_goes_on_over_a_change_and_is_lost_by_the_new_limit() -> None:
             window.reconfigure(WindowConfig(lost_after_s=0.35, coasting_sigma_m_per_s=300.0))
         estimate = window.add_pose(frame, frame * STEP_NS, [])
         statuses.append((estimate.status, estimate.covariance[5, 5] > 100.0))
-    assert [status for status, _ in statuses] == [Status.COASTING] * 4 + [Status.LOST] * 2
+    assert [status for status, _ in statuses] == [Status.COASTING] * 3 + [Status.LOST] * 3
     assert [is_unsure for _, is_unsure in statuses] == [False] * 3 + [True] * 3
 
 

@@ -201,7 +201,7 @@ def coarse_depth(recording: Any) -> Any:
     )
 
 
-_SCALE = {"depth: scale", "depth: within limits"}
+_SCALE = {"depth: scale", "depth: within limits", "depth: corners with depth"}
 
 
 @pytest.mark.parametrize(
@@ -246,13 +246,16 @@ def noise_alone(image: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(np.rint(noise), dtype=np.uint8)
 
 
+WITH_DEPTH = "depth: corners with depth"
+
+
 @pytest.mark.parametrize(
     ("fault", "expected", "tolerated"),
     [
-        (darkness, {"colour: brightness"}, {"colour: corners"}),
-        (glare, {"colour: clipped pixels"}, {"colour: brightness", "colour: corners"}),
+        (darkness, {"colour: brightness"}, {"colour: corners", WITH_DEPTH}),
+        (glare, {"colour: clipped pixels"}, {"colour: brightness", "colour: corners", WITH_DEPTH}),
         (out_of_focus, {"colour: blur"}, set()),
-        (noise_alone, {"colour: corners"}, {"colour: corners found again"}),
+        (noise_alone, {"colour: corners"}, {"colour: corners found again", WITH_DEPTH}),
     ],
 )
 def test_faults_of_images_are_found_and_nothing_else(

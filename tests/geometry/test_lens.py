@@ -177,6 +177,49 @@ def test_a_lens_narrower_than_a_plane_is_enlarged_until_no_border_is_empty() -> 
     assert maps[1].max() <= 479.01
 
 
+def test_a_pair_of_plain_lenses_shows_no_empty_border_at_the_middle_of_its_sides() -> None:
+    lens = raw("plumb_bob", _RADTAN)
+    for rectified in rectify_stereo(lens, lens, mount(1)):
+        maps = rectification_maps(rectified)
+        assert maps is not None
+        columns, rows = maps[0][240, [0, -1]], maps[1][[0, -1], 256]
+        for values, size in ((columns, 512), (rows, 480)):
+            assert values.min() >= -1.0
+            assert values.max() <= size
+
+
+def test_lenses_that_see_behind_the_plane_of_the_pair_are_still_rectified() -> None:
+    # Half a field of 77 degrees, turned by another 17: the border lies behind the raw camera.
+    T_left_right = mount(0)
+    T_left_right[:3, :3] = Rotation.from_rotvec([0.0, 0.6, 0.0]).as_matrix()
+    lens = raw("equidistant", [0.0] * 4, focal=60.0)
+    for rectified in rectify_stereo(lens, lens, T_left_right):
+        # No enlargement up to twice leaves the border full: the resolution of the centre stays.
+        assert rectified.P[0, 0] == 60.0
+        maps = rectification_maps(rectified)
+        assert maps is not None
+        assert 0.0 < maps[0][240, 256] < 511.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_middle_of_a_wide_pair_is_between_the_middles_of_its_lenses(seed: int) -> None:
+    # Cameras that look far away from the baseline's square: turned by a quarter of a radian.
+    T_left_right = mount(seed)
+    T_left_right[:3, 3] = [0.1, 0.02, 0.025]
+    left, right = rectify_stereo(
+        raw("equidistant", _FISHEYE, focal=190.0),
+        raw("equidistant", _FISHEYE, focal=192.0, shift=15.0),
+        T_left_right,
+    )
+    seen = []
+    for camera in (left, right):
+        middle = np.array([[[(512 - 1) / 2, (480 - 1) / 2]]])
+        pixel = cv2.fisheye.undistortPoints(middle, camera.K, camera.D, R=camera.R, P=left.P[:, :3])
+        seen.append(np.asarray(pixel).ravel())
+    np.testing.assert_allclose(np.mean(seen, axis=0), [511 / 2, 479 / 2], atol=1e-6)
+    np.testing.assert_array_equal(left.P[:, :3], right.P[:, :3])
+
+
 def test_a_fisheye_without_coefficients_is_still_no_pinhole() -> None:
     camera = raw("equidistant", [0.0] * 4)
     as_raw = Calibration(

@@ -198,6 +198,24 @@ def test_matches_without_a_common_motion_are_a_failure_with_counts() -> None:
     assert f"{result.n_inliers} of 60" in result.reason
 
 
+@pytest.mark.parametrize("metric", ["reprojection", "distance"])
+def test_as_many_inliers_as_are_needed_are_enough(metric: str) -> None:
+    rng = np.random.default_rng(3)
+    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": metric})
+    T, matches, is_inlier = scene(rng, 15, 3)
+    result = run(matches, config)
+    assert isinstance(result, Consensus), result
+    np.testing.assert_array_equal(result.inliers, is_inlier)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    _, one_less, _ = scene(rng, 15, 4)
+    failure = run(one_less, config)
+    assert isinstance(failure, Failure)
+    assert (failure.n_matches, failure.n_inliers) == (15, 11)
+    exactly = run(matches.select(is_inlier), config)
+    assert isinstance(exactly, Consensus)
+    assert exactly.inliers.all()
+
+
 def test_points_on_a_line_are_a_failure() -> None:
     steps = np.linspace(2.0, 9.0, 30)[:, np.newaxis]
     line = steps * [0.1, 0.05, 1.0]
@@ -298,3 +316,53 @@ def test_no_more_hypotheses_are_tried_than_configured(
     _, matches, _ = scene(np.random.default_rng(3), 60, 60)
     config = SETTINGS.model_copy(update={"n_hypotheses": n})
     assert count_hypotheses(monkeypatch, matches, config) == n
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
+    # In a block of 64 samples there may well be none: the search goes on.
+    rng = np.random.default_rng(seed)
+    T = random_motion(rng)
+    source = np.column_stack(
+        [np.linspace(-1, 1, 400), np.linspace(-1, 0.5, 400), np.full(400, 5.0)]
+    )
+    source[rng.integers(400)] += [0.0, 2.0, 1.0]
+    target = source @ T[:3, :3].T + T[:3, 3]
+    ones = np.ones((400, 3))
+    matches = Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=uvd(source),
+        target_uvd=uvd(target),
+        source_sigmas=ones,
+        target_sigmas=ones,
+    )
+    result = run(matches, SETTINGS.model_copy(update={"n_hypotheses": 3000}), 100 + seed)
+    assert isinstance(result, Consensus)
+    assert result.inliers.all()
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+
+
+def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
+    # All weight on three neighbours, each off by less than the threshold: the fit turns far.
+    rng = np.random.default_rng(5)
+    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": "distance"})
+    source = random_points(rng, 30)
+    source[:3] = [0.0, 0.0, 5.0] + 0.1 * np.eye(3)
+    target = source.copy()
+    target[:3] += 0.08 * np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    ones = np.ones((30, 3))
+    matches = Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=uvd(source),
+        target_uvd=uvd(target),
+        source_sigmas=ones,
+        target_sigmas=ones,
+    )
+    weights = np.where(np.arange(30) < 3, 1.0, 1e-9)
+    result = ransac_rigid(matches, CAMERA, config, weights=weights, rng=rng)
+    assert isinstance(result, Consensus)
+    assert result.inliers[3:].all()
+    at_fit = find_inliers(result.T_target_source[np.newaxis], matches, CAMERA, config)[0]
+    assert np.count_nonzero(at_fit) < config.min_inliers

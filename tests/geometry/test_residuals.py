@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import approx_fprime
+from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
@@ -122,6 +122,82 @@ def test_the_gate_counts_sigmas_of_the_residual(seed: int) -> None:
     np.testing.assert_array_equal(
         linearize(residuals.select(chosen), T).r, linearize(residuals, T).r[:, chosen]
     )
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=seeds)
+def test_settled_points_are_the_likeliest_for_both_frames(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = motion(rng)
+    n = 5
+    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
+    seen = np.array([project(T[:3, :3] @ point + T[:3, 3]) for point in source])
+    matches = Correspondences(
+        source_points=source,
+        target_points=source @ T[:3, :3].T + T[:3, 3],
+        source_uvd=np.array([project(point) for point in source]),
+        # Small against the curvature of the projection: one linear step is the whole way.
+        target_uvd=seen + 1e-3 * rng.normal(size=(n, 3)),
+        source_sigmas=rng.uniform(0.3, 1.0, size=(n, 3)),
+        target_sigmas=rng.uniform(0.3, 1.0, size=(n, 3)),
+    )
+    residuals = StereoResiduals.of(T, matches, CAMERA, huber=1e9)
+    settled = residuals.settled_points(T, linearize(residuals, T)).T
+    for i in range(n):
+
+        def misfit(point: FloatArray, i: int = i) -> FloatArray:
+            here = (project(point) - matches.source_uvd[i]) / matches.source_sigmas[i]
+            there = project(T[:3, :3] @ point + T[:3, 3]) - matches.target_uvd[i]
+            return 1e4 * np.concatenate([here, there / matches.target_sigmas[i]])
+
+        best = least_squares(misfit, source[i], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        moved = float(np.linalg.norm(best - source[i]))
+        np.testing.assert_allclose(settled[i], best, atol=1e-2 * moved)
+
+
+def test_a_settled_point_goes_to_at_most_twice_its_distance() -> None:
+    # A disparity of 10 px that the target says is -5: no point lies there.
+    point = np.array([[0.5, -0.4, 10.0]])
+    seen = np.array([project(point[0])])
+    for sigma, expected in ((0.1, 20.0), (10.0, None)):
+        matches = Correspondences(
+            source_points=point,
+            target_points=point,
+            source_uvd=seen,
+            target_uvd=seen - [0.0, 0.0, 15.0],
+            source_sigmas=np.full((1, 3), 1.0),
+            target_sigmas=np.full((1, 3), sigma),
+        )
+        residuals = StereoResiduals.of(np.eye(4), matches, CAMERA, huber=1e9)
+        (settled,) = residuals.settled_points(np.eye(4), linearize(residuals, np.eye(4))).T
+        if expected is None:
+            expected = 100.0 / (10.0 - 15.0 / 101.0)  # the weighted mean of both disparities
+        np.testing.assert_allclose(settled, point[0] * expected / 10.0, rtol=1e-9)
+
+
+def test_noise_is_carried_for_points_well_in_front_alone() -> None:
+    T = np.eye(4)
+    points = np.array([[0.2, 0.2, 0.2], [0.1, 0.1, 0.1], [0.11, 0.09, -5.0]])
+    J = source_jacobian(T, points, CAMERA)
+    assert np.isfinite(J).all()
+    np.testing.assert_allclose(J[..., 0].T, np.eye(3), atol=1e-12)
+    assert not np.allclose(J[..., 1].T, np.eye(3), atol=0.1)
+    assert not np.allclose(J[..., 2].T, np.eye(3), atol=0.1)
+    # What lies a millimetre in front has a derivative by the pose, what lies nearer has none.
+    for depth, is_good in ((1.01e-3, True), (0.99e-3, False)):
+        near = np.array([[0.0, 0.0, depth]])
+        ones = np.ones((1, 3))
+        matches = Correspondences(
+            source_points=near,
+            target_points=near,
+            source_uvd=np.array([project(near[0])]),
+            target_uvd=np.array([project(near[0])]),
+            source_sigmas=ones,
+            target_sigmas=ones,
+        )
+        residuals = StereoResiduals.of(T, matches, CAMERA, huber=2.0)
+        assert isinstance(residuals.linearize(T), Linearization) == is_good
+        assert residuals.within(T, 1e9).tolist() == [is_good]
 
 
 def test_points_behind_the_camera_are_in_no_gate_and_have_no_derivative() -> None:

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
@@ -153,3 +154,25 @@ def test_composed_covariance_is_that_of_sampled_compositions() -> None:
     scale = np.sqrt(np.diag(composed))
     deviation = (np.cov(errors.T) - composed) / np.outer(scale, scale)
     assert np.abs(deviation).max() < 0.05
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=seeds)
+def test_the_covariance_of_a_ros_message_is_that_of_the_twist_it_causes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R, position = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    T = se3.make_transform(R, position)
+
+    def twist_of(error: FloatArray) -> FloatArray:
+        # REP 103 and geometry_msgs: position, then turns about the fixed axes of the parent.
+        turned = Rotation.from_rotvec(error[3:]).as_matrix() @ R
+        moved = gtsam.Pose3(gtsam.Rot3(turned), position + error[:3])
+        return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(T).inverse().compose(moved)))
+
+    J = approx_fprime(np.zeros(6), twist_of, 1e-7)
+    of_message = random_covariance(rng, 1.0)
+    found = se3.covariance_from_ros(of_message, R)
+    np.testing.assert_allclose(found, J @ of_message @ J.T, atol=1e-4)
+    batch = se3.covariance_from_ros(np.stack([of_message, np.eye(6)]), np.stack([R, np.eye(3)]))
+    np.testing.assert_allclose(batch[0], found, atol=1e-12)
+    np.testing.assert_array_equal(batch[1], np.eye(6))

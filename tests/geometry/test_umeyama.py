@@ -133,8 +133,8 @@ def test_fewer_than_three_points_are_refused(n: int) -> None:
     assert isinstance(result, Failure)
     assert result.n_matches == n
     T, is_valid = fit_rigid_batch(points[np.newaxis], points[np.newaxis])
-    assert T.shape == (1, 4, 4)
-    assert not is_valid.any()
+    np.testing.assert_array_equal(T, np.eye(4)[np.newaxis])
+    assert is_valid.tolist() == [False]
 
 
 def test_weights_that_leave_two_points_are_refused() -> None:
@@ -214,3 +214,39 @@ def test_triples_without_an_answer_are_told_from_the_others() -> None:
     assert is_valid.tolist() == [True, False, False, False, False, True]
     np.testing.assert_allclose(T[[0, 5], :3, 3], 1.0)
     np.testing.assert_array_equal(T[1:4, :3, :3], np.tile(np.eye(3), (3, 1, 1)))
+
+
+def both_say(source: FloatArray, target: FloatArray) -> bool:
+    """Return whether three points have an answer; both ways to fit them must agree."""
+    _, triples = fit_rigid_triples(source[np.newaxis], target[np.newaxis])
+    is_fit = not isinstance(fit_rigid(source, target), Failure)
+    assert bool(triples[0]) == is_fit
+    return is_fit
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, size=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_triangle_is_a_line_below_a_thousandth_of_its_length_whatever_its_size(
+    seed: int, size: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_source, T_target = random_transform(rng), random_transform(rng)
+    for ratio, is_fit in ((1.5e-3, True), (0.7e-3, False)):
+        # Standard deviations across and along: of two at the ends and one beside the middle.
+        flat = size * np.array([[-1.0, 0, 0], [1.0, 0, 0], [0.0, np.sqrt(3.0) * ratio, 0]])
+        flat = flat[rng.permutation(3)]
+        T_source[:3, 3], T_target[:3, 3] = size * rng.normal(size=(2, 3))
+        assert both_say(move(T_source, flat), move(T_target, flat)) == is_fit
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds, size=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_triangle_is_a_point_where_its_size_is_the_rounding_of_its_place(
+    seed: int, size: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 2 * np.pi) + np.array([0.0, 2.0, 4.0]) * np.pi / 3.0
+    flat = size * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    for distance, is_fit in ((1e6, True), (8e6, False)):
+        place = size * distance * np.eye(3)[rng.integers(3)]
+        assert both_say(flat + place, flat + place) == is_fit

@@ -60,8 +60,8 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
         (0, 30, good), (1, 30, small),
         (0, 40, good),
         (0, 50, RecordingError("b")), (1, 50, RecordingError("c")),
-        (0, 45, good), (1, 60, good), (0, 60, good),
-        (0, 60, good), (1, 70, good), (0, 70, good),
+        (0, 45, good), (1, 60, tiny.texture(2)), (0, 60, tiny.texture(3)),
+        (0, 60, good), (1, 70, tiny.texture(4)), (0, 70, tiny.texture(5)),
     ]  # fmt: skip
     read = _read(tiny.stereo(items), threads)
     faults = [(item.stamp_ns, item.reason) for item in read if isinstance(item, FaultyFrame)]

@@ -120,6 +120,30 @@ class Sound(KltFrontend):
         super().__init__(recording("stereo").info.camera, configure())
 
 
+class FindsAnotherPlace(Sound):
+    def relocalize(self, reference: KltObservations, current: KltObservations) -> Result:
+        result = super().register(reference, current)
+        assert isinstance(result, RelativePose)
+        return replace(result, T_reference_current=offset(result.T_reference_current))
+
+
+class SaysNotWhy(Sound):
+    def relocalize(self, reference: KltObservations, current: KltObservations) -> Result:
+        return Failure(reason=" ")
+
+
+@pytest.mark.parametrize(
+    ("frontend", "reason"),
+    [
+        (FindsAnotherPlace(), "relocalize.* and register disagree by"),
+        (SaysNotWhy(), "Failure of relocalize.* gives no reason"),
+    ],
+)
+def test_a_place_found_again_must_be_the_right_one(frontend: Sound, reason: str) -> None:
+    with pytest.raises(ContractError, match=reason):
+        check_frontend(frontend, frames("stereo"))
+
+
 class ChangesTheFrame(Sound):
     def extract(self, frame: Frame) -> KltObservations:
         observations = super().extract(frame)

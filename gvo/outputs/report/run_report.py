@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -197,13 +197,14 @@ def _error_row(row: Mapping[str, Any]) -> list[str]:
 def _facts(record: RunRecord) -> dict[str, str]:
     summary, frames = record.summary, record.frames
     statuses = {status: frames.statuses.count(status) for status in dict.fromkeys(frames.statuses)}
-    coverage, memory = summary.get("coverage"), summary.get("peak_memory_mb")
+    coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
     return {
         "Sensor": str(summary.get("sensor", "")),
         "Poses of": str(summary.get("frame", "")),
         "Frames": str(len(frames.stamps_ns)),
         "Duration": _duration(record),
-        "Coverage": "" if coverage is None else f"{100.0 * float(coverage):.1f} % have a pose",
+        "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames are tied",
+        "Segments": _segment_words(summary.get("segments", ())),
         "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
         "Ground truth": str(summary.get("ground_truth", "")),
         "Learnt of the rig": _rig_words(summary.get("rig_offsets")),
@@ -211,6 +212,17 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
         "Version": _version(summary),
     }
+
+
+def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
+    if len(segments) < 2:
+        return ""
+    joined = [
+        f"{segment['id']} joined to {segment['joined_to']}"
+        for segment in segments
+        if segment.get("joined_to") is not None
+    ]
+    return ", ".join([str(len(segments)), *joined])
 
 
 def _duration(record: RunRecord) -> str:

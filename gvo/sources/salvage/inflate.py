@@ -21,7 +21,7 @@ else:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """What a Zstandard frame begins with, and no message in CDR does."""
 
-MAX_INFLATED = 1 << 30
+MAX_INFLATED = 1 << 29
 """Bytes; recorders write chunks of about one megabyte."""
 
 _BLOCK = 1 << 16
@@ -85,6 +85,41 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> I
                 window.position -= len(decompressor.unused_data or b"")
                 return Inflated(data=b"".join(parts), is_cut=False)
     return Inflated(data=b"".join(parts), is_cut=True)
+
+
+def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) -> bytes:
+    """Decompress data that are whole, of one stream or of several in a row.
+
+    Parameters
+    ----------
+    data : bytes
+    compression : str
+        "bz2", "lz4" or "zstd".
+    limit : int, optional
+        Bytes that may come out, up to `MAX_INFLATED`.
+
+    Raises
+    ------
+    DamageError
+        When it is no such data, it is cut, or more comes out than may.
+    """
+    parts: list[bytes] = []
+    limit = MAX_INFLATED if limit is None else min(limit, MAX_INFLATED)
+    n_left = limit
+    while data or not parts:
+        decompressor = _DECOMPRESSORS[compression]()
+        while data or not decompressor.needs_input:
+            parts.append(_feed(decompressor, compression, data, n_left + 1))
+            n_left -= len(parts[-1])
+            if n_left < 0:
+                raise DamageError(f"a chunk of {compression} inflates to more than {limit} bytes")
+            data = b""
+            if decompressor.eof:
+                break
+        if not decompressor.eof:
+            raise DamageError(f"a chunk of {compression} that is cut")
+        data = decompressor.unused_data or b""
+    return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def inflate_message(data: bytes) -> bytes:

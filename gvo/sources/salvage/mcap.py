@@ -153,6 +153,8 @@ def _check(part: Window, crc: int) -> None:
 
 def _places_of_summary(window: Window) -> Iterator[int]:
     """Yield where the summary says that chunks are, and where it is itself."""
+    if window.rest < _N_FOOTER:
+        return
     try:
         window.skip(window.rest - _N_FOOTER)
         if _read_record(window) != (_FOOTER, _N_FOOTER - 9 - len(MAGIC)):

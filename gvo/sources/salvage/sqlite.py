@@ -21,6 +21,8 @@ from gvo.sources.salvage.window import DamageError
 
 _MAX_ID = 2**62
 _N_HEADER = 100  # bytes
+# A text that is none comes as the second.
+_FAULTS = (apsw.Error, UnicodeDecodeError)
 _Row: TypeAlias = tuple[Any, ...]
 
 
@@ -47,7 +49,7 @@ class SqliteScan:
         try:
             with self._opened() as database:
                 self.counts = self._count(database)
-        except apsw.Error as error:
+        except _FAULTS as error:
             raise DamageError(str(error)) from error
 
     @property
@@ -77,12 +79,14 @@ class SqliteScan:
                         yield FoundMessage(channel, log_time_ns, data)
                     else:
                         self._lost[row_id] = 1
-        except apsw.Error as error:
+        except _FAULTS as error:
             raise DamageError(str(error)) from error
 
     def _count(self, database: apsw.Connection) -> dict[Channel, int]:
-        for topic_id, name, type_ in database.execute("SELECT id, name, type FROM topics"):
-            self._channels[topic_id] = Channel(str(name), standard_type(str(type_)), is_ros1=False)
+        query = "SELECT id, CAST(name AS BLOB), CAST(type AS BLOB) FROM topics"
+        for topic_id, name, type_ in database.execute(query):
+            channel = Channel(_text(name), standard_type(_text(type_)), is_ros1=False)
+            self._channels[topic_id] = channel
         counts = dict.fromkeys(self._channels.values(), 0)
         for row_id, topic_id, log_time_ns in self._rows(database, "topic_id, timestamp"):
             if topic_id in self._channels and isinstance(log_time_ns, int):
@@ -102,16 +106,20 @@ class SqliteScan:
 
     def _rows(self, database: apsw.Connection, columns: str) -> Iterator[_Row]:
         """Yield the rows in the order of their ids, and note those that cannot be read."""
-        query = f"SELECT id, {columns} FROM messages WHERE id > ? ORDER BY id"
+        query = f"SELECT id, {columns} FROM messages WHERE id > ? ORDER BY id"  # noqa: S608 - ours
         last = -1
         while True:
             try:
                 for row in database.execute(query, (last,)):
+                    if not _is_after(row, last):
+                        break  # pages of a damaged tree come again and again
                     last = row[0]
                     yield row
-                return
-            except apsw.Error:
-                found = self._skip(database, f"{query} LIMIT 1", last)
+                else:
+                    return
+            except _FAULTS:
+                pass
+            found = self._skip(database, f"{query} LIMIT 1", last)
             if found is None:
                 return
             last = found[0]
@@ -144,13 +152,23 @@ def announced_size(path: Path) -> int:
     return _size_of_page(header) * int.from_bytes(header[28:32], "big")
 
 
+def _text(value: bytes | None) -> str:
+    """Return a name that may be damaged."""
+    return "" if value is None else value.decode(errors="replace")
+
+
 def _look(database: apsw.Connection, query: str, after: int) -> _Row | None:
     """Return the row after an id, or nothing where there is none or it cannot be read."""
     try:
         row: _Row | None = database.execute(query, (after,)).fetchone()
-    except apsw.Error:
+    except _FAULTS:
         return None
-    return row
+    return row if row is not None and _is_after(row, after) else None
+
+
+def _is_after(row: _Row, last: int) -> bool:
+    """Tell whether a row is one that was asked for: in a damaged tree others are found."""
+    return isinstance(row[0], int) and row[0] > last
 
 
 class _WholePages(apsw.VFS):

@@ -18,7 +18,7 @@ STRAIGHT_M = 50.0
 TURN_M = 50.0
 LAP_M = 4 * (STRAIGHT_M + TURN_M)
 _START_M = 30.0
-_R_MAP_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+R_MAP_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def heading(s: FloatArray | float) -> FloatArray:
@@ -82,17 +82,35 @@ def drive(stamps_s: FloatArray) -> FloatArray:
     # The integral of 8.2 + 2 sin(0.6 t) + 0.8 sin(1.7 t + 1) m/s.
     s = _START_M + 8.2 * t - 2 / 0.6 * (np.cos(0.6 * t) - 1)
     s -= 0.8 / 1.7 * (np.cos(1.7 * t + 1) - np.cos(1.0))
+    return drive_along(t, s)
+
+
+def drive_along(
+    stamps_s: FloatArray, s: FloatArray, *, shake: FloatArray | float = 1.0
+) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a car on a slightly uneven road.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    s : ndarray of float64, shape (n,)
+        Where the car is then: arc lengths in metres.
+    shake : float or ndarray of float64, shape (n,)
+        Factor on how much the road shakes the car; 0 while it stands.
+    """
+    t = stamps_s
     psi = heading(s)
     zeros, ones = np.zeros_like(psi), np.ones_like(psi)
     right = np.stack([np.cos(psi), np.sin(psi), zeros], axis=-1)
     forward = np.stack([-np.sin(psi), np.cos(psi), zeros], axis=-1)
     R = np.stack([right, np.stack([zeros, zeros, -ones], axis=-1), forward], axis=-1)
-    bounce = 0.012 * np.sin(8.1 * t) + 0.008 * np.sin(12.7 * t + 2)
+    bounce = shake * (0.012 * np.sin(8.1 * t) + 0.008 * np.sin(12.7 * t + 2))
     position = np.column_stack([road_point(s), CAMERA_HEIGHT_M + bounce])
-    pitch = 0.004 * np.sin(7.3 * t + 1) + 0.003 * np.sin(2.1 * t)
-    roll = 0.004 * np.sin(5.9 * t) + 0.004 * np.sin(1.3 * t + 0.5)
-    shake = exp(np.stack([pitch, zeros, roll, zeros, zeros, zeros], axis=-1))
-    return np.asarray(make_transform(R, position) @ shake)
+    pitch = shake * (0.004 * np.sin(7.3 * t + 1) + 0.003 * np.sin(2.1 * t))
+    roll = shake * (0.004 * np.sin(5.9 * t) + 0.004 * np.sin(1.3 * t + 0.5))
+    tilt = exp(np.stack([pitch, zeros, roll, zeros, zeros, zeros], axis=-1))
+    return np.asarray(make_transform(R, position) @ tilt)
 
 
 def look_around(stamps_s: FloatArray) -> FloatArray:
@@ -113,5 +131,5 @@ def look_around(stamps_s: FloatArray) -> FloatArray:
     turns = tilts * np.sin(rates * t + [0.4, 0.0, 1.2, 2.0, 0.9, 0.1])
     turns = turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0]
     rotation = exp(np.column_stack([turns, np.zeros_like(turns)]))
-    level = make_transform(np.broadcast_to(_R_MAP_LEVEL, (len(t), 3, 3)), position)
+    level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(t), 3, 3)), position)
     return np.asarray(level @ rotation)

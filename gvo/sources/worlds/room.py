@@ -15,7 +15,7 @@ from gvo.types import FloatArray
 
 _HALF_M = 2.0
 _HEIGHT_M = 2.5
-_LAMP = Light(direction=(0.25, -0.5, 0.8), ambient=0.72, direct=0.38)
+LAMP = Light(direction=(0.25, -0.5, 0.8), ambient=0.72, direct=0.38)
 _NORTH, _EAST, _WEST = 0.0, -0.5 * np.pi, 0.5 * np.pi
 
 
@@ -28,7 +28,12 @@ def room(seed: int) -> Scene:
     Scene
         Some 250 rectangles, map axes with z up.
     """
-    rectangles = [
+    return make_scene(room_rectangles(), room_textures(seed), LAMP)
+
+
+def room_rectangles() -> list[Rectangle]:
+    """Return all that is in the room, in the map, with textures of `room_textures`."""
+    return [
         *_shell(),
         *_north_side(),
         *_desk(np.array([0.62, 1.55])),
@@ -38,7 +43,6 @@ def room(seed: int) -> Scene:
         *_coffee_table(np.array([-0.55, 0.75]), 0.2),
         *_plant(np.array([1.72, 1.66])),
     ]
-    return make_scene(rectangles, room_textures(seed), _LAMP)
 
 
 def _at(x: float, y: float) -> FloatArray:

@@ -36,7 +36,7 @@ _PARKING = (-6.2, 3.15)
 _HOUSES = (-10.2, 7.6)
 _KERB_M = 0.12
 _SKY_M = 420.0
-_DAYLIGHT = Light(
+DAYLIGHT = Light(
     direction=(0.5, -0.45, 0.8), ambient=0.82, direct=0.5, haze_m=800.0, haze_grey=205.0
 )
 
@@ -50,13 +50,18 @@ def street(seed: int) -> Scene:
     Scene
         Some 2000 rectangles, map axes with z up, the road at height 0.
     """
+    return make_scene(street_rectangles(seed), street_textures(seed), DAYLIGHT)
+
+
+def street_rectangles(seed: int) -> list[Rectangle]:
+    """Return all that stands along the street, in the map, with textures of `street_textures`."""
     rectangles = [*_backdrop(), *_road(), *_markings()]
     for side in (0, 1):
         rng = np.random.default_rng([seed, 2, side])
         rectangles += _houses(rng, side)
         rectangles += _parked_cars(rng, side)
         rectangles += _trees_and_posts(rng, side)
-    return make_scene(rectangles, street_textures(seed), _DAYLIGHT)
+    return rectangles
 
 
 def _point(s: float, right: float) -> FloatArray:

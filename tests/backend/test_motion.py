@@ -1,0 +1,105 @@
+"""The motion so far, and where it leads, against constant velocities."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from gvo.backend.motion import Motion
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.types import Estimate, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+STEP_NS = 50_000_000
+
+
+def estimate(frame: int, stamp_ns: int, T: FloatArray, covariance: FloatArray) -> Estimate:
+    return Estimate(frame_id=frame, stamp_ns=stamp_ns, T_world_cam=T, covariance=covariance)
+
+
+def generator(twist: FloatArray) -> FloatArray:
+    rx, ry, rz, tx, ty, tz = twist
+    return np.array([[0, -rz, ry, tx], [rz, 0, -rx, ty], [-ry, rx, 0, tz], [0, 0, 0, 0]])
+
+
+def moving(motion: Motion, start: FloatArray, velocity: FloatArray, n: int) -> list[Estimate]:
+    """Let a camera move on with a velocity (rad/s, m/s) and be measured n times."""
+    poses = [start @ expm(0.05 * frame * generator(velocity)) for frame in range(n)]
+    given = [estimate(k, k * STEP_NS, T, 1e-4 * np.eye(6)) for k, T in enumerate(poses)]
+    for before, each in zip([None, *given[:-1]], given, strict=True):
+        place = None if before is None else before.T_world_cam
+        motion.append(each, is_measured=True, T_world_measured=place)
+    return given
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds)
+def test_a_constant_velocity_goes_on(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    velocity, start = rng.normal(size=6), se3.exp(rng.normal(size=6))
+    motion = Motion(WindowConfig())
+    last = moving(motion, start, velocity, 3)[-1]
+    assert motion.last is last
+    assert motion.measured_id == 2
+    T_last_frame, step_covariance = motion.predict_step(last.stamp_ns + 2 * STEP_NS)
+    np.testing.assert_allclose(T_last_frame, expm(0.1 * generator(velocity)), atol=1e-9)
+    prediction = motion.predict_pose(last.stamp_ns + 2 * STEP_NS)
+    assert prediction is not None
+    T, covariance = prediction
+    np.testing.assert_allclose(T, last.T_world_cam @ T_last_frame, atol=1e-9)
+    # The uncertainty of the last pose, seen from the new one, and that of the step.
+    Ad = np.linalg.inv(se3.adjoint(T_last_frame))
+    expected = Ad @ last.covariance @ Ad.T + step_covariance
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-15)
+
+
+@settings(deadline=None, max_examples=8)
+@given(seed=seeds)
+def test_poses_without_a_measurement_follow_the_velocity_before_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    velocity, jump = rng.normal(size=6), se3.exp(rng.normal(size=6))
+    config = WindowConfig()
+    motion = Motion(config)
+    last = moving(motion, np.eye(4), velocity, 3)[-1]
+    total = motion.predict_step(last.stamp_ns + 4 * STEP_NS)[1]
+    coasted = estimate(3, last.stamp_ns + 3 * STEP_NS, jump, np.eye(6))
+    motion.append(coasted, is_measured=False)
+    assert motion.last is coasted
+    assert motion.measured_id == 2
+    T, covariance = motion.predict_step(coasted.stamp_ns + STEP_NS)
+    np.testing.assert_allclose(T, expm(0.05 * generator(velocity)), atol=1e-9)
+    # Two parts of the way add up to the whole, and the sigmas are those of the configuration.
+    first = Motion(config)
+    moving(first, np.eye(4), velocity, 3)
+    before = first.predict_step(coasted.stamp_ns)[1]
+    np.testing.assert_allclose(covariance + before, total, rtol=1e-9)
+    turn, shift = np.radians(config.coasting_sigma_deg_per_s), config.coasting_sigma_m_per_s
+    np.testing.assert_allclose(np.diag(total), np.repeat([0.2 * turn, 0.2 * shift], 3) ** 2)
+
+
+def test_the_configuration_can_change_on_the_way() -> None:
+    motion = Motion(WindowConfig())
+    last = moving(motion, np.eye(4), np.ones(6), 2)[-1]
+    T, before = motion.predict_step(last.stamp_ns + STEP_NS)
+    wider = WindowConfig(coasting_sigma_m_per_s=3.0 * WindowConfig().coasting_sigma_m_per_s)
+    motion.reconfigure(wider)
+    T_after, after = motion.predict_step(last.stamp_ns + STEP_NS)
+    np.testing.assert_array_equal(T_after, T)
+    np.testing.assert_allclose(np.diag(after), np.diag(before) * np.repeat([1.0, 9.0], 3))
+
+
+def test_where_nothing_is_known_of_the_motion_the_camera_stands() -> None:
+    motion = Motion(WindowConfig())
+    assert motion.last is None
+    assert motion.measured_id is None
+    assert motion.predict_pose(0) is None
+    T = se3.exp(np.ones(6))
+    motion.append(estimate(0, 0, T, np.eye(6)), is_measured=True)
+    np.testing.assert_array_equal(motion.predict_step(STEP_NS)[0], np.eye(4))
+    # A measurement that is not tied to the one before tells of no velocity either.
+    moving(motion, T, np.ones(6), 2)
+    assert motion.predict_step(3 * STEP_NS)[0][0, 3] != pytest.approx(0.0)
+    motion.append(estimate(5, 5 * STEP_NS, T, np.eye(6)), is_measured=True)
+    np.testing.assert_array_equal(motion.predict_step(6 * STEP_NS)[0], np.eye(4))

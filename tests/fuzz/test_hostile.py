@@ -1,0 +1,438 @@
+"""Input that means harm, by hand: what a fuzzer needs long for."""
+
+import json
+import struct
+import subprocess
+import sys
+import zlib
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from backports import zstd
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer
+
+from gvo.bounded_text import cut, read_text
+from gvo.config import load_configuration
+from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
+from gvo.g2o import parse_line as parse_g2o_line
+from gvo.outputs.run_record import read_run
+from gvo.sources.bag_reader import BagReader, typestore
+from gvo.sources.calibration_files import read_cameras
+from gvo.sources.edge_answers import read_lines
+from gvo.sources.edge_lines import MAX_LINE, parse_line
+from gvo.sources.image_headers import MAX_PIXELS, read_header
+from gvo.sources.messages import decode_compressed, transform_of
+from gvo.sources.pixels import decode_image, read_image
+from gvo.sources.rvl import decode_rvl
+from gvo.sources.salvage import inflate
+from gvo.sources.salvage.mcap import MAGIC
+from gvo.sources.salvage.sqlite import SqliteScan
+from gvo.sources.truth_specs import parse_truth
+from gvo.trajectory_files import read_trajectory
+from gvo.types import Failure
+from gvo.yaml_text import MAX_VALUES
+from tests.fuzz.bags import TARGETS as BAG_TARGETS
+
+CAMERA = "image_width: 8\nimage_height: 6\ncamera_matrix: [8, 0, 4, 0, 8, 3, 0, 0, 1]\n"
+LETTERS = "abcdefghi"
+
+
+def aliases(first: str, *, merged: bool = False) -> str:
+    """Return nine lines that stand for nine to the power of nine values."""
+    lines = [f"a: &a {first}"]
+    for before, name in pairwise(LETTERS):
+        again = f"[{', '.join([f'*{before}'] * 9)}]"
+        lines.append(f"{name}: &{name} {{<<: {again}}}" if merged else f"{name}: &{name} {again}")
+    return "\n".join(lines) + "\n"
+
+
+def as_file(folder: Path, text: str | bytes, name: str = "file.yaml") -> Path:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def pixels_of(data: bytes) -> NDArray[np.uint8]:
+    return np.frombuffer(data, dtype=np.uint8)
+
+
+def compressed(data: bytes, format_: str = "png") -> SimpleNamespace:
+    return SimpleNamespace(format=format_, data=pixels_of(data))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        aliases("[x, x, x]"),
+        aliases("{q: 1, r: 2}", merged=True),
+        "images: &a {black: *a}\n",
+        "[" * 20000,
+        "{a: " * 20000,
+        "images: {black: !!int ''}\n",
+        "images: {black: !!bool maybe}\n",
+        "images: {black: !!timestamp never}\n",
+        "images: {black: 0x" + "f" * 10000 + "}\n",
+        "images: {black: " + "9" * 10000 + "}\n",
+        "images: {black: 1" + ":1" * 20000 + "}\n",
+        "images: {black: 1" + ":1" * 20000 + ".5}\n",
+        "images: {black: [" + "1," * 200000 + "]}\n",
+        "images: {" + "blackimages" * 1000 + ": 1}\n",
+        'images: {"\\ud800": 1}\n',
+        b"images: {black: \x00}\n",
+        b"\xff\xfe",
+    ],
+    ids=lambda text: str(text[:24]),
+)
+def test_a_configuration_that_means_harm_is_refused_in_a_line(
+    text: str | bytes, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(as_file(tmp_path, text))
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["[" * 20000, "!!int ''", "0x" + "f" * 10000, "1" + ":1" * 20000, "\0", "\udcff", "{*a: 1}"],
+    ids=lambda value: value[:8],
+)
+def test_a_setting_that_means_harm_is_refused_in_a_line(value: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_configuration(None, [f"images.black={value}"])
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
+
+
+def test_aliases_that_stand_for_little_are_followed(tmp_path: Path) -> None:
+    text = "window: &w {n_links: 2}\nklt: {n_corners: 300}\n"
+    assert load_configuration(as_file(tmp_path, text)).window.n_links == 2
+    many = ", ".join(["[*b]"] * 200)
+    path = as_file(tmp_path, f"a: &b [1, 2]\nmore: [{many}]\n{CAMERA}")
+    assert read_cameras(path, sensor="rgbd", is_rectified=False).calibrations[0].width == 8
+    assert MAX_VALUES > 1000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        CAMERA + aliases("[1, 1, 1]") + "distortion_coefficients: *i\n",
+        CAMERA + aliases("[1, 1, 1]") + "distortion_model: *i\n",
+        CAMERA + aliases("[1, 1, 1]") + "depth_scale: *i\n",
+        CAMERA + aliases("{q: 1}", merged=True),
+        CAMERA + f"depth_scale: {'9' * 400}\n",
+        CAMERA + f"binning_x: {'9' * 200}\n",
+        CAMERA + f"roi: {{x_offset: {'9' * 200}}}\n",
+        CAMERA.replace("8\n", "9" * 200 + "\n", 1),
+    ],
+    ids=range(8),
+)
+def test_a_calibration_that_means_harm_is_refused_in_a_line(text: str, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError) as caught:
+        read_cameras(as_file(tmp_path, text), sensor="rgbd", is_rectified=False)
+    assert len(str(caught.value)) < 1000
+
+
+def test_no_more_of_a_text_is_read_than_it_may_hold() -> None:
+    with pytest.raises(OSError, match="more than 1000 bytes"):
+        read_text(Path("/dev/zero"), max_bytes=1000)
+
+
+def test_a_message_does_not_steer_a_terminal() -> None:
+    assert str(RecordingError("/a\x1b[2J\nb")) == "/a\\x1b[2J\\nb"
+    assert len(str(RecordingError("x" * 10**6))) < 5000
+    assert cut("ü \udcff", 10) == "ü \\udcff"
+
+
+def png(width: int, height: int, *, n_rows: int = 0) -> bytes:
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        crc = zlib.crc32(kind + content)
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((width + 1) * n_rows), 9)
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", rows), chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+@pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (10001, 10000), (10000, 10000)])
+def test_pixels_that_a_header_only_claims_are_never_allocated(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(RecordingError, match="claims"):
+        decode_image(pixels_of(png(*size)), "a topic")
+
+
+@pytest.mark.parametrize("kind", [b"IHDR", b"IDAT", b"IEND"])
+def test_a_chunk_that_a_png_only_claims_is_never_allocated(
+    kind: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = bytearray(png(8, 6, n_rows=6))
+    start = file.index(kind) - 4
+    file[start : start + 4] = b"\xff\xff\xff\xf0"
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(RecordingError, match="truncated"):
+        decode_image(pixels_of(bytes(file)), "a topic")
+
+
+def test_the_blackest_png_is_still_read() -> None:
+    assert decode_image(pixels_of(png(4000, 3000, n_rows=3000)), "a topic").shape == (3000, 4000)
+    assert MAX_PIXELS > 4000 * 3000
+
+
+@pytest.mark.parametrize("middle", [b" #" * 250, b" #1 1 " * 60, b"\n#" * 200])
+def test_comments_of_a_pnm_take_no_time(middle: bytes) -> None:
+    assert read_header(pixels_of(b"P5" + middle + b"x")) is None
+
+
+def test_a_size_in_a_comment_is_not_that_of_the_image() -> None:
+    digits = b"0" * 12 + b"32767"
+    assert read_header(pixels_of(b"P5 # 1 1 \n" + digits + b" " + digits + b" 255 ")) is None
+
+
+def test_the_first_size_of_a_tiff_counts_as_for_its_decoder() -> None:
+    tags = [(256, 32767), (257, 32766), (256, 1), (257, 1)]
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    header = read_header(pixels_of(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries))
+    assert header is not None
+    assert header[1:] == (32767, 32766)
+
+
+def test_a_jpeg_marker_without_a_length_hides_no_size() -> None:
+    def frame(side: int) -> bytes:
+        size = side.to_bytes(2, "big") * 2
+        return b"\xff\xc0\x00\x11\x08" + size + b"\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01"
+
+    hidden = (b"\xff\xd8\xff\x01" + frame(32767)).ljust(4 + 0xFFC0, b"\0")
+    header = read_header(pixels_of(hidden + frame(16) + b"\xff\xd9"))
+    assert header is not None
+    assert header.width != 16
+
+
+def test_floats_that_call_themselves_rgb_are_refused() -> None:
+    file = cv2.imencode(".tiff", np.ones((4, 4, 3)))[1].tobytes()
+    with pytest.raises(RecordingError, match="cannot be converted"):
+        decode_compressed(compressed(file, "rgb8; tiff compressed rgb8"), "/image")
+
+
+def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
+    used = "import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    code = (
+        "import numpy as np, struct\nfrom gvo.sources.rvl import decode_rvl\n"
+        f"{used}\n"
+        "data = np.full(30_000_000, 0x11, np.uint8)\n"
+        "data[:8] = np.frombuffer(struct.pack('<II', 4, 4), np.uint8)\n"
+        "decode_rvl(data, 'x')\n"
+        f"{used}"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    before, after = (int(line) // 1024 for line in answer.stdout.split())
+    assert after - before < 200
+
+
+def test_an_rvl_image_larger_than_any_depth_camera_is_refused() -> None:
+    with pytest.raises(RecordingError, match="claims"):
+        decode_rvl(pixels_of(struct.pack("<II", 5000, 5000) + b"\x11" * 100), "/depth")
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "a\0b", "x" * 300])
+def test_what_is_no_file_is_no_image(name: str) -> None:
+    with pytest.raises(RecordingError):
+        read_image(Path(name))
+
+
+def test_a_bzip2_chunk_that_explodes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inflate, "MAX_INFLATED", 1 << 20)
+    path = tmp_path / "bomb.bag"
+    writer = Writer(path)
+    writer.set_compression(Writer.CompressionFormat.BZ2)
+    with writer:
+        store = typestore(is_ros1=True)
+        topic = writer.add_connection("/a", "std_msgs/msg/String", typestore=store)
+        writer.write(topic, 1, bytes(8 << 20))
+    assert path.stat().st_size < 10000
+    with pytest.raises(RecordingError, match=r"inflates|claims"):
+        _read_all(path)
+
+
+def _read_all(path: Path) -> None:
+    """Read a bag; what it says of its damage is raised as where nothing could be read."""
+    reader = BagReader(path)
+    assert list(reader.messages(["/a"])) == []
+    raise RecordingError(reader.damage)
+
+
+def test_an_mcap_chunk_inflates_to_no_more_than_it_claims(tmp_path: Path) -> None:
+    path = as_file(tmp_path, _lying_mcap(bytes(64 << 20)), "bomb.mcap")
+    code = (
+        "import resource, sys\nfrom pathlib import Path\n"
+        "from gvo.sources.bag_reader import BagReader\n"
+        "used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024\n"
+        f"before = used()\nreader = BagReader(Path({str(path)!r}))\n"
+        "n = len(list(reader.messages(['/a'])))\nprint(n, used() - before)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    n_messages, megabytes = map(int, answer.stdout.split()) if answer.stdout else (0, 0)
+    assert n_messages == 0
+    assert megabytes < 40
+    assert "Traceback" not in answer.stderr or "RecordingError" in answer.stderr
+
+
+def _lying_mcap(content: bytes) -> bytes:
+    def record(op: int, data: bytes) -> bytes:
+        return bytes([op]) + struct.pack("<Q", len(data)) + data
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    schema = struct.pack("<H", 1) + text("std_msgs/msg/String") + text("ros2msg")
+    topics = record(3, schema + text("string data"))
+    channel = struct.pack("<HH", 1, 1) + text("/a") + text("cdr") + struct.pack("<I", 0)
+    topics += record(4, channel)
+    packed = zstd.compress(topics + content)
+    head = struct.pack("<QQQI", 1, 1, len(topics), 0) + text("zstd")
+    chunk = record(6, head + struct.pack("<Q", len(packed)) + packed)
+    start = MAGIC + record(1, text("ros2") + text("x"))
+    index = struct.pack("<QQQQI", 1, 1, len(start), len(chunk), 10) + struct.pack("<HQQ", 1, 0, 0)
+    index += text("zstd") + struct.pack("<QQ", len(packed), len(topics))
+    counts = struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, 1, 1, 1, 10) + struct.pack("<HQ", 1, 1)
+    summary = topics + record(0x0B, counts) + record(8, index)
+    body = start + chunk + record(0x0F, struct.pack("<I", 0))
+    footer = record(2, struct.pack("<QQI", len(body), 0, 0))
+    return body + summary + footer + MAGIC
+
+
+def test_rows_of_a_damaged_database_are_not_read_for_ever(tmp_path: Path) -> None:
+    """A page whose row has the id that was asked to be passed came again without end."""
+    seeds = next(target for target in BAG_TARGETS if target.name == "sqlite_bags").seeds()
+    path = as_file(tmp_path, seeds[0], "whole.db3")
+    rows = [(1, 1, 5, b""), (2, 1, 5, b""), (2, 1, 5, b"")]
+    scan = SqliteScan(path)
+    found = list(scan._rows(_Repeating(rows), "topic_id, timestamp, data"))  # type: ignore[arg-type]
+    assert [row[0] for row in found] == [1, 2]
+
+
+def test_a_damaged_name_in_a_database_is_no_traceback(tmp_path: Path) -> None:
+    seeds = next(target for target in BAG_TARGETS if target.name == "sqlite_bags").seeds()
+    damaged = seeds[0].replace(b"/left/image_rect", b"/left/im\x81\xffe_rect")
+    reader = BagReader(as_file(tmp_path, damaged, "damaged.db3"))
+    assert len({topic.name for topic in reader.topics}) == 6
+
+
+class _Repeating:
+    """A database that answers every question with the same rows."""
+
+    def __init__(self, rows: list[tuple[object, ...]]) -> None:
+        self._rows = rows
+
+    def execute(self, _query: str, _values: tuple[int, ...]) -> "_Rows":
+        return _Rows(self._rows)
+
+
+class _Rows(list[tuple[object, ...]]):
+    def fetchone(self) -> tuple[object, ...]:
+        return self[-1]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"id": "\\ud800", "stamp_ns": 0}',
+        '{"id": ' + "9" * 400 + ', "stamp_ns": 0}',
+        "x" * 2000 + ",0",
+        "a," + "9" * 4000,
+        "a," + "0," * MAX_LINE,
+        '{"id":' + "[" * 50000,
+        "b,1,a,1e300,0,0,0,0,0,1",
+        "b,1,a,0,0,0,1e308,1e308,0,1",
+        "a,9223372036854775807",
+    ],
+    ids=lambda line: line[:12],
+)
+def test_a_line_that_means_harm_is_refused_shortly(line: str) -> None:
+    with pytest.raises(ValueError, match=r".") as caught:
+        parse_line(line, "json" if line.startswith("{") else "csv")
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_line_without_an_end_takes_no_memory(tmp_path: Path) -> None:
+    path = as_file(tmp_path, b"x" * (6 * MAX_LINE) + b"\na,0\n", "lines")
+    with path.open("rb") as file:
+        first, second = read_lines(file.fileno(), lambda: None)
+    assert MAX_LINE < len(first) < 5 * MAX_LINE
+    assert second == "a,0"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 0 0 0 1e308 1e308 0 1\n",
+        "1 1e300 0 0 0 0 0 1\n",
+        "1e200 0 0 0 0 1e200 0 0 0 0 1 0\n",
+        "1" * 100000 + " 0 0 0 0 0 0 1\n",
+        "x" * 100000 + " 0 0 0 0 0 0 1\n",
+    ],
+    ids=range(5),
+)
+def test_poses_beyond_the_planets_are_refused_shortly(text: str, tmp_path: Path) -> None:
+    with pytest.raises(GvoError) as caught:
+        read_trajectory(as_file(tmp_path, text, "poses.txt"))
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_long_comment_takes_no_time(tmp_path: Path) -> None:
+    text = "#" + "qw" * 30000 + "\n1 0 0 0 0 0 0 1\n"
+    assert len(read_trajectory(as_file(tmp_path, text, "poses.txt"))) == 1
+
+
+@pytest.mark.parametrize(
+    "line", ["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 -1e308", "EDGE3 1 2 0 0 0 0 0 inf"]
+)
+def test_numbers_of_a_pose_graph_do_not_overflow(line: str) -> None:
+    with pytest.raises(ValueError, match="beyond"):
+        parse_g2o_line(line)
+
+
+def test_a_transform_does_not_overflow() -> None:
+    at = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+    far = SimpleNamespace(x=1e300, y=0.0, z=0.0)
+    turn = SimpleNamespace(x=1e308, y=1e308, z=0.0, w=1.0)
+    right = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    assert isinstance(transform_of(at, turn), Failure)
+    assert isinstance(transform_of(far, right), Failure)
+
+
+def test_a_name_that_no_file_can_have_names_none() -> None:
+    with pytest.raises(GvoError):
+        parse_truth("9" * 400)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("summary.json", "[" * 50000),
+        ("summary.json", json.dumps({"T_frame_truth": "x"})),
+        ("summary.json", json.dumps({"T_frame_truth": [[1e200] * 4] * 4})),
+        ("frames.csv", "x" * 200000 + "\n"),
+    ],
+    ids=range(4),
+)
+def test_a_run_folder_that_means_harm_is_refused(name: str, content: str, tmp_path: Path) -> None:
+    for own in ("raw.txt", "causal.txt", "smoothed.txt"):
+        as_file(tmp_path, "", own)
+    as_file(tmp_path, "stamp_ns,status,reason\n", "frames.csv")
+    as_file(tmp_path, content, name)
+    with pytest.raises(GvoError):
+        read_run(tmp_path).comparable()

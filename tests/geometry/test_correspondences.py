@@ -1,0 +1,89 @@
+"""Matched observations of two frames, by hand-written loops and projections."""
+
+from dataclasses import fields
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.types import FloatArray, Observations
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+
+
+def random_pixels(rng: np.random.Generator, n: int) -> FloatArray:
+    return rng.uniform([0.0, 0.0, 5.0], [640.0, 480.0, 50.0], size=(n, 3))
+
+
+def unproject(uvd: FloatArray) -> FloatArray:
+    u, v, d = uvd
+    z = 500.0 * 0.2 / d
+    return np.array([(u - 320.0) / 500.0 * z, (v - 240.0) / 480.0 * z, z])
+
+
+def random_correspondences(rng: np.random.Generator, n: int) -> Correspondences:
+    pixels = random_pixels(rng, n), random_pixels(rng, n)
+    sigmas = rng.uniform(0.1, 1.0, (n, 3)), rng.uniform(0.1, 1.0, (n, 3))
+    return Correspondences.of_pixels(pixels, sigmas, CAMERA)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_pixels_of_both_frames_become_points_of_their_own_frames(seed: int) -> None:
+    matches = random_correspondences(np.random.default_rng(seed), 7)
+    assert len(matches) == 7
+    for i in range(7):
+        source, target = unproject(matches.source_uvd[i]), unproject(matches.target_uvd[i])
+        np.testing.assert_allclose(matches.source_points[i], source, rtol=1e-12)
+        np.testing.assert_allclose(matches.target_points[i], target, rtol=1e-12)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_an_offset_that_is_taken_off_was_in_both_disparities(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = random_correspondences(rng, 7)
+    offset = np.array([0.0, 0.0, 0.4])
+    measured = Correspondences.of_pixels(
+        (true.source_uvd + offset, true.target_uvd + offset),
+        (true.source_sigmas, true.target_sigmas),
+        CAMERA,
+    )
+    assert not np.allclose(measured.source_points, true.source_points, rtol=1e-3)
+    for name in (field.name for field in fields(Correspondences)):
+        found = getattr(measured.without_offset(0.4, CAMERA), name)
+        np.testing.assert_allclose(found, getattr(true, name), rtol=1e-9)
+    assert measured.without_offset(0.0, CAMERA) is measured
+
+
+def test_matches_pair_what_each_frame_saw() -> None:
+    rng = np.random.default_rng(0)
+    frames = []
+    for n in (6, 5):
+        uvd = random_pixels(rng, n)
+        frames.append(
+            Observations(
+                keypoints=uvd[:, :2],
+                points_cam=np.array([unproject(each) for each in uvd]),
+                disparities=uvd[:, 2],
+                sigmas=rng.uniform(0.1, 1.0, (n, 3)),
+                stamp_ns=n,
+                descriptors_left=np.zeros((n, 32), dtype=np.uint8),
+            )
+        )
+    pairs = [(4, 0), (1, 3), (5, 4)]
+    matches = Correspondences.of(frames[0], frames[1], np.array(pairs))
+    chosen = matches.select(np.array([2, 0]))
+    for found, expected in ((matches, pairs), (chosen, [pairs[2], pairs[0]])):
+        assert len(found) == len(expected)
+        for row, (i, j) in enumerate(expected):
+            for frame, index, side in zip(frames, (i, j), ("source", "target"), strict=True):
+                point, uvd = getattr(found, f"{side}_points"), getattr(found, f"{side}_uvd")
+                np.testing.assert_array_equal(point[row], frame.points_cam[index])
+                np.testing.assert_array_equal(uvd[row, :2], frame.keypoints[index])
+                assert uvd[row, 2] == frame.disparities[index]
+                sigmas = getattr(found, f"{side}_sigmas")
+                np.testing.assert_array_equal(sigmas[row], frame.sigmas[index])

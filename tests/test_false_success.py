@@ -1,0 +1,92 @@
+"""Recordings that deceive: no frame is called `ok` where the registration is grossly wrong."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
+from gvo.geometry import se3
+from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
+
+TIED = (Status.OK, Status.RESUMED)
+
+
+@dataclass
+class Tracked:
+    """What the odometry said of each frame, and the truth."""
+
+    results: list[FrameResult]
+    T_world_cam: FloatArray
+
+    def errors_m(self) -> FloatArray:
+        estimates = np.array([result.causal.T_world_cam[:3, 3] for result in self.results])
+        return np.asarray(np.linalg.norm(estimates - self.T_world_cam[:, :3, 3], axis=1))
+
+    def wrong_steps(self) -> Iterator[int]:
+        """Yield frames registered far off: by 0.1 m or 0.5 deg, and 5 sigma of what was stated."""
+        for n in range(1, len(self.results)):
+            result, before = self.results[n], self.results[n - 1]
+            if result.registration is None:
+                continue
+            T_true = se3.invert(self.T_world_cam[n - 1]) @ self.T_world_cam[n]
+            T_raw = se3.invert(before.raw.T_world_cam) @ result.raw.T_world_cam
+            x = se3.log(se3.invert(T_true) @ T_raw)
+            is_far = np.linalg.norm(x[3:]) > 0.1 or np.linalg.norm(x[:3]) > np.radians(0.5)
+            sigmas = np.sqrt(x @ np.linalg.solve(result.registration.covariance, x))
+            if is_far and sigmas > 5.0:
+                yield n
+
+
+def track(
+    world: Any, sensor: Any = "stereo", *, n_frames: int, scale: float, **sections: Any
+) -> Tracked:
+    recording = SyntheticRecording(world, sensor, n_frames=n_frames, scale=scale)
+    config = Config.model_validate({"runtime": {"threads": 1}, **sections})
+    odometry = Odometry(recording.info.camera, config)
+    results = []
+    for frame in frames(recording, config):
+        assert isinstance(frame, StereoFrame | RgbdFrame)
+        results.append(odometry.track(frame))
+    return Tracked(results, recording.ground_truth().T_world_cam)
+
+
+@pytest.mark.slow
+def test_a_bus_that_fills_two_thirds_of_the_view_does_not_carry_the_camera_along() -> None:
+    tracked = track("traffic", n_frames=100, scale=0.4)
+    assert not list(tracked.wrong_steps())
+    assert tracked.errors_m().max() < 0.3
+
+
+def test_a_bus_that_drives_by_does_not_move_a_camera_at_rest() -> None:
+    tracked = track("traffic", n_frames=48, scale=0.4)
+    assert not list(tracked.wrong_steps())
+    assert tracked.errors_m().max() < 0.2
+
+
+def test_a_front_that_repeats_exactly_is_not_followed_by_a_window_off() -> None:
+    tracked = track("facade", n_frames=45, scale=0.4)
+    assert not list(tracked.wrong_steps())
+    travelled = np.linalg.norm(tracked.T_world_cam[-1, :3, 3])
+    assert tracked.errors_m()[-1] < 0.03 * travelled
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_before_a_blank_wall_no_pose_is_called_ok_until_the_room_is_back(sensor: str) -> None:
+    tracked = track("wall", sensor, n_frames=250, scale=0.3)
+    assert not list(tracked.wrong_steps())
+    blank = tracked.results[116:208]
+    assert not any(result.status in TIED for result in blank)
+    assert any(result.status is Status.LOST for result in blank)
+    spreads = [np.trace(result.causal.covariance[3:, 3:]) for result in blank]
+    assert spreads[-1] > 4.0 * spreads[0]
+    assert tracked.results[-1].status in TIED
+
+
+def test_a_swinging_mirror_misleads_by_no_more_than_what_it_shows_moves() -> None:
+    tracked = track("mirror", n_frames=60, scale=0.3)
+    assert not list(tracked.wrong_steps())
+    assert tracked.errors_m().max() < 0.3

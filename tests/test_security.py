@@ -1,0 +1,389 @@
+"""Nothing runs what it reads, nothing is written elsewhere, nothing is sent."""
+
+import ast
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gvo
+from gvo.outputs.converting import convert_recording
+from gvo.outputs.report import write_comparison_report, write_run_report
+from gvo.outputs.run_record import read_run
+from gvo.sources.recording import RecordingInfo
+from gvo.sources.synthetic import SyntheticRecording
+
+ROOT = Path(__file__).parent.parent
+PROGRAMS = [*sorted((ROOT / "gvo").rglob("*.py")), *sorted((ROOT / "scripts").rglob("*.py"))]
+
+# What turns data into code, or a name into a file that another program may have made meanwhile.
+FORBIDDEN_MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib"} | {
+    "marshal",
+    "shelve",
+    "code",
+    "codeop",
+}
+FORBIDDEN_NAMES = {"eval", "exec", "__import__"}
+FORBIDDEN_CALLS = {
+    *(f"os.{name}" for name in ("system", "popen", "startfile")),
+    *(f"subprocess.{name}" for name in ("getoutput", "getstatusoutput")),
+    *(f"yaml.{name}" for name in ("unsafe_load", "unsafe_load_all", "full_load", "full_load_all")),
+    "tempfile.mktemp",
+    "pandas.read_pickle",
+}
+UNSAFE_KEYWORDS = {"shell", "allow_pickle"}
+# Tests of the tests run changed copies of the project's own text; that is what they are for.
+ALLOWED = {"scripts/mutants.py": "exec", "scripts/mutation.py": "exec"}
+
+
+class Reader(ast.NodeVisitor):
+    """Collects what a program must not do."""
+
+    def __init__(self, tree: ast.Module) -> None:
+        self.faults: list[str] = []
+        self.names: dict[str, str] = {}
+        self.safe_loaders: set[str] = {"yaml.SafeLoader", "yaml.CSafeLoader"}
+        self.visit(tree)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            self.names[alias.asname or alias.name.partition(".")[0]] = (
+                alias.name if alias.asname else alias.name.partition(".")[0]
+            )
+            self._module(alias.name, node)
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        for alias in node.names:
+            self.names[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+            self._module(node.module or "", node)
+            self._call(f"{node.module}.{alias.name}", node)
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        if any(self._full(base) in self.safe_loaders for base in node.bases):
+            self.safe_loaders.add(node.name)
+        self.generic_visit(node)
+
+    def visit_Name(self, node: ast.Name) -> None:
+        if node.id in FORBIDDEN_NAMES:
+            self._note(node.id, node)
+
+    def visit_Attribute(self, node: ast.Attribute) -> None:
+        self._call(self._full(node), node)
+        self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        for keyword in node.keywords:
+            is_false = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+            if keyword.arg in UNSAFE_KEYWORDS and not is_false:
+                self._note(f"{keyword.arg}=...", node)
+        if self._full(node.func) in ("yaml.load", "yaml.load_all"):
+            loaders = [*node.args[1:2], *(k.value for k in node.keywords if k.arg == "Loader")]
+            if not any(self._full(loader) in self.safe_loaders for loader in loaders):
+                self._note("yaml.load without a safe loader", node)
+        self.generic_visit(node)
+
+    def _full(self, node: ast.expr) -> str:
+        """Return the name of a function as if it were spelt out."""
+        if isinstance(node, ast.Attribute):
+            return f"{self._full(node.value)}.{node.attr}"
+        return self.names.get(node.id, node.id) if isinstance(node, ast.Name) else ""
+
+    def _module(self, name: str, node: ast.stmt) -> None:
+        if name.partition(".")[0] in FORBIDDEN_MODULES:
+            self._note(name, node)
+
+    def _call(self, name: str, node: ast.AST) -> None:
+        if name in FORBIDDEN_CALLS or name.startswith(("os.exec", "os.spawn")):
+            self._note(name, node)
+
+    def _note(self, what: str, node: Any) -> None:
+        self.faults.append(f"line {node.lineno}: {what}")
+
+
+def faults(text: str) -> list[str]:
+    return Reader(ast.parse(text)).faults
+
+
+def test_no_program_runs_what_it_reads() -> None:
+    for path in PROGRAMS:
+        name = path.relative_to(ROOT).as_posix()
+        found = faults(path.read_text(encoding="utf-8"))
+        assert [line for line in found if line.split()[-1] != ALLOWED.get(name)] == [], name
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "import marshal as m",
+        "eval('1')",
+        "run = exec",
+        "__import__('x')",
+        "import os; os.system('ls')",
+        "from os import popen",
+        "import os as o; o.execv('a', [])",
+        "import tempfile; tempfile.mktemp()",
+        "import yaml; yaml.load(text)",
+        "import yaml; yaml.load(text, yaml.Loader)",
+        "import yaml as y; y.load_all(text, Loader=y.FullLoader)",
+        "import yaml; yaml.unsafe_load(text)",
+        "import numpy as np; np.load('a', allow_pickle=True)",
+        "import numpy as np; np.load('a', allow_pickle=is_trusted)",
+        "import subprocess; subprocess.run('ls', shell=True)",
+    ],
+)
+def test_what_runs_data_is_seen(text: str) -> None:
+    assert faults(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import re; re.compile('a'); model.eval(); rows.exec",
+        "import yaml; yaml.safe_load(text)",
+        "import yaml\nclass L(yaml.SafeLoader): ...\nyaml.load_all(text, Loader=L)",
+        "import numpy as np; np.load('a'); np.load('a', allow_pickle=False)",
+        "import subprocess; subprocess.run(['ls'], shell=False)",
+    ],
+)
+def test_what_is_harmless_passes(text: str) -> None:
+    assert faults(text) == []
+
+
+@pytest.fixture(scope="module")
+def recording() -> SyntheticRecording:
+    return SyntheticRecording("handheld", "stereo", n_frames=6, scale=0.25)
+
+
+@pytest.fixture(scope="module")
+def small_bag(recording: SyntheticRecording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("input") / "walk.mcap"
+    gvo.convert(recording, path)
+    return path
+
+
+class Watched:
+    """Folders of a run of commands in which all that a program may write to is empty at first."""
+
+    def __init__(self, folder: Path) -> None:
+        self.out, self.log = folder / "out", folder / "log.txt"
+        self.places = {name: folder / name for name in ("home", "cwd", "tmp", "matplotlib")}
+        for place in (self.out, *self.places.values()):
+            place.mkdir(parents=True)
+
+    def run(self, commands: list[list[str]]) -> list[tuple[str, str]]:
+        """Run commands; return what they did: what kind of deed, and to what."""
+        environment = {
+            **os.environ,
+            "HOME": str(self.places["home"]),
+            "TMPDIR": str(self.places["tmp"]),
+            "MPLCONFIGDIR": str(self.places["matplotlib"]),
+            "XDG_CACHE_HOME": str(self.places["home"] / "cache"),
+            "XDG_CONFIG_HOME": str(self.places["home"] / "config"),
+            "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "OMP_NUM_THREADS": "1",
+        }
+        program = Path(__file__).parent / "audited_commands.py"
+        answer = subprocess.run(
+            [sys.executable, str(program), str(self.log), json.dumps(commands)],
+            cwd=self.places["cwd"],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert answer.returncode == 0, answer.stderr
+        rows = [json.loads(line) for line in self.log.read_text(encoding="utf-8").splitlines()]
+        return [(kind, what) for kind, what in rows]
+
+    def assert_nothing_elsewhere(self, deeds: list[tuple[str, str]]) -> None:
+        """Only `--out` and what is gone again was written to, and no socket was opened."""
+        assert [what for kind, what in deeds if kind == "socket"] == []
+        allowed = (self.out, self.places["tmp"], self.places["matplotlib"])
+        written = [Path(what) for kind, what in deeds if kind == "write"]
+        assert any(path.is_relative_to(self.out) for path in written)
+        elsewhere = {p for p in written if not any(p.is_relative_to(a) for a in allowed)}
+        assert elsewhere - {Path(os.devnull)} == set()
+        # Libraries that are not written in Python tell no hook: what they leave is seen here.
+        for name in ("home", "cwd", "tmp"):
+            assert [str(path) for path in self.places[name].rglob("*")] == []
+        left = [path for path in self.out.rglob("*") if path.name.startswith(".")]
+        assert left == []
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Watched:
+    return Watched(tmp_path.resolve() / "watched")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_commands_write_nothing_but_what_they_are_told_to(
+    small_bag: Path, watched: Watched
+) -> None:
+    bag, out = str(small_bag), str(watched.out)
+    extras = [
+        "--bag",
+        f"{out}/run.mcap",
+        "--overlay",
+        f"{out}/film.webm",
+    ]
+    if importlib.util.find_spec("rerun") is not None:
+        extras += ["--rerun", f"{out}/run.rrd"]
+    truth, raw = f"{out}/run/ground_truth.txt", f"{out}/run/raw.txt"
+    deeds = watched.run(
+        [
+            ["run", bag, "--out", f"{out}/run", *extras],
+            ["compare", truth, raw, "--plot", f"{out}/errors.png", "--report", f"{out}/page.html"],
+            ["smooth", raw, "--out", f"{out}/smoothed"],
+            ["convert", bag, f"{out}/drive.db3"],
+            ["convert", bag, f"{out}/kitti", "--layout", "kitti"],
+            ["explain", bag, "--frame", "3", "--out", f"{out}/explained"],
+            ["shuttle", bag, "--out", f"{out}/shuttle"],
+        ]
+    )
+    watched.assert_nothing_elsewhere(deeds)
+    # Matplotlib looks for fonts once, and keeps the list in its own folder.
+    assert {what for kind, what in deeds if kind == "program"} <= {"fc-list"}
+    assert {path.name.partition("-")[0] for path in watched.places["matplotlib"].iterdir()} <= {
+        "fontlist"
+    }
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_run_without_report_writes_nothing_else_at_all(small_bag: Path, watched: Watched) -> None:
+    commands = [
+        ["run", str(small_bag), "--out", str(watched.out / "run"), "--no-report"],
+        ["check", str(small_bag)],
+        ["config"],
+    ]
+    deeds = watched.run(commands)
+    watched.assert_nothing_elsewhere(deeds)
+    assert {what for kind, what in deeds if kind == "program"} == set()
+    assert list(watched.places["matplotlib"].iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_deed_elsewhere_is_seen(watched: Watched, small_bag: Path) -> None:
+    # The hook itself: a converted bag beside `--out` is named by it.
+    target = watched.places["cwd"] / "drive.mcap"
+    deeds = watched.run([["convert", str(small_bag), str(target)]])
+    with pytest.raises(AssertionError):
+        watched.assert_nothing_elsewhere(deeds)
+    assert ("write", str(target)) in deeds
+
+
+PAYLOAD = "</script><script src=x></script><xss-tag onload='x'>\"'><xss-tag>&lt;"
+
+
+class Page(HTMLParser):
+    """What a browser makes of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.texts: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def assert_harmless(page: Page) -> None:
+    """The payload is there as text, and did not become part of the page."""
+    assert "xss-tag" not in page.tags
+    names = {name for name, _ in page.attributes}
+    assert not any(name.startswith("on") for name in names)
+    assert [value for name, value in page.attributes if name == "src"] == []
+    assert any("xss-tag" in text for text in page.texts)
+
+
+def poisoned(value: Any) -> Any:
+    """Return a summary with the payload at the end of every text and of every name's list."""
+    if isinstance(value, str):
+        return f"{value} {PAYLOAD}"
+    if isinstance(value, dict):
+        return {key: poisoned(item) for key, item in value.items()}
+    return [*map(poisoned, value), PAYLOAD] if isinstance(value, list) and value else value
+
+
+def test_a_report_shows_what_a_recording_says_and_does_not_run_it(
+    recording: SyntheticRecording, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    gvo.run_recording(recording, run, outputs=gvo.RunOutputs(report=False))
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    for key in ("recording", "sensor", "frame", "ground_truth", "gvo_version"):
+        summary[key] = PAYLOAD
+    summary["decisions"] = summary["warnings"] = [PAYLOAD]
+    summary["errors"] = [{**row, "name": PAYLOAD} for row in summary["errors"]]
+    summary["configuration"] = poisoned(summary["configuration"])
+    (run / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    write_run_report(run / "report.html", read_run(run))
+    page = Page((run / "report.html").read_text(encoding="utf-8"))
+    assert_harmless(page)
+    assert page.texts.count(PAYLOAD) >= 5
+
+
+def test_a_comparison_shows_names_and_does_not_run_them(
+    recording: SyntheticRecording, tmp_path: Path
+) -> None:
+    truth = recording.ground_truth()
+    path = tmp_path / "page.html"
+    evaluation = gvo.evaluate(truth, truth, name=PAYLOAD)
+    write_comparison_report(path, truth, {PAYLOAD: truth}, [evaluation], align="se3")
+    assert_harmless(Page(path.read_text(encoding="utf-8")))
+
+
+class Named:
+    """A rendered recording under another name, also that of its camera in tf."""
+
+    def __init__(self, recording: SyntheticRecording, name: str) -> None:
+        self._recording, self._name = recording, name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recording, name)
+
+    @property
+    def info(self) -> RecordingInfo:
+        return replace(
+            self._recording.info, name=self._name, frame_id=self._name, decisions=[self._name]
+        )
+
+
+@pytest.mark.parametrize("name", ["../../outside", "{}/outside", "..", "a/b", PAYLOAD])
+def test_a_recording_cannot_choose_where_it_is_written(
+    recording: SyntheticRecording, tmp_path: Path, name: str
+) -> None:
+    name, parent = name.format(tmp_path), tmp_path / "a" / "b" / "c"
+    source = Named(recording, name)
+    outputs = gvo.RunOutputs(report=False)
+    result = gvo.run_recording(source, parent / "out", outputs=outputs)
+    assert result.summary["recording"] == name
+    convert_recording(source, parent / "folder", layout="euroc")
+    convert_recording(source, parent / "walk.db3")
+    assert {path.parts[:3] for path in everything(tmp_path)} <= {
+        ("a",),
+        ("a", "b"),
+        ("a", "b", "c"),
+    }
+    assert {path.name for path in parent.iterdir()} == {"out", "folder", "walk.db3"}
+
+
+def everything(folder: Path) -> list[Path]:
+    return [path.relative_to(folder) for path in folder.rglob("*")]

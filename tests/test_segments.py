@@ -1,0 +1,247 @@
+"""A lost camera begins a segment, which is joined where a kept keyframe is seen again for sure."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from gvo.config import Config
+from gvo.geometry import se3
+from gvo.odometry import FrameResult, Odometry
+from gvo.segments import Segments
+from gvo.types import Failure, FloatArray, RelativePose, SegmentJoin, Status
+
+STEP_NS = 100_000_000
+SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A frame of a sensor that knows where it is; dark ones see nothing."""
+
+    stamp_ns: int
+    T_world_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+    is_dark: bool = False
+
+
+@dataclass
+class Beacon:
+    """A front-end that registers what is less than half a metre apart.
+
+    `see` is what it says when asked for a place again: the true relative pose, changed.
+    """
+
+    see: Callable[[FloatArray], FloatArray | None] = lambda T: T
+    reach_m: float = 0.5
+    n_looked: int = 0
+
+    def extract(self, frame: Place) -> Place:
+        return frame
+
+    def register(
+        self, reference: Place, current: Place, prior: FloatArray | None
+    ) -> RelativePose | Failure:
+        T = true_step(reference, current)
+        if reference.is_dark or current.is_dark or np.linalg.norm(T[:3, 3]) > self.reach_m:
+            return Failure(reason="nothing in common")
+        return relative(T)
+
+    def relocalize(self, reference: Place, current: Place) -> RelativePose | Failure:
+        self.n_looked += 1
+        seen = None if current.is_dark else self.see(true_step(reference, current))
+        return Failure(reason="never seen") if seen is None else relative(seen)
+
+
+class Plain(Beacon):
+    """The same without a way to look for a place."""
+
+    relocalize = None  # type: ignore[assignment]
+
+
+def true_step(reference: Place, current: Place) -> FloatArray:
+    return np.asarray(se3.invert(reference.T_world_frame) @ current.T_world_frame)
+
+
+def relative(T: FloatArray) -> RelativePose:
+    return RelativePose(T_reference_current=T, covariance=np.diag(SIGMAS**2))
+
+
+def at(x: float, turn: float = 0.0) -> FloatArray:
+    return np.asarray(
+        se3.exp(np.array([0.0, 0.0, 0.0, x, 0.0, 0.0]))
+        @ se3.exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0]))
+    )
+
+
+def walk(n_dark: int = 6, n_after: int = 12, *, away: FloatArray) -> list[Place]:
+    """Walk for a metre; the light goes out; go on from elsewhere."""
+    poses = [at(0.1 * n) for n in range(10)]
+    poses += [at(1.0)] * n_dark
+    poses += [away @ at(0.1 * n) for n in range(n_after)]
+    return [
+        Place(stamp_ns=n * STEP_NS, T_world_frame=T, is_dark=10 <= n < 10 + n_dark)
+        for n, T in enumerate(poses)
+    ]
+
+
+def run(frontend: Beacon, places: list[Place], **window: object) -> list[FrameResult]:
+    settings = {"lost_after_s": 0.35, "keyframe_distance_m": 0.3, "n_keyframes": 4} | window
+    odometry = Odometry(config=Config.model_validate({"window": settings}), frontend=frontend)
+    return [odometry.track(place) for place in places]
+
+
+def errors(results: list[FrameResult], places: list[Place]) -> list[float]:
+    return [
+        float(np.linalg.norm((result.causal.T_world_cam - place.T_world_frame)[:3]))
+        for result, place in zip(results, places, strict=True)
+    ]
+
+
+AWAY = at(3.0, turn=2.0)
+
+
+def test_a_segment_begins_with_the_first_lost_frame() -> None:
+    results = run(Beacon(see=lambda _: None), walk(away=AWAY))
+    statuses = [result.status for result in results]
+    first = statuses.index(Status.LOST)
+    # 0.35 s after the last frame that was tied, the tenth.
+    assert first == 9 + 4
+    assert [result.segment for result in results] == [0] * first + [1] * (len(results) - first)
+    assert statuses[16:18] == [Status.LOST, Status.RESUMED]
+    assert set(statuses[18:]) == {Status.OK}
+
+
+def test_a_gap_without_frames_is_as_long_as_one_of_dark_frames() -> None:
+    places = [place for place in walk(away=AWAY) if not place.is_dark]
+    results = run(Beacon(see=lambda _: None), places)
+    assert results[10].status is Status.LOST
+    assert [result.segment for result in results] == [0] * 10 + [1] * 12
+
+
+def test_a_keyframe_that_is_seen_twice_joins_the_segments() -> None:
+    places = walk(away=AWAY)
+    results = run(Beacon(), places)
+    joins = [join for result in results for join in result.joins]
+    assert len(joins) == 1
+    join = joins[0]
+    assert (join.segment, join.to_segment) == (1, 0)
+    assert join.reference_ns < 10 * STEP_NS
+    joined = join.stamp_ns // STEP_NS
+    # The first bright frame sees it, the next one, registered against the first, confirms it.
+    assert joined == 17
+    assert results[joined].status is Status.RESUMED
+    found = errors(results, places)
+    assert found[joined - 1] > 1.0
+    assert max(found[joined:]) < 0.02
+    sigma = [float(np.sqrt(result.causal.covariance[3, 3])) for result in results]
+    assert sigma[joined - 1] > 0.5
+    assert max(sigma[joined:]) < 0.2
+    assert {result.segment for result in results[joined:]} == {1}
+
+
+def test_nobody_looks_where_that_is_switched_off() -> None:
+    frontend = Beacon()
+    results = run(frontend, walk(away=AWAY), relocalize=False)
+    assert frontend.n_looked == 0
+    assert not any(result.joins for result in results)
+
+
+def test_the_raw_chain_is_never_joined() -> None:
+    places = walk(away=AWAY)
+    joined = run(Beacon(), places)
+    apart = run(Beacon(see=lambda _: None), places)
+    for first, second in zip(joined, apart, strict=True):
+        np.testing.assert_array_equal(first.raw.T_world_cam, second.raw.T_world_cam)
+
+
+def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:
+    frontend = Beacon(see=lambda _: None)
+    results = run(frontend, walk(away=at(1.0)))
+    joins = [join for result in results for join in result.joins]
+    assert [(join.segment, join.to_segment) for join in joins] == [(1, 0)]
+    assert joins[0].stamp_ns == 16 * STEP_NS
+    assert joins[0].reference_ns == 9 * STEP_NS
+
+
+def test_sightings_that_contradict_each_other_join_nothing() -> None:
+    seen = iter(range(1000))
+    results = run(Beacon(see=lambda T: np.asarray(at(0.5 * next(seen)) @ T)), walk(away=AWAY))
+    assert not any(result.joins for result in results)
+    assert errors(results, walk(away=AWAY))[-1] > 1.0
+
+
+def test_a_false_sighting_is_forgotten_when_the_next_two_agree() -> None:
+    n_false = iter(range(1000))
+    places = walk(away=AWAY)
+    results = run(Beacon(see=lambda T: T if next(n_false) else np.asarray(at(5.0) @ T)), places)
+    assert [len(result.joins) for result in results[16:20]] == [0, 0, 1, 0]
+    assert errors(results, places)[-1] < 0.02
+
+
+def test_without_a_way_to_look_for_a_place_it_is_registered_without_a_prior() -> None:
+    places = walk(away=at(0.2, turn=0.5))
+    results = run(Plain(reach_m=0.3), places)
+    assert [join.to_segment for result in results for join in result.joins] == [0]
+    assert errors(results, places)[-1] < 0.02
+
+
+def test_a_camera_that_stands_still_elsewhere_stops_looking() -> None:
+    frontend = Beacon(see=lambda _: None)
+    places = walk(n_after=1, away=AWAY)
+    places += [Place(stamp_ns=(len(places) + n) * STEP_NS, T_world_frame=AWAY) for n in range(60)]
+    run(frontend, places)
+    assert 20 <= frontend.n_looked <= 40
+
+
+def test_a_camera_that_moves_on_elsewhere_looks_ever_more_rarely() -> None:
+    frontend = Beacon(see=lambda _: None)
+    places = walk(n_after=600, away=AWAY)
+    counts = []
+    settings = {"lost_after_s": 0.35, "keyframe_distance_m": 0.1}
+    odometry = Odometry(config=Config.model_validate({"window": settings}), frontend=frontend)
+    for place in places:
+        odometry.track(place)
+        counts.append(frontend.n_looked)
+    assert counts[40] - counts[16] >= 40
+    assert 4 <= counts[-1] - counts[-200] <= 2 * 200 // 30 + 2
+
+
+def test_keyframes_that_wait_are_no_more_than_those_in_use() -> None:
+    places: list[Place] = []
+    for n in range(6):  # six rooms, each entered in the dark
+        room = walk(n_dark=6, n_after=0, away=np.eye(4))
+        start_ns = len(places) * STEP_NS
+        places += [
+            Place(
+                stamp_ns=start_ns + place.stamp_ns,
+                T_world_frame=at(20.0 * n) @ place.T_world_frame,
+                is_dark=place.is_dark,
+            )
+            for place in room
+        ]
+    results = run(Beacon(see=lambda _: None), places)
+    assert results[-1].segment == 6
+    assert max(len(result.keyframes_ns) for result in results) <= 2 * 4
+
+
+def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> None:
+    segments = Segments()
+    for n in (10, 20, 30):
+        segments.note_frame(n, None, Status.LOST)
+        segments.note_frame(n + 1, n, Status.RESUMED)
+    assert segments.current == 3
+    assert segments.apart([5, 15, 25, 35]) == [5, 15, 25]
+    assert segments.join(31, 5) == SegmentJoin(segment=3, to_segment=0, stamp_ns=31, reference_ns=5)
+    assert segments.apart([5, 15, 25, 35]) == [15, 25]
+    assert segments.join(32, 15) is not None
+    assert segments.apart([5, 15, 25, 35]) == [25]
+    assert segments.join(33, 5) is None
+
+
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_every_waiting_keyframe_has_its_turn(n: int) -> None:
+    segments = Segments()
+    held = list(range(n))
+    looked = [ns for _ in range(10) for ns in segments.to_look_for(held)]
+    assert set(looked) == set(held)

@@ -1,0 +1,167 @@
+"""Runs and checks over rendered recordings with faults; each image is rendered once."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gvo.checkup import check_recording
+from gvo.config import Config
+from gvo.errors import GvoError
+from gvo.geometry import se3
+from gvo.run_outputs import RunOutputs
+from gvo.runs import run_recording
+from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
+from gvo.sources.synthetic import SyntheticRecording
+from gvo.testing.faults import FaultySource, NamedFault
+from gvo.trajectory import Trajectory
+from gvo.trajectory_files import read_trajectory
+from gvo.types import FloatArray, IntArray
+
+_SCALE = 0.4
+
+
+@dataclass(frozen=True)
+class Held:
+    """A recording as a list of images, each rendered once at most."""
+
+    info: RecordingInfo
+    items: tuple[StampedImage, ...]
+    truth: Trajectory
+
+    def images(self) -> Iterator[StampedImage]:
+        yield from self.items
+
+    def ground_truth(self) -> Trajectory:
+        return self.truth
+
+    def cut(self, n_frames: int) -> Held:
+        """Return the first frames."""
+        return Held(
+            info=replace(self.info, n_images=n_frames),
+            items=self.items[: 2 * n_frames],
+            truth=self.truth.select(slice(0, n_frames)),
+        )
+
+
+@cache
+def _rendered(sensor: Sensor) -> Held:
+    source = SyntheticRecording("handheld", sensor, n_frames=330, scale=_SCALE)
+    items = tuple(replace(image, load=cache(image.load)) for image in source.images())
+    return Held(info=source.info, items=items, truth=source.ground_truth())
+
+
+def sound(sensor: Sensor, n_frames: int = 20) -> Held:
+    """Return a recording without faults."""
+    return _rendered(sensor).cut(n_frames)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run over a faulty recording left.
+
+    `errors_m` and `deviations` are of the causal poses: their distance to the truth, and the
+    Mahalanobis norm of the error; NaN where the truth is not known. `frames` are the numbers of
+    the poses' frames in the sound recording; `rows` those of frames.csv.
+    """
+
+    exit_code: int
+    message: str = ""
+    warnings: tuple[str, ...] = ()
+    summary: dict[str, Any] = field(default_factory=dict)
+    rows: list[dict[str, str]] = field(default_factory=list)
+    n_given: int = 0
+    frames: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    poses: dict[str, FloatArray] = field(default_factory=dict)
+    covariances: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    errors_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+    deviations: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def n(self, status: str) -> int:
+        """Count the frames of a status."""
+        return sum(row["status"] == status for row in self.rows)
+
+
+def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
+    """Run odometry; only a GvoError may come out of it, as the command line catches it."""
+    try:
+        result = run_recording(source, out, outputs=RunOutputs(report=False))
+    except GvoError as error:
+        return Outcome(exit_code=2, message=str(error))
+    with (out / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    poses = {name: read_trajectory(out / f"{name}.txt") for name in ("raw", "causal", "smoothed")}
+    causal, covariances = poses["causal"], _read_covariances(out / "causal_covariance.csv")
+    given = [shot for shot in _until_error(source) if shot.image.stream == 0]
+    with_pose = {int(row["stamp_ns"]) for row in rows if row["status"] != "skipped"}
+    # where a stamp repeats, the first image has the pose
+    of_stamp = {shot.image.stamp_ns: shot.frame for shot in reversed(given)}
+    frames = np.array([of_stamp[stamp_ns] for stamp_ns in causal.stamps_ns.tolist()])
+    assert with_pose == set(causal.stamps_ns.tolist())
+    errors_m, deviations = _errors(truth, frames, causal.T_world_cam, covariances)
+    return Outcome(
+        exit_code=result.exit_code,
+        warnings=result.warnings,
+        summary=result.summary,
+        rows=rows,
+        n_given=len(given),
+        frames=frames,
+        poses={name: trajectory.T_world_cam for name, trajectory in poses.items()},
+        covariances=covariances,
+        errors_m=errors_m,
+        deviations=deviations,
+    )
+
+
+def complaints(source: FaultySource) -> set[str]:
+    """Return what `gvo check` warns of, without the names of streams."""
+    n_samples = 4 if source.info.sensor == "stereo" else 10
+    checkup = check_recording(source, Config(), n_samples=n_samples)
+    found = checkup.with_verdict("warning", "fault")
+    return {finding.name.rpartition(": ")[2] for finding in found}
+
+
+def faulty(fault: NamedFault, sensor: Sensor, *, is_lasting: bool = False) -> FaultySource:
+    return fault.put_into(sound(sensor, fault.n_frames), is_lasting=is_lasting)
+
+
+def _until_error(source: FaultySource) -> Iterator[Any]:
+    shots = source.shots()
+    return takewhile(lambda shot: shot is not None, (_next(shots) for _ in iter(int, 1)))
+
+
+def _next(shots: Iterator[Any]) -> Any:
+    try:
+        return next(shots, None)
+    except (GvoError, OSError):
+        return None
+
+
+def _read_covariances(path: Path) -> FloatArray:
+    """Read the upper triangles of a table, stamp first."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)[:, 1:]
+    covariances = np.zeros((len(table), 6, 6))
+    rows, columns = np.triu_indices(6)
+    covariances[:, rows, columns] = covariances[:, columns, rows] = table
+    return covariances
+
+
+def _errors(
+    truth: Trajectory, frames: IntArray, poses: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    true = se3.invert(truth.T_world_cam[frames[0]]) @ truth.T_world_cam[frames]
+    errors = [se3.log(se3.invert(T) @ T_true) for T, T_true in zip(poses, true, strict=True)]
+    floor = 1e-10 * np.eye(6)
+    squares = [
+        error @ np.linalg.solve(covariance + floor, error)
+        for error, covariance in zip(errors, covariances, strict=True)
+    ]
+    distances = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    return distances, np.sqrt(np.array(squares))
