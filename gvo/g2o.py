@@ -162,7 +162,7 @@ def _covariance(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
         covariance = np.linalg.inv(information)
     except np.linalg.LinAlgError:
         return np.full((6, 6), np.nan)
-    return np.asarray(0.5 * (covariance + covariance.T))
+    return np.asarray(0.5 * covariance + 0.5 * covariance.T)  # halves first: no overflow
 
 
 def format_vertex(frame_id: int | str, T_world_frame: FloatArray) -> str:

@@ -7,6 +7,7 @@ rectified camera (x right, y down, z forward), as in image_geometry and stereo_i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, TypeAlias
@@ -337,7 +338,7 @@ def parse_initial_pose(text: str) -> InitialPose:
             f"--initial-pose {text!r}: expected X,Y,Z or X,Y,Z,QX,QY,QZ,QW (metres), or truth"
         )
     quaternion_xyzw = numbers[3:] if len(numbers) == 7 else np.array([0.0, 0.0, 0.0, 1.0])
-    norm = float(np.linalg.norm(quaternion_xyzw))
+    norm = math.hypot(*quaternion_xyzw)  # squares of huge numbers overflow
     if abs(norm - 1.0) > _NORM_TOLERANCE:
         raise ConfigurationError(
             f"--initial-pose {text!r}: the quaternion QX,QY,QZ,QW has the norm {norm:.4g}, "

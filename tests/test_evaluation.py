@@ -238,6 +238,49 @@ def test_wrong_use_is_refused() -> None:
             evaluate(reference, reference, name="e", segments=[length])
 
 
+def test_stamps_may_differ_by_what_is_allowed_and_no_more() -> None:
+    reference = drive(30)
+    late = Trajectory(stamps_ns=reference.stamps_ns + 12_000_000, T_world_cam=reference.T_world_cam)
+    with pytest.raises(TrajectoryError, match="share no stamps"):
+        evaluate(reference, late, name="late")
+    found = evaluate(reference, late, name="late", max_difference_ns=12_000_000)
+    assert found.n == 30
+    with pytest.raises(TrajectoryError, match="share no stamps"):
+        evaluate(reference, late, name="late", max_difference_ns=11_999_999)
+
+
+def test_segments_of_less_than_a_metre_and_a_single_one_are_measured() -> None:
+    reference, estimate = straight(4, 0.25), straight(4, 0.3)
+    # Half a metre is passed by the third step: one start, an error of three times 5 cm.
+    shares, turns = segment_errors(reference, estimate, lengths_m=[0.5], step=1)
+    np.testing.assert_allclose(shares, [0.15 / 0.5])
+    np.testing.assert_allclose(turns, [0.0], atol=1e-12)
+    found = evaluate(reference, estimate, name="e", segments=[0.5], segment_step=1, align="origin")
+    assert found.n_segments == 1
+    assert found.t_pct == pytest.approx(30.0)
+    assert found.r_deg_per_100m == pytest.approx(0.0, abs=1e-9)
+    two = evaluate(straight(2, 1.0), straight(2, 1.2), name="e", align="none")
+    assert two.rpe_m == pytest.approx(0.2)
+    assert two.rpe_deg == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(ValueError, match="got 1 and"):
+        segment_errors(reference, estimate, lengths_m=[0.5, 0.0], step=1)
+
+
+def test_pairs_as_far_apart_as_the_trajectory_is_long_are_none() -> None:
+    for delta, n_pairs in ((1, 4), (4, 1), (5, 0), (9, 0)):
+        errors, turns = relative_errors(straight(5, 1.0), straight(5, 1.1), delta=delta)
+        assert len(errors) == len(turns) == n_pairs
+    assert evaluate(straight(5, 1.0), straight(5, 1.1), name="e", rpe_delta=5).rpe_m is None
+
+
+def test_a_path_of_a_micrometre_is_no_motion() -> None:
+    still = straight(2, 1e-6)
+    assert float(still.distances()[-1]) == 1e-6
+    assert evaluate(still, still, name="e", align="none").path_ratio is None
+    moving = straight(2, 1.001e-6)
+    assert evaluate(moving, moving, name="e", align="none").path_ratio == pytest.approx(1.0)
+
+
 def test_an_estimate_of_another_recording_is_named() -> None:
     other = Trajectory(stamps_ns=np.arange(3), T_world_cam=np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(TrajectoryError, match=r"^raw and the reference share no stamps"):

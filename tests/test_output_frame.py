@@ -278,7 +278,18 @@ def test_the_initial_pose_is_read_with_and_without_a_rotation() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "1,2", "1,2,x", "1,2,nan", "1,2,3,0,0,90", "Truth", "1,2,3,0,0,0,0", "1;2;3"]
+    "text",
+    [
+        "",
+        "1,2",
+        "1,2,x",
+        "1,2,nan",
+        "1,2,3,0,0,90",
+        "Truth",
+        "1,2,3,0,0,0,0",
+        "1;2;3",
+        "1,2,3,-1e308,2,0,0",
+    ],
 )
 def test_an_initial_pose_that_is_none_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ConfigurationError, match=r"--initial-pose .*expected") as caught:

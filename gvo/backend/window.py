@@ -752,13 +752,24 @@ class SlidingWindow:
                 self._ledger.add(n_restored=1)
                 _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
                 reason = f"GTSAM gave up on the update: {error}"
-                if self._graph.can_be_hardened:
-                    self._graph = self._graph.hardened()
+                if not self._hardened():
+                    break
             else:
                 if self._log is not None:
                     self._log.add(factors, gtsam.Values(), keys={})
                 return estimate
         return self._reject(frame_id, reason, edge=edge)
+
+    def _hardened(self) -> bool:
+        """Go on with a graph that takes worse conditioned factors; False where there is none."""
+        if not self._graph.can_be_hardened:
+            return False
+        try:
+            self._graph = self._graph.hardened()
+        except SmoothingError as error:
+            _LOGGER.warning("the graph stays as it is: %s", first_line(error))
+            return False
+        return True
 
     def _updated(self, frame_id: FrameId, factors: gtsam.NonlinearFactorGraph) -> Estimate:
         """Return a pose after factors between known poses were added."""

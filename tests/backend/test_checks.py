@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from gvo.backend.checks import (
     covariance_fault,
     find_faults,
+    is_definite,
     place_fault,
     pose_fault,
     prior_fault,
@@ -201,3 +202,64 @@ def test_a_result_that_is_nowhere_is_told() -> None:
         assert "not finite" in pose_fault(changed(T, 1, 1, value=entry), np.eye(6))
         assert "not finite" in pose_fault(T, changed(np.eye(6), 2, 3, value=entry))
     assert "diverged" in pose_fault(changed(T, 2, 3, value=-1e9), np.eye(6))
+
+
+def test_the_bounds_themselves_are_let_in() -> None:
+    # Of numbers that have an exact square and an exact root.
+    for axis in range(3):
+        for place in (-1e8, 1e8):
+            far = changed(np.eye(4), axis, 3, value=place)
+            assert_both_doors_say(edge(far, np.eye(6)), is_good=True)
+            beyond = changed(far, axis, 3, value=np.nextafter(place, 2.0 * place))
+            assert_both_doors_say(edge(beyond, np.eye(6)), is_good=False)
+            position = PositionPrior(position_world=far[:3, 3], covariance=np.eye(3))
+            assert prior_fault(position) == ""
+            assert place_fault(2.0 * far[:3, 3]) == ""
+            assert place_fault(2.0 * beyond[:3, 3]) != ""
+    largest = changed(np.eye(6), 2, 2, value=1e12)
+    assert_both_doors_say(edge(np.eye(4), largest), is_good=True)
+    smallest = changed(np.eye(6), 2, 2, value=1e-8**2)
+    assert_both_doors_say(edge(np.eye(4), smallest), is_good=True)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "told"),
+    [
+        ([1.0, 1e-9, 1.0, 2.0, 1.0, 1.0], "its sigma 1e-09 is outside 1e-08 to 1e+06"),
+        ([1.0, 1.0, 1.0, 2.0, 3e7, 1.0], "its sigma 3e+07 is outside 1e-08 to 1e+06"),
+        ([1e9, 1.0, 1.0, 2.0, 1e-9, 1.0], "its sigma 1e-09 is outside 1e-08 to 1e+06"),
+    ],
+)
+def test_the_sigma_that_is_out_of_bounds_is_told_with_the_bounds(
+    sigmas: list[float], told: str
+) -> None:
+    assert covariance_fault(np.diag(np.square(sigmas))) == told
+
+
+def test_the_coordinate_that_is_out_of_bounds_is_told_with_the_bound() -> None:
+    told = "a coordinate of 3e+08 m is beyond 1e+08 m"
+    position = np.array([2e8, -3e8, 1.0])
+    assert transform_fault(se3.make_transform(np.eye(3), position)) == told
+    assert prior_fault(PositionPrior(position_world=position, covariance=np.eye(3))) == told
+
+
+def test_a_stack_of_places_is_as_far_as_the_farthest() -> None:
+    places = np.zeros((3, 2, 3))
+    assert place_fault(places) == ""
+    places[2, 1, 0] = -3e8
+    assert place_fault(places) == "a pose diverged to 3e+08 m"
+
+
+def test_no_edges_have_no_faults() -> None:
+    assert find_faults([]) == []
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_what_is_definite_is_told_as_eigenvalues_tell_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    for least, expected in ((1e-3, True), (-1e-3, False)):
+        eigenvalues = np.r_[rng.uniform(0.1, 2.0, 5), least]
+        symmetric = (vectors * rng.permutation(eigenvalues)) @ vectors.T
+        assert is_definite(0.5 * (symmetric + symmetric.T)) is expected

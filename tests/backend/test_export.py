@@ -67,6 +67,18 @@ def test_one_name_that_is_no_number_is_enough_to_number_all(
     assert sorted(values.keys()) == list(range(len(names)))
 
 
+@pytest.mark.parametrize("names", [[0, 7, 5], [4, np.int64(0)], [1, 9]])
+def test_names_that_are_whole_numbers_stay_zero_among_them(
+    names: list[FrameId], tmp_path: Path
+) -> None:
+    window = fill(names)
+    window.write_g2o(tmp_path / "window.g2o")
+    lines = (tmp_path / "window.g2o").read_text().splitlines()
+    for name, line in zip(names, lines, strict=False):
+        assert line.startswith(f"VERTEX_SE3:QUAT {name} ")
+        assert "#" not in line
+
+
 def test_a_file_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     with pytest.raises(SmoothingError, match="cannot be written"):
         fill(["a"]).write_g2o(tmp_path / "no such folder" / "window.g2o")

@@ -9,7 +9,7 @@ from scipy import integrate, stats
 
 from gvo.backend.factors import Factors
 from gvo.config import Kernel, WindowConfig
-from gvo.types import Edge, FloatArray, PositionPrior
+from gvo.types import Edge, FloatArray, PosePrior, PositionPrior
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 KERNELS: tuple[Kernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
@@ -121,3 +121,52 @@ def test_a_position_weighs_along_the_axes_of_the_world() -> None:
     assert factors.prior(7, prior).error(values) == pytest.approx(1.5)
     found = factors.residual_of_prior(prior, "a", T.matrix())
     np.testing.assert_allclose(found.residual, [1.0, 1.0, 1.0])
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
+def test_residuals_are_those_of_gtsam_in_the_axes_of_the_frame(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second, measured = (
+        gtsam.Pose3.Expmap(np.r_[rng.normal(size=3), 5.0 * rng.normal(size=3)]) for _ in range(3)
+    )
+    covariance = np.diag(rng.uniform(0.1, 2.0, 6) ** 2)
+    sigmas = np.sqrt(np.diag(covariance))
+    edge = Edge(reference_id="a", T_reference_frame=measured.matrix(), covariance=covariance)
+    factors = Factors(WindowConfig(kernel="none"))
+    found = factors.residual_of_edge(edge, "b", first.matrix(), second.matrix())
+    expected = gtsam.Pose3.Logmap(first.compose(measured).inverse().compose(second))
+    np.testing.assert_allclose(found.residual, expected / sigmas, atol=1e-7)
+    assert (found.reference_id, found.frame_id, found.weight) == ("a", "b", 1.0)
+    assert found.T_reference_frame is edge.T_reference_frame
+
+    prior = PosePrior(T_world_frame=measured.matrix(), covariance=covariance)
+    found = factors.residual_of_prior(prior, "b", second.matrix())
+    expected = gtsam.Pose3.Logmap(measured.inverse().compose(second))
+    np.testing.assert_allclose(found.residual, expected / sigmas, atol=1e-7)
+    assert (found.reference_id, found.frame_id) == (None, "b")
+    made = factors.prior(3, prior)
+    values = gtsam.Values()
+    values.insert(3, second)
+    whitened = found.residual @ found.residual
+    assert made.error(values) == pytest.approx(0.5 * whitened, rel=1e-6)
+
+    place = PositionPrior(position_world=rng.normal(size=3), covariance=covariance[:3, :3])
+    at = factors.residual_of_prior(place, "b", second.matrix())
+    np.testing.assert_allclose(
+        at.residual, (second.translation() - place.position_world) / sigmas[:3], atol=1e-9
+    )
+    np.testing.assert_allclose(at.T_reference_frame[:3, :3], second.rotation().matrix())
+    np.testing.assert_array_equal(at.T_reference_frame[:3, 3], place.position_world)
+
+
+def test_a_residual_is_whitened_by_the_upper_root_of_the_information() -> None:
+    rng = np.random.default_rng(2)
+    factor = rng.normal(size=(3, 3))
+    covariance = factor @ factor.T
+    place = PositionPrior(position_world=np.zeros(3), covariance=covariance)
+    T = np.eye(4)
+    T[:3, 3] = [0.3, -0.2, 0.5]
+    found = Factors(WindowConfig()).residual_of_prior(place, "a", T)
+    R = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    np.testing.assert_allclose(found.residual, R @ T[:3, 3], rtol=1e-9)

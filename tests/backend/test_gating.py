@@ -241,3 +241,99 @@ def test_what_the_references_have_in_common_is_no_disagreement_of_theirs() -> No
             gate=10.0,
         )
         assert [bool(reason) for reason in verdict.reasons] == [False, False, n_refused == 1]
+
+
+# Bounds, on a line: edges of one reference, unsure by one sigma each, that differ along x alone.
+
+SIGMA_M = 1e-3
+
+
+def on_a_line(*places: float) -> list[Edge]:
+    """Return edges so far apart, in sigmas of a difference of two."""
+    size = np.sqrt(2.0) * SIGMA_M
+    return [edge(0, shifted(x * size, 0.0, 0.0), SIGMA_M**2 * np.eye(6)) for x in places]
+
+
+def judged(edges: list[Edge], gate: float | None) -> tuple[float, list[bool]]:
+    """Return the start on the line, in the same sigmas, and which edges are refused."""
+    verdict = verdict_of(edges, {0: np.eye(4)}, gate=gate)
+    start = verdict.T_world_start.translation()[0] / (np.sqrt(2.0) * SIGMA_M)
+    return float(start), [bool(reason) for reason in verdict.reasons]
+
+
+@pytest.mark.parametrize(
+    ("places", "gate", "start", "refused"),
+    [
+        # Two edges agree up to five sigmas, then the first is believed to start at.
+        ([0.0, 4.9], None, 2.45, []),
+        ([0.0, 5.1], None, 0.0, []),
+        ([0.0, 5.9], None, 0.0, []),
+        ([5.9, 0.0], None, 5.9, []),
+        # A chain of them: what is within five sigmas of the one in the middle.
+        ([0.0, 3.0, 6.0], None, 3.0, []),
+        ([0.0, 4.9, 10.1], None, 2.45, []),
+        # A narrow gate refuses what is not yet far for a start.
+        ([0.0, 0.0, 3.0], 2.0, 0.0, [2]),
+        ([3.0, 0.0, 0.0], 2.0, 0.0, [0]),
+        ([0.0, 0.0, 1.9], 2.0, 1.9 / 3.0, []),
+        ([0.0, 0.0, 0.7], 0.5, 0.0, [2]),
+        ([0.0, 0.1, 0.7], 0.5, 0.05, [2]),
+        # A wide one leaves in what is too far to start at.
+        ([0.0, 0.0, 7.0], 10.0, 0.0, []),
+        ([0.0, 0.0, 9.9], 10.0, 0.0, []),
+        ([0.0, 0.0, 10.1], 10.0, 0.0, [2]),
+        # How far off the others are does not matter: the median is no medoid.
+        ([0.0, 0.1, 300.0, 900.0, 1000.0], None, 0.05, []),
+        ([0.0, 0.1, 300.0, 900.0, 1000.0], 10.0, 0.05, [2, 3, 4]),
+        ([1000.0, 900.0, 300.0, 0.1, 0.0], 10.0, 0.05, [0, 1, 2]),
+    ],
+)
+def test_on_a_line_the_bounds_are_those_that_are_told(
+    places: list[float], gate: float | None, start: float, refused: list[int]
+) -> None:
+    found, reasons = judged(on_a_line(*places), gate)
+    assert found == pytest.approx(start, abs=1e-6)
+    assert [index for index, is_out in enumerate(reasons) if is_out] == refused
+
+
+def test_a_single_edge_is_followed_wherever_it_leads() -> None:
+    found, reasons = judged(on_a_line(1e5), 1e-3)
+    assert found == pytest.approx(1e5)
+    assert reasons == [False]
+
+
+def test_surer_edges_draw_the_start_to_them() -> None:
+    one, other = on_a_line(0.0, 1.0)
+    surer = edge(0, other.T_reference_frame, other.covariance / 9.0)
+    assert judged([one, surer], None)[0] == pytest.approx(0.9, abs=1e-6)
+
+
+def test_the_motion_is_asked_only_where_edges_disagree_and_votes_as_one() -> None:
+    asked = []
+
+    def motion() -> Edge:
+        asked.append(True)
+        return on_a_line(20.0)[0]
+
+    for places, refused in (((0.0, 9.9), []), ((0.0, 20.1), [0]), ((20.1, 0.0), [1])):
+        asked.clear()
+        verdict = judge(
+            on_a_line(*places),
+            pose_of=lambda _: gtsam.Pose3(),
+            relative_covariance=lambda *_: np.zeros((6, 6)),
+            motion=motion,
+            gate=10.0,
+        )
+        assert [i for i, reason in enumerate(verdict.reasons) if reason] == refused
+        assert len(asked) == len(refused)
+    assert "20.1 sigma with the edge from 0 (window.gate: 10)" in verdict.reasons[1]
+
+
+def test_a_difference_along_what_is_known_to_be_tied_is_far() -> None:
+    # Two translations that are always alike: that they differ is beyond any gate.
+    tied = np.eye(6)
+    tied[3, 4] = tied[4, 3] = 1.0
+    half = 0.5 * tied
+    assert disagreement(edge(0, shifted(1.0, 1.0, 0.0), half), np.eye(4), half, gate=1.01) == ""
+    apart = edge(0, shifted(1.0, -1.0, 0.0), half)
+    assert "sigma" in disagreement(apart, np.eye(4), half, gate=1e3)

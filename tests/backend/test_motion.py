@@ -95,6 +95,13 @@ def test_where_nothing_is_known_of_the_motion_the_camera_stands() -> None:
     assert motion.last is None
     assert motion.measured_id is None
     assert motion.predict_pose(0) is None
+    # As sure as if it had been there a millisecond before: the least time that counts.
+    T_start, covariance = motion.predict_step(STEP_NS)
+    np.testing.assert_array_equal(T_start, np.eye(4))
+    config = WindowConfig()
+    turn, shift = np.radians(config.coasting_sigma_deg_per_s), config.coasting_sigma_m_per_s
+    expected = np.repeat([1e-3 * turn, 1e-3 * shift], 3) ** 2
+    np.testing.assert_allclose(np.diag(covariance), expected)
     T = se3.exp(np.ones(6))
     motion.append(estimate(0, 0, T, np.eye(6)), is_measured=True)
     np.testing.assert_array_equal(motion.predict_step(STEP_NS)[0], np.eye(4))

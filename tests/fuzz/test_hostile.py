@@ -19,6 +19,7 @@ from rosbags.rosbag1 import Writer
 from gvo.bounded_text import cut, read_text
 from gvo.config import load_configuration
 from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
+from gvo.g2o import Measurement
 from gvo.g2o import parse_line as parse_g2o_line
 from gvo.outputs.run_record import read_run
 from gvo.sources.bag_reader import BagReader, typestore
@@ -403,6 +404,13 @@ def test_a_long_comment_takes_no_time(tmp_path: Path) -> None:
 def test_numbers_of_a_pose_graph_do_not_overflow(line: str) -> None:
     with pytest.raises(ValueError, match="beyond"):
         parse_g2o_line(line)
+
+
+def test_the_covariance_of_a_huge_information_does_not_overflow() -> None:
+    line = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 -1e308 0 1 0 0 1 0 0 0 0 0 0 1 0 1"
+    parsed = parse_g2o_line(line)
+    assert isinstance(parsed, Measurement)
+    np.testing.assert_array_equal(parsed.covariance, parsed.covariance.T)
 
 
 def test_a_transform_does_not_overflow() -> None:

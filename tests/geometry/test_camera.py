@@ -1,5 +1,6 @@
 """Camera models against OpenCV, and the rectification of raw pairs."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -59,10 +60,12 @@ def test_projection_is_that_of_opencv_and_disparity_that_of_a_second_camera() ->
     ("changes", "match"),
     [
         ({"fx": 0.0}, "focal"),
+        ({"fy": 0.0}, "focal"),
         ({"fy": -1.0}, "focal"),
         ({"fx": np.nan}, "focal"),
         ({"cx": np.inf}, "finite"),
         ({"width": 0}, "size"),
+        ({"height": 0}, "size"),
         ({"height": -3}, "size"),
         ({"baseline": 0.0}, "baseline"),
         ({"baseline": -0.5}, "exchanged"),
@@ -88,6 +91,68 @@ def test_two_ideal_calibrations_give_their_camera_back() -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500.0, 480.0, 320.0, 240.0)
     assert (camera.width, camera.height) == (640, 480)
     assert camera == stereo_camera(ideal(), right)
+
+
+def test_an_image_of_one_pixel_is_one() -> None:
+    camera = PinholeCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=1, height=1)
+    np.testing.assert_array_equal(camera.K, [[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("baseline", [0.0, 0.2])
+def test_the_calibration_of_an_ideal_camera_says_all_that_a_camera_info_says(
+    baseline: float,
+) -> None:
+    if baseline:
+        calibration = Calibration.from_camera(CAMERA, baseline=baseline)
+    else:
+        calibration = Calibration.from_camera(CAMERA)
+    assert (calibration.width, calibration.height) == (640, 480)
+    assert calibration.is_rectified
+    assert calibration.model == "plumb_bob"
+    np.testing.assert_array_equal(calibration.K, [[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(calibration.D, [0.0] * 5)
+    np.testing.assert_array_equal(calibration.R, np.eye(3))
+    P = [[500.0, 0, 320, -500 * baseline], [0, 480, 240, 0], [0, 0, 1, 0]]
+    np.testing.assert_array_equal(calibration.P, P)
+    np.testing.assert_array_equal(calibration.lens.K, calibration.K)
+
+
+def with_other_p(calibration: Calibration, row: int, column: int, value: float) -> Calibration:
+    P = calibration.P.copy()
+    P[row, column] += value
+    return replace(calibration, P=P)
+
+
+def test_only_what_lies_between_the_two_cameras_is_their_baseline() -> None:
+    # Projections of a pair may be given about a third origin.
+    left = with_other_p(ideal(), 0, 3, 50.0)
+    right = with_other_p(Calibration.from_camera(CAMERA, baseline=0.2), 0, 3, 30.0)
+    assert stereo_camera(left, right).baseline == pytest.approx((50.0 + 100.0 - 30.0) / 500.0)
+    # The other rows are of no account.
+    left, right = with_other_p(left, 1, 3, 7.0), with_other_p(right, 1, 3, 9.0)
+    assert stereo_camera(left, right).baseline == pytest.approx(0.24)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "is_one"),
+    [
+        (0, 0, 4.9e-4, True),  # a millionth of the focal length
+        (0, 0, 5.1e-4, False),
+        (0, 1, 0.9e-6, True),  # and a millionth where there should be nothing
+        (0, 1, 1.1e-6, False),
+        (2, 2, -1.9e-6, True),
+        (2, 2, -2.1e-6, False),
+    ],
+)
+def test_rounding_of_a_projection_is_no_other_camera(
+    row: int, column: int, value: float, is_one: bool
+) -> None:
+    right = with_other_p(Calibration.from_camera(CAMERA, baseline=0.2), row, column, value)
+    if is_one:
+        assert stereo_camera(ideal(), right).baseline == pytest.approx(0.2, rel=1e-5)
+    else:
+        with pytest.raises(CalibrationError, match="first three"):
+            stereo_camera(ideal(), right)
 
 
 def test_exchanged_cameras_are_refused() -> None:
@@ -191,6 +256,24 @@ def test_rectification_keeps_the_raw_calibrations() -> None:
         assert not after.is_rectified
         np.testing.assert_allclose(after.R @ after.R.T, np.eye(3), atol=1e-12)
     np.testing.assert_array_equal(left.P[:, :3], right.P[:, :3])
+
+
+def test_what_is_rectified_here_is_not_called_rectified_already() -> None:
+    said = [replace(lens, is_rectified=True) for lens in (LEFT, RIGHT)]
+    for rectified in rectify_stereo(said[0], said[1], raw_pair_pose(0)):
+        assert not rectified.is_rectified
+        assert rectification_maps(rectified) is not None
+
+
+def test_a_pair_at_which_opencv_gives_up_is_refused_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def give_up(*_: object, **__: object) -> None:
+        raise cv2.error("no projection")
+
+    monkeypatch.setattr(cv2, "stereoRectify", give_up)
+    with pytest.raises(CalibrationError, match=r"cannot be rectified.*calibrate the pair again"):
+        rectify_stereo(LEFT, RIGHT, raw_pair_pose(0))
 
 
 def test_nothing_is_to_be_done_for_rectified_images() -> None:

@@ -87,3 +87,14 @@ def test_matches_pair_what_each_frame_saw() -> None:
                 assert uvd[row, 2] == frame.disparities[index]
                 sigmas = getattr(found, f"{side}_sigmas")
                 np.testing.assert_array_equal(sigmas[row], frame.sigmas[index])
+
+
+def test_what_was_measured_is_kept_by_the_frame_that_measured_it() -> None:
+    rng = np.random.default_rng(1)
+    pixels = random_pixels(rng, 4), random_pixels(rng, 4)
+    sigmas = rng.uniform(0.1, 1.0, (4, 3)), rng.uniform(0.1, 1.0, (4, 3))
+    matches = Correspondences.of_pixels(pixels, sigmas, CAMERA)
+    np.testing.assert_array_equal(matches.source_uvd, pixels[0])
+    np.testing.assert_array_equal(matches.target_uvd, pixels[1])
+    np.testing.assert_array_equal(matches.source_sigmas, sigmas[0])
+    np.testing.assert_array_equal(matches.target_sigmas, sigmas[1])

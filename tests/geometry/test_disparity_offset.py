@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from gvo.config import RegistrationConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.disparity_offset import DisparityOffset
+from gvo.geometry.disparity_offset import DisparityOffset, estimate_disparity_offset
 from gvo.geometry.refinement import Refinement, refine_pose
 from gvo.geometry.residuals import Linearization, StereoResiduals
 from gvo.types import FloatArray
@@ -145,3 +145,79 @@ def test_settled_points_do_not_lean_to_their_own_residuals() -> None:
     assert abs(leanings["measured"]) > 0.4
     assert abs(leanings["settled"]) < 0.15
     assert np.std(errors["settled"]) < np.std(errors["measured"])
+
+
+def information_share(T: FloatArray, matches: Correspondences) -> float:
+    """Return what is known of the offset beside the pose, over what target disparities tell.
+
+    By QR of the derivatives, the offset's behind those of the pose.
+    """
+    rows = []
+    for source, sigmas in zip(matches.source_points, matches.target_sigmas, strict=True):
+        x, y, z = T[:3, :3] @ source + T[:3, 3]
+        by_point = np.array(
+            [
+                [700 / z, 0, -700 * x / z**2],
+                [0, 690 / z, -690 * y / z**2],
+                [0, 0, -350 / z**2],
+            ]
+        )
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        # A larger disparity draws a point along its ray.
+        by_offset = [0, 0, 1] + by_point @ T[:3, :3] @ source * source[2] / 350
+        J = np.column_stack([-by_point @ cross, by_point, by_offset])
+        rows.append(J / sigmas[:, np.newaxis])
+    R = np.linalg.qr(np.concatenate(rows))[1]
+    return float(R[6, 6] ** 2 / np.sum(1.0 / matches.target_sigmas[:, 2] ** 2))
+
+
+def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform([100, 40], [1100, 330], size=(200, 2))
+    source_uvd = np.column_stack([pixels, rng.uniform(7.0, 70.0, 200)])
+    T = np.eye(4)
+    T[2, 3] = -step_m
+    source = unproject(source_uvd)
+    target_uvd = project(source + T[:3, 3])
+    return T, Correspondences(
+        source_points=source,
+        target_points=source + T[:3, 3],
+        source_uvd=source_uvd,
+        target_uvd=target_uvd,
+        source_sigmas=np.zeros((200, 3)),
+        target_sigmas=np.tile([0.4, 0.3, 0.2], (200, 1)),
+    )
+
+
+@pytest.mark.parametrize(("share", "is_told"), [(1.3e-10, True), (0.75e-10, False)])
+def test_a_motion_too_small_to_tell_the_offset_from_rounding_tells_nothing(
+    share: float, is_told: bool
+) -> None:
+    step = 1e-3 * np.sqrt(share / information_share(*barely_moved(1e-3)))
+    T, matches = barely_moved(float(step))
+    assert information_share(T, matches) == pytest.approx(share, rel=0.01)
+    residuals = StereoResiduals.of(T, matches, CAMERA, huber=100.0)
+    at = residuals.linearize(T)
+    assert isinstance(at, Linearization)
+    assert (estimate_disparity_offset(T, residuals, at) is not None) == is_told
+
+
+def test_the_sigma_of_the_offset_is_that_of_the_scores_that_the_matches_show() -> None:
+    T, matches = drive(4, 0.0)
+    matches = Correspondences(
+        source_points=matches.source_points,
+        target_points=matches.target_points,
+        source_uvd=matches.source_uvd,
+        target_uvd=matches.target_uvd,
+        source_sigmas=np.full((400, 3), 1e-12),
+        target_sigmas=matches.target_sigmas,
+    )
+    residuals = StereoResiduals.of(T, matches, CAMERA, huber=1e9)
+    at = residuals.linearize(T)
+    assert isinstance(at, Linearization)
+    found = estimate_disparity_offset(T, residuals, at)
+    assert found is not None
+    information = information_share(T, matches) * 400 / SIGMAS[2] ** 2
+    # Residuals are those of a noise a few times larger than stated, in each match alike.
+    size = np.sqrt(np.mean(at.r**2))
+    assert found.sigma_px == pytest.approx(size / np.sqrt(information), rel=0.2)

@@ -11,9 +11,10 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
+from gvo.geometry import lens as lens_module
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectification_maps, rectify_stereo, stereo_camera
-from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
+from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel, Lens, bouguet_wide
 from gvo.types import FloatArray
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
@@ -245,7 +246,17 @@ def test_exchanged_cameras_give_no_positive_baseline(model: DistortionModel) -> 
         stereo_camera(*pair)
 
 
-@pytest.mark.parametrize("t", [[0.0, 0.1, 0.0], [0.05, 0.1, 0.0], [0.0, 0.0, 0.0], [0, 0, 0.2]])
+@pytest.mark.parametrize(
+    "t",
+    [
+        [0.0, 0.1, 0.0],
+        [0.05, 0.1, 0.0],
+        [0.1, 0.1, 0.0],
+        [-0.1, 0.0, 0.1],
+        [0.0, 0.0, 0.0],
+        [0, 0, 0.2],
+    ],
+)
 def test_cameras_that_do_not_stand_side_by_side_are_refused(t: list[float]) -> None:
     T_left_right = np.eye(4)
     T_left_right[:3, 3] = t
@@ -262,3 +273,94 @@ def test_cameras_of_two_sizes_are_refused_with_both() -> None:
     with pytest.raises(CalibrationError, match=r"512x480 and 256x240") as caught:
         rectify_stereo(lens, small, mount(0))
     assert "\n" not in str(caught.value)
+
+
+def test_a_pair_of_barrels_is_shrunk_to_show_all_that_leaves_no_border_empty() -> None:
+    lens = raw("plumb_bob", _RADTAN)
+    for rectified in rectify_stereo(lens, lens, mount(3)):
+        assert 0.7 < rectified.P[0, 0] / lens.K[0, 0] < 0.95
+
+
+# Pinholes side by side: a wide pair of them is known to the last digit.
+
+_SIZE = {"width": 401, "height": 301}
+
+
+def pinhole(cx: float, cy: float, focal: float = 256.0) -> Lens:
+    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    return Lens(K=K, D=np.zeros(5), model="plumb_bob", **_SIZE)
+
+
+def side_by_side(x: float) -> FloatArray:
+    T_right_left = np.eye(4)
+    T_right_left[0, 3] = x
+    return T_right_left
+
+
+@pytest.mark.parametrize("x", [-0.2, 0.2])
+@pytest.mark.parametrize(
+    ("offset", "zoom"), [(0.0, 1.0), (1.5, 1.01), (2.5, 1.02), (-4.5, 1.03), (99.0, 1.99)]
+)
+def test_lenses_that_are_off_their_middle_are_enlarged_as_little_as_fills_the_border(
+    offset: float, zoom: float, x: float
+) -> None:
+    # Half of the width over the zoom, and the offset, must lie within half of the width.
+    left, right = pinhole(200.0 + offset, 150.0), pinhole(200.0 - offset, 150.0)
+    found = bouguet_wide(left, right, side_by_side(x))
+    np.testing.assert_allclose(found.R_left, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(found.R_right, np.eye(3), atol=1e-12)
+    if offset == 0.0:  # rounding may ask for one step more
+        zoom = float(found.P_left[0, 0]) / 256.0
+        assert zoom in (1.0, 1.01)
+    K = np.array([[256.0 * zoom, 0, 200], [0, 256.0 * zoom, 150], [0, 0, 1]])
+    np.testing.assert_allclose(found.P_left, np.hstack([K, np.zeros((3, 1))]), atol=1e-9)
+    shift = [[256.0 * zoom * x], [0.0], [0.0]]
+    np.testing.assert_allclose(found.P_right, np.hstack([K, shift]), atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [(0, 0), (1, 1)])
+def test_the_shortest_focal_length_of_all_is_kept(axis: tuple[int, int]) -> None:
+    short = pinhole(200.0, 150.0)
+    short.K[axis] = 250.0
+    wide = pinhole(200.0, 150.0, focal=300.0)
+    for pair in ((short, wide), (wide, short)):
+        found = bouguet_wide(*pair, side_by_side(-0.1))
+        assert 250.0 <= found.P_left[0, 0] == found.P_left[1, 1] < 1.5 * 250.0
+
+
+@pytest.mark.parametrize(
+    ("edges", "is_full"),
+    [
+        ((0.0, 400.0, 0.0, 300.0), True),  # on the border is inside
+        ((0.5, 399.5, 0.5, 299.5), True),
+        ((-0.5, 399.5, 0.5, 299.5), False),
+        ((0.5, 400.5, 0.5, 299.5), False),
+        ((0.5, 399.5, -0.5, 299.5), False),
+        ((0.5, 399.5, 0.5, 300.5), False),
+    ],
+)
+def test_a_border_is_full_where_all_of_its_four_sides_lie_in_the_raw_image(
+    edges: tuple[float, float, float, float], is_full: bool
+) -> None:
+    # Lenses whose raw image lies so in the rectified one; powers of two leave no rounding.
+    left, right, top, bottom = edges
+    fx, fy = 256.0 * (right - left) / 400.0, 256.0 * (bottom - top) / 300.0
+    K = np.array([[fx, 0.0, left], [0.0, fy, top], [0.0, 0.0, 1.0]])
+    camera = Lens(K=K, D=np.zeros(5), model="plumb_bob", **_SIZE)
+    K_rectified = np.array([[256.0, 0.0, 0.0], [0.0, 256.0, 0.0], [0.0, 0.0, 1.0]])
+    assert lens_module._is_full(camera, np.eye(3), K_rectified) == is_full
+
+
+def test_a_border_that_is_partly_behind_the_camera_is_not_full() -> None:
+    # Half of it is seen, and mirrored points of the other half would lie in the image as well.
+    turned = np.asarray(Rotation.from_rotvec([0.0, np.pi / 2, 0.0]).as_matrix())
+    camera = pinhole(200.0, 150.0, focal=1e-3)
+    assert lens_module._is_full(camera, np.eye(3), pinhole(200.0, 150.0).K)
+    assert not lens_module._is_full(camera, turned, pinhole(200.0, 150.0).K)
+
+
+def test_what_a_lens_is_asked_stays_as_it_is() -> None:
+    points = np.array([[0.3, -0.2, 2.0], [0.1, 0.4, 3.0]])
+    points.setflags(write=False)
+    found = pinhole(200.0, 150.0).project(points)
+    np.testing.assert_allclose(found, 256.0 * points[:, :2] / points[:, 2:] + [200.0, 150.0])

@@ -185,8 +185,8 @@ def test_too_few_matches_are_a_falsy_failure_with_their_number(n: int) -> None:
     result = run(matches, SETTINGS)
     assert isinstance(result, Failure)
     assert not result
-    assert result.n_matches == n
-    assert str(n) in result.reason
+    assert (result.n_matches, result.n_inliers) == (n, 0)
+    assert result.reason == f"{n} matches, 12 are needed (ransac.min_inliers)"
 
 
 def test_matches_without_a_common_motion_are_a_failure_with_counts() -> None:
@@ -366,3 +366,65 @@ def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
     assert result.inliers[3:].all()
     at_fit = find_inliers(result.T_target_source[np.newaxis], matches, CAMERA, config)[0]
     assert np.count_nonzero(at_fit) < config.min_inliers
+
+
+@pytest.mark.parametrize("metric", ["reprojection", "distance"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_what_is_as_far_as_the_threshold_is_no_inlier(metric: str, axis: int) -> None:
+    # Of numbers that single precision holds: two pixels, or half a metre.
+    camera = replace(CAMERA, fy=500.0, baseline=0.25)
+    config = RansacConfig.model_validate(
+        SETTINGS.model_dump() | {"inlier_metric": metric, "inlier_threshold_m": 0.5}
+    )
+    point, measured = np.array([[0.0, 0.0, 4.0]]), np.array([[320.0, 240.0, 31.25]])
+    for share, expected in ((0.0, True), (0.999, True), (1.0, False), (-1.0, False)):
+        seen, there = measured.copy(), point.copy()
+        seen[0, axis] += 2.0 * share
+        there[0, axis] += 0.5 * share
+        matches = replace(same_points(point, seen), target_points=there)
+        found = find_inliers(np.eye(4)[None], matches, camera, config)
+        assert found.tolist() == [[expected]]
+
+
+@pytest.mark.parametrize("depth", [0.0011, 0.01, 0.5, 1.0])
+def test_what_is_near_the_camera_is_still_in_front_of_it(depth: float) -> None:
+    points = np.array([[0.0, 0.0, depth]])
+    found = find_inliers(np.eye(4)[None], same_points(points, uvd(points)), CAMERA, SETTINGS)
+    assert found.tolist() == [[True]]
+
+
+def test_three_matches_are_enough_where_three_are_asked_for() -> None:
+    T, matches, _ = scene(np.random.default_rng(0), 3, 0)
+    config = SETTINGS.model_copy(update={"min_inliers": 3})
+    result = run(matches, config)
+    assert isinstance(result, Consensus)
+    np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
+    two = run(matches.select(np.arange(2)), config)
+    assert isinstance(two, Failure)
+    assert two.reason == "2 matches, 3 are needed (ransac.min_inliers)"
+
+
+@pytest.mark.parametrize(("n_near", "is_fitted_alone"), [(11, False), (12, True)])
+def test_near_points_are_fitted_alone_where_they_are_as_many_as_are_needed(
+    n_near: int, is_fitted_alone: bool
+) -> None:
+    # Of disparities at the bound and a little less; the far ones are all a little off.
+    rng = np.random.default_rng(9)
+    T, matches, _ = scene(rng, 40, 0)
+    is_near = np.arange(40) < n_near
+    measured = matches.source_uvd.copy()
+    measured[:, 2] = np.where(is_near, 20.0, 19.999)
+    target_uvd = matches.target_uvd.copy()
+    target_uvd[:, 2] = 30.0
+    target = matches.target_points.copy()
+    target[~is_near] += 0.01
+    near = replace(matches, source_uvd=measured, target_uvd=target_uvd, target_points=target)
+    config = RansacConfig.model_validate(
+        SETTINGS.model_dump() | {"inlier_metric": "distance", "min_disparity_px": 20.0}
+    )
+    for each in (near, replace(near, source_uvd=target_uvd, target_uvd=measured)):
+        result = run(each, config)
+        assert isinstance(result, Consensus)
+        assert result.inliers.all()
+        error = np.abs(result.T_target_source - T).max()
+        assert (error < 1e-8) == is_fitted_alone

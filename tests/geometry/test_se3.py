@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
+from scipy.special import bernoulli
 
 from gvo.geometry import se3
 from gvo.types import FloatArray
@@ -176,3 +177,56 @@ def test_the_covariance_of_a_ros_message_is_that_of_the_twist_it_causes(seed: in
     batch = se3.covariance_from_ros(np.stack([of_message, np.eye(6)]), np.stack([R, np.eye(3)]))
     np.testing.assert_allclose(batch[0], found, atol=1e-12)
     np.testing.assert_array_equal(batch[1], np.eye(6))
+
+
+# Below the change of formulas, digit by digit. With the axis in the x-z plane and the translation
+# along x, each element of the translation is one term of its series alone.
+
+small_angles = st.floats(min_value=-12.0, max_value=-0.001).map(lambda exponent: 10.0**exponent)
+
+
+@settings(deadline=None)
+@given(share=small_angles)
+def test_small_turns_are_those_of_the_power_series_to_the_last_digits(share: float) -> None:
+    angle = 1e-5 * share
+    p, q = 0.6 * angle, 0.8 * angle
+    T = se3.exp(np.array([p, 0.0, q, 1.0, 0.0, 0.0]))
+    b = 1 / 2 - angle**2 / 24 + angle**4 / 720
+    c = 1 / 6 - angle**2 / 120 + angle**4 / 5040
+    np.testing.assert_allclose(T[:3, 3], [1.0 - c * q * q, b * q, c * p * q], rtol=1e-14)
+    # Off the diagonal of a turn about z stands its sine alone.
+    turn = se3.exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(turn[[1, 0], [0, 1]], np.sin(angle) * np.array([1, -1]), rtol=4e-16)
+    np.testing.assert_allclose(turn[0, 0], np.cos(angle), rtol=4e-16)
+
+
+@settings(deadline=None)
+@given(share=small_angles)
+def test_the_twist_of_a_small_turn_is_that_of_bernoullis_series(share: float) -> None:
+    angle = 1e-4 * share
+    p, q = 0.6 * angle, 0.8 * angle
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([p, 0.0, q]).as_matrix()
+    T[:3, 3] = [1.0, 0.0, 0.0]
+    B = bernoulli(6)
+    c = B[2] / 2 - B[4] / 24 * angle**2 + B[6] / 720 * angle**4
+    xi = se3.log(T)
+    np.testing.assert_allclose(xi[[0, 2]], [p, q], rtol=1e-12)
+    rx, rz = xi[[0, 2]]
+    np.testing.assert_allclose(xi[3:], [1.0 - c * rz * rz, -0.5 * rz, c * rx * rz], rtol=3e-14)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])
+def test_any_number_of_transforms_goes_through_every_function(shape: tuple[int, ...]) -> None:
+    xi = np.random.default_rng(1).normal(size=(*shape, 6))
+    T = se3.exp(xi)
+    for found, tail in (
+        (T, (4, 4)),
+        (se3.log(T), (6,)),
+        (se3.invert(T), (4, 4)),
+        (se3.adjoint(T), (6, 6)),
+        (se3.normalize(T), (4, 4)),
+        (se3.rotation_angle(T), ()),
+        (se3.covariance_from_ros(se3.adjoint(T), T[..., :3, :3]), (6, 6)),
+    ):
+        assert found.shape == (*shape, *tail)

@@ -231,7 +231,7 @@ def test_a_triangle_is_a_line_below_a_thousandth_of_its_length_whatever_its_size
 ) -> None:
     rng = np.random.default_rng(seed)
     T_source, T_target = random_transform(rng), random_transform(rng)
-    for ratio, is_fit in ((1.5e-3, True), (0.7e-3, False)):
+    for ratio, is_fit in ((1.03e-3, True), (0.97e-3, False)):
         # Standard deviations across and along: of two at the ends and one beside the middle.
         flat = size * np.array([[-1.0, 0, 0], [1.0, 0, 0], [0.0, np.sqrt(3.0) * ratio, 0]])
         flat = flat[rng.permutation(3)]
@@ -250,3 +250,21 @@ def test_a_triangle_is_a_point_where_its_size_is_the_rounding_of_its_place(
     for distance, is_fit in ((1e6, True), (8e6, False)):
         place = size * distance * np.eye(3)[rng.integers(3)]
         assert both_say(flat + place, flat + place) == is_fit
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=seeds, size=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_the_size_that_makes_a_triangle_a_point_is_told(seed: int, size: float) -> None:
+    # Mean squares of coordinates in the plane are half a square of the size, each. The larger
+    # counts where sets are fitted, the mean of both where triples are, over 1e-13 of the place.
+    angles = np.random.default_rng(seed).uniform(0, 2 * np.pi) + np.arange(3) * 2 * np.pi / 3.0
+    flat = size * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    for square, is_batch, is_triple in (
+        (4.5e12, True, True),
+        (5.5e12, False, True),
+        (9.0e12, False, True),
+        (11e12, False, False),
+    ):
+        there = (flat + np.array([0.0, 0.0, size * np.sqrt(square)]))[np.newaxis]
+        assert bool(fit_rigid_batch(there, there)[1][0]) == is_batch
+        assert bool(fit_rigid_triples(there, there)[1][0]) == is_triple

@@ -1,0 +1,241 @@
+"""The pose graph itself: what settles, what leaves, and what GTSAM is told to do."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from gvo.backend.graph import PoseGraph
+from gvo.backend.polish import polish
+from gvo.errors import SmoothingError
+from gvo.geometry import se3
+from gvo.types import FloatArray
+
+STEP = gtsam.Pose3(se3.exp(np.array([0.02, 0.1, -0.01, 0.1, 0.0, 0.5])))
+ORIGIN = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+
+
+def between(first: int, second: int, T: gtsam.Pose3, sigma: float) -> Any:
+    return gtsam.BetweenFactorPose3(first, second, T, gtsam.noiseModel.Isotropic.Sigma(6, sigma))
+
+
+def factors_of(*factors: Any) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def values_of(poses: dict[int, gtsam.Pose3]) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, pose in poses.items():
+        values.insert(key, pose)
+    return values
+
+
+def power(n: int) -> gtsam.Pose3:
+    return gtsam.Pose3(se3.normalize(np.linalg.matrix_power(STEP.matrix(), n)))
+
+
+def chain(n: int, sigma: float = 0.1, *, is_whole: bool = False) -> PoseGraph:
+    """Return a graph of n poses a step apart."""
+    graph = PoseGraph(is_whole=is_whole)
+    factors = factors_of(
+        gtsam.PriorFactorPose3(0, gtsam.Pose3(), ORIGIN),
+        *(between(key - 1, key, STEP, sigma) for key in range(1, n)),
+    )
+    graph.update(factors, values_of({key: power(key) for key in range(n)}))
+    return graph
+
+
+def loop_of(n: int, turn_rad: float, sigma: float = 1e-3) -> gtsam.NonlinearFactorGraph:
+    """Return an edge from the first pose to the last that turns the chain."""
+    turn = gtsam.Pose3.Expmap(np.array([0.0, turn_rad, 0.0, 0.0, 0.0, 0.0]))
+    return factors_of(between(0, n - 1, power(n - 1).compose(turn), sigma))
+
+
+def step_left(graph: PoseGraph) -> float:
+    """Return the longest element of the next step of Gauss and Newton."""
+    step = graph.factors().linearize(graph.values()).optimize()
+    return max(float(np.abs(step.at(key)).max()) for key in graph.values().keys())  # noqa: SIM118
+
+
+@contextmanager
+def counted(name: str) -> Iterator[list[tuple[Any, ...]]]:
+    """Count the calls of a method of ISAM2."""
+    original, calls = getattr(gtsam.ISAM2, name), []
+
+    def call(self: Any, *arguments: Any) -> Any:
+        calls.append(arguments)
+        return original(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam.ISAM2, name, call)
+        yield calls
+
+
+@pytest.mark.parametrize(("turn_rad", "is_far"), [(0.0, False), (0.01, False), (1.0, True)])
+def test_a_graph_settles_where_an_update_moved_it_far_and_says_so(
+    turn_rad: float, is_far: bool
+) -> None:
+    graph = chain(6)
+    before = {5: graph.pose3(5)}
+    graph.update(loop_of(6, turn_rad), gtsam.Values())
+    with counted("update") as calls:
+        answer = graph.settle(before)
+    assert answer is is_far
+    assert bool(calls) == is_far
+    assert len(calls) <= 10
+    assert step_left(graph) < 1e-2
+
+
+@pytest.mark.parametrize(("moved_m", "is_far"), [(0.0199, False), (0.0201, True)])
+def test_far_is_two_hundredths(moved_m: float, is_far: bool) -> None:
+    graph = chain(3)
+    for axis in range(6):
+        for sign in (-1.0, 1.0):
+            twist = np.zeros(6)
+            twist[axis] = sign * moved_m
+            before = {1: graph.pose3(1), 2: graph.pose3(2).retract(twist)}
+            assert graph.settle(before) is is_far
+
+
+def test_a_graph_that_never_stands_still_is_updated_ten_times() -> None:
+    graph, places = chain(3), iter(range(1000))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            PoseGraph,
+            "pose3",
+            lambda *_: gtsam.Pose3(gtsam.Rot3(), np.array([float(next(places)), 0.0, 0.0])),
+        )
+        with counted("update") as calls:
+            assert graph.settle({1: gtsam.Pose3(gtsam.Rot3(), np.array([-5.0, 0.0, 0.0]))}) is True
+    assert len(calls) == 10
+
+
+def test_a_whole_graph_is_not_settled_and_may_have_moved() -> None:
+    graph = chain(6, is_whole=True)
+    with counted("update") as calls:
+        assert graph.settle({5: gtsam.Pose3()}) is True
+    assert calls == []
+
+
+def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, key: int) -> FloatArray:
+    return np.asarray(gtsam.Marginals(graph, values).marginalCovariance(key))
+
+
+@pytest.mark.parametrize("leaving", [[0], [0, 1], [2, 0], [3, 1, 2]])
+@pytest.mark.parametrize("turn_rad", [0.0, 1.0])
+def test_what_those_that_leave_knew_stays_also_after_settling(
+    leaving: Sequence[int], turn_rad: float
+) -> None:
+    n = 6
+    graph, twin = chain(n), chain(n)
+    factors = loop_of(n, turn_rad)
+    factors.add(between(n - 1, n, STEP, 0.1))
+    start = {n: graph.pose3(n - 1).compose(STEP)}
+    before = {key: graph.pose3(key) for key in (0, n - 1)} | start
+    graph.update(factors, values_of(start), alive=range(n), leaving=leaving)
+    graph.settle(before, alive=range(n + 1), leaving=leaving)
+    graph.marginalize(leaving)
+    twin.update(factors, values_of(start))
+    twin.settle(before)
+    left = sorted(set(range(n + 1)) - set(leaving))
+    assert sorted(graph.values().keys()) == left
+    assert len(graph.positions()) == len(left)
+    together = graph.covariances(left)
+    for key, covariance in zip(left, together, strict=True):
+        np.testing.assert_allclose(graph.pose(key), twin.pose(key), atol=1e-4)
+        expected = marginals(twin.factors(), twin.values(), key)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(covariance / scale, expected / scale, atol=0.03)
+        np.testing.assert_allclose(graph.covariance(key), covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_joint_covariance_comes_in_the_order_asked_for() -> None:
+    graph = chain(4)
+    for first, second in ((1, 3), (3, 1)):
+        joint = graph.joint_covariance(first, second)
+        assert joint.shape == (12, 12)
+        np.testing.assert_allclose(joint[:6, :6], graph.covariance(first), atol=1e-12)
+        np.testing.assert_allclose(joint[6:, 6:], graph.covariance(second), atol=1e-12)
+
+
+def test_factors_that_left_make_room_for_others() -> None:
+    graph = chain(3)
+    sizes = []
+    for key in range(3, 40):
+        start = {key: power(key)}
+        factors = factors_of(between(key - 1, key, STEP, 0.1))
+        graph.update(factors, values_of(start), alive=range(key - 3, key), leaving=[key - 3])
+        graph.marginalize([key - 3])
+        sizes.append(graph.factors().size())
+    assert max(sizes[10:]) == max(sizes[-10:]) < 12
+
+
+def test_only_a_whole_graph_can_be_hardened_and_only_once() -> None:
+    for is_whole, is_hardened in ((True, False), (True, True), (False, False), (False, True)):
+        graph = PoseGraph(is_whole=is_whole, is_hardened=is_hardened)
+        assert graph.can_be_hardened is (is_whole and not is_hardened)
+    graph = chain(4, is_whole=True)
+    hardened = graph.hardened()
+    assert not hardened.can_be_hardened
+    np.testing.assert_allclose(hardened.positions(), graph.positions(), atol=1e-9)
+    moved = values_of({key: power(key + 1) for key in range(4)})
+    for each in (graph, hardened):
+        assert each.moved(moved).can_be_hardened is each.can_be_hardened
+
+
+@pytest.mark.parametrize(
+    ("error", "thrown"),
+    [
+        (RuntimeError, SmoothingError),
+        (IndexError, SmoothingError),
+        (KeyboardInterrupt, KeyboardInterrupt),
+        (ValueError, ValueError),
+    ],
+)
+def test_whatever_interrupts_an_update_leaves_the_graph_as_it_was(
+    error: type[BaseException], thrown: type[BaseException]
+) -> None:
+    graph = chain(3)
+    before = graph.positions()
+
+    def interrupted_update() -> None:
+        with graph.restored_on_error():
+            graph.update(loop_of(3, 1.0), gtsam.Values())
+            raise error("one thing\nand more")
+
+    with pytest.raises(thrown) as caught:
+        interrupted_update()
+    np.testing.assert_array_equal(graph.positions(), before)
+    assert graph.factors().size() == 3
+    if thrown is SmoothingError:
+        assert str(caught.value) == "GTSAM: one thing"
+
+
+def test_the_polish_goes_on_until_the_error_stands_still() -> None:
+    original, told = gtsam.LevenbergMarquardtOptimizer, []
+
+    def watched(factors: Any, values: Any, parameters: Any) -> Any:
+        told.append(parameters)
+        return original(factors, values, parameters)
+
+    graph = chain(6)
+    factors = graph.factors()
+    factors.push_back(loop_of(6, 1.5))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", watched)
+        optimum, found = polish(factors, graph.values())
+    (parameters,) = told
+    assert parameters.getRelativeErrorTol() == 1e-10
+    assert parameters.getAbsoluteErrorTol() == 0.0
+    assert parameters.getMaxIterations() == 200
+    assert found.error_before > found.error_after > 1.0
+    again, second = polish(factors, optimum)
+    assert second.error_before == found.error_after == pytest.approx(factors.error(optimum))
+    assert second.error_after == pytest.approx(found.error_after, rel=1e-9)
+    assert factors.error(again) <= factors.error(optimum)

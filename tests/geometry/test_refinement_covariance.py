@@ -1,0 +1,316 @@
+"""The covariance of a refined pose, and the rounds that lead to it, match by match."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from gvo.config import RegistrationConfig
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
+from gvo.geometry.residuals import StereoResiduals
+from gvo.trace import Event, watched
+from gvo.types import BoolArray, Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+HUBER = 1.9
+SETTINGS = RegistrationConfig(n_iterations=20, huber=HUBER, gate=4.0)
+
+
+def project(points: FloatArray) -> FloatArray:
+    x, y, z = points.T
+    return np.stack([500 * x / z + 320, 480 * y / z + 240, 100 / z], axis=1)
+
+
+def derivative(point: FloatArray) -> FloatArray:
+    """Return that of (u, v, disparity), shape (3, 6), by a motion of the point on the left."""
+    x, y, z = point
+    by_point = np.array(
+        [[500 / z, 0, -500 * x / z**2], [0, 480 / z, -480 * y / z**2], [0, 0, -100 / z**2]]
+    )
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.hstack([-by_point @ cross, by_point])
+
+
+def measure(rng: np.random.Generator, errors: FloatArray) -> tuple[FloatArray, Correspondences]:
+    """Return T_target_source and matches; errors (n, 3) in sigmas, in the target frame alone."""
+    n = len(errors)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(0.05 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = 0.3 * rng.normal(size=3)
+    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
+    target = source @ T[:3, :3].T + T[:3, 3]
+    sigmas = rng.uniform(0.2, 1.0, size=(n, 3))
+    return T, Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=project(source),
+        target_uvd=project(target) + sigmas * errors,
+        source_sigmas=np.zeros((n, 3)),
+        target_sigmas=sigmas,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sums:
+    """What the covariance is made of, summed in loops."""
+
+    H: FloatArray
+    """Of the weighted matches."""
+    curvature: FloatArray
+    """Second derivative of the robust cost, as far as it comes of the residuals' own."""
+    spread: FloatArray
+    """Of the gradient."""
+    scale: float
+
+    def covariance(self, *, is_curved: bool = True) -> FloatArray:
+        inverse = np.linalg.inv(self.curvature if is_curved else self.H)
+        return np.asarray(inverse @ self.spread @ inverse.T)
+
+
+def add_up(T: FloatArray, matches: Correspondences) -> Sums:
+    """Return the sums over all matches, by the formulas of Huber and White."""
+    n = len(matches)
+    H, curvature, seen, squares = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 0.0
+    for i in range(n):
+        point = T[:3, :3] @ matches.source_points[i] + T[:3, 3]
+        J = derivative(point) / matches.target_sigmas[i][:, np.newaxis]
+        r = (matches.target_uvd[i] - project(point[np.newaxis])[0]) / matches.target_sigmas[i]
+        length = float(np.linalg.norm(r))
+        weight = min(1.0, HUBER / length)
+        along = np.outer(r, r) / length**2 if length > HUBER else np.zeros((3, 3))
+        H += weight * J.T @ J
+        curvature += weight * J.T @ (np.eye(3) - along) @ J
+        gradient = weight * J.T @ r
+        seen += np.outer(gradient, gradient)
+        squares += weight * length**2
+    scale = max(float(np.sqrt(squares / (3 * n - 6))), 0.1)
+    seen *= n / max(n - 2, 1)
+    spread = (n * seen + 24 * scale**2 * H) / (n + 24) + 0.1**2 * H
+    return Sums(H=H, curvature=curvature, spread=spread, scale=scale)
+
+
+def all_of(matches: Correspondences) -> BoolArray:
+    return np.ones(len(matches), dtype=np.bool_)
+
+
+def covariance_of(T: FloatArray, matches: Correspondences) -> Refinement:
+    found = fit_covariance(T, matches, all_of(matches), CAMERA, SETTINGS)
+    assert isinstance(found, Refinement), found
+    return found
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=seeds, n=st.integers(8, 60), size=st.sampled_from([0.02, 0.5, 1.0, 1.5]))
+def test_the_covariance_is_that_of_the_robust_cost_match_by_match(
+    seed: int, n: int, size: float
+) -> None:
+    # Some residuals are beyond the kernel's threshold, along all axes.
+    rng = np.random.default_rng(seed)
+    T, matches = measure(rng, size * rng.normal(size=(n, 3)))
+    expected = add_up(T, matches)
+    loss = np.diag(np.linalg.inv(expected.curvature)) / np.diag(np.linalg.inv(expected.H))
+    if not np.all((loss > 0) & (loss < 9)):
+        return
+    found = covariance_of(T, matches)
+    assert found.scale == pytest.approx(expected.scale, rel=1e-9)
+    covariance = expected.covariance()
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    np.testing.assert_allclose(found.covariance / scale, covariance / scale, atol=1e-6)
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+
+
+def test_three_matches_have_a_covariance() -> None:
+    T, matches = measure(np.random.default_rng(4), np.full((3, 3), 0.5))
+    expected = add_up(T, matches)
+    found = covariance_of(T, matches)
+    np.testing.assert_allclose(found.covariance, expected.covariance(), rtol=1e-6)
+    assert found.scale == pytest.approx(expected.scale)
+
+
+def loss_of(T: FloatArray, matches: Correspondences) -> float:
+    """Return by how much the curvature of long residuals raises a variance, at most."""
+    sums = add_up(T, matches)
+    variances, promised = np.linalg.inv(sums.curvature), np.linalg.inv(sums.H)
+    return float(np.max(np.diag(variances) / np.diag(promised)))
+
+
+def wrong_depths(length: float) -> tuple[FloatArray, Correspondences]:
+    """Return 26 matches; the disparities of all but two are wrong by this many sigmas."""
+    rng = np.random.default_rng(8)
+    errors = np.full((26, 3), 1e-9)
+    errors[2:, 2] = length * rng.choice([-1.0, 1.0], 24)
+    T, matches = measure(rng, errors)
+    shares = np.array([200.0, 200.0, 1.0])  # pixels tell nothing of the depth
+    uvd = project(matches.target_points) + 0.1 * errors
+    return T, replace(matches, target_uvd=uvd, target_sigmas=np.tile(0.1 * shares, (26, 1)))
+
+
+@pytest.mark.parametrize(("loss", "is_curved"), [(9.9, True), (10.1, False)])
+def test_the_curvature_counts_where_it_loses_less_than_nine_tenths(
+    loss: float, is_curved: bool
+) -> None:
+    length = brentq(lambda length: loss_of(*wrong_depths(length)) - loss, 1.0001 * HUBER, 100.0)
+    T, matches = wrong_depths(float(length))
+    assert loss_of(T, matches) == pytest.approx(loss, rel=1e-6)
+    expected = add_up(T, matches).covariance(is_curved=is_curved)
+    np.testing.assert_allclose(covariance_of(T, matches).covariance, expected, rtol=1e-5)
+
+
+# Where a direction is open.
+
+
+def near_a_line(spread_m: float) -> Correspondences:
+    rng = np.random.default_rng(1)
+    line = np.linspace(0.0, 1.0, 30)[:, np.newaxis] * [1.0, 0.3, 4.0] + [0.5, 0.0, 3.0]
+    points = line + spread_m * rng.normal(size=(30, 3))
+    return Correspondences(
+        source_points=points,
+        target_points=points,
+        source_uvd=project(points),
+        target_uvd=project(points),
+        source_sigmas=np.zeros((30, 3)),
+        target_sigmas=np.ones((30, 3)),
+    )
+
+
+def inflation_of(matches: Correspondences) -> float:
+    """Return the largest variance as a multiple of what it is with the other parameters known."""
+    J = np.concatenate([derivative(point) for point in matches.source_points])
+    # By QR of the derivatives themselves: half of the digits that their product loses.
+    R_inverse = np.linalg.inv(np.linalg.qr(J, mode="r"))
+    return float(np.max(np.sum(J**2, axis=0) * np.sum(R_inverse**2, axis=1)))
+
+
+@pytest.mark.parametrize(("inflation", "is_open"), [(0.7e10, False), (1.4e10, True)])
+def test_a_direction_is_open_beyond_a_hundred_thousand_sigmas(
+    inflation: float, is_open: bool
+) -> None:
+    spread = 1e-4 * np.sqrt(inflation_of(near_a_line(1e-4)) / inflation)
+    matches = near_a_line(float(spread))
+    assert inflation_of(matches) == pytest.approx(inflation, rel=0.05)
+    found = fit_covariance(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS)
+    assert isinstance(found, Failure if is_open else Refinement)
+
+
+# The rounds of a refinement, as told to whoever watches.
+
+
+def steps_before_and_after(events: list[Event]) -> tuple[int, int]:
+    """Return how many steps were made before and after the inliers were chosen again."""
+    names = [event.name for event in events]
+    gated = names.index("refinement.gated")
+    return names[:gated].count("refinement.step"), names[gated:].count("refinement.step")
+
+
+@pytest.mark.parametrize("n_iterations", [1, 2, 3])
+def test_the_first_round_is_of_two_steps_and_none_has_more_than_configured(
+    n_iterations: int,
+) -> None:
+    rng = np.random.default_rng(0)
+    T, matches = measure(rng, rng.normal(size=(40, 3)))
+    # So far away, and so narrow a kernel, that no step is small.
+    config = RegistrationConfig(n_iterations=n_iterations, huber=0.01, gate=1e6)
+    start = se3.exp(np.full(6, 0.05)) @ T
+    with watched() as events:
+        refine_pose(start, matches, all_of(matches), CAMERA, config)
+    assert steps_before_and_after(events) == (min(n_iterations, 2), n_iterations)
+
+
+def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
+    rng = np.random.default_rng(1)
+    T, matches = measure(rng, 1e-3 * rng.normal(size=(40, 3)))
+    sums = add_up(T, matches)
+    for start_sigmas, n_steps in ((0.02, 1), (0.05, 2), (0.9, 2)):
+        direction = np.linalg.solve(np.linalg.cholesky(sums.H).T, np.eye(6)[0])
+        start = se3.exp(start_sigmas * direction) @ T
+        with watched() as events:
+            refine_pose(start, matches, all_of(matches), CAMERA, SETTINGS)
+        first, _ = steps_before_and_after(events)
+        assert first == n_steps
+
+
+@pytest.mark.parametrize(("n_wrong", "n_kept"), [(0, 10), (10, 10), (11, 10), (12, 22), (25, 35)])
+def test_a_choice_that_loses_more_than_half_of_the_inliers_is_not_taken(
+    n_wrong: int, n_kept: int
+) -> None:
+    # The wrong ones are so unsure that they do not move the pose, and beyond the gate.
+    rng = np.random.default_rng(3)
+    errors = np.zeros((10 + n_wrong, 3))
+    errors[10:] = 10.0
+    T, matches = measure(rng, errors)
+    sigmas = np.full((10 + n_wrong, 3), 1.0)
+    sigmas[:10] = 1e-3
+    uvd = project(matches.target_points) + sigmas * errors
+    matches = replace(matches, target_uvd=uvd, target_sigmas=sigmas)
+    found = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS)
+    assert isinstance(found, Refinement)
+    assert np.count_nonzero(found.inliers) == n_kept
+    assert found.inliers[:10].all()
+
+
+def test_a_refined_pose_is_a_rotation_to_the_last_digit() -> None:
+    rng = np.random.default_rng(5)
+    T, matches = measure(rng, rng.normal(size=(40, 3)))
+    spoilt = T.copy()
+    spoilt[:3, :3] *= 1.0 + 1e-6
+    found = refine_pose(spoilt, matches, all_of(matches), CAMERA, SETTINGS)
+    assert isinstance(found, Refinement)
+    R = found.T_target_source[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+
+
+# Steps alone.
+
+
+def residuals_of(T: FloatArray, matches: Correspondences) -> StereoResiduals:
+    return StereoResiduals.of(T, matches, CAMERA, huber=HUBER)
+
+
+def test_descending_leads_where_a_refinement_leads() -> None:
+    rng = np.random.default_rng(6)
+    T, matches = measure(rng, rng.normal(size=(40, 3)))
+    start = se3.exp(0.02 * rng.normal(size=6)) @ T
+    residuals = residuals_of(start, matches)
+    found = descend(start, residuals, n_iterations=20)
+    wide = RegistrationConfig(n_iterations=20, huber=HUBER, gate=1e6)
+    refined = refine_pose(start, matches, all_of(matches), CAMERA, wide)
+    assert found is not None
+    assert isinstance(refined, Refinement)
+    np.testing.assert_allclose(found, refined.T_target_source, atol=1e-4)
+    # One step of Gauss and Newton, and the turn of it that OpenCV makes.
+    one = descend(start, residuals, n_iterations=1)
+    assert one is not None
+    at = residuals.linearize(start)
+    assert not isinstance(at, Failure)
+    step = np.linalg.solve(at.H, at.g)
+    expected = np.eye(4)
+    expected[:3, :3], expected[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
+    np.testing.assert_allclose(one, expected @ start, atol=1e-9)
+
+
+def test_descending_from_nowhere_leads_nowhere() -> None:
+    matches = near_a_line(0.0)
+    assert descend(np.eye(4), residuals_of(np.eye(4), matches), n_iterations=5) is None
+    behind = replace(matches, source_points=-matches.source_points)
+    assert descend(np.eye(4), residuals_of(np.eye(4), behind), n_iterations=5) is None
+
+
+@pytest.mark.parametrize("is_refined", [True, False])
+def test_numbers_that_overflow_on_the_way_are_no_warning(is_refined: bool) -> None:
+    # Measured beyond what squares hold: the residuals are infinite.
+    _, matches = measure(np.random.default_rng(7), np.full((12, 3), 1e160))
+    residuals = residuals_of(np.eye(4), matches)
+    if is_refined:
+        answer = refine_pose(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS)
+        assert isinstance(answer, Failure)
+    else:
+        assert descend(np.eye(4), residuals, n_iterations=3) is None
