@@ -11,9 +11,8 @@ import numpy as np
 from gvo.coasting import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
-from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
-from gvo.types import Estimate, Failure, FloatArray, RelativePose, Status
+from gvo.types import Contradiction, Estimate, Failure, FloatArray, RelativePose, Status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

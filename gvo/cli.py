@@ -58,7 +58,6 @@ _Compare = Annotated[
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
-EXIT_PARTLY = 3
 
 
 class _KeyframePolicy(StrEnum):
@@ -407,7 +406,7 @@ def convert(
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.outputs.converting import convert_recording
-    from gvo.runs import EXIT_COMPLETE
+    from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}
     settings = load(config, set_)
@@ -456,5 +455,12 @@ def main() -> None:
         app()
     except GvoError as error:
         typer.echo(f"gvo: error: {error}", err=True)
-        is_partly = isinstance(error, OutputError) and error.is_partly
-        raise SystemExit(EXIT_PARTLY if is_partly else EXIT_UNUSABLE) from None
+        raise SystemExit(_exit_code(error)) from None
+
+
+def _exit_code(error: GvoError) -> int:
+    if not (isinstance(error, OutputError) and error.is_partly):
+        return EXIT_UNUSABLE
+    from gvo.runs import EXIT_PARTLY
+
+    return EXIT_PARTLY

@@ -114,6 +114,11 @@ class Failure:
         return False
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction(Failure):
+    """A failure that another attempt at the same two frames cannot heal: two answers, not none."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StereoFrame:
     """One rectified stereo pair.

@@ -11,20 +11,7 @@ from gvo.types import Estimate, FaultyFrame, SegmentJoin, Status
 def counted(n_ok: int, n_coasting: int) -> RunTally:
     tally = RunTally()
     for number, status in enumerate([Status.OK] * n_ok + [Status.COASTING] * n_coasting):
-        pose = Estimate(stamp_ns=number, T_world_cam=np.eye(4), covariance=np.eye(6))
-        result = FrameResult(
-            raw=pose,
-            causal=pose,
-            finished=(),
-            status=status,
-            reason="",
-            n_keypoints=9,
-            n_points=8,
-            n_matches=7,
-            n_inliers=6,
-            n_links=3,
-        )
-        tally.add_result(result)
+        add(tally, number, status, 0)
     return tally
 
 

@@ -745,20 +745,19 @@ class SlidingWindow:
         """Add a factor between poses that are there."""
         factors = gtsam.NonlinearFactorGraph()
         factors.add(factor)
-        for _ in range(2 if self._graph.can_be_hardened else 1):
+        while True:
             try:
                 estimate = self._updated(frame_id, factors)
             except SmoothingError as error:
                 self._ledger.add(n_restored=1)
                 _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
-                reason = f"GTSAM gave up on the update: {error}"
                 if not self._hardened():
-                    break
+                    reason = f"GTSAM gave up on the update: {error}"
+                    return self._reject(frame_id, reason, edge=edge)
             else:
                 if self._log is not None:
                     self._log.add(factors, gtsam.Values(), keys={})
                 return estimate
-        return self._reject(frame_id, reason, edge=edge)
 
     def _hardened(self) -> bool:
         """Go on with a graph that takes worse conditioned factors; False where there is none."""

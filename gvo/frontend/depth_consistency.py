@@ -10,11 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from gvo.config import DepthConfig
-from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.trace import note
-from gvo.types import DepthArray, Failure, FloatArray, RelativePose
+from gvo.types import Contradiction, DepthArray, Failure, FloatArray, RelativePose
 
 # Points along each side of the grid that is compared.
 _N_GRID = 24

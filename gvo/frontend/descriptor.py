@@ -15,11 +15,11 @@ from gvo.frontend.relocalization import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparities
 from gvo.frontend.temporal import match_temporal, predict_pixels
-from gvo.frontend.verification import Contradiction
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.trace import note
 from gvo.types import (
+    Contradiction,
     Failure,
     FloatArray,
     Frame,

@@ -28,7 +28,7 @@ COARSE_ERROR_PX = _REDUCTION + 1
 
 def search_disparities(
     images: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
-) -> tuple[FloatArray, BoolArray]:
+) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Find the disparities of pixels to a few pixels, by normalized cross-correlation.
 
     Parameters
@@ -45,28 +45,8 @@ def search_disparities(
     disparities : ndarray of float64, shape (n,)
         Right to `COARSE_ERROR_PX`.
     is_found : ndarray of bool, shape (n,)
-    """
-    disparities, _, is_found = search_with_rivals(images, pixels, max_disparity)
-    return disparities, is_found
-
-
-def search_with_rivals(
-    images: tuple[ImageArray, ImageArray], pixels: FloatArray, max_disparity: float
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Find the disparities of pixels as `search_disparities`, and the next best ones elsewhere.
-
-    Parameters
-    ----------
-    images, pixels, max_disparity
-        See `search_disparities`.
-
-    Returns
-    -------
-    disparities : ndarray of float64, shape (n,)
-        Right to `COARSE_ERROR_PX`.
     rivals : ndarray of float64, shape (n,)
         A disparity farther away that is nearly as good here; not a number where there is none.
-    is_found : ndarray of bool, shape (n,)
     """
     left, right = (_reduce(image) for image in images)
     n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
@@ -80,24 +60,23 @@ def search_with_rivals(
     is_found = correlations[np.arange(len(best)), best] > _MIN_CORRELATION
     between, is_between = parabola_minimum(-correlations)
     steps = n_steps - np.where(is_between, between, best)
-    rivals, is_rivalled = _find_rivals(correlations, best, n_steps)
-    rivals[~is_rivalled] = np.nan
-    return float(_REDUCTION) * steps, float(_REDUCTION) * rivals, is_found
+    rivals = _find_rivals(correlations, best, n_steps)
+    return float(_REDUCTION) * steps, is_found, float(_REDUCTION) * rivals
 
 
-def _find_rivals(
-    correlations: NDArray[np.float32], best: IntArray, n_steps: int
-) -> tuple[FloatArray, BoolArray]:
-    """Return the best steps away from the best, and where these are nearly as good."""
+def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
+    """Return the best steps away from the best where they are nearly as good, else no number."""
     rows = np.arange(len(best))
     elsewhere = correlations.copy()
     for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):
         elsewhere[rows, np.clip(best + offset, 0, n_steps)] = -1.0
     second = np.argmax(elsewhere, axis=1)
-    between, is_between = parabola_minimum(-elsewhere)
-    steps = n_steps - np.where(is_between, between, second).astype(np.float64)
     gaps = correlations[rows, best] - elsewhere[rows, second]
-    return steps, np.asarray(gaps < _MAX_GAP)
+    rivalled = np.flatnonzero(gaps < _MAX_GAP)
+    between, is_between = parabola_minimum(-elsewhere[rivalled])
+    rivals = np.full(len(best), np.nan)
+    rivals[rivalled] = n_steps - np.where(is_between, between, second[rivalled])
+    return rivals
 
 
 def _reduce(image: ImageArray) -> NDArray[np.float32]:

@@ -18,7 +18,7 @@ from gvo.frontend.disparity import (
     measure_disparities,
     measure_row_shift,
 )
-from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_with_rivals
+from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
 from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
@@ -26,13 +26,13 @@ from gvo.frontend.relocalization import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import is_in_depth_range
 from gvo.frontend.tracking import track_pixels
-from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.trace import note
 from gvo.types import (
     BoolArray,
+    Contradiction,
     Failure,
     FloatArray,
     Frame,
@@ -145,11 +145,10 @@ class KltFrontend:
         result: RelativePose | Failure | None = None
         if prior is not None:
             result = self._register_from(prior, reference, current)
-        if not result and not isinstance(result, Contradiction):
+        if not isinstance(result, RelativePose | Contradiction):
             start = np.eye(4) if prior is None else prior
             rough = self._register_from(start, reference, current, is_wide=True)
-            is_open = isinstance(rough, Failure) and not isinstance(rough, Contradiction)
-            if is_open and prior is None:
+            if prior is None and not isinstance(rough, RelativePose | Contradiction):
                 rough = self._register_descriptors(reference, current)
             if isinstance(rough, Failure):
                 return rough
@@ -188,13 +187,13 @@ class KltFrontend:
         result: RelativePose | Failure,
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
-        frames = reference.frame, current.frame
-        if isinstance(result, Failure) or isinstance(frames[0], StereoFrame):
+        first, second = reference.frame, current.frame
+        if isinstance(result, Failure):
             return result
-        if isinstance(frames[1], StereoFrame):
-            return result
-        depths = frames[0].depth, frames[1].depth
-        return check_depths(result, depths, self.camera, self._config.depth)
+        if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
+            depths = first.depth, second.depth
+            return check_depths(result, depths, self.camera, self._config.depth)
+        return result
 
     def _register_descriptors(
         self, reference: KltObservations, current: KltObservations
@@ -282,8 +281,7 @@ class KltFrontend:
         in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
         uvd = self.camera.project_stereo(points[in_front])
         uvd[:, 2] += offset_px
-        limits = np.array([self.camera.width, self.camera.height]) - 1
-        is_in_view = np.all((uvd[:, :2] >= 0) & (uvd[:, :2] <= limits), axis=1)
+        is_in_view = self.camera.is_in_view(uvd[:, :2])
         return uvd[is_in_view], in_front[is_in_view]
 
     def _correspondences(
@@ -305,7 +303,7 @@ class KltFrontend:
         self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
     ) -> tuple[FloatArray, BoolArray]:
         farthest = float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
-        rough, rivals, is_found = search_with_rivals((frame.left, frame.right), corners, farthest)
+        rough, is_found, rivals = search_disparities((frame.left, frame.right), corners, farthest)
         disparities, is_valid = follow_disparities(
             (frame.left, frame.right),
             corners,
@@ -343,11 +341,16 @@ class KltFrontend:
         rivals, is_at_rest = follow_disparities(
             images, corners, rough, config, n_steps=N_SEARCH_STEPS, row_offset_px=row_offset_px
         )
-        is_alike = are_rivalled(
-            images, corners, (found, rivals), config, row_offset_px=row_offset_px
-        )
         # Those that come back to the disparity found were none.
-        return np.asarray(is_at_rest & is_alike & (np.abs(rivals - found) > COARSE_ERROR_PX))
+        is_rivalled = is_at_rest & (np.abs(rivals - found) > COARSE_ERROR_PX)
+        is_rivalled[is_rivalled] = are_rivalled(
+            images,
+            corners[is_rivalled],
+            (found[is_rivalled], rivals[is_rivalled]),
+            config,
+            row_offset_px=row_offset_px,
+        )
+        return np.asarray(is_rivalled)
 
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool

@@ -129,9 +129,7 @@ def check_view(
     T_current_reference = se3.invert(result.T_reference_current)
     points = se3.transform_points(T_current_reference, points_reference)
     points = points[points[:, 2] > _MIN_DEPTH_M]
-    limits = np.array([camera.width, camera.height]) - 1
-    pixels = camera.project(points)
-    n_in_view = int(np.count_nonzero(np.all((pixels >= 0) & (pixels <= limits), axis=1)))
+    n_in_view = int(np.count_nonzero(camera.is_in_view(camera.project(points))))
     if result.n_inliers >= _MIN_SHARE_OF_VIEW * n_in_view:
         return result
     return Failure(

@@ -26,7 +26,7 @@ from gvo.geometry.ransac import ransac_rigid
 from gvo.geometry.refinement import Refinement, descend, refine_pose
 from gvo.geometry.residuals import StereoResiduals
 from gvo.trace import note
-from gvo.types import BoolArray, Failure, FloatArray
+from gvo.types import BoolArray, Contradiction, Failure, FloatArray
 
 # A second motion counts from such a share of all matches on: below, it is a car in the distance,
 # or chance.
@@ -44,11 +44,6 @@ _N_STEPS = 1
 # is smaller than that of a pose that is guessed.
 _APART_PX = 1.0
 _MIN_DEPTH_M = 0.1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Contradiction(Failure):
-    """A failure that another attempt at the same two frames cannot heal: two answers, not none."""
 
 
 def verify_motion(

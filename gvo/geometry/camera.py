@@ -18,7 +18,7 @@ from gvo.geometry.lens import (
     bouguet,
     bouguet_wide,
 )
-from gvo.types import FloatArray
+from gvo.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +70,21 @@ class PinholeCamera:
         """
         x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
+    def is_in_view(self, pixels: FloatArray) -> BoolArray:
+        """Tell which pixels lie within the image.
+
+        Parameters
+        ----------
+        pixels : ndarray of float64, shape (n, 2)
+            (u, v).
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+        """
+        limits = np.array([self.width, self.height]) - 1
+        return np.asarray(np.all((pixels >= 0) & (pixels <= limits), axis=1))
 
     def unproject(self, pixels: FloatArray) -> FloatArray:
         """Return the rays with unit depth through pixels.

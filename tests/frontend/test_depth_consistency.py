@@ -6,10 +6,9 @@ import pytest
 from gvo.config import Config, DepthConfig
 from gvo.frontend.depth_consistency import check_depths, compare_depths
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.types import DepthArray, FloatArray, RelativePose
+from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose
 
 RECORDING = SyntheticRecording("handheld", "rgbd", n_frames=31, scale=1.0)
 IMAGES = list(RECORDING.images())

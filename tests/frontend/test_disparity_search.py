@@ -19,21 +19,21 @@ def pair(disparity: FloatArray | float) -> tuple[ImageArray, ImageArray]:
 def test_the_coarse_search_finds_any_disparity_to_a_few_pixels(disparity: float) -> None:
     pixels = grid(border=12)
     pixels = pixels[pixels[:, 0] > disparity + 14]
-    found, is_found = search_disparities(pair(disparity), pixels, 70.0)
+    found, is_found, _ = search_disparities(pair(disparity), pixels, 70.0)
     assert is_found.mean() > 0.9
     is_near = np.abs(found - disparity) <= COARSE_ERROR_PX
     assert is_near[is_found].mean() > 0.9
 
 
 def test_the_coarse_search_does_not_leave_the_image() -> None:
-    found, _ = search_disparities(pair(20.0), grid(border=0), 1000.0)
+    found, _, _ = search_disparities(pair(20.0), grid(border=0), 1000.0)
     assert np.all(found <= grid(border=0)[:, 0] + COARSE_ERROR_PX)
     assert np.all(found >= 0)
 
 
 def test_flat_images_hold_no_disparities() -> None:
     flat = np.full(SHAPE, 90, dtype=np.uint8)
-    _, is_found = search_disparities((flat, flat), grid(), 50.0)
+    _, is_found, _ = search_disparities((flat, flat), grid(), 50.0)
     assert not is_found.any()
 
 
@@ -44,5 +44,5 @@ def test_images_smaller_than_a_patch_give_nothing(shape: tuple[int, int]) -> Non
 
 
 def test_no_pixels_give_no_disparities() -> None:
-    found, is_found = search_disparities(pair(3.0), np.zeros((0, 2)), 50.0)
+    found, is_found, _ = search_disparities(pair(3.0), np.zeros((0, 2)), 50.0)
     assert found.shape == is_found.shape == (0,)

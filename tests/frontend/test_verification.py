@@ -5,11 +5,10 @@ import pytest
 
 from gvo.config import Config
 from gvo.frontend.registration import register_correspondences
-from gvo.frontend.verification import Contradiction
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.types import Failure, FloatArray, RelativePose
+from gvo.types import Contradiction, Failure, FloatArray, RelativePose
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.3)
 SIGMA_PX = 0.2

@@ -46,6 +46,19 @@ def random_motion(rng: np.random.Generator) -> FloatArray:
     return T
 
 
+def matched(source: FloatArray, target: FloatArray) -> Correspondences:
+    """Return correspondences of points (n, 3), all of sigma one."""
+    ones = np.ones(source.shape)
+    return Correspondences(
+        source_points=source,
+        target_points=target,
+        source_uvd=uvd(source),
+        target_uvd=uvd(target),
+        source_sigmas=ones,
+        target_sigmas=ones,
+    )
+
+
 def scene(
     rng: np.random.Generator, n: int, n_outliers: int
 ) -> tuple[FloatArray, Correspondences, BoolArray]:
@@ -55,15 +68,7 @@ def scene(
     target = source @ T[:3, :3].T + T[:3, 3]
     is_inlier = rng.permutation(n) >= n_outliers
     target[~is_inlier] = random_points(rng, n_outliers)
-    ones = np.ones((n, 3))
-    matches = Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=uvd(source),
-        target_uvd=uvd(target),
-        source_sigmas=ones,
-        target_sigmas=ones,
-    )
+    matches = matched(source, target)
     return T, matches, is_inlier
 
 
@@ -220,14 +225,7 @@ def test_points_on_a_line_are_a_failure() -> None:
     steps = np.linspace(2.0, 9.0, 30)[:, np.newaxis]
     line = steps * [0.1, 0.05, 1.0]
     farther = line + np.array([0.0, 0.0, 0.5])
-    matches = Correspondences(
-        source_points=line,
-        target_points=farther,
-        source_uvd=uvd(line),
-        target_uvd=uvd(farther),
-        source_sigmas=np.ones((30, 3)),
-        target_sigmas=np.ones((30, 3)),
-    )
+    matches = matched(line, farther)
     result = run(matches, SETTINGS)
     assert isinstance(result, Failure)
     assert result.n_matches == 30
@@ -328,15 +326,7 @@ def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
     )
     source[rng.integers(400)] += [0.0, 2.0, 1.0]
     target = source @ T[:3, :3].T + T[:3, 3]
-    ones = np.ones((400, 3))
-    matches = Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=uvd(source),
-        target_uvd=uvd(target),
-        source_sigmas=ones,
-        target_sigmas=ones,
-    )
+    matches = matched(source, target)
     result = run(matches, SETTINGS.model_copy(update={"n_hypotheses": 3000}), 100 + seed)
     assert isinstance(result, Consensus)
     assert result.inliers.all()
@@ -351,15 +341,7 @@ def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
     source[:3] = [0.0, 0.0, 5.0] + 0.1 * np.eye(3)
     target = source.copy()
     target[:3] += 0.08 * np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    ones = np.ones((30, 3))
-    matches = Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=uvd(source),
-        target_uvd=uvd(target),
-        source_sigmas=ones,
-        target_sigmas=ones,
-    )
+    matches = matched(source, target)
     weights = np.where(np.arange(30) < 3, 1.0, 1e-9)
     result = ransac_rigid(matches, CAMERA, config, weights=weights, rng=rng)
     assert isinstance(result, Consensus)
