@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from gvo import cli_seeing
+from gvo import cli_batch, cli_seeing
 from gvo.cli_options import (
     CalibrationFiles,
     Color,
@@ -446,6 +446,7 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
+cli_batch.add_commands(app)
 cli_seeing.add_commands(app)
 
 

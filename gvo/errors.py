@@ -39,6 +39,10 @@ class ResumeError(GvoError):
     """A run cannot go on where it was interrupted."""
 
 
+class RunBusyError(ResumeError):
+    """Another process is writing the run."""
+
+
 class CalibrationError(GvoError):
     """A calibration is missing or does not describe a usable camera."""
 

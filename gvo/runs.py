@@ -56,6 +56,8 @@ class RunResult:
         The page that shows it, where one was written.
     notes : tuple of str
         What became of the wish to resume a run, a line each.
+    is_found : bool
+        The folder held this run, complete: nothing was computed.
     """
 
     summary: dict[str, Any]
@@ -64,6 +66,7 @@ class RunResult:
     warnings: tuple[str, ...]
     report: Path | None = None
     notes: tuple[str, ...] = ()
+    is_found: bool = False
 
 
 def run_recording(
@@ -198,6 +201,7 @@ def _already_complete(found: Complete, out: Path) -> RunResult:
         warnings=tuple(summary.get("warnings", ())),
         report=page if page.exists() else None,
         notes=(f"{out} holds this run, complete: nothing was left to do",),
+        is_found=True,
     )
 
 

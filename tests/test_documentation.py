@@ -84,7 +84,7 @@ def test_examples_in_docstrings_run(name: str) -> None:
 
 @pytest.mark.parametrize(("page", "code"), blocks("python"))
 def test_python_in_the_documentation_runs(workplace: Path, page: str, code: str) -> None:
-    exec(compile(code, page, "exec"), {})
+    exec(compile(code, page, "exec"), {"__name__": "__main__"})
 
 
 @pytest.fixture

@@ -181,8 +181,10 @@ class Watched:
 
     def run(self, commands: list[list[str]]) -> list[tuple[str, str]]:
         """Run commands; return what they did: what kind of deed, and to what."""
+        # What measures the coverage writes files of its own.
+        inherited = {k: v for k, v in os.environ.items() if not k.startswith("COVERAGE_")}
         environment = {
-            **os.environ,
+            **inherited,
             "HOME": str(self.places["home"]),
             "TMPDIR": str(self.places["tmp"]),
             "MPLCONFIGDIR": str(self.places["matplotlib"]),

@@ -191,10 +191,15 @@ def replace_text(path: Path, text: str) -> None:
     OSError
         When it cannot be written; the one before stands.
     """
+    replace_bytes(path, text.encode())
+
+
+def replace_bytes(path: Path, data: bytes) -> None:
+    """Write a file as `replace_text` does."""
     beside = path.with_name(f"{path.name}.new")
     try:
         with io.FileIO(beside, "wb") as file:
-            append_whole(file, text.encode())
+            append_whole(file, data)
             os.fsync(file.fileno())
         beside.replace(path)
     except OSError:

@@ -14,6 +14,7 @@ from gvo.errors import ResumeError
 from gvo.outputs.run_folder import JOURNAL, SUMMARY, RunFolder
 from gvo.resuming.header import find_difference
 from gvo.resuming.journal import Journal
+from gvo.resuming.record_file import refuse_busy
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
@@ -70,13 +71,15 @@ def begin(path: Path, header: dict[str, Any], *, resume: bool) -> Beginning | Co
     OutputError
         When the folder cannot be written.
     ResumeError
-        When it holds another run.
+        When it holds another run, or one that another process is writing.
     """
     found = _find(path, header) if resume else None
     if isinstance(found, Complete):
         return found
     with ExitStack() as stack:
-        if found is not None:
+        if found is None:
+            refuse_busy(path / JOURNAL)
+        else:
             stack.callback(found.close)
         folder = RunFolder(path, goes_on=found is not None)
         stack.callback(folder.close)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gvo.closable import Closable
-from gvo.errors import ResumeError
+from gvo.errors import RunBusyError
 from gvo.outputs.line_file import append_whole
 
 _MAGIC = b"gvo journal 1\n"
@@ -19,6 +19,20 @@ _MAGIC = b"gvo journal 1\n"
 _PREFIX = struct.Struct("<II")
 # A record of the front-end takes some kilobytes; what claims more is none.
 MAX_RECORD = 1 << 20
+
+
+def refuse_busy(path: Path) -> None:
+    """Refuse a file of records that a process has open.
+
+    Raises
+    ------
+    RunBusyError
+    """
+    try:
+        with path.open("rb") as file:
+            _lock(file, path)
+    except OSError:
+        return  # none there, or whoever replaces it is told
 
 
 class RecordFile(Closable):
@@ -36,7 +50,7 @@ class RecordFile(Closable):
     ------
     OSError
         When it cannot be opened.
-    ResumeError
+    RunBusyError
         When another process has it.
     """
 
@@ -44,8 +58,8 @@ class RecordFile(Closable):
         self.path = path
         self._file = io.FileIO(path, "wb+" if is_new else "rb+")
         try:
-            self._lock()
-        except ResumeError:
+            _lock(self._file, path)
+        except RunBusyError:
             self._file.close()
             raise
         if is_new:
@@ -103,13 +117,13 @@ class RecordFile(Closable):
         self.path.unlink(missing_ok=True)
         self._file.close()
 
-    def _lock(self) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ResumeError(
-                f"{self.path.parent}: another process is writing this run; wait for its end, or "
-                "end it"
-            ) from None
-        except OSError:
-            return  # a file system without locks
+
+def _lock(file: io.FileIO | io.BufferedReader, path: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RunBusyError(
+            f"{path.parent}: another process is writing this run; wait for its end, or end it"
+        ) from None
+    except OSError:
+        return  # a file system without locks

@@ -24,6 +24,8 @@ _KINDS = (
     "a recording is a .bag, .mcap or .db3 file, a ROS 2 bag folder (metadata.yaml), or a folder "
     "of KITTI odometry (calib.txt), EuRoC (mav0 or cam0) or TUM RGB-D (rgb.txt)"
 )
+# By such a name in it a folder is known to be one recording.
+FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
 _TOPICS = ("left", "right", "color", "depth")
 
 

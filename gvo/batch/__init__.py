@@ -1,0 +1,61 @@
+"""Many recordings at once, on one machine or a cluster of Dask.
+
+Everything here needs Dask (`pip install 'gvo[batch]'`), which is loaded when a name is asked for.
+
+Examples
+--------
+>>> import gvo.batch
+>>> table = gvo.batch.run("recordings", out="results")  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from gvo.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from gvo.batch.engine import BatchProgress, ClusterError, connected
+    from gvo.batch.recordings import NamedRecording, find_recordings
+    from gvo.batch.running import BatchOptions, run, run_batch
+    from gvo.batch.variants import Variant, make_variants
+
+_MODULES = {
+    "gvo.batch.engine": ("BatchProgress", "ClusterError", "connected"),
+    "gvo.batch.recordings": ("NamedRecording", "find_recordings"),
+    "gvo.batch.running": ("BatchOptions", "run", "run_batch"),
+    "gvo.batch.variants": ("Variant", "make_variants"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_NEEDED = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
+
+__all__ = [
+    "BatchOptions",
+    "BatchProgress",
+    "ClusterError",
+    "NamedRecording",
+    "Variant",
+    "connected",
+    "find_recordings",
+    "make_variants",
+    "run",
+    "run_batch",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its module."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'gvo.batch' has no attribute {name!r}")
+    try:
+        return getattr(import_module(_MODULE_OF[name]), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] not in _NEEDED:
+            raise
+        raise ConfigurationError(f"batches need {error.name}: pip install 'gvo[batch]'") from error
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted([*globals(), *_MODULE_OF])

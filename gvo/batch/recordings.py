@@ -1,0 +1,172 @@
+"""Which recordings a batch is asked for: paths, patterns, folders, lists, URLs."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from gvo.batch.results import CSV, PARQUET
+from gvo.batch.storage import Place, is_url
+from gvo.batch.tasks import MARK
+from gvo.bounded_text import read_text
+from gvo.errors import RecordingError
+from gvo.outputs.run_folder import REPORT
+from gvo.sources.opening import BAG_SUFFIXES, FOLDER_MARKERS
+
+_LIST_SUFFIX = ".txt"
+_PATTERN = re.compile(r"[*?\[]")
+# Folders within folders that are looked through: a link to a folder above must have an end.
+_MAX_DEPTH = 12
+_UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
+_MAX_NAME = 150
+_COMPRESSED = ".zstd"
+_COMMENT = re.compile(r"(^|\s)#.*")
+# Names of the batch's own files, as they are written and as they stay.
+_TAKEN = {f"{name}{end}" for name in (CSV, PARQUET, REPORT, MARK) for end in ("", ".new")}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedRecording:
+    """A recording and its name in the batch.
+
+    Parameters
+    ----------
+    name : str
+        Unlike those of all others, fit for a folder.
+    location : str
+        Absolute path, or URL.
+    """
+
+    name: str
+    location: str
+
+
+def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
+    """Find the recordings that are asked for, each once, in the order asked.
+
+    Parameters
+    ----------
+    asked : sequence of str or Path
+        Each a recording, as a path or a URL that fsspec knows; a pattern (`*`, `?`, `[`, `**`);
+        a folder, which is searched where it is no recording itself; or a `.txt` file with any of
+        these, one a line, relative to its folder, `#` before a comment (after a blank, within a
+        line). A path that does not exist is taken for a recording that only the workers see.
+
+    Raises
+    ------
+    RecordingError
+        Where one of them leads to no recording at all.
+    ValueError
+        Where nothing is asked for.
+    """
+    if not asked:
+        raise ValueError("expected at least one recording")
+    locations: dict[str, None] = {}
+    for one in asked:
+        found = _expand(str(one))
+        if not found:
+            raise RecordingError(f"{one}: no recording there")
+        locations.update(dict.fromkeys(found))
+    names = _name(list(locations))
+    return [NamedRecording(name=names[each], location=each) for each in locations]
+
+
+def safe_name(text: str) -> str:
+    """Return a text as the name of a folder."""
+    return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
+
+
+def _expand(text: str) -> list[str]:
+    if not is_url(text) and text.endswith(_LIST_SUFFIX) and Path(text).is_file():
+        return list(_read_list(Path(text)))
+    return list(_search(text))
+
+
+def _read_list(path: Path) -> Iterator[str]:
+    try:
+        lines = read_text(path, encoding="utf-8-sig").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from error
+    for number, line in enumerate(lines, start=1):
+        entry = _COMMENT.sub("", line).strip()
+        if not entry:
+            continue
+        found = list(_search(entry if is_url(entry) else str(path.parent / entry)))
+        if not found:
+            raise RecordingError(f"{path}, line {number}: {entry}: no recording there")
+        yield from found
+
+
+def _search(text: str) -> Iterator[str]:
+    """Yield the recordings that a path, a pattern or a folder leads to."""
+    place = Place.of(text)
+    if not _PATTERN.search(place.path) or place.exists():
+        yield from (found.location for found in _search_below(place))
+        return
+    taken: set[str] = set()
+    for match in place.matches():
+        # The files of a recording that is a folder are no recordings of their own.
+        is_inside = not taken.isdisjoint(map(str, PurePosixPath(match.path).parents))
+        if not is_inside and (match.is_folder() or _is_bag(match.name)):
+            found = list(_search_below(match))
+            taken.update(one.path for one in found)
+            yield from (one.location for one in found)
+
+
+def _search_below(place: Place, depth: int = 0) -> Iterator[Place]:
+    """Yield a place where it is a recording, else those in the folder."""
+    if not place.is_folder():
+        yield place
+        return
+    entries = place.entries()
+    if any(entry.name in FOLDER_MARKERS for entry in entries):
+        yield place
+        return
+    for entry in entries:
+        is_open = depth < _MAX_DEPTH and not entry.name.startswith(".")
+        if is_open and (_is_bag(entry.name) or entry.is_folder()):
+            yield from _search_below(entry, depth + 1)
+
+
+def _is_bag(name: str) -> bool:
+    return name.removesuffix(_COMPRESSED).endswith(BAG_SUFFIXES)
+
+
+def _name(locations: Sequence[str]) -> dict[str, str]:
+    """Return each one's name: as much of the end of its path as tells it from others."""
+    ends = {each: list(_ends(each)) for each in locations}
+    names = {each: safe_name(ends[each][0]) for each in locations}
+    for length in range(1, max(map(len, ends.values()))):
+        counts = Counter(names.values())
+        for each in locations:
+            if counts[names[each]] > 1:
+                names[each] = safe_name(ends[each][min(length, len(ends[each]) - 1)])
+    return _number(names)
+
+
+def _ends(location: str) -> Iterator[str]:
+    """Yield ends of a path, each longer than the one before."""
+    # What follows in a URL is the archive that the path lies in.
+    path = location.partition("::")[0] if is_url(location) else location
+    *parents, last = [part for part in PurePosixPath(path).parts if part != "/"] or ["root"]
+    plain = last.removesuffix(_COMPRESSED)
+    yield plain.rpartition(".")[0] if plain.endswith(BAG_SUFFIXES) else plain
+    yield last
+    for n_parents in range(1, len(parents) + 1):
+        yield "-".join([*parents[-n_parents:], last])
+
+
+def _number(names: dict[str, str]) -> dict[str, str]:
+    """Tell apart what still has one name, or one of the batch's own files."""
+    taken = set(_TAKEN)
+    numbered = {}
+    for each, name in names.items():
+        free, number = name, 2
+        while free in taken:
+            free, number = f"{name}-{number}", number + 1
+        taken.add(free)
+        numbered[each] = free
+    return numbered

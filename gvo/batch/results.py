@@ -1,0 +1,95 @@
+"""The table of a batch: rows, as a DataFrame and in files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import pandas as pd
+
+from gvo.errors import OutputError
+from gvo.outputs.batch_rows import BatchRow, Value
+from gvo.outputs.line_file import replace_bytes
+
+CSV = "results.csv"
+PARQUET = "results.parquet"
+# Of 64 bits.
+_MAX_INT = 1 << 63
+_FIRST = ("recording", "variant", "status", "reason")
+_COUNTS = ("frames", "tracked", "segments")
+_NUMBERS = (
+    "coverage_percent",
+    "ate_raw_m",
+    "ate_causal_m",
+    "ate_smoothed_m",
+    "rpe_smoothed_m",
+    "rpe_smoothed_deg",
+    "t_smoothed_percent",
+    "r_smoothed_deg_per_100m",
+    "frame_ms",
+    "run_s",
+)
+
+
+def to_frame(rows: Sequence[BatchRow]) -> pd.DataFrame:
+    """Return rows as a table.
+
+    Parameters
+    ----------
+    rows : sequence of BatchRow
+
+    Returns
+    -------
+    DataFrame
+        A row each. First name, configuration, status and reason, then the parameters in which
+        configurations differ, by `section.key`, then the rest. Whole numbers are `Int64`; what
+        has no answer is missing.
+    """
+    keys = list(dict.fromkeys(key for row in rows for key in row.parameters))
+    records = [asdict(row) for row in rows]
+    names = [name for name in BatchRow.__slots__ if name not in (*_FIRST, "parameters")]
+    columns = {name: [_text(record[name]) for record in records] for name in (*_FIRST, *names)}
+    frame = pd.DataFrame(columns, columns=[*_FIRST, *names])
+    frame = frame.astype(dict.fromkeys(_COUNTS, "Int64") | dict.fromkeys(_NUMBERS, "float64"))
+    for place, key in enumerate(keys, start=len(_FIRST)):
+        frame.insert(place, key, _column([row.parameters.get(key) for row in rows]))
+    return frame
+
+
+def write_results(frame: pd.DataFrame, folder: Path) -> None:
+    """Write a table as `results.csv` and `results.parquet`, each as a whole.
+
+    Raises
+    ------
+    OutputError
+        When one cannot be written; the one before stands.
+    """
+    contents = {
+        CSV: frame.to_csv(index=False, lineterminator="\n").encode(),
+        PARQUET: frame.to_parquet(index=False),
+    }
+    for name, content in contents.items():
+        try:
+            replace_bytes(folder / name, content)
+        except OSError as error:
+            raise OutputError(f"{folder / name}: cannot be written: {error.strerror}") from error
+
+
+def _text(value: Value) -> Value:
+    """Return a text that can be written: names of files may hold what is no character."""
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
+
+
+def _column(values: Sequence[Value]) -> pd.Series:
+    """Return the values of a parameter; of more than one kind, as texts."""
+    kinds = {type(value) for value in values if value is not None}
+    is_small = all(abs(value) < _MAX_INT for value in values if type(value) is int)
+    if kinds == {int} and is_small:
+        return pd.Series(values, dtype="Int64")
+    if float in kinds and kinds <= {int, float}:
+        return pd.Series([None if v is None else float(v) for v in values], dtype="float64")
+    if len(kinds) == 1 and kinds <= {bool, str}:
+        return pd.Series(list(map(_text, values)), dtype="boolean" if bool in kinds else "string")
+    return pd.Series([json.dumps(value) for value in values], dtype="string")

@@ -1,0 +1,222 @@
+"""A batch: recordings times configurations, a table and a report over all."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pandas as pd
+from distributed import Client
+
+from gvo.batch.engine import BatchProgress, Engine, connected
+from gvo.batch.recordings import NamedRecording, find_recordings
+from gvo.batch.results import to_frame, write_results
+from gvo.batch.storage import is_url, store
+from gvo.batch.tasks import MARK, Task, TaskOptions
+from gvo.batch.variants import Variant, differences, name_variants
+from gvo.config import Config
+from gvo.errors import OutputError
+from gvo.outputs.batch_rows import BatchRow
+from gvo.outputs.line_file import replace_text
+from gvo.outputs.run_folder import REPORT
+from gvo.sources.excerpt import Excerpt
+from gvo.sources.opening import RecordingOptions
+from gvo.version import __version__
+
+# How often the table is written while the batch goes.
+_EVERY_S = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatchOptions:
+    """What all runs of a batch have in common.
+
+    Parameters
+    ----------
+    recording : RecordingOptions
+        Topics and calibration.
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    report : bool
+        Draw the picture and the page of each run; that of the batch is drawn anyway.
+    force : bool
+        Run what an earlier batch has finished, too.
+    """
+
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    excerpt: Excerpt | None = None
+    report: bool = True
+    force: bool = False
+
+
+def run(
+    recordings: Sequence[str | Path] | str | Path,
+    configs: Config | Sequence[Config] | Mapping[str, Config] | None = None,
+    *,
+    out: str | Path,
+    client: Client | None = None,
+    options: BatchOptions | None = None,
+    on_progress: Callable[[BatchProgress], None] | None = None,
+) -> pd.DataFrame:
+    """Run odometry over many recordings, with one configuration or several.
+
+    Each run writes its folder as `run_recording` does, below `out`: by the name of the recording
+    and, where there are several, of the configuration. A run that is complete there, of the same
+    recording, configuration and version, is taken over; an interrupted one goes on.
+
+    Parameters
+    ----------
+    recordings : path or URL, or a sequence of them
+        Recordings, patterns, folders, lists; see `find_recordings`.
+    configs : Config, sequence, or mapping of names, optional
+        The defaults where omitted, but for `runtime.threads`, which is 1: each core has a run.
+    out : str or Path
+        Folder that all workers see, or a URL.
+    client : distributed.Client, optional
+        Of the cluster; as many workers as there are cores, one thread each, where omitted.
+    options : BatchOptions, optional
+    on_progress : callable, optional
+        Called in this thread, some times a second. What it raises ends the batch; what was done
+        stands.
+
+    Returns
+    -------
+    DataFrame
+        A row for each run, as `results.csv` holds it, in the order of recordings and
+        configurations.
+
+    Raises
+    ------
+    RecordingError
+        When there is no recording to be found.
+    OutputError
+        When the folder cannot be written.
+    ClusterError
+        When the scheduler is lost.
+    """
+    asked = [recordings] if isinstance(recordings, str | Path) else list(recordings)
+    variants = name_variants(configs)
+    return run_batch(
+        find_recordings(asked),
+        variants,
+        out=out,
+        client=client,
+        options=options or BatchOptions(),
+        on_progress=on_progress,
+    )
+
+
+def run_batch(
+    recordings: Sequence[NamedRecording],
+    variants: Sequence[Variant],
+    *,
+    out: str | Path,
+    client: Client | None = None,
+    options: BatchOptions,
+    on_progress: Callable[[BatchProgress], None] | None = None,
+) -> pd.DataFrame:
+    """Run recordings that are found, with configurations that have names; see `run`."""
+    tasks = make_tasks(recordings, variants)
+    table = _Table(out, tasks)
+    shared = TaskOptions(
+        out=table.location,
+        mark=table.mark,
+        recording=options.recording,
+        excerpt=options.excerpt,
+        report=options.report,
+        force=options.force,
+    )
+    with ExitStack() as stack:
+        stack.enter_context(table.written())
+        client = client or stack.enter_context(connected(None, None))
+        # Closed at once where a row cannot be written: what runs then is given up.
+        rows = stack.enter_context(closing(Engine(client, shared, on_progress).run(tasks)))
+        for row in rows:
+            table.add(row)
+    return table.frame()
+
+
+def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]) -> list[Task]:
+    """Return a task for each recording with each configuration."""
+    parameters = differences([variant.config for variant in variants])
+    return [
+        Task(
+            recording=recording.name,
+            variant=variant.name,
+            source=recording.location,
+            folder=f"{recording.name}/{variant.name}" if len(variants) > 1 else recording.name,
+            config=variant.config,
+            parameters=values,
+        )
+        for recording in recordings
+        for variant, values in zip(variants, parameters, strict=True)
+    ]
+
+
+class _Table:
+    """The rows of a batch, and the files that show them."""
+
+    def __init__(self, out: str | Path, tasks: Sequence[Task]) -> None:
+        self.mark = uuid.uuid4().hex
+        self._is_remote = is_url(out)
+        self.location = str(out).rstrip("/") if self._is_remote else str(Path(out).absolute())
+        self._places = {task.folder: place for place, task in enumerate(tasks)}
+        self._rows: list[BatchRow] = []
+        self._written_s = time.monotonic()
+
+    def add(self, row: BatchRow) -> None:
+        self._rows.append(row)
+        if time.monotonic() - self._written_s > _EVERY_S and not self._is_remote:
+            write_results(self.frame(), Path(self.location))
+            self._written_s = time.monotonic()
+
+    def rows(self) -> list[BatchRow]:
+        """Return the rows in the order of the tasks."""
+        return sorted(self._rows, key=lambda row: self._places[row.folder])
+
+    def frame(self) -> pd.DataFrame:
+        return to_frame(self.rows())
+
+    @contextmanager
+    def written(self) -> Iterator[None]:
+        """Mark the folder; write table and report in the end, however it comes."""
+        with self._folder() as folder:
+            self._mark(folder)
+        try:
+            yield
+        finally:
+            if self._rows:
+                with self._folder() as folder:
+                    write_results(self.frame(), folder)
+                    self._draw(folder)
+
+    @contextmanager
+    def _folder(self) -> Iterator[Path]:
+        """Give the folder, or for a URL one whose files are stored there."""
+        if not self._is_remote:
+            yield Path(self.location)
+            return
+        with tempfile.TemporaryDirectory(prefix="gvo-") as copies:
+            yield Path(copies)
+            store(Path(copies), self.location)
+
+    def _mark(self, folder: Path) -> None:
+        content = {"mark": self.mark, "gvo_version": __version__, "n_runs": len(self._places)}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            replace_text(folder / MARK, json.dumps(content) + "\n")
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+    def _draw(self, folder: Path) -> None:
+        from gvo.outputs.report.batch_report import write_batch_report
+
+        n_missing = len(self._places) - len(self._rows)
+        note = f"{n_missing} runs were not made: the batch was stopped" if n_missing else ""
+        write_batch_report(folder / REPORT, self.rows(), title=Path(self.location).name, note=note)

@@ -1,0 +1,220 @@
+"""One task of a batch: one recording, run with one configuration, as a worker does it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from gvo.batch.storage import fetch, fetch_file, is_url, store
+from gvo.config import Config
+from gvo.errors import ConfigurationError, GvoError, OutputError, ResumeError, RunBusyError
+from gvo.outputs.batch_rows import BatchRow, RunStatus, Value, figures_of
+from gvo.outputs.run_folder import SUMMARY
+from gvo.run_outputs import RunOutputs
+from gvo.run_tally import Progress
+from gvo.runs import EXIT_COMPLETE, RunResult, run_recording
+from gvo.sources.excerpt import Excerpt
+from gvo.sources.opening import RecordingOptions, open_recording
+from gvo.version import __version__
+
+MARK = "batch.json"
+# How long another process may take to end its run in a folder.
+_BUSY_S = 30.0
+_BUSY_TICK_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskOptions:
+    """What all tasks of a batch have in common.
+
+    Parameters
+    ----------
+    out : str
+        Folder of the batch, as an absolute path or a URL.
+    mark : str
+        What its `batch.json` holds: a worker that does not find it there has another disk.
+    recording : RecordingOptions
+        Topics and calibration.
+    excerpt : Excerpt, optional
+    report : bool
+        Draw the picture and the report of each run.
+    force : bool
+        Run what is finished, too.
+    gvo_version : str
+        Of the client: a worker with another one would give other results.
+    """
+
+    out: str
+    mark: str
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    excerpt: Excerpt | None = None
+    report: bool = True
+    force: bool = False
+    gvo_version: str = __version__
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """A recording and a configuration.
+
+    Parameters
+    ----------
+    recording : str
+        Name.
+    variant : str
+        Name of the configuration.
+    source : str
+        Absolute path or URL of the recording.
+    folder : str
+        Run folder, relative to the batch's.
+    config : Config
+    parameters : dict of str to value
+        In which the configurations of the batch differ.
+    """
+
+    recording: str
+    variant: str
+    source: str
+    folder: str
+    config: Config
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+
+    def row(self, status: RunStatus, reason: str = "") -> BatchRow:
+        """Return the task's row of the table, without figures."""
+        return BatchRow(
+            recording=self.recording,
+            variant=self.variant,
+            status=status,
+            reason=reason,
+            source=self.source,
+            folder=self.folder,
+            parameters=self.parameters,
+            gvo_version=__version__,
+            configuration_hash=digest(self.config.model_dump(mode="json")),
+        )
+
+
+def run_task(
+    task: Task,
+    options: TaskOptions,
+    *,
+    scratch: Path | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> BatchRow:
+    """Run a recording, unless its folder holds the finished run.
+
+    A run that was interrupted goes on; another one is replaced.
+
+    Parameters
+    ----------
+    task : Task
+    options : TaskOptions
+    scratch : Path, optional
+        Folder for what is copied from or to a URL; the system's where omitted.
+    on_progress : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    BatchRow
+        Also where there is nothing but a reason.
+    """
+    start = time.perf_counter()
+    try:
+        if options.gvo_version != __version__:
+            raise ConfigurationError(
+                f"the worker has gvo {__version__}, the client {options.gvo_version}: install one"
+            )
+        with tempfile.TemporaryDirectory(prefix="gvo-", dir=scratch) as copies:
+            result = _run(task, options, Path(copies), on_progress)
+    except GvoError as error:
+        return task.row("failed", str(error))
+    status: RunStatus = "complete" if result.exit_code == EXIT_COMPLETE else "partly"
+    return replace(
+        task.row(status, "" if status == "complete" else "; ".join(result.warnings)),
+        **figures_of(result.summary),
+        run_s=None if result.is_found else time.perf_counter() - start,
+        is_found=result.is_found,
+        run_hash=digest([result.summary["run"], result.summary["configuration"]]),
+    )
+
+
+def digest(values: object) -> str:
+    """Return a digest of plain values."""
+    text = json.dumps(values, sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _run(
+    task: Task,
+    options: TaskOptions,
+    copies: Path,
+    on_progress: Callable[[Progress], None] | None,
+) -> RunResult:
+    path = fetch(task.source, copies) if is_url(task.source) else Path(task.source)
+    source = open_recording(path, config=task.config, options=options.recording)
+
+    def run(folder: Path, *, resume: bool) -> RunResult:
+        return run_recording(
+            source,
+            folder,
+            config=task.config,
+            excerpt=options.excerpt,
+            outputs=RunOutputs(report=options.report),
+            resume=resume,
+            on_progress=on_progress,
+        )
+
+    def go_on(folder: Path) -> RunResult:
+        if options.force:
+            return run(folder, resume=False)
+        try:
+            return run(folder, resume=True)
+        except RunBusyError:
+            raise
+        except ResumeError:
+            return run(folder, resume=False)
+
+    if not is_url(options.out):
+        out = Path(options.out)
+        _refuse_other_disk(out, options.mark)
+        return _when_free(lambda: go_on(out / task.folder))
+    folder, url = copies / "run", f"{options.out.rstrip('/')}/{task.folder}"
+    folder.mkdir()
+    fetch_file(f"{url}/{SUMMARY}", folder / SUMMARY)
+    result = go_on(folder)
+    if not result.is_found:
+        store(folder, url)
+    return result
+
+
+def _when_free(run: Callable[[], RunResult]) -> RunResult:
+    """Run as soon as nobody else writes the folder.
+
+    A worker that was given up, or whose batch was stopped, may write for a while yet.
+    """
+    end_s = time.monotonic() + _BUSY_S
+    while True:
+        try:
+            return run()
+        except RunBusyError:
+            if time.monotonic() > end_s:
+                raise
+            time.sleep(_BUSY_TICK_S)
+
+
+def _refuse_other_disk(out: Path, mark: str) -> None:
+    try:
+        is_there = json.loads((out / MARK).read_text(encoding="utf-8"))["mark"] == mark
+    except (OSError, ValueError, KeyError, TypeError):
+        is_there = False
+    if not is_there:
+        raise OutputError(
+            f"{out}: the worker does not see there what the client does; give --out on a disk "
+            "that both share, or a URL; and one batch at a time"
+        )

@@ -1,0 +1,118 @@
+"""The report of a batch: many recordings, one configuration or many."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from gvo.outputs.batch_rows import BatchRow
+from gvo.outputs.report.batch_boxes import box_plot
+from gvo.outputs.report.batch_effects import effect_sheets
+from gvo.outputs.report.batch_front import front_sheet
+from gvo.outputs.report.batch_table import runs_html
+from gvo.outputs.report.batch_values import Batch, printable
+from gvo.outputs.report.page import facts_html, list_html, plots_html, write_page
+from gvo.outputs.report.sheets import Plot, settings, write_plots
+
+_MAX_LISTED = 20
+
+
+def write_batch_report(
+    path: Path, rows: Sequence[BatchRow], *, title: str, note: str = "", plots: Path | None = None
+) -> None:
+    """Write a page about a batch; equal input gives equal files.
+
+    Parameters
+    ----------
+    path : Path
+        The page, replaced where it exists. The folders of the rows are relative to its own.
+    rows : sequence of BatchRow
+        In any order, at least one.
+    title : str
+    note : str
+        A sentence below the title.
+    plots : Path, optional
+        Folder for each plot as PNG and PDF.
+
+    Raises
+    ------
+    ConfigurationError
+        When the page or the folder cannot be written.
+    TrajectoryError
+        When a plot cannot be written.
+    ValueError
+        Where there is no row.
+    """
+    if not rows:
+        raise ValueError("expected at least one row")
+    batch = Batch.of(rows)
+    with settings(), warnings.catch_warnings():
+        # a page has its letters from the reader's machine, whatever the fonts here lack
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        sheets = _sheets(batch)
+        body = [
+            *_head(batch, title, note),
+            *(part for plot, table in sheets for part in (*plots_html([plot]), table)),
+            runs_html(batch, path.parent),
+        ]
+        write_page(path, printable(title), body)
+        if plots is not None:
+            write_plots([plot for plot, _ in sheets], plots)
+
+
+def _sheets(batch: Batch) -> list[tuple[Plot, str]]:
+    """Return the plots, each with the table below it."""
+    sheets = [(box_plot(batch), "")]
+    if batch.runs.parameters:
+        sheets += effect_sheets(batch)
+    if batch.is_sweep:
+        sheets.append(front_sheet(batch))
+    return sheets
+
+
+def _head(batch: Batch, title: str, note: str) -> list[str]:
+    parts = [
+        f"<h1>{escape(printable(title))}</h1>",
+        f"<p>{escape(printable(note))}</p>" if note else "",
+        list_html("Failed", _failures(batch), kind="warnings"),
+        facts_html(_facts(batch)),
+        '<p class="note"><a href="#runs">All runs, the worst first</a></p>',
+    ]
+    return [part for part in parts if part]
+
+
+def _failures(batch: Batch) -> list[str]:
+    """Return the reasons with the number of runs that failed for each, the commonest first."""
+    reasons = Counter(printable(row.reason) for row in batch.rows if row.status == "failed")
+    lines = [
+        f"{n} {'run' if n == 1 else 'runs'}: {reason or 'no reason was given'}"
+        for reason, n in reasons.most_common(_MAX_LISTED)
+    ]
+    if len(reasons) > _MAX_LISTED:
+        lines.append(f"{len(reasons) - _MAX_LISTED} other reasons: see the table")
+    return lines
+
+
+def _facts(batch: Batch) -> dict[str, str]:
+    rows = batch.rows
+    statuses = Counter(row.status for row in rows)
+    seconds = [row.run_s for row in rows if row.run_s is not None]
+    n_true = int(batch.runs.has(batch.errors_m).sum())
+    n_found = sum(row.is_found for row in rows)
+    return {
+        "Recordings": str(len({row.recording for row in rows})),
+        "Configurations": str(len(batch.means)),
+        "Swept": ", ".join(map(printable, batch.runs.parameters)),
+        "Runs": f"{len(rows)}: {statuses['complete']} complete, {statuses['partly']} partly, "
+        f"{statuses['failed']} failed",
+        "Found finished": str(n_found) if n_found else "",
+        "Frames": str(sum(row.frames or 0 for row in rows)),
+        "Ground truth": f"{n_true} runs have comparable errors"
+        if n_true
+        else "no run has an error",
+        "Time of all runs": f"{sum(seconds):.0f} s" if seconds else "",
+        "Version": ", ".join(sorted({f"gvo {r.gvo_version}" for r in rows if r.gvo_version})),
+    }

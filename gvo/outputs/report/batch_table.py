@@ -1,0 +1,145 @@
+"""The table of a batch's runs, the worst first, each with a link to its folder."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+import numpy as np
+
+from gvo.outputs.batch_rows import BatchRow
+from gvo.outputs.report.batch_values import Batch, number_text, printable
+from gvo.outputs.run_folder import REPORT
+from gvo.types import FloatArray
+
+_SCHEMES = ("http", "https")
+_ERROR = "ATE smoothed [m]"
+_RANKS = {"failed": 0, "partly": 1, "complete": 2}
+_COLUMNS: tuple[tuple[str, Callable[[BatchRow], float | None], str], ...] = (
+    ("frames", lambda row: row.frames, "d"),
+    ("coverage [%]", lambda row: row.coverage_percent, ".1f"),
+    ("segments", lambda row: row.segments, "d"),
+    ("ATE raw [m]", lambda row: row.ate_raw_m, ".4g"),
+    (_ERROR, lambda row: row.ate_smoothed_m, ".4g"),
+    ("RPE [m]", lambda row: row.rpe_smoothed_m, ".4g"),
+    ("RPE [deg]", lambda row: row.rpe_smoothed_deg, ".4g"),
+    ("t_err [%]", lambda row: row.t_smoothed_percent, ".4g"),
+    ("r_err [deg/100 m]", lambda row: row.r_smoothed_deg_per_100m, ".4g"),
+    ("frame [ms]", lambda row: row.frame_ms, ".1f"),
+    ("run [s]", lambda row: row.run_s, ".1f"),
+)
+
+
+def runs_html(batch: Batch, folder: Path) -> str:
+    """Return the section with the table of all runs.
+
+    Parameters
+    ----------
+    batch : Batch
+    folder : Path
+        That of the page: links are relative to it.
+    """
+    over_best = batch.over_best()
+    order = sorted(range(len(batch.rows)), key=lambda n: _rank(batch, n, float(over_best[n])))
+    rows = [batch.rows[n] for n in order]
+    columns = dict(_number_columns(rows, over_best[order] if batch.is_sweep else None))
+    header = ["recording", *(["configuration"] if batch.is_sweep else []), "status"]
+    head = "".join(f"<th>{name}</th>" for name in header)
+    head += "".join(f'<th class="number">{name}</th>' for name in columns)
+    lines = zip(*columns.values(), strict=True) if columns else [() for _ in rows]
+    body = "\n".join(
+        f"<tr><td>{_linked(row, folder)}</td>"
+        + (f"<td>{_name(row.variant)}</td>" if batch.is_sweep else "")
+        + f"{_outcome(row, numbers)}</tr>"
+        for row, numbers in zip(rows, lines, strict=True)
+    )
+    return (
+        f'<section id="runs">\n<h2>All runs</h2>\n<p class="note">{_words(batch)}</p>\n'
+        f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>'
+        "</div>\n</section>"
+    )
+
+
+def _words(batch: Batch) -> str:
+    measure = "the ATE over the best one of the recording" if batch.is_sweep else "the smoothed ATE"
+    return (
+        "Failed runs first, then those that are partly done, the least covered first, then the "
+        f"others by {measure if batch.has_errors else 'their coverage'}, the worst first. A name "
+        "leads to the report of the run."
+    )
+
+
+def _rank(batch: Batch, n: int, over_best: float) -> tuple[float | str, ...]:
+    """Return what sorts the worst to the top."""
+    row = batch.rows[n]
+    error = over_best if batch.is_sweep else float(batch.errors_m[n])
+    coverage = math.inf if row.coverage_percent is None else row.coverage_percent
+    by_error = math.inf if math.isnan(error) else -error
+    by_status = (coverage, by_error) if row.status == "partly" else (by_error, coverage)
+    return _RANKS[row.status], *by_status, -(row.frame_ms or 0.0), row.recording, row.variant
+
+
+def _number_columns(
+    rows: Sequence[BatchRow], over_best: FloatArray | None
+) -> Iterator[tuple[str, list[str]]]:
+    """Yield the columns that hold any number."""
+    for name, value, form in _COLUMNS:
+        values = [value(row) for row in rows]
+        if any(each is not None for each in values):
+            yield name, [number_text(each, form) for each in values]
+        if name == _ERROR and over_best is not None and not np.all(np.isnan(over_best)):
+            yield "over the best", [number_text(float(ratio), ".3f") for ratio in over_best]
+
+
+def _outcome(row: BatchRow, numbers: Sequence[str]) -> str:
+    """Return the status and what came of it: the reason, where that is all."""
+    reason = escape(printable(row.reason))
+    if row.status == "failed":
+        return f'<td>failed</td><td colspan="{max(1, len(numbers))}">{reason}</td>'
+    status = f'{row.status}<div class="note">{reason}</div>' if reason else row.status
+    return f"<td>{status}</td>" + "".join(f'<td class="number">{each}</td>' for each in numbers)
+
+
+def _name(text: str) -> str:
+    # a long one may break where a parameter ends
+    return escape(printable(text)).replace(",", ",<wbr>")
+
+
+def _linked(row: BatchRow, folder: Path) -> str:
+    name, address = _name(row.recording), run_address(row.folder, folder)
+    return f'<a href="{escape(address)}">{name}</a>' if address else name
+
+
+def run_address(run: str, folder: Path) -> str:
+    """Return where a link to a run leads: its report, or its folder where there is none.
+
+    Parameters
+    ----------
+    run : str
+        Folder of the run, relative to `folder`, or an address in the web.
+    folder : Path
+        That of the page.
+
+    Returns
+    -------
+    str
+        Percent-encoded; empty where there is nothing to lead to.
+    """
+    if "://" in run:
+        return run if urlsplit(run).scheme in _SCHEMES else ""
+    found = next((at for at in (f"{run}/{REPORT}", run) if _exists(folder / at)), None)
+    if found is None:
+        return ""
+    path = Path(found)
+    if path.is_absolute():
+        return path.as_uri()
+    # a colon would make a scheme of what is before it: it is encoded as well
+    return quote(path.as_posix(), errors="surrogateescape")
+
+
+def _exists(path: Path) -> bool:
+    return os.path.exists(path)  # noqa: PTH110 - that of Path raises where the name is too long
