@@ -77,7 +77,7 @@ def batch(
     color: Color = None,
     depth: Depth = None,
 ) -> None:
-    """Run many recordings, with one configuration or several: a table and a report over all."""
+    """Run many recordings, or many parameters: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
     from gvo.sources.excerpt import make_excerpt
     from gvo.sources.opening import RecordingOptions
