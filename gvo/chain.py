@@ -14,6 +14,9 @@ from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
 from gvo.geometry import se3
 from gvo.types import Contradiction, Estimate, Failure, FloatArray, RelativePose, Status
 
+# The usual velocity is the median of those of so many seconds.
+_USUAL_S = 1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawStep:
@@ -84,6 +87,7 @@ class RawChain(Generic[ObservationsT]):
         self._predecessor: _Link[ObservationsT] | None = None
         self._anchor: _Link[ObservationsT] | None = None
         self._velocity: FloatArray | None = None
+        self._velocities: list[tuple[int, FloatArray]] = []
 
     @property
     def anchor_ns(self) -> int | None:
@@ -148,12 +152,25 @@ class RawChain(Generic[ObservationsT]):
     ) -> RelativePose | Failure:
         """Search around the predicted pixels, then around the previous ones."""
         if self._velocity is not None and self._is_foretold(current.stamp_ns):
-            prior = se3.invert(link.T_world_frame) @ T_world_predicted
-            result = register_checked(self._frontend, link.observations, current, prior)
+            T_frame_world = se3.invert(link.T_world_frame)
+            result = register_checked(
+                *(self._frontend, link.observations, current, T_frame_world @ T_world_predicted),
+                T_usual=self._usual_motion(T_frame_world, current.stamp_ns),
+            )
             # What speaks against the prediction would be taken for true without it.
             if isinstance(result, RelativePose | Contradiction):
                 return result
         return register_checked(self._frontend, link.observations, current, None)
+
+    def _usual_motion(self, T_frame_world: FloatArray, stamp_ns: int) -> FloatArray | None:
+        """Return the motion from a frame at the usual velocity; None before there is one."""
+        predecessor = self._predecessor
+        if predecessor is None or not self._velocities:
+            return None
+        usual = np.median([velocity for _, velocity in self._velocities], axis=0)
+        elapsed_s = 1e-9 * (stamp_ns - predecessor.observations.stamp_ns)
+        T_frame_predecessor = T_frame_world @ predecessor.T_world_frame
+        return np.asarray(T_frame_predecessor @ se3.exp(usual * elapsed_s))
 
     def _is_foretold(self, stamp_ns: int) -> bool:
         """Tell whether the last velocity still says where a frame should be."""
@@ -185,6 +202,7 @@ class RawChain(Generic[ObservationsT]):
         )
         span_s = 1e-9 * (current.stamp_ns - link.observations.stamp_ns)
         self._velocity = se3.log(result.T_reference_current) / span_s
+        self._note_velocity(current.stamp_ns, self._velocity)
         self._predecessor = self._anchor = _link_of(current, estimate)
         return RawStep(
             estimate=estimate,
@@ -195,6 +213,10 @@ class RawChain(Generic[ObservationsT]):
             n_matches=result.n_matches,
             n_inliers=result.n_inliers,
         )
+
+    def _note_velocity(self, stamp_ns: int, velocity: FloatArray) -> None:
+        kept = [*self._velocities, (stamp_ns, velocity)]
+        self._velocities = [(ns, each) for ns, each in kept if 1e-9 * (stamp_ns - ns) <= _USUAL_S]
 
     def _coast(
         self,

@@ -16,7 +16,7 @@ from gvo.types import Failure, FloatArray, Frame, RelativePose
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """One call of a front-end's `register`, or `relocalize`.
+    """One call of a front-end's `register`, `register_expecting` or `relocalize`.
 
     Parameters
     ----------
@@ -124,8 +124,18 @@ class WatchedFrontend:
         prior: FloatArray | None = None,
     ) -> RelativePose | Failure:
         """Register as the front-end does."""
+        return self.register_expecting(reference, current, prior, None)
+
+    def register_expecting(
+        self,
+        reference: Any,  # noqa: ANN401 - the front-end's own
+        current: Any,  # noqa: ANN401
+        prior: FloatArray | None,
+        T_usual: FloatArray | None,
+    ) -> RelativePose | Failure:
+        """Register as the front-end does where the usual motion is known too."""
         with watched() as events:
-            result = self._frontend.register(reference, current, prior)
+            result = self._frontend.register_expecting(reference, current, prior, T_usual)
         self._append(reference, prior, result, events)
         return result
 

@@ -146,12 +146,22 @@ class DescriptorFrontend:
         -------
         RelativePose or Failure
         """
+        return self.register_expecting(reference, current, prior, None)
+
+    def register_expecting(
+        self,
+        reference: Observations,
+        current: Observations,
+        prior: FloatArray | None,
+        T_usual: FloatArray | None,
+    ) -> RelativePose | Failure:
+        """Register, and heed the usual motion, (4, 4), in the windows around the prior."""
         narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
         if prior is not None:
-            result = self._register_within(reference, current, prior, narrow)
+            result = self._register_within(reference, current, prior, narrow, T_usual=T_usual)
             if isinstance(result, RelativePose | Contradiction):
                 return result
-        rough = self._register_within(reference, current, prior, wide)
+        rough = self._register_within(reference, current, prior, wide, T_usual=T_usual)
         if isinstance(rough, Failure):
             return rough
         # Nothing foretold it: what else it predicts must be there too.
@@ -184,6 +194,8 @@ class DescriptorFrontend:
         current: Observations,
         prior: FloatArray | None,
         radius_px: float,
+        *,
+        T_usual: FloatArray | None = None,
     ) -> RelativePose | Failure:
         predicted = predict_pixels(reference, prior, self.camera)
         note(
@@ -209,6 +221,7 @@ class DescriptorFrontend:
             self._config,
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=prior,
+            T_usual=T_usual,
             with_offset=self.rig_offsets.is_learning,
         )
         if isinstance(result, Failure):

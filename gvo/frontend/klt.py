@@ -142,9 +142,19 @@ class KltFrontend:
         RelativePose or Failure
             The second column of `matches` is -1: tracks do not end at observations.
         """
+        return self.register_expecting(reference, current, prior, None)
+
+    def register_expecting(
+        self,
+        reference: KltObservations,
+        current: KltObservations,
+        prior: FloatArray | None,
+        T_usual: FloatArray | None,
+    ) -> RelativePose | Failure:
+        """Register, and heed the usual motion, (4, 4), in the round that starts from the prior."""
         result: RelativePose | Failure | None = None
         if prior is not None:
-            result = self._register_from(prior, reference, current)
+            result = self._register_from(prior, reference, current, T_usual=T_usual)
         if not isinstance(result, RelativePose | Contradiction):
             start = np.eye(4) if prior is None else prior
             rough = self._register_from(start, reference, current, is_wide=True)
@@ -220,6 +230,7 @@ class KltFrontend:
         current: KltObservations,
         *,
         is_wide: bool = False,
+        T_usual: FloatArray | None = None,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
         klt = self._config.klt
@@ -263,6 +274,7 @@ class KltFrontend:
             self._config,
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=None if is_wide else T_reference_current,
+            T_usual=T_usual,
             with_offset=self.rig_offsets.is_learning and not is_wide,
         )
         if isinstance(result, Failure):

@@ -39,6 +39,13 @@ class Frontend(Protocol[ObservationsT]):
     of frames that may be far apart in time and place, so that a lost camera is found again. It
     should be right rather than successful. Without it, `register` is asked, with no prior.
 
+    Another is `register_expecting(reference, current, prior, T_usual)`: what `register` does,
+    where also the motion at the usual velocity is known, T_reference_current, shape (4, 4), by
+    the median velocity of the last second. What pulls off gently before a camera draws the
+    prior along, but not this: it tells which of two motions is that of the camera. It is a
+    guess that may be wrong. Without the method, `register` is asked. A class that derives from
+    a front-end with it and has a `register` of its own needs its own of this too.
+
     `gvo.testing.check_frontend` tests the contract.
     """
 
@@ -77,15 +84,30 @@ def register_checked(
     reference: ObservationsT,
     current: ObservationsT,
     prior: FloatArray | None,
+    *,
+    T_usual: FloatArray | None = None,
 ) -> RelativePose | Failure:
     """Register two frames and turn a relative pose that is none into a failure.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    reference, current : observations
+    prior : ndarray of float64, shape (4, 4), or None
+        Predicted T_reference_current.
+    T_usual : ndarray of float64, shape (4, 4), optional
+        T_reference_current at the usual velocity, for a front-end with `register_expecting`.
 
     Raises
     ------
     ValueError
         When the front-end returns something else.
     """
-    return _checked(frontend, "register", frontend.register(reference, current, prior))
+    expecting = getattr(frontend, "register_expecting", None)
+    if T_usual is None or expecting is None:
+        return _checked(frontend, "register", frontend.register(reference, current, prior))
+    result = expecting(reference, current, prior, T_usual)
+    return _checked(frontend, "register_expecting", result)
 
 
 def relocalize_checked(

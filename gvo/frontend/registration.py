@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.usual_motion import heed_usual_motion
 from gvo.frontend.verification import verify_motion
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -28,6 +29,7 @@ def register_correspondences(
     *,
     stamps_ns: tuple[int, int],
     start: FloatArray | None = None,
+    T_usual: FloatArray | None = None,
     with_offset: bool = False,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
@@ -49,6 +51,8 @@ def register_correspondences(
         left for samples to find: these matches and this motion are where the refinement
         starts, which chooses its matches again anyhow. Of no use with `registration.refine`
         none, where the fit to the consensus is the result.
+    T_usual : ndarray of float64, shape (4, 4), optional
+        T_reference_current at the usual velocity, see `heed_usual_motion`.
     with_offset : bool
         Estimate a constant offset of the disparities too, `RelativePose.offset_px`.
 
@@ -79,12 +83,10 @@ def register_correspondences(
     )
     note("registration.refined", refined=refined)
     if not isinstance(refined, Failure) and config.registration.refine != "none":
-        refined = verify_motion(
-            refined,
-            correspondences,
-            camera,
-            config,
-            T_target_predicted=None if start is None else se3.invert(start),
+        refined = _verify(
+            *(refined, correspondences, camera, config),
+            start=start,
+            T_usual=T_usual,
             rng=_rng(config, stamps_ns),
             with_offset=with_offset,
         )
@@ -101,6 +103,33 @@ def register_correspondences(
             n_inliers=n_inliers,
         )
     return _relative_pose(refined, correspondences, matches)
+
+
+def _verify(
+    refined: Refinement,
+    correspondences: Correspondences,
+    camera: StereoCamera,
+    config: Config,
+    *,
+    start: FloatArray | None,
+    T_usual: FloatArray | None,
+    rng: np.random.Generator,
+    with_offset: bool,
+) -> Refinement | Failure:
+    """Return the motion that the predictions speak for, at the last velocity and the usual one."""
+    verified = verify_motion(
+        *(refined, correspondences, camera, config),
+        T_target_predicted=None if start is None else se3.invert(start),
+        rng=rng,
+        with_offset=with_offset,
+    )
+    if isinstance(verified, Failure) or T_usual is None:
+        return verified
+    return heed_usual_motion(
+        *(verified, correspondences, camera, config),
+        T_target_usual=se3.invert(T_usual),
+        with_offset=with_offset,
+    )
 
 
 def _known_consensus(

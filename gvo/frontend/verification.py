@@ -30,16 +30,16 @@ from gvo.types import BoolArray, Contradiction, Failure, FloatArray
 
 # A second motion counts from such a share of all matches on: below, it is a car in the distance,
 # or chance.
-_SIZEABLE = 0.1
+SIZEABLE = 0.1
 # From such a ratio of the smaller to the larger group on neither is the world beyond doubt.
 _DOUBTFUL = 0.4
 # The prediction tells two motions apart where one is nearer by this factor; in between it would
 # be its own error, not the motion, that decides.
-_NEARER = 2.0
+NEARER = 2.0
 # A misfit speaks for the prediction where its residual there is shorter by a fifth: where result
 # and prediction are the same but for noise, as they mostly are, few do, and nothing is computed.
 _BETTER = 0.8
-_N_STEPS = 1
+N_STEPS = 1
 # Nearer to each other than this, in pixels of the median point, the larger group will do: its error
 # is smaller than that of a pose that is guessed.
 _APART_PX = 1.0
@@ -80,7 +80,7 @@ def verify_motion(
     Refinement or Failure
         The first motion, the second one, or a failure where nothing tells which one it is.
     """
-    n_needed = max(config.ransac.min_inliers, _SIZEABLE * len(matches))
+    n_needed = max(config.ransac.min_inliers, SIZEABLE * len(matches))
     found = _find_other(first, matches, camera, config, T_target_predicted, rng, n_needed)
     if found is None:
         return first
@@ -103,7 +103,7 @@ def verify_motion(
         first = first if isinstance(alone, Failure) else alone
     groups = [_group(each, matches, camera, config, T_target_predicted) for each in (first, second)]
     motions = [group.refined.T_target_source for group in groups]
-    apart_px = _flow_px(motions[0], motions[1], matches, camera)
+    apart_px = flow_px(motions[0], motions[1], matches, camera)
     return _decide(groups[0], groups[1], apart_px=apart_px, n_needed=n_needed)
 
 
@@ -144,7 +144,7 @@ def _near_prediction(
     seeds = misfits & (residuals.squared(T_target_predicted) < _BETTER**2 * squared)
     if np.count_nonzero(seeds) < n_needed:
         return None
-    return descend(T_target_predicted, residuals.select(seeds), n_iterations=_N_STEPS)
+    return descend(T_target_predicted, residuals.select(seeds), n_iterations=N_STEPS)
 
 
 def _by_samples(
@@ -183,9 +183,9 @@ def _decide(
     if np.count_nonzero(first.fitting & ~second.fitting) < n_needed:
         # What was found first was a compromise: hardly anything fits it alone.
         return max(second, first, key=lambda group: group.n_fitting).refined
-    if second.surprise_px * _NEARER < first.surprise_px:
+    if second.surprise_px * NEARER < first.surprise_px:
         return second.refined
-    if first.surprise_px * _NEARER < second.surprise_px:
+    if first.surprise_px * NEARER < second.surprise_px:
         return first.refined
     larger, smaller = sorted((first, second), key=lambda group: -group.n_fitting)
     if smaller.n_fitting < _DOUBTFUL * larger.n_fitting or apart_px < _APART_PX:
@@ -214,11 +214,11 @@ def _group(
         fitting=refined.residuals.within(T, config.registration.gate),
         surprise_px=np.inf
         if T_target_predicted is None
-        else _flow_px(T, T_target_predicted, matches, camera),
+        else flow_px(T, T_target_predicted, matches, camera),
     )
 
 
-def _flow_px(
+def flow_px(
     T_first: FloatArray, T_second: FloatArray, matches: Correspondences, camera: StereoCamera
 ) -> float:
     """Return how far apart two motions see the points, the median, pixels."""

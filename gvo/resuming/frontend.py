@@ -143,9 +143,21 @@ class RepeatableFrontend:
         /,
     ) -> RelativePose | Failure:
         """Estimate the motion from the reference to the current frame."""
+        return self.register_expecting(reference, current, prior, None)
+
+    def register_expecting(
+        self,
+        reference: Any,  # noqa: ANN401 - the front-end's own
+        current: Any,  # noqa: ANN401
+        prior: FloatArray | None,
+        T_usual: FloatArray | None,
+        /,
+    ) -> RelativePose | Failure:
+        """Estimate it where the usual motion is known too; a record calls both `register`."""
         if isinstance(current, RepeatedObservations) and current.renewed is None:
             return self._answer(current, ("register", reference.stamp_ns, prior is not None))
-        result = self._frontend.register(_renewed(reference), _renewed(current), prior)
+        pair = _renewed(reference), _renewed(current)
+        result = self._frontend.register_expecting(*pair, prior, T_usual)
         self._note("register", reference.stamp_ns, result, has_prior=prior is not None)
         return result
 

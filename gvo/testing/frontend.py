@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -24,6 +24,8 @@ _PRIOR_SIGMAS = 10.0
 _PRIOR_LIMITS = np.repeat([0.005, 0.02], 3)
 _SHIFT_PX = 3
 _SHIFT_DEPTH_M = 5.0
+# The method that is asked where a usual motion is known.
+_EXPECTING = "register_expecting"
 
 
 class ContractError(AssertionError):
@@ -43,6 +45,8 @@ def check_frontend(
     - it maps the current frame to the reference, not the other way round (camera images only);
     - the same call gives the same result, bit for bit, and changes none of its arguments;
     - where nothing can be seen there is a falsy `Failure` with a reason, and no exception;
+    - `register_expecting`, where it has one, says the same as `register`, within 5 sigma, by a
+      usual motion that is right or 10 sigma off, and keeps all that `register` has to keep;
     - `relocalize`, where it has one, fails or says the same as `register`, within 5 sigma.
 
     Differences below 0.1 mrad and 1 mm count as none.
@@ -83,6 +87,7 @@ def check_frontend(
         _check_prior(frontend, result, *pair)
     _check_direction(frontend, frames[0])
     for pair, result in zip(pairwise(observations), results, strict=True):
+        _check_usual_motion(frontend, result, *pair)
         _check_relocalization(frontend, result, *pair)
     for nothing in _without_anything(frames[0], frames[-1], blank):
         _check_nothing_seen(frontend, observations[0], nothing)
@@ -112,19 +117,19 @@ def _check_extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
 
 
 def _register(
-    frontend: Frontend[Any], reference: Stamped, current: Stamped, prior: FloatArray | None
+    frontend: Frontend[Any], reference: Stamped, current: Stamped, *motions: FloatArray | None
 ) -> RelativePose | Failure:
-    """Register twice, and check what holds for any arguments."""
-    name = f"register({reference.stamp_ns}, {current.stamp_ns})"
-    given = None if prior is None else prior.copy()
-    before = [fingerprint(value) for value in (reference, current, prior)]
-    results = [frontend.register(reference, current, given) for _ in range(2)]
-    after = [fingerprint(value) for value in (reference, current, given)]
-    for part, is_same in zip(
-        ("reference", "current", "prior"), np.equal(before, after), strict=True
-    ):
+    """Register twice, by a prior or also a usual motion; check what holds for any arguments."""
+    method = "register" if len(motions) == 1 else _EXPECTING
+    name = f"{method}({reference.stamp_ns}, {current.stamp_ns})"
+    given = [reference, current, *(None if each is None else each.copy() for each in motions)]
+    before = [fingerprint(value) for value in given]
+    call: Callable[..., RelativePose | Failure] = getattr(frontend, method)
+    first, second = call(*given), call(*given)
+    after = [fingerprint(value) for value in given]
+    parts = ("reference", "current", "prior", "T_usual")
+    for part, is_same in zip(parts, np.equal(before, after), strict=False):
         _require(is_same, f"{name} changes its argument {part}")
-    first, second = results
     _require(
         isinstance(first, RelativePose | Failure),
         f"{name} must return RelativePose or Failure, got {type(first).__name__}",
@@ -174,19 +179,42 @@ def _check_inverse(
 def _check_prior(
     frontend: Frontend[Any], result: RelativePose, reference: Stamped, current: Stamped
 ) -> None:
+    for prior in (result.T_reference_current, _misled(result)):
+        guided = _register(frontend, reference, current, prior)
+        name = f"register({reference.stamp_ns}, {current.stamp_ns})"
+        _check_guided(name, "a prior", result, guided)
+
+
+def _check_usual_motion(
+    frontend: Frontend[Any], result: RelativePose, reference: Stamped, current: Stamped
+) -> None:
+    if not hasattr(frontend, _EXPECTING):
+        return
+    prior = result.T_reference_current
+    for T_usual in (prior, _misled(result)):
+        guided = _register(frontend, reference, current, prior, T_usual)
+        name = f"{_EXPECTING}({reference.stamp_ns}, {current.stamp_ns})"
+        _check_guided(name, "a usual motion", result, guided)
+
+
+def _misled(result: RelativePose) -> FloatArray:
+    """Return a motion that is off by more sigmas than chance would have it."""
     sigmas: FloatArray = np.sqrt(np.diag(result.covariance))
     signs = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     error: FloatArray = signs * np.minimum(_PRIOR_SIGMAS * sigmas, _PRIOR_LIMITS)
-    for prior in (result.T_reference_current, result.T_reference_current @ se3.exp(error)):
-        guided = _register(frontend, reference, current, prior)
-        name = f"register({reference.stamp_ns}, {current.stamp_ns})"
-        if isinstance(guided, Failure):
-            raise ContractError(f"{name} fails with a prior and not without: {guided.reason}")
-        _check_agreement(
-            f"{name} with and without a prior",
-            se3.invert(result.T_reference_current) @ guided.T_reference_current,
-            result.covariance + guided.covariance,
-        )
+    return np.asarray(result.T_reference_current @ se3.exp(error))
+
+
+def _check_guided(
+    name: str, guide: str, result: RelativePose, guided: RelativePose | Failure
+) -> None:
+    if isinstance(guided, Failure):
+        raise ContractError(f"{name} fails with {guide} and not without: {guided.reason}")
+    _check_agreement(
+        f"{name} with and without {guide}",
+        se3.invert(result.T_reference_current) @ guided.T_reference_current,
+        result.covariance + guided.covariance,
+    )
 
 
 def _check_relocalization(
@@ -271,12 +299,15 @@ def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:
 
 def _check_nothing_seen(frontend: Frontend[Any], observations: Stamped, frame: Stamped) -> None:
     stamps = f"{observations.stamp_ns}, {frame.stamp_ns}"
+    known: list[tuple[FloatArray | None, ...]] = [(None,), (np.eye(4),)]
+    if hasattr(frontend, _EXPECTING):
+        known.append((np.eye(4), np.eye(4)))
     try:
         nothing = frontend.extract(frame)
         results = [
-            _register(frontend, reference, current, prior)
+            _register(frontend, reference, current, *motions)
             for reference, current in ((observations, nothing), (nothing, observations))
-            for prior in (None, np.eye(4))
+            for motions in known
         ]
     except ContractError:
         raise

@@ -78,6 +78,34 @@ def ask(answer: object) -> RelativePose | Failure:
     return register_checked(frontend, None, None, None)
 
 
+class Expecting(Answering):
+    """Says nothing but where the usual motion is known, and what it was handed."""
+
+    handed: tuple[Any, ...] = ()
+
+    def register_expecting(self, *handed: Any) -> Any:
+        self.handed = handed
+        return pose()
+
+
+def test_a_front_end_is_asked_with_the_usual_motion_where_it_can_be() -> None:
+    frontend, failure = Expecting(Failure(reason="dark")), Failure(reason="dark")
+    prior, T_usual = np.eye(4), se3.exp(np.ones(6))
+    assert register_checked(frontend, 1, 2, prior, T_usual=T_usual)
+    assert frontend.handed[:2] == (1, 2)
+    assert frontend.handed[2] is prior
+    assert frontend.handed[3] is T_usual
+    assert not register_checked(frontend, 1, 2, prior)
+    assert register_checked(Answering(failure), 1, 2, prior, T_usual=T_usual) is failure
+
+
+def test_answers_with_the_usual_motion_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    frontend = Expecting(None)
+    monkeypatch.setattr(frontend, "register_expecting", lambda *handed: None)
+    with pytest.raises(ValueError, match="register_expecting of Expecting must return"):
+        register_checked(frontend, 1, 2, None, T_usual=np.eye(4))
+
+
 def test_sound_answers_are_handed_through() -> None:
     for answer in (pose(), Failure(reason="dark")):
         assert ask(answer) is answer

@@ -144,6 +144,49 @@ def test_a_place_found_again_must_be_the_right_one(frontend: Sound, reason: str)
         check_frontend(frontend, frames("stereo"))
 
 
+class BelievesTheUsualMotion(Sound):
+    def register_expecting(self, *arguments: Any) -> Result:
+        result = super().register_expecting(*arguments)
+        if isinstance(result, Failure) or arguments[3] is None:
+            return result
+        return replace(result, T_reference_current=arguments[3].copy())
+
+
+class ChangesTheUsualMotion(Sound):
+    def register_expecting(self, *arguments: Any) -> Result:
+        if arguments[3] is not None:
+            arguments[3][0, 3] += 1.0
+        return super().register_expecting(*arguments)
+
+
+class FailsWithTheUsualMotion(Sound):
+    def register_expecting(self, *arguments: Any) -> Result:
+        is_known = arguments[3] is not None
+        return Failure(reason="odd") if is_known else super().register_expecting(*arguments)
+
+
+class AlwaysFindsTheUsualMotion(Sound):
+    def register_expecting(self, *arguments: Any) -> Result:
+        result = super().register_expecting(*arguments)
+        if isinstance(result, RelativePose) or arguments[3] is None:
+            return result
+        return RelativePose(T_reference_current=arguments[3].copy(), covariance=np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("frontend", "reason"),
+    [
+        (BelievesTheUsualMotion, "^register_expecting.* a usual motion disagree by"),
+        (ChangesTheUsualMotion, "^register_expecting.* changes its argument T_usual"),
+        (FailsWithTheUsualMotion, "^register_expecting.* fails with a usual motion.*: odd"),
+        (AlwaysFindsTheUsualMotion, "are registered"),
+    ],
+)
+def test_a_usual_motion_must_not_be_believed_blindly(frontend: type[Sound], reason: str) -> None:
+    with pytest.raises(ContractError, match=reason):
+        check_frontend(frontend(), frames("stereo"))
+
+
 class ChangesTheFrame(Sound):
     def extract(self, frame: Frame) -> KltObservations:
         observations = super().extract(frame)

@@ -1,0 +1,184 @@
+"""Matches that continue the usual motion, while the prediction has been drawn away from it."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.chain import RawChain
+from gvo.config import Config, WindowConfig
+from gvo.explain.watch import WatchedFrontend
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.klt import KltFrontend
+from gvo.frontend.protocol import register_checked
+from gvo.frontend.registration import register_correspondences
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.resuming.frontend import RepeatableFrontend
+from gvo.types import Failure, FloatArray, RelativePose
+
+CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
+STATED_PX = 0.7
+STILL = np.zeros(6)
+# A bus at 5 m: what it moves by from frame to frame, 1.5 px, is well within the stated noise.
+BUS = np.array([0.0, 0.0, 0.0, 0.015, 0.0, 0.0])
+
+
+def matches_of(*groups: tuple[FloatArray, int], noise_px: float) -> Correspondences:
+    rng = np.random.default_rng(7)
+    sources, targets = [], []
+    for twist, n in groups:
+        uvd = np.column_stack(
+            [rng.uniform(20, 620, n), rng.uniform(20, 460, n), rng.uniform(18, 24, n)]
+        )
+        points = CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2])
+        moved = se3.transform_points(se3.invert(se3.exp(twist)), points)
+        sources.append(uvd)
+        targets.append(CAMERA.project_stereo(moved))
+    source, target = np.concatenate(sources), np.concatenate(targets)
+    noise = rng.normal(0.0, noise_px, (2, *source.shape))
+    sigmas = np.full(source.shape, STATED_PX)
+    return Correspondences.of_pixels(
+        (source + noise[0], target + noise[1]), (sigmas, sigmas), CAMERA
+    )
+
+
+def register(
+    matches: Correspondences, prior: FloatArray, T_usual: FloatArray | None = None
+) -> FloatArray:
+    """Return the translation that is found, metres."""
+    indices = np.tile(np.arange(len(matches))[:, np.newaxis], 2)
+    result = register_correspondences(
+        *(matches, indices, CAMERA, Config()), stamps_ns=(1, 2), start=prior, T_usual=T_usual
+    )
+    assert isinstance(result, RelativePose), result
+    return np.asarray(result.T_reference_current[:3, 3])
+
+
+@pytest.mark.parametrize("n_bus", [100, 140, 300])
+def test_a_bus_that_has_drawn_the_prediction_along_is_not_followed(n_bus: int) -> None:
+    matches = matches_of((STILL, 60), (BUS, n_bus), noise_px=0.05)
+    assert np.linalg.norm(register(matches, se3.exp(BUS), se3.exp(STILL))) < 0.003
+    # By the prediction alone it is.
+    assert np.linalg.norm(register(matches, se3.exp(BUS))) > 0.005
+
+
+@pytest.mark.parametrize(
+    ("others", "bus", "noise_px"),
+    [
+        pytest.param((STILL, 60), 6.0 * BUS, STATED_PX, id="noise as stated"),
+        pytest.param((STILL, 14), BUS, 0.05, id="few continue it"),
+        pytest.param((STILL, 0), BUS, 0.05, id="none continues it"),
+        pytest.param((-BUS, 60), BUS, 0.05, id="the others are no nearer to it"),
+    ],
+)
+def test_a_result_stays_bit_by_bit_where_the_usual_motion_says_nothing(
+    others: tuple[FloatArray, int], bus: FloatArray, noise_px: float
+) -> None:
+    matches = matches_of(others, (bus, 200), noise_px=noise_px)
+    np.testing.assert_array_equal(
+        register(matches, se3.exp(bus), se3.exp(STILL)), register(matches, se3.exp(bus))
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "heeding"), [("klt", [True, False, False]), ("descriptor", [True, True, False])]
+)
+def test_the_usual_motion_is_heeded_where_the_prediction_is_and_not_in_the_round_after_it(
+    kind: str, heeding: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
+    frontend: Any = make_frontend(
+        recording.info.camera, Config.model_validate({"frontend": {"kind": kind}})
+    )
+    pair = [frontend.extract(frame) for frame in gvo.frames(recording, Config())]
+    T_usual, handed = se3.exp(BUS), []
+
+    def spy(*arguments: Any, **options: Any) -> RelativePose | Failure:
+        handed.append(options.get("T_usual"))
+        # The first round leads to nothing, so that all that follow are made.
+        return Failure(reason="") if len(handed) == 1 else real(*arguments, **options)
+
+    module = import_module(type(frontend).__module__)
+    real = module.register_correspondences
+    monkeypatch.setattr(module, "register_correspondences", spy)
+    assert isinstance(frontend.register_expecting(*pair, np.eye(4), T_usual), RelativePose)
+    assert [each is T_usual for each in handed] == heeding
+    handed.clear()
+    assert isinstance(frontend.register(*pair, np.eye(4)), RelativePose)
+    assert handed == [None, None, None]
+
+
+def repeatable(camera: StereoCamera, config: Config) -> RepeatableFrontend:
+    return RepeatableFrontend(make_frontend(camera, config))
+
+
+@pytest.mark.parametrize("wrap", [WatchedFrontend, repeatable])
+def test_a_front_end_inside_another_is_handed_the_usual_motion_too(
+    wrap: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
+    frontend = wrap(recording.info.camera, Config())
+    first, second = (frontend.extract(frame) for frame in gvo.frames(recording, Config()))
+    handed: list[Any] = []
+
+    def spy(_: KltFrontend, *arguments: Any) -> Failure:
+        handed[:] = arguments
+        return Failure(reason="dark")
+
+    monkeypatch.setattr(KltFrontend, "register_expecting", spy)
+    prior, T_usual = np.eye(4), se3.exp(BUS)
+    assert not register_checked(frontend, first, second, prior, T_usual=T_usual)
+    for given, known in zip(handed, (first, second, prior, T_usual), strict=True):
+        assert given is known
+    assert not register_checked(frontend, first, second, prior)
+    assert handed[3] is None
+
+
+@dataclass
+class Seen:
+    stamp_ns: int
+
+
+class Scripted:
+    """Registers neighbours by given steps, and keeps what was expected of them."""
+
+    def __init__(self, steps_m: list[float]) -> None:
+        self.steps_m = steps_m
+        self.usual_m: list[float] = []
+
+    def extract(self, frame: Seen) -> Seen:
+        return frame
+
+    def register(self, reference: Seen, current: Seen, prior: FloatArray | None) -> RelativePose:
+        assert prior is None, "asked without the usual motion, which is known"
+        T = np.eye(4)
+        T[0, 3] = self.steps_m.pop(0)
+        return RelativePose(
+            T_reference_current=T,
+            covariance=1e-6 * np.eye(6),
+            matches=np.zeros((0, 2), dtype=np.int64),
+            inliers=np.zeros(0, dtype=np.bool_),
+        )
+
+    def register_expecting(
+        self, reference: Seen, current: Seen, prior: FloatArray, T_usual: FloatArray
+    ) -> RelativePose:
+        self.usual_m.append(float(T_usual[0, 3]))
+        return self.register(reference, current, None)
+
+
+def test_the_usual_velocity_is_the_median_of_the_last_second() -> None:
+    # Uneven, so that every other number of steps, and their mean, would be seen.
+    steps_m = [0.01 * n**2 for n in range(30)]
+    frontend = Scripted(list(steps_m))
+    chain: RawChain[Seen] = RawChain(frontend, WindowConfig())
+    for n in range(len(steps_m) + 1):
+        chain.advance(Seen(100_000_000 * n))
+    # At 10 Hz: those that ended a second ago or later, and the last one.
+    expected = [np.median(steps_m[max(n - 11, 0) : n]) for n in range(1, len(steps_m))]
+    np.testing.assert_allclose(frontend.usual_m, expected, atol=1e-12)
