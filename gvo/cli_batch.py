@@ -71,6 +71,9 @@ def batch(
     with_report: Annotated[
         bool, typer.Option("--report/--no-report", help="Draw the picture and page of each run.")
     ] = True,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
+    ] = None,
     calibration: CalibrationFiles = None,
     left: Left = None,
     right: Right = None,
@@ -99,6 +102,7 @@ def batch(
         excerpt=excerpt,
         report=with_report,
         force=force,
+        plots=plots,
     )
     typer.echo(f"{len(found)} recordings, {len(variants)} configurations")
     with (

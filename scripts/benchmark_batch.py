@@ -75,7 +75,13 @@ def measure_overhead(folder: Path, n_tasks: int) -> None:
     links.mkdir()
     for number in range(n_tasks):
         (links / f"short{number:05d}.mcap").symlink_to(bag)
-    memory: list[float] = []
+    memory: list[tuple[float, float]] = []
+
+    def measure(progress: gvo.batch.BatchProgress) -> None:
+        # Asking the workers takes time as well.
+        if progress.row is not None and progress.n_done % max(n_tasks // 50, 1) == 0:
+            memory.append((resident_mb(), max(client.run(resident_mb).values())))
+
     with gvo.batch.connected(None, 2) as client:
         run([bag], folder / "warm", client)
         start = time.perf_counter()
@@ -89,7 +95,7 @@ def measure_overhead(folder: Path, n_tasks: int) -> None:
             out=folder / "many",
             client=client,
             options=gvo.batch.BatchOptions(report=False),
-            on_progress=lambda progress: memory.append(resident_mb()),
+            on_progress=measure,
         )
         elapsed_s = time.perf_counter() - start
     runs_s = float(table["run_s"].sum())
@@ -99,9 +105,10 @@ def measure_overhead(folder: Path, n_tasks: int) -> None:
         f"run, {overhead_ms:.1f} ms per task beyond it (empty tasks: "
         f"{1e3 * 2 * empty_s / n_tasks:.1f} ms)"
     )
-    tenth = len(memory) // 10
-    early, late = max(memory[tenth : 2 * tenth]), max(memory[-tenth:])
-    print(f"client: {early:.0f} MB in the second tenth of the batch, {late:.0f} MB in the last")
+    for name, held in zip(("client", "largest worker"), zip(*memory, strict=True), strict=True):
+        tenth = max(len(held) // 10, 1)
+        early, late = max(held[tenth : 2 * tenth]), max(held[-tenth:])
+        print(f"{name}: {early:.0f} MB in the second tenth of the tasks, {late:.0f} MB in the last")
 
 
 def run(bags: Sequence[Path], out: Path, client: Client) -> pd.DataFrame:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import pytest
 
-HEAVY = ("matplotlib", "viser", "rerun", "selenium")
+BATCHES = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
+HEAVY = ("matplotlib", "viser", "rerun", "selenium", *BATCHES)
 # Runs the command as a terminal would, then tells which of the libraries came with it.
 _PROGRAM = """
 import json, sys
@@ -70,6 +71,17 @@ def poses(tmp_path: Path) -> Path:
 
 def test_the_package_and_its_names_load_nothing_that_draws() -> None:
     assert loaded_after("from gvo import *") == (0, [])
+
+
+def test_batches_are_named_without_being_loaded() -> None:
+    assert loaded_after("import gvo.batch; dir(gvo.batch)") == (0, [])
+    code, loaded = loaded_after("from gvo.batch import Variant, make_variants; make_variants()")
+    assert code == 0
+    assert "matplotlib" not in loaded
+
+
+def test_help_on_batches_loads_nothing() -> None:
+    assert loaded_by("batch", "--help") == (0, [])
 
 
 def test_odometry_over_frames_loads_nothing_that_draws(room_bag: Path) -> None:

@@ -51,9 +51,10 @@ def __getattr__(name: str) -> object:
     try:
         return getattr(import_module(_MODULE_OF[name]), name)
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] not in _NEEDED:
+        package = (error.name or "").partition(".")[0]
+        if package not in _NEEDED:
             raise
-        raise ConfigurationError(f"batches need {error.name}: pip install 'gvo[batch]'") from error
+        raise ConfigurationError(f"batches need {package}: pip install 'gvo[batch]'") from error
 
 
 def __dir__() -> list[str]:

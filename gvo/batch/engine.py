@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster
+import dask
+from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, Security
 
 from gvo.batch.tasks import Task, TaskOptions
 from gvo.batch.worker import work
 from gvo.bounded_text import cut
-from gvo.errors import GvoError
+from gvo.errors import ConfigurationError, GvoError
 from gvo.outputs.batch_rows import BatchRow
 
 # Handed out at once, at least: a cluster that grows with its work must see some.
@@ -26,6 +27,8 @@ _PER_THREAD = 2
 _TICK_S = 0.2
 _MAX_REASON = 500
 _CONNECT_S = "30s"
+# What a worker did in each hundredth of a second is kept for an hour: megabytes for each run.
+_WORKERS_HERE = {"distributed.worker.profile.enabled": False}
 # How often the workers are counted.
 _COUNT_S = 2.0
 _GONE = "the scheduler is gone; the same command goes on where the batch was"
@@ -81,9 +84,12 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
     ------
     ClusterError
         When nobody answers there.
+    ConfigurationError
+        When a package is missing that workers here need.
     """
     if scheduler is None:
         with (
+            dask.config.set(_WORKERS_HERE),
             LocalCluster(
                 n_workers=n_workers,
                 threads_per_worker=1,
@@ -92,7 +98,7 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
                 silence_logs=logging.CRITICAL,
                 preload="gvo.batch.quiet",
                 # Else whoever has a login here could have the workers run what he likes.
-                security=True,
+                security=_make_security(),
             ) as cluster,
             Client(cluster) as client,
         ):
@@ -104,6 +110,15 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
         raise ClusterError(f"{scheduler}: no scheduler of Dask answers: {error}") from error
     with _quiet(), client:
         yield client
+
+
+def _make_security() -> Security:
+    """Return keys for this batch alone."""
+    try:
+        security: Security = Security.temporary()
+    except ImportError as error:
+        raise ConfigurationError("batches need cryptography: pip install 'gvo[batch]'") from error
+    return security
 
 
 @contextmanager

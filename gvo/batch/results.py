@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pandas as pd
+import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
 
 from gvo.errors import OutputError
 from gvo.outputs.batch_rows import BatchRow, Value

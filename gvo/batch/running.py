@@ -47,12 +47,15 @@ class BatchOptions:
         Draw the picture and the page of each run; that of the batch is drawn anyway.
     force : bool
         Run what an earlier batch has finished, too.
+    plots : Path, optional
+        Folder for each plot of the batch's report as PNG and PDF.
     """
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     excerpt: Excerpt | None = None
     report: bool = True
     force: bool = False
+    plots: Path | None = None
 
 
 def run(
@@ -123,7 +126,7 @@ def run_batch(
 ) -> pd.DataFrame:
     """Run recordings that are found, with configurations that have names; see `run`."""
     tasks = make_tasks(recordings, variants)
-    table = _Table(out, tasks)
+    table = _Table(out, tasks, options.plots)
     shared = TaskOptions(
         out=table.location,
         mark=table.mark,
@@ -162,7 +165,8 @@ def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]
 class _Table:
     """The rows of a batch, and the files that show them."""
 
-    def __init__(self, out: str | Path, tasks: Sequence[Task]) -> None:
+    def __init__(self, out: str | Path, tasks: Sequence[Task], plots: Path | None) -> None:
+        self._plots = plots
         self.mark = uuid.uuid4().hex
         self._is_remote = is_url(out)
         self.location = str(out).rstrip("/") if self._is_remote else str(Path(out).absolute())
@@ -219,4 +223,10 @@ class _Table:
 
         n_missing = len(self._places) - len(self._rows)
         note = f"{n_missing} runs were not made: the batch was stopped" if n_missing else ""
-        write_batch_report(folder / REPORT, self.rows(), title=Path(self.location).name, note=note)
+        write_batch_report(
+            folder / REPORT,
+            self.rows(),
+            title=Path(self.location).name,
+            note=note,
+            plots=self._plots,
+        )

@@ -1,6 +1,8 @@
 """A file of records gives back what is whole, and nothing else, however it ends."""
 
 import struct
+import subprocess
+import sys
 import tempfile
 import tracemalloc
 import zlib
@@ -10,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.errors import ResumeError
-from gvo.resuming.record_file import MAX_RECORD, RecordFile
+from gvo.errors import ResumeError, RunBusyError
+from gvo.resuming.record_file import MAX_RECORD, RecordFile, refuse_busy
 
 PAYLOADS = [b"first", b"", b"x" * 1000, bytes(range(256))]
 
@@ -95,3 +97,47 @@ def test_a_file_is_open_once(tmp_path: Path) -> None:
 
 def test_the_check_sum_is_that_of_the_payload(content: bytes) -> None:
     assert struct.pack("<II", 5, zlib.crc32(b"first")) + b"first" in content
+
+
+# Holds a file of records until its standard input ends.
+_HOLDER = """
+import sys
+from pathlib import Path
+from gvo.resuming.record_file import RecordFile
+with RecordFile(Path(sys.argv[1]), is_new=True) as file:
+    file.append(b"mine")
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_file_that_another_process_has_is_busy_until_that_ends(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    command = [sys.executable, "-c", _HOLDER, str(path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as holder:
+        assert holder.stdout is not None
+        try:
+            assert holder.stdout.readline() == "ready\n"
+            for _ in range(2):
+                with pytest.raises(RunBusyError, match=f"^{tmp_path}: another process is writing"):
+                    refuse_busy(path)
+                with pytest.raises(RunBusyError):
+                    RecordFile(path, is_new=False)
+        finally:
+            holder.kill()
+            holder.communicate()
+    refuse_busy(path)
+    assert read(path) == [b"mine"]
+
+
+def test_a_file_that_nobody_has_is_not_busy(content: bytes, tmp_path: Path) -> None:
+    refuse_busy(tmp_path / "none")
+    refuse_busy(tmp_path)
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    for _ in range(2):
+        refuse_busy(path)
+    assert path.read_bytes() == content
+    with RecordFile(path, is_new=False) as file:
+        assert len(list(file.records())) == len(PAYLOADS)

@@ -1,0 +1,286 @@
+"""`gvo batch`: what it takes, what it says, how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from gvo.batch import BatchProgress
+from gvo.cli_batch import _clock, _words
+from gvo.outputs.run_record import read_run
+from tests.batch.conftest import (
+    GVO,
+    Cluster,
+    assert_same_run,
+    copy_of,
+    is_complete,
+    is_under_way,
+    state_of,
+    wait_until,
+)
+from tests.conftest import Answer, Command
+
+Batch = Callable[..., Answer]
+
+
+@pytest.fixture
+def batch(cluster: Cluster, command: Command) -> Batch:
+    """Return a function that runs `gvo batch` on the cluster."""
+
+    def run(*arguments: object) -> Answer:
+        return command("batch", *arguments, "--scheduler", cluster.address, "--no-report")
+
+    return run
+
+
+def is_one_line(text: str) -> bool:
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def test_all_complete_is_0(batch: Batch, bags: Path, tmp_path: Path) -> None:
+    answer = batch(bags, "--out", tmp_path)
+    assert answer.code == 0
+    lines = answer.out.splitlines()
+    assert lines == [
+        "3 recordings, 1 configurations",
+        f"3 runs: 3 complete; {tmp_path}/report.html",
+    ]
+    said = sorted(line.partition("] ")[2] for line in answer.err.splitlines())
+    assert said == [f"walk{n}: complete" for n in range(3)]
+    assert [line.partition("]")[0] for line in answer.err.splitlines()] == ["[1/3", "[2/3", "[3/3"]
+
+
+def test_some_failed_is_3_and_each_is_named(batch: Batch, bags: Path, tmp_path: Path) -> None:
+    (tmp_path / "broken.bag").write_text("no bag")
+    answer = batch(bags / "walk0.mcap", tmp_path / "broken.bag", "--out", tmp_path / "out")
+    assert answer.code == 3
+    assert f"gvo: warning: broken: failed: {tmp_path}/broken.bag" in answer.err
+    assert "2 runs: 1 complete, 1 failed" in answer.out
+    table = pd.read_csv(tmp_path / "out" / "results.csv")
+    assert table["status"].tolist() == ["complete", "failed"]
+
+
+def test_all_failed_is_2(batch: Batch, tmp_path: Path) -> None:
+    answer = batch("/none/a.bag", "/none/b.bag", "--out", tmp_path)
+    assert answer.code == 2
+    assert answer.err.splitlines()[-1] == "gvo: error: all runs failed"
+    assert "2 runs: 2 failed" in answer.out
+    assert len(pd.read_csv(tmp_path / "results.csv")) == 2
+
+
+def test_many_failures_are_named_up_to_a_number(batch: Batch, tmp_path: Path) -> None:
+    answer = batch(*(f"/none/{n}.bag" for n in range(25)), "--out", tmp_path)
+    warnings = [line for line in answer.err.splitlines() if line.startswith("gvo: warning: ")]
+    assert len(warnings) == 21
+    assert warnings[-1] == "gvo: warning: 5 more runs are not complete, see the table"
+
+
+@pytest.mark.parametrize("is_one_option", [True, False])
+def test_configurations_and_sweeps_are_all_pairs(
+    batch: Batch, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_one_option: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, size in (("a", 3), ("b", 4)):
+        (tmp_path / f"{name}.yaml").write_text(f"window: {{size: {size}}}\n")
+    # As the shell leaves a pattern in quotes, and as it expands one without.
+    files = ["*.yaml"] if is_one_option else ["a.yaml", "b.yaml"]
+    bag, sweep = bags / "walk0.mcap", "window.n_links=1,2"
+    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep)
+    assert answer.code == 0, answer.err
+    table = pd.read_parquet(tmp_path / "out" / "results.parquet")
+    values = list(zip(table["window.size"], table["window.n_links"], strict=True))
+    assert values == [(3, 1), (3, 2), (4, 1), (4, 2)]
+    assert table["variant"][0] == "a,window.n_links=1"
+    assert is_complete(tmp_path / "out" / "walk0" / "b,window.n_links=2")
+
+
+def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path: Path) -> None:
+    options = ["--set", "window.size=3", "--every", "2", "--duration", "10"]
+    assert batch(bags / "walk0.mcap", "--out", tmp_path, *options).code == 0
+    summary = read_run(tmp_path / "walk0").summary
+    assert summary["configuration"]["window"]["size"] == 3
+    assert summary["frames"] == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--sweep", "window.sise=3,4"], "did you mean window.size"),
+        (["--sweep", "window.size=3,many"], "valid integer"),
+        (["--sweep", "window.size=3,1"], "greater than or equal to 2"),
+        (["--sweep", "window.size"], "expected section.key=a,b,c"),
+        (["--sweep", "window.size=2020-01-01"], "no parameter has such a value"),
+        (["--set", "window.size=1"], "greater than or equal to 2"),
+        (["--configs", "none.yaml"], "none.yaml: no such configuration"),
+        (["--configs", "none*.yaml"], "none*.yaml: no such configuration"),
+        (["--every", "0"], "every"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler names a cluster"),
+        (["nope://x/a.bag"], "Protocol not known"),
+        (["*.nothing"], "no recording there"),
+    ],
+)
+def test_misuse_is_a_line_before_anything_begins(
+    command: Command,
+    tmp_path: Path,
+    bags: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = command("batch", bags, "--out", tmp_path / "out", *arguments)
+    assert answer.code == 2
+    assert said in answer.err
+    assert is_one_line(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").touch()
+    answer = command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out")
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "expected a recording" in answer.err
+
+
+def test_a_folder_that_cannot_be_written_is_a_line(
+    batch: Batch, bags: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    answer = batch(bags, "--out", tmp_path / "file")
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+
+
+@pytest.mark.parametrize("name", ["fsspec", "pyarrow", "cryptography"])
+def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, name: str) -> None:
+    program = f"import sys; sys.modules[{name!r}] = None\n{GVO[-1]}"
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", program, "batch", str(bags), "--out", str(out)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert answer.returncode == 2
+    assert is_one_line(answer.stderr), answer.stderr
+    assert f"batches need {name}: pip install 'gvo[batch]'" in answer.stderr
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
+    bags: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
+) -> None:
+    command = [*GVO, "batch", str(bags / "*.mcap"), "--out", str(tmp_path), "--workers", "2"]
+    answer = subprocess.run([*command, "--no-report"], capture_output=True, text=True, check=False)
+    assert answer.returncode == 0, answer.stderr
+    # Nothing of what the processes have to say to one another.
+    assert all(line.startswith("[") for line in answer.stderr.splitlines()), answer.stderr
+    bag = bags / "walk0.mcap"
+    assert_same_run(tmp_path / bag.stem, run_alone(bag))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
+    bags: Path, long_bag: Path, tmp_path: Path, batch: Batch, number: signal.Signals
+) -> None:
+    """As a terminal does it: Ctrl-C goes to all of its processes."""
+    out = tmp_path / "out"
+    command = [*GVO, "batch", bags / "walk0.mcap", long_bag, "--out", out, "--workers", "2"]
+    process = subprocess.Popen(
+        [*map(str, command), "--no-report"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    group = process.pid
+    try:
+        wait_until(lambda: is_complete(out / "walk0") and is_under_way(out / "long"), "the middle")
+        if number == signal.SIGINT:
+            os.killpg(group, number)
+        else:
+            process.send_signal(number)
+        assert process.stderr is not None
+        said = process.stderr.read()
+        process.wait(timeout=60)
+        wait_until(lambda: not is_alive(group), "the end of the workers")
+    finally:
+        if is_alive(group):
+            os.killpg(group, signal.SIGKILL)
+        process.wait()
+        if process.stderr is not None:
+            process.stderr.close()
+    assert not is_complete(out / "long")
+    codes = {signal.SIGINT: 130, signal.SIGKILL: -9}
+    assert process.returncode == codes[number]
+    if number != signal.SIGKILL:
+        assert said.splitlines()[1:] == [
+            f"gvo: interrupted; what was done stands in {out}: the same command goes on"
+        ]
+    before = state_of(out / "walk0")
+    answer = batch(bags / "walk0.mcap", long_bag, "--out", out)
+    assert answer.code == 0, answer.err
+    assert "walk0: complete, found" in answer.err
+    assert state_of(out / "walk0") == before
+
+
+def is_alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_list_of_recordings_is_read(batch: Batch, bags: Path, tmp_path: Path) -> None:
+    copy_of(bags / "walk0.mcap", tmp_path / "in", "a.mcap")
+    (tmp_path / "in" / "list.txt").write_text(f"a.mcap # here\n{bags}/walk1.mcap\n")
+    answer = batch(tmp_path / "in" / "list.txt", "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    assert is_complete(tmp_path / "out" / "a")
+    assert is_complete(tmp_path / "out" / "walk1")
+
+
+def test_the_line_on_a_terminal_says_how_long_it_takes() -> None:
+    values: dict[str, Any] = {
+        "n_done": 3,
+        "n_total": 9,
+        "n_found": 1,
+        "n_failed": 1,
+        "n_workers": 4,
+    }
+    progress = BatchProgress(**values, frames_per_s=99.6, left_s=75.0)
+    expected = "3 of 9 runs, 1 failed, 100 frames/s on 4 workers, 01:15 left"
+    assert _words(progress) == expected
+    early = BatchProgress(**values, frames_per_s=0.0, left_s=None)
+    assert _words(early) == "3 of 9 runs, 1 failed, 0 frames/s on 4 workers"
+    assert _clock(3661) == "01:01:01"
+
+
+def test_on_a_terminal_there_is_one_line(
+    batch: Batch, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+
+    class Status:
+        def __init__(self, text: str, **_: object) -> None:
+            shown.append(text)
+
+        def __enter__(self) -> SimpleNamespace:
+            return SimpleNamespace(update=shown.append)
+
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("rich.status.Status", Status)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    answer = batch(bags / "walk0.mcap", "--out", tmp_path)
+    assert answer.code == 0
+    assert answer.err == ""
+    assert shown[0] == "waiting for workers"
+    assert shown[-1].startswith("1 of 1 runs, 0 failed")

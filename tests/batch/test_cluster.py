@@ -1,0 +1,221 @@
+"""On a cluster of processes any of them may die: nothing is lost, nothing is done twice."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+import gvo
+from gvo.batch import BatchProgress, ClusterError, run
+from tests.batch.conftest import (
+    GVO,
+    NO_REPORT,
+    Cluster,
+    assert_same_run,
+    is_complete,
+    is_under_way,
+    state_of,
+    wait_until,
+)
+from tests.conftest import Command
+
+NOWHERE = "tcp://127.0.0.1:1"
+
+
+def batch(*arguments: object) -> subprocess.Popen[str]:
+    """Start `gvo batch`."""
+    command = [*GVO, "batch", *map(str, arguments), "--no-report"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+class Watch:
+    """Sees which workers hold tasks."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self.names: set[str] = set()
+
+    def __call__(self, progress: BatchProgress) -> None:
+        known = self._client.scheduler_info(n_workers=-1)["workers"]
+        for address, keys in self._client.processing().items():
+            if address in known and any(str(key[0]).startswith("gvo-batch") for key in keys):
+                self.names.add(str(known[address]["name"]))
+
+
+def test_tasks_spread_over_the_workers(cluster: Cluster, bags: Path, tmp_path: Path) -> None:
+    with Client(cluster.address) as client:
+        watch = Watch(client)
+        table = run(bags, out=tmp_path, client=client, options=NO_REPORT, on_progress=watch)
+        assert client.futures == {}
+    assert table["status"].tolist() == ["complete"] * 3
+    assert watch.names == set(cluster.workers)
+
+
+def test_recordings_and_results_are_found_by_their_urls(
+    cluster: Cluster,
+    bags: Path,
+    tmp_path: Path,
+    command: Command,
+    run_alone: Callable[[Path], Path],
+) -> None:
+    arguments = [f"file://{bags}/walk0.mcap", "--out", f"file://{tmp_path}/out", "--no-report"]
+    for _ in range(2):
+        answer = command("batch", *arguments, "--scheduler", cluster.address)
+        assert answer.code == 0, answer.err
+        assert_same_run(tmp_path / "out" / "walk0", run_alone(bags / "walk0.mcap"))
+        before = state_of(tmp_path / "out" / "walk0")
+    assert state_of(tmp_path / "out" / "walk0") == before
+    assert "complete, found" in answer.err
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
+    cluster: Cluster,
+    bags: Path,
+    long_bag: Path,
+    tmp_path: Path,
+    run_alone: Callable[[Path], Path],
+) -> None:
+    killed: list[str] = []
+
+    def kill(progress: BatchProgress) -> None:
+        if killed or not is_under_way(tmp_path / "long"):
+            return
+        (address,) = [
+            address
+            for address, keys in client.processing().items()
+            if any(key[1] == 0 for key in keys if isinstance(key, tuple))
+        ]
+        name = client.scheduler_info(n_workers=-1)["workers"][address]["name"]
+        assert not is_complete(tmp_path / "long")
+        cluster.kill_worker(name)
+        killed.append(name)
+
+    with Client(cluster.address) as client:
+        asked = [long_bag, bags]
+        table = run(asked, out=tmp_path, client=client, options=NO_REPORT, on_progress=kill)
+    assert len(killed) == 1
+    assert table["status"].tolist() == ["complete"] * 4
+    for bag in (long_bag, bags / "walk0.mcap"):
+        assert_same_run(tmp_path / bag.stem, run_alone(bag))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_batch_that_was_stopped_goes_on_where_it_was(
+    cluster: Cluster,
+    bags: Path,
+    long_bag: Path,
+    tmp_path: Path,
+    command: Command,
+    run_alone: Callable[[Path], Path],
+    number: signal.Signals,
+) -> None:
+    arguments = [long_bag, bags, "--out", tmp_path, "--scheduler", cluster.address]
+    with batch(*arguments) as process:
+        try:
+            wait_until(
+                lambda: is_complete(tmp_path / "walk0") and is_under_way(tmp_path / "long"),
+                "the middle of the batch",
+            )
+            process.send_signal(number)
+            said = process.communicate(timeout=60)[1]
+        finally:
+            process.kill()
+    assert not is_complete(tmp_path / "long")
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert said.splitlines()[-1].startswith("gvo: interrupted; what was done stands in")
+    before = state_of(tmp_path / "walk0")
+    answer = command("batch", *arguments, "--no-report")
+    assert answer.code == 0, answer.err
+    assert "walk0: complete, found" in answer.err
+    assert "long: complete\n" in answer.err
+    assert state_of(tmp_path / "walk0") == before
+    for bag in (long_bag, bags / "walk0.mcap"):
+        assert_same_run(tmp_path / bag.stem, run_alone(bag))
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
+    tmp_path: Path, long_bag: Path, bags: Path, cluster: Cluster, command: Command
+) -> None:
+    folder = tmp_path / "other"
+    folder.mkdir()
+    out, asked = tmp_path / "out", [bags / "walk0.mcap", long_bag]
+    other = Cluster(folder)
+    try:
+        other.add_worker()
+        with batch(*asked, "--out", out, "--scheduler", other.address) as process:
+            wait_until(lambda: is_under_way(out / "long"), "the middle of the batch")
+            other.scheduler.kill()
+            said = process.communicate(timeout=120)[1]
+    finally:
+        other.close()
+    assert process.returncode == 2, said
+    assert said.splitlines()[-1].startswith("gvo: error: ")
+    assert "the scheduler is gone" in said.splitlines()[-1]
+    assert "Traceback" not in said
+    options = ["--out", out, "--scheduler", cluster.address, "--no-report"]
+    answer = command("batch", *asked, *options)
+    assert answer.code == 0, answer.err
+    assert answer.err.count("complete, found") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_worker_with_another_disk_or_version_says_so(
+    tmp_path: Path, bags: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that stands elsewhere sees something else where a path leads by where one stands."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    there.mkdir()
+    (tmp_path / "older.py").write_text(
+        "import gvo.batch.tasks\ngvo.batch.tasks.__version__ = '0'\n"
+    )
+    (tmp_path / "cluster").mkdir()
+    cluster = Cluster(tmp_path / "cluster")
+    monkeypatch.chdir(here)
+    try:
+        other_disk = cluster.add_worker(cwd=there)
+        with Client(cluster.address) as client:
+            table = run(bags, out="/proc/self/cwd/out", client=client, options=NO_REPORT)
+            assert set(table["status"]) == {"failed"}
+            assert all("a disk that both share, or a URL" in reason for reason in table["reason"])
+            assert list(there.iterdir()) == []
+            cluster.kill_worker(other_disk)
+            cluster.add_worker("--preload", str(tmp_path / "older.py"))
+            table = run(bags, out=tmp_path / "out", client=client, options=NO_REPORT)
+    finally:
+        cluster.close()
+    expected = f"the worker has gvo 0, the client {gvo.__version__}: install one"
+    assert table["reason"].tolist() == [expected] * 3
+
+
+def test_no_scheduler_is_a_line(
+    bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
+    answer = command("batch", bags, "--out", tmp_path / "out", "--scheduler", NOWHERE)
+    assert answer.code == 2
+    assert answer.err.startswith(f"gvo: error: {NOWHERE}: no scheduler of Dask answers")
+    assert answer.err.count("\n") == 1
+
+
+def test_a_lost_scheduler_is_an_error_of_its_own(tmp_path: Path, blocked: Path) -> None:
+    (tmp_path / "cluster").mkdir()
+    cluster = Cluster(tmp_path / "cluster")
+    try:
+        with Client(cluster.address) as client:
+
+            def kill(progress: BatchProgress) -> None:
+                cluster.scheduler.kill()
+
+            with pytest.raises(ClusterError, match="the scheduler is gone"):
+                run(blocked, out=tmp_path / "out", client=client, on_progress=kill)
+    finally:
+        cluster.close()

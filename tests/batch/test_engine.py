@@ -1,0 +1,219 @@
+"""Tasks are handed out, watched and tried again; none is lost, none is kept."""
+
+import json
+import os
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+from distributed import Client
+
+import gvo
+from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
+from gvo.batch.recordings import NamedRecording
+from gvo.batch.running import make_tasks
+from gvo.batch.tasks import MARK, Task, TaskOptions
+from gvo.batch.variants import make_variants
+from gvo.outputs.batch_rows import BatchRow
+from tests.batch.conftest import is_complete, wait_until
+
+N_MANY = 300
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> TaskOptions:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / MARK).write_text(json.dumps({"mark": "x"}))
+    return TaskOptions(out=str(tmp_path / "out"), mark="x", report=False)
+
+
+def tasks_of(*sources: object) -> list[Task]:
+    recordings = [
+        NamedRecording(name=f"r{number}", location=str(source))
+        for number, source in enumerate(sources)
+    ]
+    return make_tasks(recordings, make_variants())
+
+
+def missing(n_tasks: int) -> list[Task]:
+    """Return tasks that take no time: their recordings are not there."""
+    return tasks_of(*(f"/none/{number}.bag" for number in range(n_tasks)))
+
+
+def known_to_scheduler(client: Client) -> int:
+    def count(dask_scheduler: Any) -> int:
+        return sum(str(key).startswith("('gvo-batch") for key in dask_scheduler.tasks)
+
+    return int(client.run_on_scheduler(count))
+
+
+@contextmanager
+def forgiving(n_failures: int) -> Iterator[None]:
+    """Let the scheduler give a task up after so many dead workers."""
+    with dask.config.set({"distributed.scheduler.allowed-failures": n_failures}):
+        yield
+
+
+def test_every_task_gives_one_row(near: Client, options: TaskOptions) -> None:
+    tasks = missing(20)
+    rows = list(Engine(near, options).run(tasks))
+    assert {row.folder for row in rows} == {task.folder for task in tasks}
+    assert len(rows) == len(tasks)
+    assert all(row.status == "failed" and "does not exist" in row.reason for row in rows)
+
+
+def test_no_tasks_give_no_rows(near: Client, options: TaskOptions) -> None:
+    assert list(Engine(near, options).run([])) == []
+
+
+def test_nothing_is_kept_and_not_all_is_handed_out_at_once(
+    near: Client, options: TaskOptions
+) -> None:
+    n_held: list[int] = []
+    n_known: list[int] = []
+
+    def count(progress: BatchProgress) -> None:
+        n_held.append(len(near.futures))
+        if progress.n_done % 50 == 0:
+            n_known.append(known_to_scheduler(near))
+
+    engine = Engine(near, options, count)
+    rows = list(engine.run(missing(N_MANY)))
+    assert len(rows) == N_MANY
+    assert max(n_held) <= 101
+    assert max(n_known) <= 110
+    assert min(n_held[-5:]) < 10
+    assert near.futures == {}
+    assert engine._running == {}
+    assert engine._frames == {}
+    wait_until(lambda: known_to_scheduler(near) == 0, "the scheduler forgets them")
+
+
+def test_an_exception_of_any_kind_is_a_row_with_its_reason(
+    near: Client, options: TaskOptions, bags: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(source: Any, *_: Any, **__: Any) -> None:
+        raise LookupError(f"what?\n{'x' * 1000}")
+
+    monkeypatch.setattr("gvo.batch.tasks.run_recording", fail)
+    tasks = tasks_of(bags / "walk0.mcap", "/none.bag")
+    rows = {row.folder: row for row in Engine(near, options).run(tasks)}
+    assert (rows["r0"].status, rows["r0"].reason) == ("failed", "LookupError: what?")
+    assert "does not exist" in rows["r1"].reason
+
+
+def test_a_device_as_recording_stops_nobody(
+    near: Client, options: TaskOptions, tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "pipe.bag")
+    (tmp_path / "closed").mkdir(mode=0)
+    (tmp_path / "empty.bag").touch()
+    (tmp_path / "loop.bag").symlink_to(tmp_path / "loop.bag")
+    places = ["pipe.bag", "closed", "empty.bag", "loop.bag", "\0.bag", "x" * 5000]
+    tasks = tasks_of(*(tmp_path / place for place in places))
+    rows = list(Engine(near, options).run(tasks))
+    assert len(rows) == len(places)
+    assert all(row.status == "failed" and row.reason for row in rows)
+
+
+def test_progress_counts_what_is_done(near: Client, options: TaskOptions, bags: Path) -> None:
+    tasks = tasks_of(bags / "walk0.mcap", "/none.bag", bags / "walk1.mcap")
+    first: list[BatchProgress] = []
+    list(Engine(near, options, first.append).run(tasks))
+    assert (first[0].n_done, first[0].n_total, first[0].n_found) == (1, 3, 0) or first[
+        0
+    ].row is None
+    last = first[-1]
+    assert (last.n_done, last.n_total, last.n_found, last.n_failed) == (3, 3, 0, 1)
+    assert (last.n_workers, last.left_s) == (1, 0.0)
+    assert last.frames_per_s > 0
+    assert sum(progress.row is not None for progress in first) == 3
+    again: list[BatchProgress] = []
+    list(Engine(near, options, again.append).run(tasks))
+    assert (again[-1].n_found, again[-1].n_failed, again[-1].frames_per_s) == (2, 1, 0.0)
+
+
+def test_what_a_caller_raises_ends_the_batch_and_gives_up_the_rest(
+    near: Client, options: TaskOptions
+) -> None:
+    def stop(progress: BatchProgress) -> None:
+        if progress.n_done == 3:
+            raise KeyboardInterrupt
+
+    rows: list[BatchRow] = []
+    with pytest.raises(KeyboardInterrupt):
+        rows.extend(Engine(near, options, stop).run(missing(N_MANY)))
+    assert near.futures == {}
+    wait_until(lambda: known_to_scheduler(near) == 0, "the scheduler forgets them")
+
+
+def test_an_engine_runs_again(near: Client, options: TaskOptions) -> None:
+    engine = Engine(near, options)
+    for _ in range(2):
+        assert len(list(engine.run(missing(3)))) == 3
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:x", ""])
+def test_nobody_there_is_a_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
+    with (
+        pytest.raises(ClusterError, match="no scheduler of Dask answers") as error,
+        connected(address, None),
+    ):
+        pass
+    assert "\n" not in str(error.value)
+
+
+class Killer:
+    """Kills the worker that holds a task, each time or once."""
+
+    def __init__(self, client: Client, is_due: Any) -> None:
+        self._client = client
+        self._is_due = is_due
+        self.killed: set[int] = set()
+
+    def __call__(self, progress: BatchProgress) -> None:
+        # Asking the workers themselves would wait for those that are just dying.
+        cluster: Any = self._client.cluster
+        pids = {nanny.worker_address: nanny.pid for nanny in cluster.workers.values()}
+        for worker, keys in self._client.processing().items():
+            pid = pids.get(worker)
+            is_held = any(self._is_due(key) for key in keys)
+            if is_held and pid is not None and pid not in self.killed:
+                self.killed.add(pid)
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_who_kills_each_worker_fails_and_the_neighbours_complete(
+    options: TaskOptions, bags: Path, blocked: Path
+) -> None:
+    sources = [bags / f"walk{n}.mcap" for n in range(3)]
+    tasks = tasks_of(blocked, *sources, "/none.bag")
+    with forgiving(0), connected(None, 2) as client:
+        killer = Killer(client, lambda key: key[1] in (0, len(tasks)))
+        rows = {row.folder: row for row in Engine(client, options, killer).run(tasks)}
+        assert len(client.futures) == 0
+    assert Counter(row.status for row in rows.values()) == {"complete": 3, "failed": 2}
+    assert rows["r0"].reason.startswith("its worker died, each time")
+    assert "does not exist" in rows["r4"].reason
+    assert len(killer.killed) >= 2
+    assert all(is_complete(Path(options.out) / f"r{n}") for n in (1, 2, 3))
+
+
+def test_the_row_of_a_task_given_up_has_what_is_known_of_it() -> None:
+    (task,) = make_tasks(
+        [NamedRecording(name="a", location="/a.bag")], make_variants(settings=["window.size=3"])
+    )
+    row = replace(task, parameters={"window.size": 3}).row("failed", "why")
+    assert (row.recording, row.variant, row.source) == ("a", "default", "/a.bag")
+    assert (row.status, row.reason, row.gvo_version) == ("failed", "why", gvo.__version__)
+    assert row.parameters == {"window.size": 3}
+    assert row.configuration_hash

@@ -1,0 +1,211 @@
+"""Every recording that is asked for is found once, under a name of its own."""
+
+import os
+import re
+import zipfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import fsspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvo.batch.recordings import NamedRecording, find_recordings, safe_name
+from gvo.batch.recordings import _name as name_all
+from gvo.batch.storage import fetch
+from gvo.errors import RecordingError
+
+OWN_FILES = {"batch.json", "report.html", "results.csv", "results.parquet"}
+
+
+def make_files(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+
+
+def locations(found: Iterable[NamedRecording]) -> list[str]:
+    return [one.location for one in found]
+
+
+def names(found: Iterable[NamedRecording]) -> list[str]:
+    return [one.name for one in found]
+
+
+def test_paths_are_kept_in_their_order_each_once(tmp_path: Path) -> None:
+    make_files(tmp_path, "b.bag", "a.mcap")
+    asked: list[str | Path] = [tmp_path / "b.bag", tmp_path / "a.mcap", f"{tmp_path}/./b.bag"]
+    found = find_recordings(asked)
+    assert locations(found) == [f"{tmp_path}/b.bag", f"{tmp_path}/a.mcap"]
+    assert names(found) == ["b", "a"]
+
+
+def test_relative_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_files(tmp_path, "a.bag")
+    assert locations(find_recordings(["a.bag"])) == [str(tmp_path / "a.bag")]
+
+
+def test_a_folder_is_searched_for_recordings_of_every_kind(tmp_path: Path) -> None:
+    bags = ["x.bag", "x.db3", "x.mcap", "x.mcap.zstd", "deep/er/y.bag"]
+    folders = {
+        "ros2": "metadata.yaml",
+        "kitti": "calib.txt",
+        "kitti2": "times.txt",
+        "euroc": "mav0/cam0/data.csv",
+        "asl": "cam0/data.csv",
+        "tum": "rgb.txt",
+    }
+    make_files(tmp_path, *bags, "notes.md", ".hidden/z.bag", "other/image.png")
+    for folder, marker in folders.items():
+        make_files(tmp_path / folder, marker, "inside.db3")
+    found = locations(find_recordings([tmp_path]))
+    assert sorted(found) == sorted(str(tmp_path / name) for name in [*bags, *folders])
+
+
+def test_a_pattern_gives_what_matches(tmp_path: Path) -> None:
+    make_files(tmp_path, "a1.bag", "a2.mcap", "b.bag", "a.txt", "deep/er/a3.bag")
+    assert names(find_recordings([f"{tmp_path}/a*"])) == ["a1", "a2"]
+    assert names(find_recordings([f"{tmp_path}/?.bag"])) == ["b"]
+    assert names(find_recordings([f"{tmp_path}/[ab]*.bag"])) == ["a1", "b"]
+    assert names(find_recordings([f"{tmp_path}/d*"])) == ["a3"]
+    assert sorted(names(find_recordings([f"{tmp_path}/**"]))) == ["a1", "a2", "a3", "b"]
+
+
+def test_the_files_of_a_bag_folder_are_no_recordings_of_their_own(tmp_path: Path) -> None:
+    make_files(tmp_path, "drive/metadata.yaml", "drive/drive_0.db3", "drive/drive_1.db3")
+    make_files(tmp_path, "drive-2/metadata.yaml", "drive-2/drive_0.db3")
+    for pattern in ("**", "**/*", "*/**"):
+        assert sorted(names(find_recordings([f"{tmp_path}/{pattern}"]))) == ["drive", "drive-2"]
+
+
+def test_a_name_that_looks_like_a_pattern_is_that_file(tmp_path: Path) -> None:
+    make_files(tmp_path, "[1].bag", "1.bag", "what?.bag")
+    for name in ("[1].bag", "what?.bag"):
+        assert locations(find_recordings([tmp_path / name])) == [str(tmp_path / name)]
+
+
+@pytest.mark.parametrize("name", ["a::b.bag", "a b.bag", "a#b.bag", "ä.bag", "a%20b.bag", "-x.bag"])
+def test_strange_names_of_files_are_paths(tmp_path: Path, name: str) -> None:
+    make_files(tmp_path, name)
+    for asked in (tmp_path / name, tmp_path, f"{tmp_path}/*.bag"):
+        assert locations(find_recordings([asked])) == [str(tmp_path / name)]
+
+
+def test_a_link_to_a_folder_above_has_an_end(tmp_path: Path) -> None:
+    make_files(tmp_path, "deep/a.bag")
+    (tmp_path / "deep" / "up").symlink_to(tmp_path)
+    assert str(tmp_path / "deep" / "a.bag") in locations(find_recordings([tmp_path]))
+
+
+def test_a_list_has_one_recording_a_line(tmp_path: Path) -> None:
+    make_files(tmp_path, "in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap")
+    (tmp_path / "in" / "list.txt").write_bytes(
+        b"\xef\xbb\xbf# recordings\r\na.bag\r\n\r\n  b#1.bag   # a comment\n../more\n"
+        b"../more/*.mcap\n/not/here.bag\nfile:///not/there.bag"
+    )
+    found = locations(find_recordings([tmp_path / "in" / "list.txt"]))
+    places = ["in/a.bag", "in/b#1.bag", "more/c.bag", "more/d.mcap"]
+    expected = [str(tmp_path / place) for place in places]
+    assert found == [*expected, "/not/here.bag", "file:///not/there.bag"]
+
+
+def test_a_line_that_leads_nowhere_is_named(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_text("# nothing\nx*.bag\n")
+    with pytest.raises(RecordingError, match=r"list\.txt, line 2: x\*\.bag: no recording there"):
+        find_recordings([tmp_path / "list.txt"])
+    (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(RecordingError, match=r"list\.txt: cannot be read"):
+        find_recordings([tmp_path / "list.txt"])
+
+
+def test_a_path_that_is_not_here_is_left_to_the_workers() -> None:
+    assert names(find_recordings(["/only/on/workers/a.bag"])) == ["a"]
+
+
+@pytest.mark.parametrize("kind", ["empty folder", "pattern", "empty list"])
+def test_nothing_found_is_an_error(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "list.txt").write_text("# none\n")
+    (tmp_path / "empty").mkdir()
+    asked = {"empty folder": "empty", "pattern": "x*.bag", "empty list": "list.txt"}[kind]
+    with pytest.raises(RecordingError, match=re.escape(f"{asked}: no recording there")):
+        find_recordings([tmp_path / asked])
+
+
+def test_nothing_asked_for_is_misuse() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        find_recordings([])
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("nope://x/a.bag", "Protocol not known"),
+        ("nope://x/*.bag", "Protocol not known"),
+        ("memory://place/*.bag", "no recording there"),
+    ],
+)
+def test_a_url_that_leads_nowhere_is_named(memory: str, url: str, said: str) -> None:
+    with pytest.raises(RecordingError, match=f"^{re.escape(url)}: .*{said}"):
+        find_recordings([url])
+
+
+def test_urls_are_searched_like_folders(memory: str) -> None:
+    files = fsspec.filesystem("memory")
+    for name in ("a.bag", "deep/b.mcap", "drive/metadata.yaml", "drive/drive_0.db3", "notes.md"):
+        files.pipe(f"/place/{name}", b"")
+    expected = [f"{memory}/{name}" for name in ("a.bag", "deep/b.mcap", "drive")]
+    assert locations(find_recordings([memory])) == expected
+    assert locations(find_recordings([f"{memory}/"])) == expected
+    assert locations(find_recordings([f"{memory}/*.bag"])) == expected[:1]
+    assert locations(find_recordings([f"{memory}/a.bag", memory])) == expected
+    assert sorted(locations(find_recordings([f"{memory}/**"]))) == expected
+
+
+def test_what_is_found_in_an_archive_is_fetched_from_there(tmp_path: Path) -> None:
+    archive = tmp_path / "a.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("in/one.bag", b"1")
+        file.writestr("in/two.bag", b"2")
+    for asked in (f"zip://in::file://{archive}", f"zip://in/*.bag::file://{archive}"):
+        found = find_recordings([asked])
+        assert names(found) == ["one", "two"]
+        contents = [fetch(one.location, tmp_path).read_bytes() for one in found]
+        assert contents == [b"1", b"2"]
+
+
+def test_a_name_is_the_stem_where_that_is_enough() -> None:
+    asked = ["/x/a.bag", "/y/b.mcap.zstd", "/z/c", "file:///u/d.db3", "/v/2011.09.26"]
+    assert names(find_recordings(asked)) == ["a", "b", "c", "d", "2011.09.26"]
+
+
+def test_what_has_one_stem_is_told_apart_by_its_ending_or_its_folders() -> None:
+    asked = ["/x/a.bag", "/x/a.mcap", "/p/1/drive.bag", "/p/2/drive.bag", "/p/b.bag"]
+    expected = ["a.bag", "a.mcap", "1-drive.bag", "2-drive.bag", "b"]
+    assert names(find_recordings(asked)) == expected
+
+
+@pytest.mark.parametrize("name", sorted(OWN_FILES))
+def test_no_run_folder_stands_where_the_batch_writes(name: str) -> None:
+    found = names(find_recordings([f"/x/{name}", f"/x/{name}.new", f"/y/{name}.bag"]))
+    assert len(set(found)) == 3
+    assert not set(found) & {name, f"{name}.new"}
+
+
+@given(st.lists(st.text(min_size=1), min_size=1, unique=True))
+def test_every_name_is_unlike_all_others_and_fit_for_a_folder(texts: list[str]) -> None:
+    given_names = name_all([f"/{text}" for text in texts])
+    assert list(given_names) == [f"/{text}" for text in texts]
+    made = list(given_names.values())
+    assert len(set(made)) == len(made)
+    for name in made:
+        assert re.fullmatch(r"[A-Za-z0-9_=,+-][A-Za-z0-9._=,+-]*", name)
+        assert len(os.fsencode(name)) <= 200
+
+
+@given(st.text())
+def test_a_safe_name_is_itself_safe(text: str) -> None:
+    name = safe_name(text)
+    assert name not in ("", ".", "..")
+    assert safe_name(name) == name

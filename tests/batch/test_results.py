@@ -1,0 +1,182 @@
+"""The table holds what the rows hold, and both files give it back."""
+
+import math
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.batch.results import CSV, PARQUET, to_frame, write_results
+from gvo.errors import OutputError
+from gvo.outputs.batch_rows import BatchRow, Value
+
+HOSTILE = ['a,b"c\nd\re', "=1+1", " blank ", "NULL", "ü\u2028🤖", "\x00", "<script>", "\\N", "'"]
+
+
+def failed(**values: Any) -> BatchRow:
+    given: dict[str, Any] = {
+        "recording": "b",
+        "variant": "default",
+        "source": "/b.bag",
+        "folder": "b",
+    } | values
+    return BatchRow(status="failed", **{"reason": "does not exist"} | given)
+
+
+def complete(**values: Any) -> BatchRow:
+    figures: dict[str, Any] = {
+        "sensor": "stereo",
+        "frames": 10,
+        "tracked": 9,
+        "coverage_percent": 100 / 3,
+        "segments": 1,
+        "ate_smoothed_m": 0.1 + 0.2,
+        "rpe_smoothed_deg": 1e-300,
+        "run_s": 12.5,
+        "gvo_version": "1",
+        "configuration_hash": "00ff",
+    }
+    given: dict[str, Any] = {
+        "recording": "a",
+        "variant": "default",
+        "source": "/a.bag",
+        "folder": "a",
+    } | values
+    return BatchRow(status="complete", **figures | given)
+
+
+def read_csv(path: Path, frame: pd.DataFrame) -> pd.DataFrame:
+    kinds = {str(name): kind for name, kind in frame.dtypes.items()}
+    return pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
+
+
+def assert_both_give_it_back(frame: pd.DataFrame, folder: Path) -> None:
+    write_results(frame, folder)
+    pd.testing.assert_frame_equal(pd.read_parquet(folder / PARQUET), frame)
+    # A table of text cannot tell an empty text from none.
+    texts = list(frame.select_dtypes(["object", "string"]).columns)
+    read = read_csv(folder / CSV, frame)
+    filled = dict.fromkeys(texts, "")
+    pd.testing.assert_frame_equal(read.fillna(filled), frame.fillna(filled), check_dtype=False)
+    assert {path.name for path in folder.iterdir()} == {CSV, PARQUET}
+
+
+def test_both_files_give_the_table_back(tmp_path: Path) -> None:
+    frame = to_frame([complete(), failed(), complete(recording="c", is_found=True, run_s=None)])
+    assert_both_give_it_back(frame, tmp_path)
+    assert pd.read_csv(tmp_path / CSV)["ate_smoothed_m"].tolist()[0] == 0.1 + 0.2
+
+
+def test_every_field_of_a_row_has_its_column() -> None:
+    row = complete(parameters={"window.size": 4})
+    frame = to_frame([row])
+    values = asdict(row)
+    del values["parameters"]
+    assert set(frame.columns) == {*values, "window.size"}
+    for name, value in values.items():
+        found = frame[name].iloc[0]
+        assert pd.isna(found) if value is None else found == value, name
+
+
+def test_no_field_of_a_row_is_of_a_kind_unknown_to_the_table() -> None:
+    kinds = {"Int64", "float64", "bool"}
+    texts = {each.name for each in fields(BatchRow) if "str" in str(each.type)}
+    texts |= {"status"}
+    frame = to_frame([complete(), failed()])
+    for name, kind in frame.dtypes.items():
+        assert (str(kind) in kinds) == (name not in texts), name
+
+
+def test_a_table_of_failures_alone_has_the_same_columns(tmp_path: Path) -> None:
+    frame = to_frame([failed(), failed(recording="c")])
+    assert list(frame.columns) == list(to_frame([complete()]).columns)
+    numbers = frame.drop(columns=["is_found"]).select_dtypes("number")
+    assert numbers.isna().all().all()
+    assert (numbers.dtypes == to_frame([complete()])[numbers.columns].dtypes).all()
+    assert_both_give_it_back(frame, tmp_path)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_and_reasons_are_given_back_whatever_they_hold(tmp_path: Path, name: str) -> None:
+    frame = to_frame([failed(recording=name, reason=name, source=name), complete()])
+    assert frame["reason"].iloc[0] == name
+    assert_both_give_it_back(frame, tmp_path)
+
+
+def test_what_is_no_character_in_the_name_of_a_file_is_escaped(tmp_path: Path) -> None:
+    source = b"/x/\xff.bag".decode(errors="surrogateescape")
+    frame = to_frame([failed(source=source, reason=f"{source}: no", parameters={"a.b": source})])
+    assert frame["source"].iloc[0] == r"/x/\udcff.bag"
+    assert_both_give_it_back(frame, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "expected"),
+    [
+        ([1, 2, None], "Int64", [1, 2, None]),
+        ([1, 2.5, None], "float64", [1.0, 2.5, None]),
+        ([True, False, None], "boolean", [True, False, None]),
+        (["klt", "a,b", None], "string", ["klt", "a,b", None]),
+        ([1, "klt", None], "string", ["1", '"klt"', "null"]),
+        ([True, 1], "string", ["true", "1"]),
+        ([10**30, 1], "string", [str(10**30), "1"]),
+        ([2**63 - 1, -(2**63) + 1], "Int64", [2**63 - 1, -(2**63) + 1]),
+        ([1e-7, 10**30], "float64", [1e-7, 1e30]),
+        ([None, None], "string", ["null", "null"]),
+    ],
+)
+def test_the_values_of_a_parameter_are_one_kind(
+    tmp_path: Path, values: list[Value], kind: str, expected: list[Value]
+) -> None:
+    rows = [complete(parameters={"x.y": value}) for value in values]
+    frame = to_frame(rows)
+    assert str(frame["x.y"].dtype) == kind
+    found = [None if pd.isna(value) else value for value in frame["x.y"]]
+    assert found == expected
+    assert_both_give_it_back(frame, tmp_path)
+
+
+@settings(max_examples=30)
+@given(
+    values=st.lists(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_any_values_of_a_parameter_can_be_written(
+    tmp_path_factory: pytest.TempPathFactory, values: list[Value]
+) -> None:
+    folder = tmp_path_factory.mktemp("table")
+    frame = to_frame([complete(parameters={"x.y": value}) for value in values])
+    write_results(frame, folder)
+    pd.testing.assert_frame_equal(pd.read_parquet(folder / PARQUET), frame)
+
+
+def test_parameters_stand_beside_the_status_and_may_be_missing() -> None:
+    frame = to_frame([complete(parameters={"a.b": 1}), failed(parameters={"c.d": 2.5})])
+    assert list(frame.columns)[:6] == ["recording", "variant", "status", "reason", "a.b", "c.d"]
+    assert frame["a.b"].tolist()[0] == 1
+    assert pd.isna(frame["a.b"].iloc[1])
+    assert math.isnan(frame["c.d"].iloc[0])
+
+
+def test_a_table_without_rows_has_its_columns(tmp_path: Path) -> None:
+    frame = to_frame([])
+    assert len(frame) == 0
+    assert list(frame.columns) == list(to_frame([complete()]).columns)
+
+
+def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path) -> None:
+    write_results(to_frame([complete()]), tmp_path)
+    before = (tmp_path / PARQUET).read_bytes()
+    (tmp_path / CSV).unlink()
+    (tmp_path / CSV).mkdir()
+    with pytest.raises(OutputError, match=r"results\.csv: cannot be written"):
+        write_results(to_frame([failed()]), tmp_path)
+    assert (tmp_path / PARQUET).read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {CSV, PARQUET}

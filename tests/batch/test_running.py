@@ -1,0 +1,235 @@
+"""A batch leaves a folder for each run, a table and a page, however it ends."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pandas as pd
+import pytest
+from distributed import Client
+
+import gvo
+import gvo.batch
+from gvo.batch import BatchOptions, BatchProgress, Variant, run, run_batch
+from gvo.batch.recordings import NamedRecording, find_recordings
+from gvo.batch.running import make_tasks
+from gvo.batch.variants import make_variants
+from gvo.errors import OutputError, RecordingError
+from gvo.sources.excerpt import Excerpt
+from tests.batch.conftest import NO_REPORT, assert_same_run, copy_of, state_of
+
+FORCED = BatchOptions(report=False, force=True)
+
+
+def with_size(size: int) -> gvo.Config:
+    return gvo.load_configuration(settings=[f"window.size={size}", "runtime.threads=1"])
+
+
+def run_files(out: Path) -> dict[Path, Any]:
+    """Return the state of what runs wrote, without the batch's own files."""
+    return {path: state for path, state in state_of(out).items() if path.parent != out}
+
+
+def test_a_batch_writes_runs_a_table_and_a_page(
+    near: Client, bags: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
+) -> None:
+    out = tmp_path / "out"
+    asked: list[str | Path] = [bags / "walk1.mcap", bags / "walk0.mcap", "/none.bag"]
+    table = run(asked, out=out, client=near, options=NO_REPORT)
+    assert table["recording"].tolist() == ["walk1", "walk0", "none"]
+    assert table["status"].tolist() == ["complete", "complete", "failed"]
+    assert table["folder"].tolist() == ["walk1", "walk0", "none"]
+    assert_same_run(out / "walk0", run_alone(bags / "walk0.mcap"))
+    pd.testing.assert_frame_equal(pd.read_parquet(out / "results.parquet"), table)
+    assert len(pd.read_csv(out / "results.csv")) == 3
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert all(name in page for name in ("walk0", "walk1", "none"))
+    expected = {"walk0", "walk1", "batch.json", "report.html", "results.csv", "results.parquet"}
+    assert {path.name for path in out.iterdir()} == expected
+
+
+def test_what_is_finished_is_found_and_the_rest_is_run(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run(bags / "walk0.mcap", out=out, client=near, options=NO_REPORT)
+    before = run_files(out)
+    table = run(bags, out=out, client=near, options=NO_REPORT)
+    assert table["is_found"].tolist() == [True, False, False]
+    assert {path: run_files(out)[path] for path in before} == before
+    forced = run(bags, out=out, client=near, options=FORCED)
+    assert not forced["is_found"].any()
+    assert {path: run_files(out)[path][0] for path in before} != {
+        path: state[0] for path, state in before.items()
+    }
+    columns = ["recording", "status", "ate_smoothed_m", "run_hash", "configuration_hash"]
+    pd.testing.assert_frame_equal(forced[columns], table[columns])
+
+
+def test_another_recording_of_the_same_name_is_run(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    bag = copy_of(bags / "walk0.mcap", tmp_path / "in", "walk.mcap")
+    first = run(bag, out=out, client=near, options=NO_REPORT)
+    copy_of(bags / "walk1.mcap", tmp_path / "in", "walk.mcap")
+    second = run(bag, out=out, client=near, options=NO_REPORT)
+    assert not second["is_found"].any()
+    assert first["run_hash"][0] != second["run_hash"][0]
+    other = run(bag, with_size(3), out=out, client=near, options=NO_REPORT)
+    assert not other["is_found"].any()
+    assert (
+        json.loads((out / "walk" / "summary.json").read_text())["configuration"]["window"]["size"]
+        == 3
+    )
+
+
+def test_configurations_have_folders_and_columns_of_their_own(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    configs = {"small": with_size(2), "large": with_size(9)}
+    asked = [bags / "walk0.mcap", bags / "walk1.mcap"]
+    table = run(asked, configs, out=out, client=near, options=NO_REPORT)
+    names = [f"walk{n}/{variant}" for n in range(2) for variant in configs]
+    assert table["folder"].tolist() == names
+    assert table["window.size"].tolist() == [2, 9, 2, 9]
+    assert table["configuration_hash"].nunique() == 2
+    for name, size in zip(names, [2, 9, 2, 9], strict=True):
+        summary = json.loads((out / name / "summary.json").read_text())
+        assert summary["configuration"]["window"]["size"] == size
+    single = run(asked, [with_size(2)], out=tmp_path / "b", client=near, options=NO_REPORT)
+    assert "window.size" not in single.columns
+    assert_same_run(out / "walk0" / "small", tmp_path / "b" / "walk0")
+
+
+def test_options_reach_every_run(near: Client, bags: Path, tmp_path: Path) -> None:
+    options = BatchOptions(report=False, excerpt=Excerpt(every=2))
+    assert run(bags, out=tmp_path, client=near, options=options)["frames"].tolist() == [4, 4, 4]
+
+
+class StoppedError(Exception):
+    """Ends a batch."""
+
+
+def test_a_stopped_batch_leaves_its_table_and_goes_on(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    def stop(progress: BatchProgress) -> None:
+        if progress.n_done == 1:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        run(bags, out=tmp_path, client=near, options=NO_REPORT, on_progress=stop)
+    table = pd.read_parquet(tmp_path / "results.parquet")
+    assert len(table) == 1
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "2 runs were not made: the batch was stopped" in page
+    again = run(bags, out=tmp_path, client=near, options=NO_REPORT)
+    assert again["status"].tolist() == ["complete"] * 3
+    (first,) = table["recording"]
+    assert again.set_index("recording")["is_found"][first]
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "were not made" not in page
+
+
+def test_the_table_grows_while_the_batch_goes(
+    near: Client, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.batch.running._EVERY_S", 0.0)
+    lengths: list[int] = []
+
+    def look(progress: BatchProgress) -> None:
+        if progress.row is not None:
+            lengths.append(len(pd.read_parquet(tmp_path / "results.parquet")))
+
+    run(
+        [*bags.iterdir(), "/none.bag"],
+        out=tmp_path,
+        client=near,
+        options=NO_REPORT,
+        on_progress=look,
+    )
+    assert lengths == [1, 2, 3, 4]
+
+
+def test_a_table_that_cannot_be_written_ends_the_batch(
+    near: Client, bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.batch.running._EVERY_S", 0.0)
+    (tmp_path / "results.csv").mkdir()
+    with pytest.raises(OutputError, match=r"results\.csv: cannot be written") as error:
+        run(bags, out=tmp_path, client=near, options=NO_REPORT)
+    # Though the error, and with it all that it went through, is still held.
+    assert near.futures == {}
+    assert error is not None
+
+
+def test_everything_may_lie_behind_urls(
+    near: Client, bags: Path, memory: str, run_alone: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    files: Any = fsspec.filesystem("memory")
+    for bag in bags.iterdir():
+        files.pipe(f"/place/in/{bag.name}", bag.read_bytes())
+    first = run(f"{memory}/in", out=f"{memory}/out/", client=near, options=NO_REPORT)
+    assert first["status"].tolist() == ["complete"] * 3
+    assert first["source"][0] == f"{memory}/in/walk0.mcap"
+    files.get("/place/out/", str(tmp_path / "copy"), recursive=True)
+    names = {path.name for path in (tmp_path / "copy").iterdir() if path.is_file()}
+    assert names == {"batch.json", "report.html", "results.csv", "results.parquet"}
+    assert_same_run(tmp_path / "copy" / "walk0", run_alone(bags / "walk0.mcap"))
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "copy" / "results.parquet"), first)
+    again = run(f"{memory}/in/*.mcap", out=f"{memory}/out", client=near, options=NO_REPORT)
+    assert again["is_found"].all()
+
+
+def test_a_folder_that_cannot_be_written_is_said_at_once(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file: cannot be written"):
+        run(bags, out=tmp_path / "file", client=near, options=NO_REPORT)
+
+
+def test_without_recordings_nothing_is_begun(near: Client, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no recording there"):
+        run(tmp_path, out=tmp_path / "out", client=near)
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_of_files_that_are_no_text_are_no_obstacle(
+    near: Client, bags: Path, tmp_path: Path
+) -> None:
+    name = b"w\xffalk.mcap".decode(errors="surrogateescape")
+    copy_of(bags / "walk0.mcap", tmp_path / "in", name)
+    (tmp_path / "in" / b"\xfe.bag".decode(errors="surrogateescape")).touch()
+    table = run(tmp_path / "in", out=tmp_path / "out", client=near, options=NO_REPORT)
+    assert sorted(table["status"]) == ["complete", "failed"]
+    assert len(pd.read_csv(tmp_path / "out" / "results.csv")) == 2
+
+
+def test_tasks_are_all_pairs_in_folders_of_their_own() -> None:
+    recordings = [NamedRecording(name=name, location=f"/{name}.bag") for name in "ab"]
+    variants = make_variants(sweeps=["window.size=3,4", "window.gate=null,9.5"])
+    tasks = make_tasks(recordings, variants)
+    assert len(tasks) == 8
+    assert len({task.folder for task in tasks}) == 8
+    assert tasks[1].parameters == {"window.size": 3, "window.gate": 9.5}
+    (single,) = make_tasks(recordings[:1], variants[:1])
+    assert (single.folder, single.parameters) == ("a", {})
+
+
+def test_what_is_named_already_is_run(near: Client, bags: Path, tmp_path: Path) -> None:
+    (found,) = find_recordings([bags / "walk0.mcap"])
+    variant = Variant(name="mine", config=with_size(3))
+    table = run_batch([found], [variant], out=tmp_path, client=near, options=NO_REPORT)
+    assert (table["variant"][0], table["folder"][0]) == ("mine", "walk0")
+
+
+def test_public_names_are_there() -> None:
+    assert set(gvo.batch.__all__) <= set(dir(gvo.batch))
+    assert all(getattr(gvo.batch, name) is not None for name in gvo.batch.__all__)
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = gvo.batch.nonsense

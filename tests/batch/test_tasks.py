@@ -1,0 +1,266 @@
+"""A task is a run like that of `gvo run`, unless its folder holds it already."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+
+import gvo
+from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
+from gvo.outputs.batch_rows import BatchRow
+from gvo.outputs.run_folder import JOURNAL
+from gvo.resuming.record_file import RecordFile
+from gvo.run_tally import Progress
+from gvo.sources.excerpt import Excerpt
+from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of
+
+CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])
+
+
+def task_of(source: object, config: gvo.Config = CONFIG, **values: Any) -> Task:
+    given = {"recording": "a", "variant": "default", "folder": "a"} | values
+    return Task(source=str(source), config=config, **given)
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> TaskOptions:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / MARK).write_text('{"mark": "x"}')
+    return TaskOptions(out=str(out), mark="x", report=False)
+
+
+@pytest.fixture
+def bag(bags: Path, tmp_path: Path) -> Path:
+    return copy_of(bags / "walk0.mcap", tmp_path / "in", "walk.mcap")
+
+
+class StopError(Exception):
+    """Ends a run."""
+
+
+def stop_at(n_frames: int) -> Callable[[Progress], None]:
+    def check(progress: Progress) -> None:
+        if progress.n_done >= n_frames:
+            raise StopError
+
+    return check
+
+
+def test_a_task_writes_what_a_run_writes(
+    bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path]
+) -> None:
+    seen: list[int] = []
+    row = run_task(task_of(bag), options, on_progress=lambda progress: seen.append(progress.n_done))
+    out, alone = Path(options.out) / "a", run_alone(bag)
+    assert_same_run(out, alone)
+    assert {path.name for path in out.iterdir()} == {path.name for path in alone.iterdir()}
+    assert seen == list(range(1, N_FRAMES + 1))
+    summary = json.loads((alone / "summary.json").read_text())
+    errors = {each["name"]: each for each in summary["errors"]}
+    assert row.status == "complete"
+    assert (row.frames, row.tracked) == (N_FRAMES, summary["tracked"])
+    assert row.ate_raw_m == errors["raw"]["ate_m"]
+    assert row.ate_smoothed_m == errors["smoothed"]["ate_m"]
+    assert row.rpe_smoothed_deg == errors["smoothed"]["rpe_deg"]
+    assert row.run_s is not None
+    assert (row.gvo_version, row.is_found) == (gvo.__version__, False)
+
+
+def test_a_report_is_drawn_where_it_is_wanted(bag: Path, options: TaskOptions) -> None:
+    run_task(task_of(bag), replace(options, report=True))
+    assert (Path(options.out) / "a" / "report.html").exists()
+
+
+def test_a_finished_run_is_found_and_not_touched(bag: Path, options: TaskOptions) -> None:
+    first = run_task(task_of(bag), options)
+    before = state_of(Path(options.out))
+    second = run_task(task_of(bag), options)
+    assert state_of(Path(options.out)) == before
+    assert (second.is_found, second.run_s) == (True, None)
+    assert replace(second, is_found=False, run_s=first.run_s) == first
+
+
+def test_a_finished_run_is_made_again_where_that_is_wanted(bag: Path, options: TaskOptions) -> None:
+    run_task(task_of(bag), options)
+    out = Path(options.out) / "a"
+    (out / "raw.txt").write_text("")
+    assert not run_task(task_of(bag), replace(options, force=True)).is_found
+    assert (out / "raw.txt").read_text().count("\n") == N_FRAMES
+
+
+@pytest.mark.parametrize("change", ["configuration", "recording", "excerpt", "damaged"])
+def test_another_run_in_the_folder_is_replaced(
+    bag: Path, bags: Path, options: TaskOptions, tmp_path: Path, change: str
+) -> None:
+    run_task(task_of(bag), options)
+    fresh = replace(options, out=str(shutil.copytree(options.out, tmp_path / "fresh")))
+    shutil.rmtree(tmp_path / "fresh" / "a")
+    task = task_of(bag)
+    if change == "configuration":
+        task = task_of(bag, gvo.load_configuration(settings=["window.size=3", "runtime.threads=1"]))
+    elif change == "recording":
+        copy_of(bags / "walk1.mcap", bag.parent, bag.name)
+    elif change == "excerpt":
+        options, fresh = (replace(each, excerpt=Excerpt(every=2)) for each in (options, fresh))
+    else:
+        (Path(options.out) / "a" / "summary.json").write_text("{")
+    row = run_task(task, options)
+    assert (row.status, row.is_found) == ("complete", False)
+    run_task(task, fresh)
+    assert_same_run(Path(options.out) / "a", tmp_path / "fresh" / "a")
+
+
+def test_an_interrupted_run_goes_on_from_its_journal(
+    bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    with pytest.raises(StopError):
+        run_task(task_of(bag), options, on_progress=stop_at(5))
+    out = Path(options.out) / "a"
+    assert (out / JOURNAL).exists()
+    assert run_task(task_of(bag), options).status == "complete"
+    assert not (out / JOURNAL).exists()
+    assert_same_run(out, run_alone(bag))
+
+
+def test_what_was_computed_before_an_interruption_stands(bag: Path, options: TaskOptions) -> None:
+    with pytest.raises(StopError):
+        run_task(task_of(bag), options, on_progress=stop_at(5))
+    timings = Path(options.out) / "a" / "timings.csv"
+    before = timings.read_bytes()
+    run_task(task_of(bag), options)
+    assert timings.read_bytes().startswith(before)
+
+
+def test_a_recording_that_fails_is_a_row_with_its_reason(
+    options: TaskOptions, tmp_path: Path
+) -> None:
+    (tmp_path / "text.bag").write_text("no bag")
+    for source, said in ((tmp_path / "none.bag", "does not exist"), (tmp_path / "text.bag", "")):
+        row = run_task(task_of(source, parameters={"a.b": 1}), options)
+        assert (row.status, row.frames, row.run_s) == ("failed", None, None)
+        assert row.reason.startswith(f"{source}")
+        assert said in row.reason
+        assert (row.recording, row.folder, row.source) == ("a", "a", str(source))
+        assert row.parameters == {"a.b": 1}
+
+
+def test_a_run_with_faults_is_partly(
+    bag: Path, options: TaskOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = gvo.run_recording(
+        gvo.open_recording(bag),
+        Path(options.out) / "b",
+        config=CONFIG,
+        outputs=gvo.RunOutputs(report=False),
+    )
+    partly = gvo.RunResult(
+        summary=result.summary, evaluations=(), exit_code=3, warnings=("one", "two")
+    )
+    monkeypatch.setattr("gvo.batch.tasks.run_recording", lambda *_, **__: partly)
+    row = run_task(task_of(bag), options)
+    assert (row.status, row.reason, row.frames) == ("partly", "one; two", N_FRAMES)
+
+
+@pytest.mark.parametrize("content", [None, '{"mark": "y"}', "[]", "{}", "\xff"])
+def test_a_disk_that_is_not_the_clients_is_refused(
+    bag: Path, options: TaskOptions, content: str | None
+) -> None:
+    mark = Path(options.out) / MARK
+    mark.unlink()
+    if content is not None:
+        mark.write_text(content, encoding="latin-1")
+    row = run_task(task_of(bag), options)
+    assert row.status == "failed"
+    assert "does not see there what the client does" in row.reason
+    assert not (Path(options.out) / "a").exists()
+
+
+def test_another_version_is_refused(bag: Path, options: TaskOptions) -> None:
+    row = run_task(task_of(bag), replace(options, gvo_version="0.0.1"))
+    assert row.status == "failed"
+    assert row.reason == (f"the worker has gvo {gvo.__version__}, the client 0.0.1: install one")
+    assert not (Path(options.out) / "a").exists()
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_that_another_process_writes_is_waited_for(
+    bag: Path, options: TaskOptions, monkeypatch: pytest.MonkeyPatch, force: bool
+) -> None:
+    out = Path(options.out) / "a"
+    out.mkdir()
+    journal = RecordFile(out / JOURNAL, is_new=True)
+    waited: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waited.append(seconds)
+        if len(waited) == 3:
+            journal.close()
+
+    monkeypatch.setattr("gvo.batch.tasks.time.sleep", wait)
+    row = run_task(task_of(bag), replace(options, force=force))
+    assert (row.status, len(waited)) == ("complete", 3)
+
+
+def test_a_folder_that_stays_busy_is_a_failure_and_the_other_run_goes_on(
+    bag: Path, options: TaskOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.batch.tasks._BUSY_S", 0.0)
+    rows: list[BatchRow] = []
+
+    def start_another(progress: Progress) -> None:
+        if progress.n_done == 3:
+            rows.append(run_task(task_of(bag), options))
+
+    row = run_task(task_of(bag), options, on_progress=start_another)
+    assert "another process is writing this run" in rows[0].reason
+    assert (rows[0].status, row.status) == ("failed", "complete")
+
+
+def test_recordings_and_results_may_lie_behind_urls(
+    bag: Path, memory: str, tmp_path: Path, run_alone: Callable[[Path], Path]
+) -> None:
+    files: Any = fsspec.filesystem("memory")
+    files.pipe("/place/walk.mcap", bag.read_bytes())
+    options = TaskOptions(out=f"{memory}/out", mark="x", report=False)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    row = run_task(task_of(f"{memory}/walk.mcap"), options, scratch=scratch)
+    assert row.status == "complete"
+    files.get("/place/out/a/", str(tmp_path / "copy"), recursive=True)
+    assert_same_run(tmp_path / "copy", run_alone(bag))
+    assert list(scratch.iterdir()) == []
+    before = {path: (files.created(path), files.cat_file(path)) for path in files.find("/place")}
+    assert run_task(task_of(f"{memory}/walk.mcap"), options, scratch=scratch).is_found
+    after = {path: (files.created(path), files.cat_file(path)) for path in files.find("/place")}
+    assert after == before
+    missing = run_task(task_of(f"{memory}/none.mcap"), options, scratch=scratch)
+    assert (missing.status, missing.reason) == ("failed", f"{memory}/none.mcap: does not exist")
+    assert list(scratch.iterdir()) == []
+
+
+def test_hashes_tell_configurations_and_recordings_apart(
+    bag: Path, bags: Path, options: TaskOptions
+) -> None:
+    other = gvo.load_configuration(settings=["window.size=3", "runtime.threads=1"])
+    rows = [
+        run_task(task_of(source, config, folder=str(n)), options)
+        for n, (source, config) in enumerate(
+            [
+                (bag, CONFIG),
+                (bags / "walk0.mcap", CONFIG),
+                (bags / "walk1.mcap", CONFIG),
+                (bag, other),
+            ]
+        )
+    ]
+    assert [row.status for row in rows] == ["complete"] * 4
+    assert rows[0].run_hash == rows[1].run_hash
+    assert len({row.run_hash for row in rows}) == 3
+    assert len({row.configuration_hash for row in rows}) == 2
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1}) != digest({"a": 1, "b": 3})

@@ -1,0 +1,176 @@
+"""A sweep is the product of its values, and what is wrong with it is said in a line."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import gvo
+from gvo.batch.variants import Variant, differences, make_variants, name_variants
+from gvo.config import Config
+from gvo.errors import ConfigurationError
+
+
+def values_of(variant: Variant) -> tuple[int | None, int]:
+    return variant.config.window.size, variant.config.window.n_links
+
+
+def test_without_anything_there_is_the_default_on_one_thread() -> None:
+    (variant,) = make_variants()
+    assert variant.name == "default"
+    assert variant.config == gvo.load_configuration(settings=["runtime.threads=1"])
+
+
+def test_two_sweeps_are_all_pairs() -> None:
+    variants = make_variants(sweeps=["window.size=4,5,6", "window.n_links=1,3"])
+    assert list(map(values_of, variants)) == list(itertools.product((4, 5, 6), (1, 3)))
+    assert variants[1].name == "window.size=4,window.n_links=3"
+
+
+@given(
+    st.lists(st.integers(2, 50), min_size=1, max_size=4, unique=True),
+    st.lists(st.floats(0.125, 1e30), min_size=1, max_size=4, unique=True),
+)
+def test_values_are_taken_as_they_are_written(sizes: list[int], gates: list[float]) -> None:
+    sweeps = [
+        f"window.size={','.join(map(str, sizes))}",
+        f"window.gate={','.join(map(repr, gates))}",
+    ]
+    variants = make_variants(sweeps=sweeps)
+    found = [(variant.config.window.size, variant.config.window.gate) for variant in variants]
+    assert found == list(itertools.product(sizes, gates))
+    assert len({variant.name for variant in variants}) == len(variants)
+
+
+def test_words_truths_and_nothing_can_be_swept() -> None:
+    kinds = make_variants(sweeps=["frontend.kind=klt,descriptor"])
+    assert [variant.config.frontend.kind for variant in kinds] == ["klt", "descriptor"]
+    gates = make_variants(sweeps=["window.gate=null,9.5"])
+    assert [variant.config.window.gate for variant in gates] == [None, 9.5]
+    assert [variant.name for variant in gates] == ["window.gate=null", "window.gate=9.5"]
+
+
+def test_files_settings_and_sweeps_go_together(tmp_path: Path) -> None:
+    for name, size in (("small", 3), ("large", 9)):
+        (tmp_path / f"{name}.yaml").write_text(f"window: {{size: {size}, n_links: 2}}\n")
+    files = [tmp_path / "small.yaml", tmp_path / "large.yaml"]
+    variants = make_variants(files, ["ransac.seed=7"], ["window.n_links=1,3"])
+    assert list(map(values_of, variants)) == [(3, 1), (3, 3), (9, 1), (9, 3)]
+    assert {variant.config.ransac.seed for variant in variants} == {7}
+    assert variants[0].name == "small,window.n_links=1"
+    assert [each.name for each in make_variants(files)] == ["small", "large"]
+
+
+def test_files_of_one_name_are_told_apart_and_one_file_is_one(tmp_path: Path) -> None:
+    files = [tmp_path / place / "base.yaml" for place in "abc"]
+    for size, file in enumerate(files, start=3):
+        file.parent.mkdir()
+        file.write_text(f"window: {{size: {size}}}\n")
+    variants = make_variants([*files, files[0]])
+    assert [each.name for each in variants] == ["base", "base-2", "base-3"]
+    assert [values_of(each)[0] for each in variants] == [3, 4, 5]
+
+
+def test_who_asks_for_threads_gets_them(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("runtime: {threads: 3}\n")
+    asked: list[dict[str, Any]] = [
+        {"files": [tmp_path / "a.yaml"]},
+        {"settings": ["runtime.threads=3"]},
+        {"sweeps": ["runtime.threads=3"]},
+    ]
+    for one in asked:
+        assert make_variants(**one)[0].config.runtime.threads == 3
+    (variant,) = make_variants(settings=["window.size=4"])
+    assert variant.config.runtime.threads == 1
+
+
+@pytest.mark.parametrize(
+    ("sweep", "said"),
+    [
+        ("window.size", "expected section.key=a,b,c"),
+        ("window.size=", "expected section.key=a,b,c"),
+        ("=4,5", "expected section.key=a,b,c"),
+        ("size=4,5", "--sweep size=4,5: expected section.key=a,b,c"),
+        ("window.size=4,,5", "no YAML"),
+        ("window.size='4", "no YAML"),
+        ("window.size=4]", "no YAML"),
+        ("window.size=!!python/object:os.system {}", "no YAML"),
+        ("window.size=&a [*a]", "no YAML"),
+        ("window.size=4,5,4", "4 is given twice"),
+        ("window.size=2020-01-01", "no parameter has such a value"),
+        ("window.size=!!binary aGVsbG8=", "no parameter has such a value"),
+        ("window.size=4,1", "greater than or equal to 2"),
+        ("window.size=4,many", "valid integer"),
+        ("window.size=[4]", "window.size"),
+        ("window.gate=.inf", "finite"),
+        ("window.sise=4", "did you mean window.size"),
+        ("windw.size=4", "did you mean window"),
+        ("frontend.kind=klt,nonsense", "'klt' or 'descriptor'"),
+    ],
+)
+def test_what_is_wrong_with_a_sweep_is_said_in_a_line(sweep: str, said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        make_variants(sweeps=[sweep])
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_key_is_swept_once() -> None:
+    with pytest.raises(ConfigurationError, match=r"--sweep window\.size: is given twice"):
+        make_variants(sweeps=["window.size=4", "window.n_links=1", " window.size =5"])
+
+
+def test_a_grid_that_has_no_end_is_refused_before_it_is_made() -> None:
+    values = ",".join(map(str, range(2, 22)))
+    keys = ("window.size", "window.n_links", "ransac.seed", "ransac.min_inliers")
+    with pytest.raises(ConfigurationError, match="more than 100000 configurations"):
+        make_variants(sweeps=[f"{key}={values}" for key in keys])
+
+
+def test_a_file_that_is_no_configuration_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("window: {sise: 3}\n")
+    with pytest.raises(ConfigurationError, match=r"window\.sise"):
+        make_variants([tmp_path / "a.yaml"])
+    with pytest.raises(ConfigurationError, match=r"none\.yaml: cannot be read"):
+        make_variants([tmp_path / "none.yaml"])
+
+
+def with_size(size: int) -> Config:
+    return gvo.load_configuration(settings=[f"window.size={size}"])
+
+
+def test_configurations_are_named_by_what_they_differ_in() -> None:
+    named = name_variants([with_size(4), with_size(6), with_size(4)])
+    assert [each.name for each in named] == ["window.size=4", "window.size=6", "window.size=4-2"]
+    assert [values_of(each)[0] for each in named] == [4, 6, 4]
+    assert [each.name for each in name_variants([Config(), Config()])] == ["default", "default-2"]
+
+
+def test_configurations_keep_names_that_are_given_to_them() -> None:
+    named = name_variants({"a": with_size(4), "../b": with_size(6), "..": with_size(7)})
+    assert [values_of(each)[0] for each in named] == [4, 6, 7]
+    assert named[0].name == "a"
+    assert all("/" not in each.name and not each.name.startswith(".") for each in named)
+
+
+def test_one_configuration_is_the_default_and_none_is_that_of_gvo() -> None:
+    assert [each.name for each in name_variants(with_size(4))] == ["default"]
+    assert name_variants(None)[0].config.runtime.threads == 1
+    with pytest.raises(ConfigurationError, match="at least one"):
+        name_variants([])
+
+
+def test_only_what_differs_is_told() -> None:
+    settings: tuple[list[str], ...] = (["window.size=4"], ["window.size=4", "window.gate=null"], [])
+    found = differences([gvo.load_configuration(settings=list(each)) for each in settings])
+    default = Config()
+    assert found == [
+        {"window.size": 4, "window.gate": default.window.gate},
+        {"window.size": 4, "window.gate": None},
+        {"window.size": default.window.size, "window.gate": default.window.gate},
+    ]
+    assert differences([Config()]) == [{}]
+    assert differences([]) == []
