@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from gvo.batch.names import free_name, safe_name
 from gvo.batch.results import CSV, PARQUET
 from gvo.batch.storage import Place, is_url
 from gvo.batch.tasks import MARK
@@ -20,8 +21,6 @@ _LIST_SUFFIX = ".txt"
 _PATTERN = re.compile(r"[*?\[]")
 # Folders within folders that are looked through: a link to a folder above must have an end.
 _MAX_DEPTH = 12
-_UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
-_MAX_NAME = 150
 _COMPRESSED = ".zstd"
 _COMMENT = re.compile(r"(^|\s)#.*")
 # Names of the batch's own files, as they are written and as they stay.
@@ -72,11 +71,6 @@ def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
         locations.update(dict.fromkeys(found))
     names = _name(list(locations))
     return [NamedRecording(name=names[each], location=each) for each in locations]
-
-
-def safe_name(text: str) -> str:
-    """Return a text as the name of a folder."""
-    return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
 
 
 def _expand(text: str) -> list[str]:
@@ -164,9 +158,6 @@ def _number(names: dict[str, str]) -> dict[str, str]:
     taken = set(_TAKEN)
     numbered = {}
     for each, name in names.items():
-        free, number = name, 2
-        while free in taken:
-            free, number = f"{name}-{number}", number + 1
-        taken.add(free)
-        numbered[each] = free
+        numbered[each] = free_name(name, taken)
+        taken.add(numbered[each])
     return numbered

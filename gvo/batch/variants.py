@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from gvo.batch.recordings import safe_name
+from gvo.batch.names import free_name, safe_name
 from gvo.bounded_text import cut
 from gvo.config import Config, RuntimeConfig, load_configuration
 from gvo.errors import ConfigurationError
@@ -68,7 +68,7 @@ def make_variants(
         words = ",".join(filter(None, [base, _text_of(dict(zip(keys, chosen, strict=True)))]))
         name = safe_name(words or DEFAULT)
         config = load_configuration(file, [*settings, *values])
-        variants[_free(name, variants)] = _on_one_thread(config)
+        variants[free_name(name, variants)] = _on_one_thread(config)
     return [Variant(name=name, config=config) for name, config in variants.items()]
 
 
@@ -98,7 +98,7 @@ def name_variants(
         raise ConfigurationError("expected at least one configuration")
     variants: dict[str, Config] = {}
     for name, config in named:
-        variants[_free(name, variants)] = config
+        variants[free_name(name, variants)] = config
     return [Variant(name=name, config=config) for name, config in variants.items()]
 
 
@@ -152,15 +152,8 @@ def _parse_sweep(sweep: str) -> list[Value]:
 def _names(files: Sequence[Path]) -> dict[Path, str]:
     names: dict[str, Path] = {}
     for file in dict.fromkeys(files):
-        names[_free(safe_name(file.stem), names)] = file
+        names[free_name(safe_name(file.stem), names)] = file
     return {file: name for name, file in names.items()}
-
-
-def _free(name: str, taken: Mapping[str, object]) -> str:
-    free, number = name, 2
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
 
 
 def _on_one_thread(config: Config) -> Config:
