@@ -104,7 +104,8 @@ def batch(
         force=force,
         plots=plots,
     )
-    typer.echo(f"{len(found)} recordings, {len(variants)} configurations")
+    counts = _count(len(found), "recording"), _count(len(variants), "configuration")
+    typer.echo(", ".join(counts))
     with (
         interruptible() as check,
         _told_how_to_go_on(out),
@@ -180,6 +181,10 @@ def _words(progress: BatchProgress) -> str:
     )
 
 
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def _clock(seconds: float) -> str:
     return time.strftime("%H:%M:%S" if seconds >= 3600 else "%M:%S", time.gmtime(seconds))
 
@@ -196,7 +201,7 @@ def _report(table: pd.DataFrame, out: str) -> NoReturn:
     if len(lines) > _MAX_WARNINGS:
         warn([f"{len(lines) - _MAX_WARNINGS} more runs are not complete, see the table"])
     words = ", ".join(f"{n} {status}" for status, n in counts.items() if n)
-    typer.echo(f"{len(table)} runs: {words}; {out.rstrip('/')}/{REPORT}")
+    typer.echo(f"{_count(len(table), 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
     if counts["complete"] == len(table):
         raise typer.Exit(EXIT_COMPLETE)
     if counts["failed"] == len(table):

@@ -49,7 +49,7 @@ def test_all_complete_is_0(batch: Batch, bags: Path, tmp_path: Path) -> None:
     assert answer.code == 0
     lines = answer.out.splitlines()
     assert lines == [
-        "3 recordings, 1 configurations",
+        "3 recordings, 1 configuration",
         f"3 runs: 3 complete; {tmp_path}/report.html",
     ]
     said = sorted(line.partition("] ")[2] for line in answer.err.splitlines())
@@ -92,13 +92,16 @@ def test_configurations_and_sweeps_are_all_pairs(
     # As the shell leaves a pattern in quotes, and as it expands one without.
     files = ["*.yaml"] if is_one_option else ["a.yaml", "b.yaml"]
     bag, sweep = bags / "walk0.mcap", "window.n_links=1,2"
-    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep)
+    answer = batch(bag, "--out", "out", "--configs", *files, "--sweep", sweep, "--plots", "plots")
     assert answer.code == 0, answer.err
     table = pd.read_parquet(tmp_path / "out" / "results.parquet")
     values = list(zip(table["window.size"], table["window.n_links"], strict=True))
     assert values == [(3, 1), (3, 2), (4, 1), (4, 2)]
     assert table["variant"][0] == "a,window.n_links=1"
     assert is_complete(tmp_path / "out" / "walk0" / "b,window.n_links=2")
+    plots = {path.stem[3:]: path for path in (tmp_path / "plots").glob("*.png")}
+    assert {"boxes", "error_by_value", "front"} <= set(plots)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in plots.values())
 
 
 def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path: Path) -> None:
