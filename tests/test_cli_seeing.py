@@ -23,6 +23,7 @@ import gvo
 Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 COMMANDS = (
+    "batch",
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
     *("explain", "view", "shuttle"),
 )

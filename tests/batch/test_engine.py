@@ -171,21 +171,24 @@ def test_nobody_there_is_a_line(address: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 class Killer:
-    """Kills the worker that holds a task, each time or once."""
+    """Kills each worker that runs a recording, under whatever key the task is tried again."""
 
-    def __init__(self, client: Client, is_due: Any) -> None:
+    def __init__(self, client: Client, source: Path) -> None:
         self._client = client
-        self._is_due = is_due
+        self._source = str(source)
+        self.engine: Engine | None = None
         self.killed: set[int] = set()
 
     def __call__(self, progress: BatchProgress) -> None:
         # Asking the workers themselves would wait for those that are just dying.
         cluster: Any = self._client.cluster
         pids = {nanny.worker_address: nanny.pid for nanny in cluster.workers.values()}
+        assert self.engine is not None
+        running = self.engine._running.items()
+        due = {key for key, (_, task, _) in running if task.source == self._source}
         for worker, keys in self._client.processing().items():
             pid = pids.get(worker)
-            is_held = any(self._is_due(key) for key in keys)
-            if is_held and pid is not None and pid not in self.killed:
+            if due & set(keys) and pid is not None and pid not in self.killed:
                 self.killed.add(pid)
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
@@ -198,8 +201,9 @@ def test_who_kills_each_worker_fails_and_the_neighbours_complete(
     sources = [bags / f"walk{n}.mcap" for n in range(3)]
     tasks = tasks_of(blocked, *sources, "/none.bag")
     with forgiving(0), connected(None, 2) as client:
-        killer = Killer(client, lambda key: key[1] in (0, len(tasks)))
-        rows = {row.folder: row for row in Engine(client, options, killer).run(tasks)}
+        killer = Killer(client, blocked)
+        killer.engine = Engine(client, options, killer)
+        rows = {row.folder: row for row in killer.engine.run(tasks)}
         assert len(client.futures) == 0
     assert Counter(row.status for row in rows.values()) == {"complete": 3, "failed": 2}
     assert rows["r0"].reason.startswith("its worker died, each time")
