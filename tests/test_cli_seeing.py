@@ -23,9 +23,8 @@ import gvo
 Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 COMMANDS = (
-    "batch",
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
-    *("explain", "view", "shuttle"),
+    *("batch", "explain", "view", "shuttle"),
 )
 TABLES = (
     *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
