@@ -47,11 +47,15 @@ class Watch:
 
 
 def test_tasks_spread_over_the_workers(cluster: Cluster, bags: Path, tmp_path: Path) -> None:
+    # More than two for each thread: the scheduler hands them out as threads are free.
+    configs = {f"c{number}": gvo.Config() for number in range(4)}
     with Client(cluster.address) as client:
         watch = Watch(client)
-        table = run(bags, out=tmp_path, client=client, options=NO_REPORT, on_progress=watch)
+        table = run(
+            bags, configs, out=tmp_path, client=client, options=NO_REPORT, on_progress=watch
+        )
         assert client.futures == {}
-    assert table["status"].tolist() == ["complete"] * 3
+    assert table["status"].tolist() == ["complete"] * 12
     assert watch.names == set(cluster.workers)
 
 
