@@ -9,7 +9,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any
@@ -369,7 +369,10 @@ def rest(stream: IO[str] | None, line: str) -> str:
 
 def listening(process: subprocess.Popen[str]) -> dict[int, str]:
     """Return port and local address of the sockets of a process that listen, by the kernel."""
-    links = [path.readlink() for path in Path(f"/proc/{process.pid}/fd").iterdir()]
+    links = []
+    for path in Path(f"/proc/{process.pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # closed meanwhile
+            links.append(path.readlink())
     mine = {str(link)[8:-1] for link in links if str(link).startswith("socket:[")}
     found = {}
     for table in ("tcp", "tcp6"):

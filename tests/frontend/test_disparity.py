@@ -44,7 +44,7 @@ def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
     found, is_valid = measure_disparities(pair(disparity), pixels, predicted, CONFIG, reach_px=3)
     assert is_valid.mean() > 0.9
     errors = found[is_valid] - disparity
-    assert abs(np.median(errors)) < 0.02
+    assert abs(np.median(errors)) < 0.03
     assert np.quantile(np.abs(errors), 0.9) < 0.06
 
 
