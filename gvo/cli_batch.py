@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
@@ -23,7 +23,7 @@ from gvo.cli_options import (
     Start,
 )
 from gvo.errors import ConfigurationError
-from gvo.terminal import interruptible, warn
+from gvo.terminal import both, interruptible, warn
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,13 +112,9 @@ def batch(
         connected(scheduler, workers) as client,
         _progress() as show,
     ):
-
-        def on_progress(progress: BatchProgress) -> None:
-            show(progress)
-            check(progress)
-
+        told = both(show, check)
         table = run_batch(
-            found, variants, out=out, client=client, options=options, on_progress=on_progress
+            found, variants, out=out, client=client, options=options, on_progress=told
         )
     _report(table, out)
 
@@ -191,10 +187,11 @@ def _clock(seconds: float) -> str:
 
 def _report(table: pd.DataFrame, out: str) -> NoReturn:
     """Print what a batch gave, and end with its exit code."""
+    from gvo.outputs.batch_rows import RunStatus
     from gvo.outputs.run_folder import REPORT
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
-    counts = {status: int((table["status"] == status).sum()) for status in _STATUSES}
+    counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}
     unfinished = table[table["status"] != "complete"]
     lines = [f"{row.folder}: {row.status}: {row.reason}" for row in unfinished.itertuples()]
     warn(lines[:_MAX_WARNINGS])
@@ -207,6 +204,3 @@ def _report(table: pd.DataFrame, out: str) -> NoReturn:
     if counts["failed"] == len(table):
         raise ConfigurationError("all runs failed")
     raise typer.Exit(EXIT_PARTLY)
-
-
-_STATUSES = ("complete", "partly", "failed")

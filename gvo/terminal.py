@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import typer
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gvo.run_tally import Progress
     from gvo.runs import RunResult
 
+ProgressT = TypeVar("ProgressT")
 # By how much the total of a progress bar may be off.
 _MAX_OFF = 0.02
 _EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
@@ -133,11 +134,11 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
 
 
 def both(
-    show: Callable[[Progress], None], check: Callable[[object], None]
-) -> Callable[[Progress], None]:
+    show: Callable[[ProgressT], None], check: Callable[[object], None]
+) -> Callable[[ProgressT], None]:
     """Return a callback that draws, then looks for signals."""
 
-    def on_progress(progress: Progress) -> None:
+    def on_progress(progress: ProgressT) -> None:
         show(progress)
         check(progress)
 

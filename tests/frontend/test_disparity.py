@@ -1,5 +1,6 @@
 """Disparities of pixels, on images whose disparities are exact."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -44,7 +45,8 @@ def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
     found, is_valid = measure_disparities(pair(disparity), pixels, predicted, CONFIG, reach_px=3)
     assert is_valid.mean() > 0.9
     errors = found[is_valid] - disparity
-    assert abs(np.median(errors)) < 0.03
+    # OpenCV 4 rounds where it interpolates to a 32nd of a pixel.
+    assert abs(np.median(errors)) < (0.03 if cv2.__version__.startswith("4.") else 0.02)
     assert np.quantile(np.abs(errors), 0.9) < 0.06
 
 
