@@ -122,7 +122,7 @@ def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
 
 
 def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
-    measured = run("benchmark", "--window", 1000)
+    measured = run("benchmark", "--window", 500)
     assert measured.returncode == 0, measured.stderr
     rows = [line.split() for line in measured.stdout.splitlines()[1:]]
     assert [row[0] for row in rows] == ["nearest", "random", "farthest"]
@@ -223,12 +223,10 @@ def test_bad_input_is_told_without_a_traceback(name: str, arguments: list[str]) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "seeds"), [("descriptor", "10-10"), ("klt", "10-11")])
-def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at(
-    kind: str, seeds: str
-) -> None:
-    # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of few they spread more.
-    measured = run("consistency", "--seeds", seeds, "--set", f"frontend.kind={kind}")
+@pytest.mark.parametrize("kind", ["descriptor", "klt"])
+def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at(kind: str) -> None:
+    # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of one they spread more.
+    measured = run("consistency", "--seeds", "10", "--set", f"frontend.kind={kind}")
     assert measured.returncode == 0, measured.stderr
     rows = [line.split() for line in measured.stdout.splitlines()[1:]]
     assert [row[:2] for row in rows] == [

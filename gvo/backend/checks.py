@@ -49,14 +49,20 @@ def place_fault(positions_world: FloatArray) -> str:
     largest = float(np.abs(positions_world).max())
     if largest <= 2.0 * _MAX_COORDINATE_M:
         return ""
-    return f"a pose diverged to {largest:.3g} m"
+    return _divergence(largest)
 
 
-def pose_fault(T_world_frame: FloatArray, covariance: FloatArray) -> str:
-    """Return why a result cannot be right; empty where it may be."""
-    if not math.isfinite(T_world_frame.sum() + covariance.sum()):
+def pose_fault(T_world_frame: FloatArray) -> str:
+    """Return why a pose that came out cannot be right; empty where it may be."""
+    rows = T_world_frame.tolist()
+    if not math.isfinite(sum(map(sum, rows))):
         return "a pose is not finite"
-    return place_fault(T_world_frame[:3, 3])
+    largest = max(abs(row[3]) for row in rows)
+    return "" if largest <= 2.0 * _MAX_COORDINATE_M else _divergence(largest)
+
+
+def _divergence(largest: float) -> str:
+    return f"a pose diverged to {largest:.3g} m"
 
 
 def sane_covariance(covariance: FloatArray) -> FloatArray:
@@ -116,12 +122,19 @@ def is_definite(symmetric: FloatArray) -> bool:
 
 
 def _are_plain(covariances: FloatArray) -> bool:
-    """Tell at little cost that all are good; those that are only nearly symmetric take longer."""
-    return bool(
-        np.abs(covariances).max() <= _MAX_SIGMA**2
-        and covariances.diagonal(axis1=1, axis2=2).min() >= _MIN_SIGMA**2
-        and (covariances == covariances.transpose(0, 2, 1)).all()
-        and all(is_definite(covariance) for covariance in covariances * _LESS_DEFINITE)
+    """Tell at little cost that all are good; those that are only nearly symmetric take longer.
+
+    What is not a number is not equal to itself, and no element of a definite matrix is larger than
+    the largest of its diagonal.
+    """
+    variances = covariances.reshape(-1, 36)[:, ::7].tolist()
+    return (
+        all(
+            min(diagonal) >= _MIN_SIGMA**2 and max(diagonal) <= _MAX_SIGMA**2
+            for diagonal in variances
+        )
+        and bool((covariances == covariances.transpose(0, 2, 1)).all())
+        and all(map(is_definite, covariances * _LESS_DEFINITE))
     )
 
 

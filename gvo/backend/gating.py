@@ -77,8 +77,8 @@ def judge(
     informations = np.array([dposv(covariance, _IDENTITY)[1] for covariance in covariances])
     twists = _twists(predictions)
     reasons = [""] * len(edges)
-    mean = _mean(twists, informations)
-    if _spread(twists - mean, informations) <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
+    mean, spread = _mean(twists, informations)
+    if spread <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
         return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
     distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
@@ -91,8 +91,8 @@ def judge(
         twists = _twists(predictions)
         distances = _distances(twists, covariances[left])
     is_near = _are_near_medoid(distances)
-    start = predictions[0].retract(_mean(twists[is_near], informations[is_near]))
-    return Verdict(T_world_start=start, reasons=reasons)
+    mean, _ = _mean(twists[is_near], informations[is_near])
+    return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
 
 
 def disagreement(
@@ -163,21 +163,17 @@ def _are_near_medoid(distances: FloatArray) -> BoolArray:
     return np.asarray(distances[medoid] <= _AGREEMENT)
 
 
-def _mean(twists: FloatArray, informations: FloatArray) -> FloatArray:
-    """Return the weighted mean, shape (6,), of twists.
+def _mean(twists: FloatArray, informations: FloatArray) -> tuple[FloatArray, float]:
+    """Return the weighted mean, shape (6,), of twists (n, 6), and how far they lie around it.
 
-    So a robust kernel weighs each edge near where it will be, not from where one of them was.
+    By such a start a robust kernel weighs each edge near where it will be, not from where one of
+    them was. The spread is the sum of the squared lengths of the deviations, in sigmas. No two of
+    the twists are farther apart, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
     """
-    weighted = np.einsum("nij,nj->i", informations, twists)
-    return np.asarray(dposv(informations.sum(axis=0), weighted)[1])
-
-
-def _spread(deviations: FloatArray, informations: FloatArray) -> float:
-    """Return the sum of the squared lengths of deviations from one point, in sigmas.
-
-    No two of them are farther apart, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
-    """
-    return float(np.einsum("ni,nij,nj", deviations, informations, deviations))
+    weighted = np.matmul(informations, twists[:, :, np.newaxis])[:, :, 0]
+    total = np.add.reduce(weighted)
+    mean = dposv(np.add.reduce(informations), total)[1]
+    return mean, float(np.vdot(weighted, twists) - np.vdot(total, mean))
 
 
 @lru_cache(maxsize=32)

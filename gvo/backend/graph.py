@@ -140,7 +140,7 @@ class PoseGraph:
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),
-    ) -> bool:
+    ) -> tuple[dict[int, gtsam.Pose3], bool]:
         """Go on until poses stand still, where the update just done moved them far.
 
         One step of Gauss-Newton is exact for what moves by a fraction of a radian only; after a
@@ -155,19 +155,24 @@ class PoseGraph:
 
         Returns
         -------
+        dict of int to gtsam.Pose3
+            Where they are now.
         bool
-            Whether they had moved far.
+            Whether they may have moved far.
         """
+        after = {key: self.pose3(key) for key in before}
+        if self._is_whole:
+            return after, True
         limit = _FAR
-        for _ in range(0 if self._is_whole else _MAX_STEPS):
-            after = {key: self.pose3(key) for key in before}
+        for _ in range(_MAX_STEPS):
             moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
             if max(max(map(abs, move)) for move in moves) < limit:
-                return limit == _STILL
+                return after, limit == _STILL
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
             self.update(*nothing, alive=alive, leaving=leaving)
-        return True
+            after = {key: self.pose3(key) for key in before}
+        return after, True
 
     def marginalize(self, keys: Sequence[int]) -> None:
         """Take out poses that the last update made ready; what they knew stays."""

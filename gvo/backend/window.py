@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import gtsam
 import numpy as np
@@ -56,16 +56,24 @@ _ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
 _UNKNOWN_SIGMAS = np.repeat([1.0, 1e4], 3)
 
 
+class _Tie(NamedTuple):
+    """An accepted edge, with the key of its reference and what made its factor: its kernel."""
+
+    edge: Edge
+    factors: Factors
+    reference_key: int
+
+
 @dataclass(slots=True, kw_only=True)
 class _Member:
     """A pose of the window, with what was measured of it.
 
-    Each measurement comes with what made its factor, and so knows its kernel.
+    Ties to poses that have left since stay among the edges.
     """
 
     key: int
     stamp_ns: int
-    edges: list[tuple[Edge, Factors]]
+    edges: list[_Tie]
     priors: list[tuple[Prior, Factors]]
     is_kept: bool = False
     status: Status = Status.OK
@@ -76,13 +84,15 @@ class _Member:
 class _Arrival:
     """A pose on its way into the window, with what is usable of its measurements.
 
-    `anchor` and `coasting` hold it where the measurements do not; they are none themselves.
+    `T_world_references` are the poses of the references at that moment, by their names. `anchor`
+    and `coasting` hold the pose where the measurements do not; they are none themselves.
     """
 
     frame_id: FrameId
     key: int
     stamp_ns: int
     T_world_start: gtsam.Pose3
+    T_world_references: dict[FrameId, gtsam.Pose3] = field(default_factory=dict)
     edges: list[Edge] = field(default_factory=list)
     priors: list[Prior] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
@@ -292,7 +302,7 @@ class SlidingWindow:
             frame_id, self._factors.between(reference_key, member.key, edge), edge=edge
         )
         if isinstance(answer, Estimate):
-            member.edges.append((edge, self._factors))
+            member.edges.append(_Tie(edge, self._factors, reference_key))
             self._ledger.add(n_edges=1)
         return answer
 
@@ -337,7 +347,7 @@ class SlidingWindow:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
         member = self._member(frame_id)
         T_world_frame = self._graph.pose(member.key)
-        if member.causal is not None and place_fault(T_world_frame[:3, 3]):
+        if member.causal is not None and pose_fault(T_world_frame):
             return member.causal.T_world_cam
         return T_world_frame
 
@@ -351,7 +361,7 @@ class SlidingWindow:
         Empty where it is not in the window.
         """
         member = self._members.get(frame_id)
-        return () if member is None else tuple(edge for edge, _ in member.edges)
+        return () if member is None else tuple(tie.edge for tie in self._standing(member))
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
@@ -395,9 +405,10 @@ class SlidingWindow:
         found = []
         for frame_id, member in self._members.items():
             found += [
-                factors.residual_of_edge(edge, frame_id, poses[edge.reference_id], poses[frame_id])
-                for edge, factors in member.edges
-                if edge.reference_id in poses
+                tie.factors.residual_of_edge(
+                    tie.edge, frame_id, poses[tie.edge.reference_id], poses[frame_id]
+                )
+                for tie in self._standing(member)
             ]
             found += [
                 factors.residual_of_prior(prior, frame_id, poses[frame_id])
@@ -508,7 +519,7 @@ class SlidingWindow:
             arrival.priors.append(prior)
 
     def _receive_edges(self, arrival: _Arrival, edges: list[Edge]) -> None:
-        verdict = self._judge(edges, arrival.stamp_ns)
+        verdict = self._judge(arrival, edges)
         arrival.T_world_start = verdict.T_world_start
         for edge, reason in zip(edges, verdict.reasons, strict=True):
             if reason:
@@ -568,12 +579,19 @@ class SlidingWindow:
             is_gated=is_gated,
         )
 
-    def _judge(self, edges: list[Edge], stamp_ns: int) -> Verdict:
+    def _judge(self, arrival: _Arrival, edges: list[Edge]) -> Verdict:
+        known = arrival.T_world_references
+
+        def pose_of(frame_id: FrameId) -> gtsam.Pose3:
+            if frame_id not in known:
+                known[frame_id] = self._graph.pose3(self._members[frame_id].key)
+            return known[frame_id]
+
         return judge(
             edges,
-            pose_of=lambda frame_id: self._graph.pose3(self._members[frame_id].key),
+            pose_of=pose_of,
             relative_covariance=self._relative_covariance,
-            motion=lambda: self._coasting_edge(stamp_ns),
+            motion=lambda: self._coasting_edge(arrival.stamp_ns),
             gate=self._config.gate,
         )
 
@@ -703,26 +721,32 @@ class SlidingWindow:
 
     def _insert(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        coasting = [] if arrival.coasting is None else [arrival.coasting]
+        ties = [
+            _Tie(edge, self._factors, self._members[edge.reference_id].key)
+            for edge in arrival.edges
+        ]
+        for tie in ties:
+            factors.add(self._factors.between(tie.reference_key, arrival.key, tie.edge))
+        if arrival.coasting is not None:
+            last_key = self._members[arrival.coasting.reference_id].key
+            factors.add(self._factors.between(last_key, arrival.key, arrival.coasting))
         anchors = [] if arrival.anchor is None else [arrival.anchor]
-        for edge in [*arrival.edges, *coasting]:
-            reference_key = self._members[edge.reference_id].key
-            factors.add(self._factors.between(reference_key, arrival.key, edge))
         for prior in [*arrival.priors, *anchors]:
             factors.add(self._factors.prior(arrival.key, prior))
         values.insert(arrival.key, arrival.T_world_start)
         leaving = self._leaving()
         keys = [self._members[frame_id].key for frame_id in leaving]
         alive = [member.key for member in self._members.values()]
-        references = {self._members[edge.reference_id].key for edge in arrival.edges}
-        before = {key: self._graph.pose3(key) for key in references}
+        before = {
+            tie.reference_key: arrival.T_world_references[tie.edge.reference_id] for tie in ties
+        }
         before[arrival.key] = arrival.T_world_start
         with self._graph.restored_on_error():
             self._graph.update(factors, values, alive=alive, leaving=keys)
-            is_moved = self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
+            after, is_moved = self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
             covariances = self._graph.covariances([*keys, arrival.key])
-            pose = self._graph.pose(arrival.key), covariances.pop()
-            _check_result(*pose)
+            pose = np.asarray(after[arrival.key].matrix()), covariances.pop()
+            _check_result(pose[0])
             finished = list(map(self._estimate, leaving, covariances))
             if is_moved:
                 self._check_others()
@@ -730,11 +754,12 @@ class SlidingWindow:
         if self._log is not None:
             self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)
         self._finished += finished
-        self._forget(leaving)
+        for frame_id in leaving:
+            del self._members[frame_id]
         self._members[arrival.frame_id] = _Member(
             key=arrival.key,
             stamp_ns=arrival.stamp_ns,
-            edges=[(edge, self._factors) for edge in arrival.edges],
+            edges=ties,
             priors=[(prior, self._factors) for prior in arrival.priors],
         )
         return pose
@@ -778,7 +803,7 @@ class SlidingWindow:
             self._graph.update(factors, gtsam.Values())
             self._graph.settle(before)
             estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam, estimate.covariance)
+            _check_result(estimate.T_world_cam)
             self._check_others()
         return estimate
 
@@ -795,12 +820,15 @@ class SlidingWindow:
         old = list(self._members.items())[:n_old]
         return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
 
-    def _forget(self, leaving: Sequence[FrameId]) -> None:
-        for frame_id in leaving:
-            del self._members[frame_id]
-        gone = set(leaving)
-        for member in self._members.values():
-            member.edges = [tie for tie in member.edges if tie[0].reference_id not in gone]
+    def _standing(self, member: _Member) -> Iterator[_Tie]:
+        """Yield the edges of a pose whose references are still in the window.
+
+        A name may have been given again to another pose: the key tells.
+        """
+        for tie in member.edges:
+            reference = self._members.get(tie.edge.reference_id)
+            if reference is not None and reference.key == tie.reference_key:
+                yield tie
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))
@@ -843,7 +871,7 @@ class SlidingWindow:
         """Return a pose also where GTSAM cannot give it, or its covariance, any more."""
         try:
             estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam, estimate.covariance)
+            _check_result(estimate.T_world_cam)
         except (RuntimeError, SmoothingError) as error:
             member = self._members[frame_id]
             place = f"{frame_id!r} at {member.stamp_ns} ns"
@@ -883,6 +911,6 @@ def _absence(frame_id: FrameId) -> str:
     return f"{frame_id!r} is not in the window: it has left, or never was"
 
 
-def _check_result(T_world_frame: FloatArray, covariance: FloatArray) -> None:
-    if fault := pose_fault(T_world_frame, covariance):
+def _check_result(T_world_frame: FloatArray) -> None:
+    if fault := pose_fault(T_world_frame):
         raise SmoothingError(f"GTSAM: {fault}")
