@@ -254,7 +254,14 @@ class WindowSmoother:
     def add(self, arrival: Arrival) -> list[gvo.Estimate]:
         """Add a pose; return it, and the poses that left."""
         stamp_ns = arrival.frame * STEP_NS
-        edges = [replace(edge) for edge in arrival.edges]  # what it costs to make them, too
+        edges = [  # what it costs to make them, too
+            Edge(
+                reference_id=edge.reference_id,
+                T_reference_frame=edge.T_reference_frame,
+                covariance=edge.covariance,
+            )
+            for edge in arrival.edges
+        ]
         causal = self.window.add_pose(arrival.frame, stamp_ns, edges, arrival.prior)
         if arrival.is_kept:
             self.window.keep(arrival.frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -26,6 +27,23 @@ _KERNELS: dict[Kernel, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
     "geman_mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
     "dcs": gtsam.noiseModel.mEstimator.DCS.Create,
 }
+
+
+class Measurement(NamedTuple):
+    """An edge, and what GTSAM needs of it: made once, for the gate and the factor."""
+
+    edge: Edge
+    T_reference_frame: gtsam.Pose3
+    gaussian: gtsam.noiseModel.Gaussian
+
+    @classmethod
+    def of(cls, edge: Edge) -> Measurement:
+        """Return the measurement of a valid edge."""
+        return cls(
+            edge,
+            gtsam.Pose3(edge.T_reference_frame),
+            gtsam.noiseModel.Gaussian.Covariance(edge.covariance),
+        )
 
 
 class Factors:
@@ -55,15 +73,18 @@ class Factors:
             for kernel, create in _KERNELS.items()
         }
 
-    def between(self, reference_key: int, key: int, edge: Edge) -> gtsam.NonlinearFactor:
+    def between(
+        self, reference_key: int, key: int, measurement: Measurement
+    ) -> gtsam.NonlinearFactor:
         """Return the between-factor of an edge."""
-        noise = self._noise(edge.covariance, edge.kernel or self._default)
-        T = gtsam.Pose3(edge.T_reference_frame)
-        return gtsam.BetweenFactorPose3(reference_key, key, T, noise)
+        edge, T_reference_frame, gaussian = measurement
+        noise = self._robust(gaussian, edge.kernel or self._default)
+        return gtsam.BetweenFactorPose3(reference_key, key, T_reference_frame, noise)
 
     def prior(self, key: int, prior: Prior) -> gtsam.NonlinearFactor:
         """Return the factor of a prior."""
-        noise = self._noise(prior.covariance, prior.kernel)
+        gaussian = gtsam.noiseModel.Gaussian.Covariance(prior.covariance)
+        noise = self._robust(gaussian, prior.kernel)
         if isinstance(prior, PosePrior):
             return gtsam.PriorFactorPose3(key, gtsam.Pose3(prior.T_world_frame), noise)
         return gtsam.GPSFactor(key, prior.position_world, noise)
@@ -108,8 +129,7 @@ class Factors:
             weight=self._weight(residual, prior.kernel),
         )
 
-    def _noise(self, covariance: FloatArray, kernel: Kernel) -> gtsam.noiseModel.Base:
-        gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    def _robust(self, gaussian: gtsam.noiseModel.Gaussian, kernel: Kernel) -> gtsam.noiseModel.Base:
         estimator = self._estimators.get(kernel)
         return (
             gaussian if estimator is None else gtsam.noiseModel.Robust.Create(estimator, gaussian)

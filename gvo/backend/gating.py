@@ -14,13 +14,14 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from gvo.backend.factors import Measurement
 from gvo.geometry import se3
 from gvo.types import BoolArray, Edge, FloatArray, FrameId, IntArray
 
 # Sigmas of the difference of two edges, a 6-vector: all but a thousandth of good ones.
 _AGREEMENT = 5.0
-_IDENTITY = np.eye(6)
 _TRACE = 1e-9 * np.eye(6)
+_ZERO = np.zeros(6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +41,7 @@ class Verdict:
 
 
 def judge(
-    edges: Sequence[Edge],
+    measurements: Sequence[Measurement],
     *,
     pose_of: Callable[[FrameId], gtsam.Pose3],
     relative_covariance: Callable[[FrameId, FrameId], FloatArray],
@@ -56,8 +57,8 @@ def judge(
 
     Parameters
     ----------
-    edges : sequence of Edge
-        At least one, valid.
+    measurements : sequence of Measurement
+        At least one, of valid edges.
     pose_of : callable
         Returns the present pose of a reference, T_world_reference.
     relative_covariance : callable
@@ -69,22 +70,21 @@ def judge(
     gate : float or None
         In sigmas of the difference of two predictions; None refuses nothing.
     """
-    predictions = [_predict(edge, pose_of) for edge in edges]
-    if len(edges) == 1:
+    predictions = [_predict(measurement, pose_of) for measurement in measurements]
+    if len(measurements) == 1:
         return Verdict(T_world_start=predictions[0], reasons=[""])
-    covariances = np.array([edge.covariance for edge in edges])
-    # By LAPACK itself, in a third of the time of numpy.
-    informations = np.array([dposv(covariance, _IDENTITY)[1] for covariance in covariances])
+    informations = np.array([measurement.gaussian.information() for measurement in measurements])
     twists = _twists(predictions)
-    reasons = [""] * len(edges)
+    reasons = [""] * len(measurements)
     mean, spread = _mean(twists, informations)
     if spread <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
         return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
+    covariances = np.array([measurement.edge.covariance for measurement in measurements])
     distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
-        voters = [*edges, *filter(None, [motion()])]
+        voters = [*measurements, *map(Measurement.of, filter(None, [motion()]))]
         true_distances = _true_distances(voters, pose_of, relative_covariance)
-        reasons = _outvoted(edges, true_distances, gate=gate)
+        reasons = _outvoted(measurements, true_distances, gate=gate)
     if any(reasons):
         left = [index for index, reason in enumerate(reasons) if not reason]
         predictions, informations = [predictions[index] for index in left], informations[left]
@@ -117,23 +117,25 @@ def disagreement(
     return f"it disagrees by {sigmas:.3g} sigma with the window (window.gate: {gate:g})"
 
 
-def _predict(edge: Edge, pose_of: Callable[[FrameId], gtsam.Pose3]) -> gtsam.Pose3:
-    return pose_of(edge.reference_id).compose(gtsam.Pose3(edge.T_reference_frame))
+def _predict(measurement: Measurement, pose_of: Callable[[FrameId], gtsam.Pose3]) -> gtsam.Pose3:
+    return pose_of(measurement.edge.reference_id).compose(measurement.T_reference_frame)
 
 
-def _outvoted(edges: Sequence[Edge], distances: FloatArray, *, gate: float) -> list[str]:
+def _outvoted(
+    measurements: Sequence[Measurement], distances: FloatArray, *, gate: float
+) -> list[str]:
     """Return for each edge why the others outvote it; empty where they do not.
 
     Where two edges disagree, the motion so far, behind them, has the casting vote.
     """
-    n = len(edges)
+    n = len(measurements)
     # Capped: how far off an outlier is must not weigh more than that it is one.
     medoid = int(np.minimum(distances, gate).sum(axis=1)[:n].argmin())
     n_agreeing = np.count_nonzero(distances <= gate, axis=1)
     is_out = (distances[medoid, :n] > gate) & (n_agreeing[:n] < n_agreeing[medoid])
     return [
         f"it disagrees by {distances[medoid, index]:.3g} sigma with the edge from "
-        f"{edges[medoid].reference_id!r} (window.gate: {gate:g})"
+        f"{measurements[medoid].edge.reference_id!r} (window.gate: {gate:g})"
         if is_out[index]
         else ""
         for index in range(n)
@@ -141,12 +143,13 @@ def _outvoted(edges: Sequence[Edge], distances: FloatArray, *, gate: float) -> l
 
 
 def _true_distances(
-    edges: Sequence[Edge],
+    measurements: Sequence[Measurement],
     pose_of: Callable[[FrameId], gtsam.Pose3],
     relative_covariance: Callable[[FrameId, FrameId], FloatArray],
 ) -> FloatArray:
     """Return Mahalanobis distances, shape (n, n), that know how sure the references are."""
-    predictions = [_predict(edge, pose_of) for edge in edges]
+    predictions = [_predict(measurement, pose_of) for measurement in measurements]
+    edges = [measurement.edge for measurement in measurements]
     distances = np.zeros((len(edges), len(edges)))
     for i, j in zip(*_pairs(len(edges)), strict=True):
         Ad = se3.adjoint(se3.invert(edges[j].T_reference_frame))
@@ -184,7 +187,8 @@ def _pairs(n: int) -> tuple[IntArray, IntArray]:
 
 def _twists(predictions: Sequence[gtsam.Pose3]) -> FloatArray:
     """Return the predictions as twists about the first, shape (n, 6)."""
-    return np.array([predictions[0].localCoordinates(prediction) for prediction in predictions])
+    first, *others = predictions
+    return np.array([_ZERO, *(first.localCoordinates(prediction) for prediction in others)])
 
 
 def _distances(twists: FloatArray, covariances: FloatArray) -> FloatArray:

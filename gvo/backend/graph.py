@@ -111,7 +111,7 @@ class PoseGraph:
         ----------
         factors : gtsam.NonlinearFactorGraph
         values : gtsam.Values
-            Start values of new poses.
+            Start values of new poses, which the factors tie.
         alive : collection of int
             All keys that are in the graph; needed where some are leaving.
         leaving : sequence of int
@@ -122,16 +122,16 @@ class PoseGraph:
             self._isam.update(factors, values)
             return
         n_leaving = len(leaving)
-        # Last comes what the factors tie: its covariances are cheap then, and as a rule the next
-        # pose is tied to the same.
-        groups = dict.fromkeys(factors.keyVector(), n_leaving + 1)
+        groups = dict.fromkeys(alive, n_leaving)
+        # Last comes what the factors tie, the new poses among them: its covariances are cheap
+        # then, and as a rule the next pose is tied to the same.
+        groups |= dict.fromkeys(factors.keyVector(), n_leaving + 1)
         groups |= {key: group for group, key in enumerate(leaving)}
         constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key, group in groups.items():
+            constrained.insert2(key, group)
         for key in alive:
-            constrained.insert2(key, groups.get(key, n_leaving))
             reeliminate.push_back(key)
-        for key in values.keys():  # noqa: SIM118 - not a dict
-            constrained.insert2(key, n_leaving + 1)
         self._isam.update(factors, values, [], constrained, None, reeliminate, False)
 
     def settle(
@@ -165,8 +165,7 @@ class PoseGraph:
             return after, True
         limit = _FAR
         for _ in range(_MAX_STEPS):
-            moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
-            if max(max(map(abs, move)) for move in moves) < limit:
+            if _stand_still(before, after, limit):
                 return after, limit == _STILL
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -197,8 +196,9 @@ class PoseGraph:
         """Return the marginal covariances of poses; of several at once, they share their work."""
         if len(keys) == 1:
             return [self.covariance(keys[0])]
-        joint = self._isam.jointMarginalCovariance(keys).fullMatrix()
-        return [definite(joint[row : row + 6, row : row + 6]) for row in range(0, len(joint), 6)]
+        joint = _symmetric(self._isam.jointMarginalCovariance(keys).fullMatrix())
+        blocks = [joint[row : row + 6, row : row + 6] for row in range(0, len(joint), 6)]
+        return [block if is_definite(block) else _repaired(block) for block in blocks]
 
     def joint_covariance(self, first: int, second: int) -> FloatArray:
         """Return the joint covariance of two poses, shape (12, 12), in the order asked for."""
@@ -217,6 +217,18 @@ class PoseGraph:
         return self._isam.calculateEstimate()
 
 
+def _stand_still(
+    before: Mapping[int, gtsam.Pose3], after: Mapping[int, gtsam.Pose3], limit: float
+) -> bool:
+    """Tell whether no element of the twists between two places of poses reaches a limit."""
+    # Where no element of two transforms differs by more than 0.4 of it, no twist can: an angle is
+    # at most 3 / sqrt(2), a distance sqrt(3) times the largest difference. GTSAM tells so quickly.
+    if all(before[key].equals(after[key], 0.4 * limit) for key in before):
+        return True
+    moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
+    return bool(max(max(map(abs, move)) for move in moves) < limit)
+
+
 def first_line(error: BaseException) -> str:
     """Return what GTSAM says in a paragraph, in one line."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
@@ -228,11 +240,19 @@ def definite(covariance: FloatArray) -> FloatArray:
     Where sigmas lie many orders apart, rounding may leave the smallest eigenvalue of the
     correlations at or below zero.
     """
+    symmetric = _symmetric(covariance)
+    return symmetric if is_definite(symmetric) else _repaired(symmetric)
+
+
+def _symmetric(covariance: FloatArray) -> FloatArray:
     symmetric = 0.5 * (covariance + covariance.T)
-    if not math.isfinite(symmetric.sum()):
+    if not math.isfinite(np.add.reduce(symmetric, axis=None)):
         raise SmoothingError("GTSAM: a covariance is not finite")
-    if is_definite(symmetric):
-        return np.asarray(symmetric)
+    return np.asarray(symmetric)
+
+
+def _repaired(symmetric: FloatArray) -> FloatArray:
+    """Return a covariance that rounding made indefinite, definite again."""
     variances = np.diag(symmetric)
     if variances.min() <= 0.0:
         raise SmoothingError("GTSAM: a variance is not positive")

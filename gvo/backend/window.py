@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -20,7 +21,7 @@ from gvo.backend.checks import (
 )
 from gvo.backend.comparison import MeasurementLog
 from gvo.backend.export import g2o_lines
-from gvo.backend.factors import Factors
+from gvo.backend.factors import Factors, Measurement
 from gvo.backend.gating import Verdict, disagreement, judge
 from gvo.backend.graph import PoseGraph, definite, first_line
 from gvo.backend.ledger import Ledger, WindowCounts
@@ -84,7 +85,8 @@ class _Member:
 class _Arrival:
     """A pose on its way into the window, with what is usable of its measurements.
 
-    `T_world_references` are the poses of the references at that moment, by their names. `anchor`
+    `T_world_references` are the poses of the references at that moment, by their names;
+    `T_world_after` those of the pose and of them once it is in the graph, by their keys. `anchor`
     and `coasting` hold the pose where the measurements do not; they are none themselves.
     """
 
@@ -93,7 +95,8 @@ class _Arrival:
     stamp_ns: int
     T_world_start: gtsam.Pose3
     T_world_references: dict[FrameId, gtsam.Pose3] = field(default_factory=dict)
-    edges: list[Edge] = field(default_factory=list)
+    T_world_after: dict[int, gtsam.Pose3] = field(default_factory=dict)
+    measurements: list[Measurement] = field(default_factory=list)
     priors: list[Prior] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     anchor: PosePrior | None = None
@@ -103,7 +106,7 @@ class _Arrival:
     @property
     def is_measured(self) -> bool:
         """Tell whether a measurement ties the pose, or it is the origin."""
-        return bool(self.edges or self.priors or self.is_origin)
+        return bool(self.measurements or self.priors or self.is_origin)
 
 
 class SlidingWindow:
@@ -299,7 +302,9 @@ class SlidingWindow:
         member = self._members[frame_id]
         reference_key = self._members[edge.reference_id].key
         answer = self._extend(
-            frame_id, self._factors.between(reference_key, member.key, edge), edge=edge
+            frame_id,
+            self._factors.between(reference_key, member.key, Measurement.of(edge)),
+            edge=edge,
         )
         if isinstance(answer, Estimate):
             member.edges.append(_Tie(edge, self._factors, reference_key))
@@ -519,13 +524,14 @@ class SlidingWindow:
             arrival.priors.append(prior)
 
     def _receive_edges(self, arrival: _Arrival, edges: list[Edge]) -> None:
-        verdict = self._judge(arrival, edges)
+        measurements = [Measurement.of(edge) for edge in edges]
+        verdict = self._judge(arrival, measurements)
         arrival.T_world_start = verdict.T_world_start
-        for edge, reason in zip(edges, verdict.reasons, strict=True):
+        for measurement, reason in zip(measurements, verdict.reasons, strict=True):
             if reason:
-                self._refuse(arrival, edge, reason, is_gated=True)
+                self._refuse(arrival, measurement.edge, reason, is_gated=True)
             else:
-                arrival.edges.append(edge)
+                arrival.measurements.append(measurement)
 
     def _receive_without_edges(self, arrival: _Arrival) -> None:
         """Start at the prior, else at the origin, else where the last velocity leads."""
@@ -579,7 +585,7 @@ class SlidingWindow:
             is_gated=is_gated,
         )
 
-    def _judge(self, arrival: _Arrival, edges: list[Edge]) -> Verdict:
+    def _judge(self, arrival: _Arrival, measurements: list[Measurement]) -> Verdict:
         known = arrival.T_world_references
 
         def pose_of(frame_id: FrameId) -> gtsam.Pose3:
@@ -588,7 +594,7 @@ class SlidingWindow:
             return known[frame_id]
 
         return judge(
-            edges,
+            measurements,
             pose_of=pose_of,
             relative_covariance=self._relative_covariance,
             motion=lambda: self._coasting_edge(arrival.stamp_ns),
@@ -637,12 +643,13 @@ class SlidingWindow:
 
     def _note_motion(self, arrival: _Arrival, estimate: Estimate) -> None:
         """Remember how the camera moved, if the graph says so and not a prior alone."""
-        measured_id = self._motion.measured_id
-        is_known = bool(arrival.edges) and measured_id in self._members
+        measured = self._members.get(self._motion.measured_id) if arrival.measurements else None
+        T_world_measured = None
+        if measured is not None:
+            T = arrival.T_world_after.get(measured.key)
+            T_world_measured = self._graph.pose(measured.key) if T is None else T.matrix()
         self._motion.append(
-            estimate,
-            is_measured=arrival.is_measured,
-            T_world_measured=self.pose(measured_id) if is_known else None,
+            estimate, is_measured=arrival.is_measured, T_world_measured=T_world_measured
         )
 
     def _enter(self, arrival: _Arrival, status: Status | None) -> Estimate:
@@ -664,7 +671,7 @@ class SlidingWindow:
             self._finished.append(estimate)
         self._ledger.add(
             n_poses=1,
-            n_edges=len(arrival.edges),
+            n_edges=len(arrival.measurements),
             n_priors=len(arrival.priors),
             n_coasting=int(not arrival.is_measured),
         )
@@ -694,9 +701,10 @@ class SlidingWindow:
         self._graph = self._graph.hardened()
 
     def _drop_measurements(self, arrival: _Arrival) -> None:
-        for edge in [*arrival.edges, *(None for _ in arrival.priors)]:
+        edges = [measurement.edge for measurement in arrival.measurements]
+        for edge in [*edges, *(None for _ in arrival.priors)]:
             self._refuse(arrival, edge, "GTSAM gave up on the update")
-        arrival.edges, arrival.priors = [], []
+        arrival.measurements, arrival.priors = [], []
         arrival.anchor, arrival.is_origin = None, False
         self._receive_without_edges(arrival)
 
@@ -721,15 +729,17 @@ class SlidingWindow:
 
     def _insert(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        ties = [
-            _Tie(edge, self._factors, self._members[edge.reference_id].key)
-            for edge in arrival.edges
-        ]
-        for tie in ties:
-            factors.add(self._factors.between(tie.reference_key, arrival.key, tie.edge))
+        ties, before = [], {arrival.key: arrival.T_world_start}
+        for measurement in arrival.measurements:
+            reference_id = measurement.edge.reference_id
+            key = self._members[reference_id].key
+            factors.add(self._factors.between(key, arrival.key, measurement))
+            ties.append(_Tie(measurement.edge, self._factors, key))
+            before[key] = arrival.T_world_references[reference_id]
         if arrival.coasting is not None:
             last_key = self._members[arrival.coasting.reference_id].key
-            factors.add(self._factors.between(last_key, arrival.key, arrival.coasting))
+            coasting = Measurement.of(arrival.coasting)
+            factors.add(self._factors.between(last_key, arrival.key, coasting))
         anchors = [] if arrival.anchor is None else [arrival.anchor]
         for prior in [*arrival.priors, *anchors]:
             factors.add(self._factors.prior(arrival.key, prior))
@@ -737,17 +747,15 @@ class SlidingWindow:
         leaving = self._leaving()
         keys = [self._members[frame_id].key for frame_id in leaving]
         alive = [member.key for member in self._members.values()]
-        before = {
-            tie.reference_key: arrival.T_world_references[tie.edge.reference_id] for tie in ties
-        }
-        before[arrival.key] = arrival.T_world_start
         with self._graph.restored_on_error():
             self._graph.update(factors, values, alive=alive, leaving=keys)
             after, is_moved = self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
-            covariances = self._graph.covariances([*keys, arrival.key])
-            pose = np.asarray(after[arrival.key].matrix()), covariances.pop()
+            arrival.T_world_after = after
+            # The new pose first: GTSAM is faster so than the other way round.
+            covariance, *others = self._graph.covariances([arrival.key, *keys])
+            pose = np.asarray(after[arrival.key].matrix()), covariance
             _check_result(pose[0])
-            finished = list(map(self._estimate, leaving, covariances))
+            finished = list(map(self._estimate, leaving, others))
             if is_moved:
                 self._check_others()
             self._graph.marginalize(keys)
@@ -817,7 +825,7 @@ class SlidingWindow:
         if self._config.size is None:
             return []
         n_old = max(len(self._members) + 1 - self._config.size, 0)
-        old = list(self._members.items())[:n_old]
+        old = islice(self._members.items(), n_old)
         return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
 
     def _standing(self, member: _Member) -> Iterator[_Tie]:

@@ -1,5 +1,7 @@
 """Factors against the costs that the kernels' authors give."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from gvo.backend.factors import Factors
+from gvo.backend.factors import Factors, Measurement
 from gvo.config import Kernel, WindowConfig
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior
 
@@ -56,16 +58,11 @@ def test_the_cost_of_an_edge_is_that_of_its_kernel(seed: int, size: float, kerne
     values.insert(0, gtsam.Pose3())
     values.insert(1, gtsam.Pose3.Expmap(xi))
     for made in (
-        Factors(WindowConfig(kernel=kernel)).between(0, 1, edge),
+        Factors(WindowConfig(kernel=kernel)).between(0, 1, Measurement.of(edge)),
         Factors(WindowConfig(kernel="none")).between(
             0,
             1,
-            Edge(
-                reference_id=0,
-                T_reference_frame=np.eye(4),
-                covariance=covariance,
-                kernel=kernel,
-            ),
+            Measurement.of(replace(edge, kernel=kernel)),
         ),
     ):
         expected = expected_cost(kernel, size, CONSTANTS.get(kernel, 0.0))

@@ -138,7 +138,8 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
     answer = command("batch", *arguments, "--no-report")
     assert answer.code == 0, answer.err
     assert "walk0: complete, found" in answer.err
-    assert "long: complete\n" in answer.err
+    # A worker may have ended what it was at after its client was gone.
+    assert "long: complete" in answer.err
     assert state_of(tmp_path / "walk0") == before
     for bag in (long_bag, bags / "walk0.mcap"):
         assert_same_run(tmp_path / bag.stem, run_alone(bag))
