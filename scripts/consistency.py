@@ -8,22 +8,24 @@ raw     over 1 s of the raw chain
 window  between the newest pose and the one in the window that is nearest to 1 s old, 0.5 to 1.5 s,
         from their joint covariance (`odometry.window.relative_pose`)
 
-Each row also names the largest bias: the mean of an error over its sigma, and its axis.
+Each row also names the largest bias: the mean of an error over its sigma, and its axis. Several
+front-ends see the same frames, which are rendered once.
 
-Example: python scripts/consistency.py --seeds 10-19 --set frontend.kind=klt
+Example: python scripts/consistency.py --seeds 10-19 --frontends klt descriptor
 """
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 import gvo
 from gvo.geometry import se3
+from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.sources.recording import Source
-from gvo.types import FaultyFrame, FloatArray
+from gvo.types import FaultyFrame, FloatArray, Frame
 
 WORLDS = {
     "drive": ("driving", "stereo", 80),
@@ -43,15 +45,18 @@ def main() -> None:
     parser.add_argument("recordings", type=Path, nargs="*", help="instead of rendered ones")
     parser.add_argument("--seeds", type=seeds, default="0-9", help="first and last, or one")
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
+    parser.add_argument("--frontends", nargs="+", choices=("klt", "descriptor"), default=[])
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()
-    config = gvo.load_configuration(settings=arguments.set)
+    kinds = [f"frontend.kind={kind}" for kind in arguments.frontends]
+    settings = [[*arguments.set, kind] for kind in kinds] or [arguments.set]
+    configs = [gvo.load_configuration(settings=each) for each in settings]
     print(f"{'recording':<34} {'pairs':>6} {'rotation':>9} {'translation':>12}  bias")
     for path in arguments.recordings:
-        report(path.name, [gvo.open_recording(path, config=config)], config)
+        report(path.name, [gvo.open_recording(path, config=configs[0])], configs)
     if not arguments.recordings:
         for name in arguments.worlds:
-            report(name, (rendered(name, seed) for seed in arguments.seeds), config)
+            report(name, (rendered(name, seed) for seed in arguments.seeds), configs)
 
 
 def seeds(text: str) -> range:
@@ -69,26 +74,33 @@ def rendered(name: str, seed: int) -> Source:
     return gvo.SyntheticRecording(world, sensor, n_frames=n_frames, seed=seed)  # type: ignore[arg-type]
 
 
-def report(name: str, sources: Iterable[Source], config: gvo.Config) -> None:
+def report(name: str, sources: Iterable[Source], configs: Sequence[gvo.Config]) -> None:
     """Run odometry over recordings and print the NEES of all their pairs together."""
-    errors: dict[str, list[tuple[FloatArray, FloatArray]]] = {"raw": [], "window": []}
+    errors: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for source in sources:
         truth = source.ground_truth()
         if truth is None:
             raise gvo.GvoError(f"{source.info.name}: expected a ground truth, found none")
-        for kind, pairs in relative_poses(source, config).items():
-            errors[kind] += compare(pairs, truth)
+        frames = list(gvo.frames(source, configs[0]))  # those of all front-ends
+        for config in configs:
+            frontend = f"{config.frontend.kind} " if len(configs) > 1 else ""
+            for kind, pairs in relative_poses(source.info.camera, frames, config).items():
+                errors.setdefault(f"{frontend}{kind}", []).extend(compare(pairs, truth))
     for kind, pairs_of_kind in errors.items():
         if pairs_of_kind:
             print_row(f"{name} {kind}", *map(np.array, zip(*pairs_of_kind, strict=True)))
 
 
-def relative_poses(source: Source, config: gvo.Config) -> dict[str, list[Relative]]:
-    """Run odometry over a recording and return its relative poses over about 1 s."""
-    odometry = gvo.Odometry(source.info.camera, config)
+def relative_poses(
+    camera: StereoCamera | PinholeCamera,
+    frames: Iterable[Frame | FaultyFrame],
+    config: gvo.Config,
+) -> dict[str, list[Relative]]:
+    """Run odometry over frames and return its relative poses over about 1 s."""
+    odometry = gvo.Odometry(camera, config)
     raw: list[gvo.Estimate] = []
     in_window: list[Relative] = []
-    for frame in gvo.frames(source, config):
+    for frame in frames:
         if isinstance(frame, FaultyFrame):
             continue
         raw.append(odometry.track(frame).raw)
