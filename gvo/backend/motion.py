@@ -19,6 +19,10 @@ class Motion:
 
     def __init__(self, config: WindowConfig) -> None:
         self._config = config
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the poses so far."""
         self._measured: Estimate | None = None
         self._step: tuple[FloatArray, FloatArray, float] | None = None
         self.last: Estimate | None = None

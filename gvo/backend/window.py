@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
-import gtsam
 import numpy as np
 
-from gvo.backend.checks import (
-    find_faults,
-    place_fault,
-    pose_fault,
-    prior_fault,
-    sane_covariance,
-)
+from gvo.backend.arrival import ORIGIN, Arrival
+from gvo.backend.checks import find_faults, prior_fault
 from gvo.backend.comparison import MeasurementLog
 from gvo.backend.export import g2o_lines
-from gvo.backend.factors import Factors, Measurement
-from gvo.backend.gating import Verdict, disagreement, judge
-from gvo.backend.graph import PoseGraph, definite, first_line
+from gvo.backend.gating import disagreement
+from gvo.backend.graph import first_line
 from gvo.backend.ledger import Ledger, WindowCounts
+from gvo.backend.members import absence
 from gvo.backend.motion import Motion
-from gvo.backend.polish import Polish, polish
+from gvo.backend.polish import Polish
+from gvo.backend.reception import Reception
+from gvo.backend.window_graph import WindowGraph
 from gvo.coasting import StatusClock
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
@@ -48,65 +42,6 @@ from gvo.types import (
 Keeping = Literal["manual", "distance"]
 
 _LOGGER = logging.getLogger(__name__)
-
-# Of poses that a smaller window lets go: what they cost together grows with the cube.
-_MAX_LEAVING = 32
-# Of a first pose without a prior, which defines the world: radians and metres.
-_ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
-# Of a first pose of which the position alone is known: radians, and metres beside its prior.
-_UNKNOWN_SIGMAS = np.repeat([1.0, 1e4], 3)
-
-
-class _Tie(NamedTuple):
-    """An accepted edge, with the key of its reference and what made its factor: its kernel."""
-
-    edge: Edge
-    factors: Factors
-    reference_key: int
-
-
-@dataclass(slots=True, kw_only=True)
-class _Member:
-    """A pose of the window, with what was measured of it.
-
-    Ties to poses that have left since stay among the edges.
-    """
-
-    key: int
-    stamp_ns: int
-    edges: list[_Tie]
-    priors: list[tuple[Prior, Factors]]
-    is_kept: bool = False
-    status: Status = Status.OK
-    causal: Estimate | None = None
-
-
-@dataclass(slots=True, kw_only=True)
-class _Arrival:
-    """A pose on its way into the window, with what is usable of its measurements.
-
-    `T_world_references` are the poses of the references at that moment, by their names;
-    `T_world_after` those of the pose and of them once it is in the graph, by their keys. `anchor`
-    and `coasting` hold the pose where the measurements do not; they are none themselves.
-    """
-
-    frame_id: FrameId
-    key: int
-    stamp_ns: int
-    T_world_start: gtsam.Pose3
-    T_world_references: dict[FrameId, gtsam.Pose3] = field(default_factory=dict)
-    T_world_after: dict[int, gtsam.Pose3] = field(default_factory=dict)
-    measurements: list[Measurement] = field(default_factory=list)
-    priors: list[Prior] = field(default_factory=list)
-    rejected: list[Rejected] = field(default_factory=list)
-    anchor: PosePrior | None = None
-    coasting: Edge | None = None
-    is_origin: bool = False
-
-    @property
-    def is_measured(self) -> bool:
-        """Tell whether a measurement ties the pose, or it is the origin."""
-        return bool(self.measurements or self.priors or self.is_origin)
 
 
 class SlidingWindow:
@@ -155,17 +90,13 @@ class SlidingWindow:
             _check_config(config)
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
-        self._factors = Factors(self._config)
-        self._is_whole = self._config.size is None
-        self._graph = self._new_graph()
-        self._members: dict[FrameId, _Member] = {}
-        self._finished: list[Estimate] = []
-        self._n_keys = 0
+        self._graph = WindowGraph(self._config, log)
+        self._members = self._graph.members
         self._ledger = Ledger()
         self._clock = StatusClock(self._config.lost_after_s)
         self._motion = Motion(self._config)
+        self._reception = Reception(self._graph, self._motion, self._ledger)
         self._polish: Polish | None = None
-        self._log = log
 
     def __contains__(self, frame_id: object) -> bool:
         """Tell whether a frame is in the window."""
@@ -178,7 +109,7 @@ class SlidingWindow:
     @property
     def newest(self) -> FrameId:
         """The newest frame of the window; None while it is empty."""
-        return next(reversed(self._members), None)
+        return self._members.newest
 
     @property
     def counts(self) -> WindowCounts:
@@ -208,29 +139,10 @@ class SlidingWindow:
         _check_config(config)
         if config == self._config:
             return
-        former, self._config = self._config, config
-        if (config.kernel, config.kernel_threshold) != (former.kernel, former.kernel_threshold):
-            self._factors = Factors(config)
+        self._config = config
+        self._graph.reconfigure(config)
         self._clock.reconfigure(config.lost_after_s)
         self._motion.reconfigure(config)
-        if not self._members:
-            self._is_whole = config.size is None
-            self._graph = self._new_graph()
-        elif self._is_whole and config.size is not None:
-            self._prepare_to_leave()
-
-    def _prepare_to_leave(self) -> None:
-        """Go on with a graph that poses can leave."""
-        self._is_whole = False
-        graph = self._new_graph()
-        try:
-            with graph.restored_on_error():
-                graph.update(self._graph.factors(), self._graph.values())
-        except SmoothingError as error:
-            # It can still be made anew from the poses, where the next update fails.
-            _LOGGER.warning("the graph stays as it is: %s", first_line(error))
-        else:
-            self._graph = graph
 
     def add_pose(
         self,
@@ -272,7 +184,9 @@ class SlidingWindow:
         """
         edges = _as_edges(frame_id, edges)
         self._check_arrival(frame_id, stamp_ns, edges, prior)
-        arrival = self._receive(frame_id, int(stamp_ns), edges, prior)
+        arrival = self._reception.receive(
+            frame_id, int(stamp_ns), edges, prior, gate=self._config.gate
+        )
         estimate = self._enter(arrival, status)
         self._note_motion(arrival, estimate)
         if self._keeps_by_distance and frame_id in self._members:
@@ -293,22 +207,14 @@ class SlidingWindow:
         Estimate or Rejected
             The frame's pose with the edge; falsy where the edge was refused.
         """
-        self._find(frame_id)
+        self._members.find(frame_id)
         _as_edges(frame_id, [edge])
-        fault = self._membership_fault(frame_id, edge) or find_faults([edge])[0]
+        fault = self._tie_fault(frame_id, edge) or find_faults([edge])[0]
         gated = "" if fault else self._gate_loop(frame_id, edge)
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
-        member = self._members[frame_id]
-        reference_key = self._members[edge.reference_id].key
-        answer = self._extend(
-            frame_id,
-            self._factors.between(reference_key, member.key, Measurement.of(edge)),
-            edge=edge,
-        )
-        if isinstance(answer, Estimate):
-            member.edges.append(_Tie(edge, self._factors, reference_key))
-            self._ledger.add(n_edges=1)
+        answer = self._try(lambda: self._graph.add_edge(frame_id, edge), frame_id, edge=edge)
+        self._ledger.add(n_edges=int(isinstance(answer, Estimate)))
         return answer
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
@@ -325,40 +231,34 @@ class SlidingWindow:
             The frame's pose with the prior; falsy where the prior was refused.
         """
         _check_prior(frame_id, prior)
-        is_there = self._find(frame_id) is not None
-        fault = prior_fault(prior) if is_there else _absence(frame_id)
+        is_there = self._members.find(frame_id) is not None
+        fault = prior_fault(prior) if is_there else absence(frame_id)
         if fault:
             return self._reject(frame_id, fault)
-        member = self._members[frame_id]
-        answer = self._extend(frame_id, self._factors.prior(member.key, prior))
-        if isinstance(answer, Estimate):
-            member.priors.append((prior, self._factors))
-            self._ledger.add(n_priors=1)
+        answer = self._try(lambda: self._graph.add_prior(frame_id, prior), frame_id)
+        self._ledger.add(n_priors=int(isinstance(answer, Estimate)))
         return answer
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose of the window as a keyframe until it is released."""
-        self._member(frame_id).is_kept = True
+        self._members.member(frame_id).is_kept = True
 
     def release(self, frame_id: FrameId) -> None:
         """Let a kept pose leave, with the next update after it is no longer recent."""
-        self._member(frame_id).is_kept = False
+        self._members.member(frame_id).is_kept = False
 
     def kept(self) -> list[FrameId]:
         """Return the kept frames, oldest first."""
-        return [frame_id for frame_id, member in self._members.items() if member.is_kept]
+        return self._members.kept
 
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        member = self._member(frame_id)
-        T_world_frame = self._graph.pose(member.key)
-        if member.causal is not None and pose_fault(T_world_frame):
-            return member.causal.T_world_cam
-        return T_world_frame
+        self._members.member(frame_id)
+        return self._graph.pose(frame_id)
 
     def poses(self) -> dict[FrameId, FloatArray]:
         """Return T_world_frame of all poses of the window, oldest first."""
-        return {frame_id: self.pose(frame_id) for frame_id in self._members}
+        return {frame_id: self._graph.pose(frame_id) for frame_id in self._members}
 
     def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
         """Return the edges from earlier frames that were accepted for a frame.
@@ -366,16 +266,18 @@ class SlidingWindow:
         Empty where it is not in the window.
         """
         member = self._members.get(frame_id)
-        return () if member is None else tuple(tie.edge for tie in self._standing(member))
+        if member is None:
+            return ()
+        return tuple(tie.edge for tie in self._members.standing_ties(member))
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
-        return self._member(frame_id).stamp_ns
+        return self._members.member(frame_id).stamp_ns
 
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return what is known now of a pose of the window."""
-        self._member(frame_id)
-        return self._final_estimate(frame_id)
+        self._members.member(frame_id)
+        return self._graph.estimate(frame_id)
 
     def covariance(self, frame_id: FrameId) -> FloatArray:
         """Return the marginal covariance, shape (6, 6), of a pose of the window."""
@@ -398,7 +300,7 @@ class SlidingWindow:
         return Edge(
             reference_id=reference_id,
             T_reference_frame=se3.invert(self.pose(reference_id)) @ self.pose(frame_id),
-            covariance=self._relative_covariance(reference_id, frame_id),
+            covariance=self._graph.relative_covariance(reference_id, frame_id),
         )
 
     def graph(self) -> list[GraphEdge]:
@@ -406,20 +308,7 @@ class SlidingWindow:
 
         What poses that left knew is in the marginals and not listed.
         """
-        poses = self.poses()
-        found = []
-        for frame_id, member in self._members.items():
-            found += [
-                tie.factors.residual_of_edge(
-                    tie.edge, frame_id, poses[tie.edge.reference_id], poses[frame_id]
-                )
-                for tie in self._standing(member)
-            ]
-            found += [
-                factors.residual_of_prior(prior, frame_id, poses[frame_id])
-                for prior, factors in member.priors
-            ]
-        return found
+        return self._graph.measurements()
 
     def write_g2o(self, path: str | Path) -> None:
         """Write poses and edges of the window as a g2o file.
@@ -443,8 +332,7 @@ class SlidingWindow:
 
     def pop_finished(self) -> list[Estimate]:
         """Hand over the smoothed estimates of the poses that left since the last call."""
-        finished, self._finished = self._finished, []
-        return finished
+        return self._graph.pop_finished()
 
     def finish(self) -> list[Estimate]:
         """Hand over all estimates that were not popped yet, in the order of their stamps.
@@ -452,15 +340,8 @@ class SlidingWindow:
         Where the window kept everything they are polished first. It is empty afterwards, ready
         for another first pose.
         """
-        self._polish = None
-        if self._is_whole and self._members:
-            self._finished += self._polished()
-        else:
-            self._finished += [self._final_estimate(frame_id) for frame_id in self._members]
-        self._members = {}
-        self._is_whole = self._config.size is None
-        self._graph = self._new_graph()
-        self._motion = Motion(self._config)
+        self._polish = self._graph.finish()
+        self._motion.restart()
         self._clock = StatusClock(self._config.lost_after_s)
         return sorted(self.pop_finished(), key=lambda estimate: estimate.stamp_ns)
 
@@ -469,7 +350,7 @@ class SlidingWindow:
     def _check_arrival(
         self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
     ) -> None:
-        is_known = self._find(frame_id) is not None
+        is_known = self._members.find(frame_id) is not None
         if frame_id is None or is_known:
             raise ValueError(
                 f"{frame_id!r} is in the window already" if is_known else "no frame_id"
@@ -486,92 +367,20 @@ class SlidingWindow:
         if len(edges) > 0 and last is None:
             raise ValueError(f"{frame_id!r} is the first pose and can have no edges, only a prior")
 
-    def _membership_fault(self, frame_id: FrameId, edge: Edge, *, is_new: bool = False) -> str:
+    def _tie_fault(self, frame_id: FrameId, edge: Edge) -> str:
         if edge.reference_id == frame_id:
             return "an edge of a pose to itself"
-        for end in [edge.reference_id] if is_new else [edge.reference_id, frame_id]:
+        for end in (edge.reference_id, frame_id):
             if end not in self._members:
-                return _absence(end)
+                return absence(end)
         return ""
 
-    def _receive(
-        self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
-    ) -> _Arrival:
-        """Sort out what is usable, and find where to start."""
-        arrival = _Arrival(
-            frame_id=frame_id, key=self._n_keys, stamp_ns=stamp_ns, T_world_start=gtsam.Pose3()
-        )
-        self._n_keys += 1
-        if prior is not None:
-            self._receive_prior(arrival, prior)
-        valid = []
-        for edge, fault in zip(edges, find_faults(edges), strict=True):
-            reason = self._membership_fault(frame_id, edge, is_new=True) or fault
-            if reason:
-                self._refuse(arrival, edge, reason)
-            else:
-                valid.append(edge)
-        if valid:
-            self._receive_edges(arrival, valid)
-        else:
-            self._receive_without_edges(arrival)
-        return arrival
-
-    def _receive_prior(self, arrival: _Arrival, prior: Prior) -> None:
-        if fault := prior_fault(prior):
-            self._refuse(arrival, None, fault)
-        else:
-            arrival.priors.append(prior)
-
-    def _receive_edges(self, arrival: _Arrival, edges: list[Edge]) -> None:
-        measurements = [Measurement.of(edge) for edge in edges]
-        verdict = self._judge(arrival, measurements)
-        arrival.T_world_start = verdict.T_world_start
-        for measurement, reason in zip(measurements, verdict.reasons, strict=True):
-            if reason:
-                self._refuse(arrival, measurement.edge, reason, is_gated=True)
-            else:
-                arrival.measurements.append(measurement)
-
-    def _receive_without_edges(self, arrival: _Arrival) -> None:
-        """Start at the prior, else at the origin, else where the last velocity leads."""
-        prior = arrival.priors[0] if arrival.priors else None
-        if isinstance(prior, PosePrior):
-            arrival.T_world_start = gtsam.Pose3(prior.T_world_frame)
-        elif self._motion.last is not None:
-            self._coast(arrival)
-        elif isinstance(prior, PositionPrior):
-            arrival.T_world_start = gtsam.Pose3(gtsam.Rot3(), prior.position_world)
-            arrival.anchor = PosePrior(
-                T_world_frame=arrival.T_world_start.matrix(), covariance=np.diag(_UNKNOWN_SIGMAS**2)
-            )
-        else:
-            arrival.anchor, arrival.is_origin = _ORIGIN, True
-
-    def _coast(self, arrival: _Arrival) -> None:
-        """Tie the pose to the last one by the velocity so far."""
-        arrival.coasting = self._coasting_edge(arrival.stamp_ns)
-        if arrival.coasting is not None:
-            T_last_frame = gtsam.Pose3(arrival.coasting.T_reference_frame)
-            last_key = self._members[arrival.coasting.reference_id].key
-            arrival.T_world_start = self._graph.pose3(last_key).compose(T_last_frame)
-        elif (prediction := self._motion.predict_pose(arrival.stamp_ns)) is not None:
-            arrival.T_world_start = gtsam.Pose3(prediction[0])
-            arrival.anchor = PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
-
-    def _refuse(
-        self, arrival: _Arrival, edge: Edge | None, reason: str, *, is_gated: bool = False
-    ) -> None:
-        """Refuse an edge of a new pose, or its prior."""
-        arrival.rejected.append(
-            self._ledger.reject(
-                arrival.frame_id,
-                arrival.stamp_ns,
-                reason,
-                reference_id=None if edge is None else edge.reference_id,
-                is_gated=is_gated,
-            )
-        )
+    def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
+        """Return why an edge between known poses is refused; empty where it fits them."""
+        if self._config.gate is None:
+            return ""
+        known = self.relative_pose(edge.reference_id, frame_id)
+        return disagreement(edge, known.T_reference_frame, known.covariance, gate=self._config.gate)
 
     def _reject(
         self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False
@@ -585,82 +394,17 @@ class SlidingWindow:
             is_gated=is_gated,
         )
 
-    def _judge(self, arrival: _Arrival, measurements: list[Measurement]) -> Verdict:
-        known = arrival.T_world_references
-
-        def pose_of(frame_id: FrameId) -> gtsam.Pose3:
-            if frame_id not in known:
-                known[frame_id] = self._graph.pose3(self._members[frame_id].key)
-            return known[frame_id]
-
-        return judge(
-            measurements,
-            pose_of=pose_of,
-            relative_covariance=self._relative_covariance,
-            motion=lambda: self._coasting_edge(arrival.stamp_ns),
-            gate=self._config.gate,
-        )
-
-    def _coasting_edge(self, stamp_ns: int) -> Edge | None:
-        """Return the edge from the last pose, where it is in the window, by the velocity so far."""
-        last = self._motion.last
-        if last is None or last.frame_id not in self._members:
-            return None
-        T_last_frame, covariance = self._motion.predict_step(stamp_ns)
-        return Edge(
-            reference_id=last.frame_id,
-            T_reference_frame=T_last_frame,
-            covariance=covariance,
-            kernel="none",
-        )
-
-    def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
-        """Return why an edge between known poses is refused; empty where it fits them."""
-        if self._config.gate is None:
-            return ""
-        known = self.relative_pose(edge.reference_id, frame_id)
-        return disagreement(edge, known.T_reference_frame, known.covariance, gate=self._config.gate)
-
-    def _relative_covariance(self, reference_id: FrameId, frame_id: FrameId) -> FloatArray:
-        """Return the covariance (6, 6) of T_reference_frame, zero of a pose to itself."""
-        if reference_id == frame_id:
-            return np.zeros((6, 6))
-        T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
-        # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
-        J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
-        try:
-            keys = self._members[reference_id].key, self._members[frame_id].key
-            joint = self._graph.joint_covariance(*keys)
-            return definite(J @ joint @ J.T)
-        except (RuntimeError, SmoothingError):
-            # What they share is lost in rounding: as if they shared nothing, which is no less.
-            apart = np.zeros((12, 12))
-            apart[:6, :6] = self._final_estimate(reference_id).covariance
-            apart[6:, 6:] = self._final_estimate(frame_id).covariance
-            return sane_covariance(J @ apart @ J.T)
-
     # What goes into the graph
 
-    def _note_motion(self, arrival: _Arrival, estimate: Estimate) -> None:
-        """Remember how the camera moved, if the graph says so and not a prior alone."""
-        measured = self._members.get(self._motion.measured_id) if arrival.measurements else None
-        T_world_measured = None
-        if measured is not None:
-            T = arrival.T_world_after.get(measured.key)
-            T_world_measured = self._graph.pose(measured.key) if T is None else T.matrix()
-        self._motion.append(
-            estimate, is_measured=arrival.is_measured, T_world_measured=T_world_measured
-        )
-
-    def _enter(self, arrival: _Arrival, status: Status | None) -> Estimate:
+    def _enter(self, arrival: Arrival, status: Status | None) -> Estimate:
         """Put the pose into the graph; where GTSAM gives up, with ever less beside it."""
-        pose = self._insert_safely(arrival)
+        T_world_frame, covariance = self._insert(arrival)
         found = self._clock.next(arrival.stamp_ns, is_tied=arrival.is_measured)
         estimate = Estimate(
             frame_id=arrival.frame_id,
             stamp_ns=arrival.stamp_ns,
-            T_world_cam=pose[0],
-            covariance=pose[1],
+            T_world_cam=T_world_frame,
+            covariance=covariance,
             status=status if status and arrival.is_measured else found,
             rejected=tuple(arrival.rejected),
         )
@@ -668,7 +412,7 @@ class SlidingWindow:
             member = self._members[arrival.frame_id]
             member.status, member.causal = estimate.status, estimate
         else:
-            self._finished.append(estimate)
+            self._graph.finish_one(estimate)
         self._ledger.add(
             n_poses=1,
             n_edges=len(arrival.measurements),
@@ -677,166 +421,65 @@ class SlidingWindow:
         )
         return estimate
 
-    def _insert_safely(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
+    def _insert(self, arrival: Arrival) -> tuple[FloatArray, FloatArray]:
         """Return the pose of the new frame and its covariance, whatever GTSAM does."""
-        harden = [self._harden] if self._graph.can_be_hardened else []
-        for simplify in (None, *harden, self._drop_measurements, self._rebuild_for):
+        harden = [lambda _: self._graph.harden()] if self._graph.can_be_hardened else []
+        for simplify in (None, *harden, self._drop_measurements, self._rebuild):
             try:
                 if simplify is not None:
                     simplify(arrival)
-                return self._insert(arrival)
+                return self._graph.insert(arrival)
             except SmoothingError as error:
                 self._ledger.add(n_restored=1)
                 place = f"{arrival.frame_id!r} at {arrival.stamp_ns} ns"
                 _LOGGER.warning("%s: %s; the window stands as before", place, error)
         # Not even alone: the pose is handed over as it is reckoned, and never in the window.
         prediction = self._motion.predict_pose(arrival.stamp_ns)
-        return prediction or (_ORIGIN.T_world_frame, _ORIGIN.covariance)
+        return prediction or (ORIGIN.T_world_frame, ORIGIN.covariance)
 
-    def _new_graph(self) -> PoseGraph:
-        return PoseGraph(is_whole=self._is_whole)
+    def _drop_measurements(self, arrival: Arrival) -> None:
+        self._reception.drop_measurements(arrival, "GTSAM gave up on the update")
 
-    def _harden(self, _: _Arrival) -> None:
-        """Go on with a graph that takes worse conditioned measurements."""
-        self._graph = self._graph.hardened()
-
-    def _drop_measurements(self, arrival: _Arrival) -> None:
-        edges = [measurement.edge for measurement in arrival.measurements]
-        for edge in [*edges, *(None for _ in arrival.priors)]:
-            self._refuse(arrival, edge, "GTSAM gave up on the update")
-        arrival.measurements, arrival.priors = [], []
-        arrival.anchor, arrival.is_origin = None, False
-        self._receive_without_edges(arrival)
-
-    def _rebuild_for(self, arrival: _Arrival) -> None:
-        """Make the graph anew from its poses and what is known of each; nobody leaves."""
-        graph = PoseGraph(is_whole=self._is_whole, is_hardened=True)
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for frame_id, member in self._members.items():
-            estimate = self._final_estimate(frame_id)
-            prior = PosePrior(
-                T_world_frame=se3.normalize(estimate.T_world_cam),
-                covariance=sane_covariance(estimate.covariance),
-            )
-            factors.add(self._factors.prior(member.key, prior))
-            values.insert(member.key, gtsam.Pose3(estimate.T_world_cam))
-        with graph.restored_on_error():
-            graph.update(factors, values)
-        self._graph = graph
+    def _rebuild(self, _: Arrival) -> None:
+        self._graph.rebuild()
         self._ledger.add(n_rebuilt=1)
-        for member in self._members.values():
-            member.edges, member.priors = [], []
 
-    def _insert(self, arrival: _Arrival) -> tuple[FloatArray, FloatArray]:
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        ties, before = [], {arrival.key: arrival.T_world_start}
-        for measurement in arrival.measurements:
-            reference_id = measurement.edge.reference_id
-            key = self._members[reference_id].key
-            factors.add(self._factors.between(key, arrival.key, measurement))
-            ties.append(_Tie(measurement.edge, self._factors, key))
-            before[key] = arrival.T_world_references[reference_id]
-        if arrival.coasting is not None:
-            last_key = self._members[arrival.coasting.reference_id].key
-            coasting = Measurement.of(arrival.coasting)
-            factors.add(self._factors.between(last_key, arrival.key, coasting))
-        anchors = [] if arrival.anchor is None else [arrival.anchor]
-        for prior in [*arrival.priors, *anchors]:
-            factors.add(self._factors.prior(arrival.key, prior))
-        values.insert(arrival.key, arrival.T_world_start)
-        leaving = self._leaving()
-        keys = [self._members[frame_id].key for frame_id in leaving]
-        alive = [member.key for member in self._members.values()]
-        with self._graph.restored_on_error():
-            self._graph.update(factors, values, alive=alive, leaving=keys)
-            after, is_moved = self._graph.settle(before, alive=[*alive, arrival.key], leaving=keys)
-            arrival.T_world_after = after
-            # The new pose first: GTSAM is faster so than the other way round.
-            covariance, *others = self._graph.covariances([arrival.key, *keys])
-            pose = np.asarray(after[arrival.key].matrix()), covariance
-            _check_result(pose[0])
-            finished = list(map(self._estimate, leaving, others))
-            if is_moved:
-                self._check_others()
-            self._graph.marginalize(keys)
-        if self._log is not None:
-            self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)
-        self._finished += finished
-        for frame_id in leaving:
-            del self._members[frame_id]
-        self._members[arrival.frame_id] = _Member(
-            key=arrival.key,
-            stamp_ns=arrival.stamp_ns,
-            edges=ties,
-            priors=[(prior, self._factors) for prior in arrival.priors],
-        )
-        return pose
-
-    def _extend(
-        self, frame_id: FrameId, factor: gtsam.NonlinearFactor, *, edge: Edge | None = None
+    def _try(
+        self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
     ) -> Estimate | Rejected:
-        """Add a factor between poses that are there."""
-        factors = gtsam.NonlinearFactorGraph()
-        factors.add(factor)
+        """Return a pose with another measurement, or why GTSAM gave it up."""
         while True:
             try:
-                estimate = self._updated(frame_id, factors)
+                return extend()
             except SmoothingError as error:
                 self._ledger.add(n_restored=1)
                 _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
-                if not self._hardened():
+                if not self._harden():
                     reason = f"GTSAM gave up on the update: {error}"
                     return self._reject(frame_id, reason, edge=edge)
-            else:
-                if self._log is not None:
-                    self._log.add(factors, gtsam.Values(), keys={})
-                return estimate
 
-    def _hardened(self) -> bool:
+    def _harden(self) -> bool:
         """Go on with a graph that takes worse conditioned factors; False where there is none."""
         if not self._graph.can_be_hardened:
             return False
         try:
-            self._graph = self._graph.hardened()
+            self._graph.harden()
         except SmoothingError as error:
             _LOGGER.warning("the graph stays as it is: %s", first_line(error))
             return False
         return True
 
-    def _updated(self, frame_id: FrameId, factors: gtsam.NonlinearFactorGraph) -> Estimate:
-        """Return a pose after factors between known poses were added."""
-        key = self._members[frame_id].key
-        with self._graph.restored_on_error():
-            before = {key: self._graph.pose3(key)}
-            self._graph.update(factors, gtsam.Values())
-            self._graph.settle(before)
-            estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam)
-            self._check_others()
-        return estimate
-
-    def _check_others(self) -> None:
-        """Raise where an update sent a pose to infinity; a whole graph is too large to look at."""
-        if not self._is_whole and (fault := place_fault(self._graph.positions())):
-            raise SmoothingError(f"GTSAM: {fault}")
-
-    def _leaving(self) -> list[FrameId]:
-        """Return who leaves with the next pose: neither recent then, nor kept."""
-        if self._config.size is None:
-            return []
-        n_old = max(len(self._members) + 1 - self._config.size, 0)
-        old = islice(self._members.items(), n_old)
-        return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
-
-    def _standing(self, member: _Member) -> Iterator[_Tie]:
-        """Yield the edges of a pose whose references are still in the window.
-
-        A name may have been given again to another pose: the key tells.
-        """
-        for tie in member.edges:
-            reference = self._members.get(tie.edge.reference_id)
-            if reference is not None and reference.key == tie.reference_key:
-                yield tie
+    def _note_motion(self, arrival: Arrival, estimate: Estimate) -> None:
+        """Remember how the camera moved, if the graph says so and not a prior alone."""
+        measured_id = self._motion.measured_id
+        measured = self._members.get(measured_id) if arrival.measurements else None
+        T_world_measured = None
+        if measured is not None:
+            T = arrival.T_world_after.get(measured.key)
+            T_world_measured = self._graph.pose(measured_id) if T is None else T.matrix()
+        self._motion.append(
+            estimate, is_measured=arrival.is_measured, T_world_measured=T_world_measured
+        )
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
         T_frame_world = se3.invert(self.pose(frame_id))
@@ -849,54 +492,6 @@ class SlidingWindow:
         n_kept = len(scores) + int(self._members[frame_id].is_kept)
         for kept_id in choose_released(scores, self._config, n_kept=n_kept):
             self.release(kept_id)
-
-    # What comes out
-
-    def _member(self, frame_id: FrameId) -> _Member:
-        member = self._find(frame_id)
-        if member is None:
-            raise ValueError(_absence(frame_id))
-        return member
-
-    def _find(self, frame_id: FrameId) -> _Member | None:
-        """Return a pose of the window, if it is there; misuse is told."""
-        try:
-            return self._members.get(frame_id)
-        except TypeError:
-            raise ValueError(f"a frame_id must be hashable, got {frame_id!r}") from None
-
-    def _estimate(self, frame_id: FrameId, covariance: FloatArray | None = None) -> Estimate:
-        member = self._members[frame_id]
-        return Estimate(
-            stamp_ns=member.stamp_ns,
-            T_world_cam=self._graph.pose(member.key),
-            covariance=self._graph.covariance(member.key) if covariance is None else covariance,
-            status=member.status,
-            frame_id=frame_id,
-        )
-
-    def _final_estimate(self, frame_id: FrameId) -> Estimate:
-        """Return a pose also where GTSAM cannot give it, or its covariance, any more."""
-        try:
-            estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam)
-        except (RuntimeError, SmoothingError) as error:
-            member = self._members[frame_id]
-            place = f"{frame_id!r} at {member.stamp_ns} ns"
-            _LOGGER.warning("%s: %s; its causal pose stands", place, first_line(error))
-            if member.causal is None:
-                raise
-            return replace(member.causal, status=member.status, rejected=())
-        return estimate
-
-    def _polished(self) -> list[Estimate]:
-        """Return all poses at the least error of the whole graph."""
-        try:
-            optimized, self._polish = polish(self._graph.factors(), self._graph.values())
-            self._graph = self._graph.moved(optimized)
-        except (RuntimeError, SmoothingError) as error:
-            _LOGGER.warning("the poses stand as iSAM2 left them: %s", first_line(error))
-        return [self._final_estimate(frame_id) for frame_id in self._members]
 
 
 def _as_edges(frame_id: FrameId, edges: Sequence[Edge]) -> tuple[Edge, ...]:
@@ -913,12 +508,3 @@ def _check_config(config: WindowConfig) -> None:
 def _check_prior(frame_id: FrameId, prior: Prior) -> None:
     if not isinstance(prior, PosePrior | PositionPrior):
         raise ValueError(f"the prior of {frame_id!r} must be a PosePrior or a PositionPrior")
-
-
-def _absence(frame_id: FrameId) -> str:
-    return f"{frame_id!r} is not in the window: it has left, or never was"
-
-
-def _check_result(T_world_frame: FloatArray) -> None:
-    if fault := pose_fault(T_world_frame):
-        raise SmoothingError(f"GTSAM: {fault}")
