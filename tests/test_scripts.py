@@ -122,7 +122,7 @@ def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
 
 
 def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
-    measured = run("benchmark", "--window", 500)
+    measured = run("benchmark", "--window", 1000)
     assert measured.returncode == 0, measured.stderr
     rows = [line.split() for line in measured.stdout.splitlines()[1:]]
     assert [row[0] for row in rows] == ["nearest", "random", "farthest"]
