@@ -127,10 +127,10 @@ def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
         `stamp tx ty tz qx qy qz qw` with qw >= 0; nanometres, and twelve decimals of the
         quaternion.
     """
-    quaternion = Rotation.from_matrix(T_world_cam[:3, :3]).as_quat(canonical=True)
+    quaternion = se3.quaternions(T_world_cam[:3, :3]).tolist()
     # adding zero turns -0.0 into 0.0
-    t = " ".join(f"{round(float(value), 9) + 0.0:.9f}" for value in T_world_cam[:3, 3])
-    q = " ".join(f"{round(float(value), 12) + 0.0:.12f}" for value in quaternion)
+    t = " ".join(f"{round(value, 9) + 0.0:.9f}" for value in T_world_cam[:3, 3].tolist())
+    q = " ".join(f"{round(value, 12) + 0.0:.12f}" for value in quaternion)
     return f"{format_stamp(stamp_ns)} {t} {q}"
 
 

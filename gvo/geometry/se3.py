@@ -12,7 +12,6 @@ doi:10.48550/arXiv.1812.01537.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo.types import FloatArray
 
@@ -88,7 +87,7 @@ def log(T: FloatArray) -> FloatArray:
         Twists (rx, ry, rz, tx, ty, tz), rotation angle in [0, pi].
     """
     flat = T.reshape(-1, 4, 4)
-    omega = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
+    omega = _rotation_vectors(quaternions(flat[:, :3, :3]))
     angle = np.linalg.norm(omega, axis=-1)[:, np.newaxis, np.newaxis]
     is_small = angle < 1e-4
     safe = np.where(is_small, 1.0, angle)
@@ -98,6 +97,38 @@ def log(T: FloatArray) -> FloatArray:
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
     rho = (V_inverse @ flat[:, :3, 3, np.newaxis])[..., 0]
     return np.concatenate([omega, rho], axis=-1).reshape(*T.shape[:-2], 6)
+
+
+def quaternions(R: FloatArray) -> FloatArray:
+    """Return the unit quaternions (x, y, z, w), shape (..., 4), of rotations (..., 3, 3); w >= 0.
+
+    Without the checks of `scipy.spatial.transform.Rotation`, which take ten times as long.
+
+    References
+    ----------
+    I. Y. Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix", Journal
+    of Guidance, Control, and Dynamics 23(6), 2000, doi:10.2514/2.4654 (the matrix 4 q q^T).
+    """
+    Q = np.empty((*R.shape[:-2], 4, 4))
+    Q[..., :3, :3] = R + np.swapaxes(R, -1, -2)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    trace = diagonal.sum(axis=-1)
+    Q[..., [0, 1, 2], [0, 1, 2]] = 1.0 - trace[..., np.newaxis] + 2.0 * diagonal
+    Q[..., 3, 3] = 1.0 + trace
+    Q[..., 3, :3] = Q[..., :3, 3] = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
+    # Each row is the quaternion times one of its elements: the longest has the most digits.
+    longest = np.argmax(np.diagonal(Q, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(Q, longest[..., np.newaxis, np.newaxis], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+
+
+def _rotation_vectors(q: FloatArray) -> FloatArray:
+    """Return the rotation vectors, shape (..., 3), of quaternions (..., 4) with w >= 0."""
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    is_turned = sine > 0.0
+    angle_over_sine = 2.0 * np.arctan2(sine, q[..., 3:]) / np.where(is_turned, sine, 1.0)
+    return np.asarray(q[..., :3] * np.where(is_turned, angle_over_sine, 2.0))
 
 
 def adjoint(T: FloatArray) -> FloatArray:

@@ -64,6 +64,22 @@ def test_exp_undoes_log_at_half_a_turn(seed: int) -> None:
 
 
 @settings(deadline=None)
+@given(angle=st.one_of(angles, st.just(np.pi)), seed=seeds)
+def test_quaternions_are_those_of_scipy(angle: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotations = Rotation.from_rotvec([angle * random_direction(rng) for _ in range(6)])
+    R = rotations.as_matrix().reshape(2, 3, 3, 3)
+    q = se3.quaternions(R)
+    assert q.shape == (2, 3, 4)
+    assert np.all(q[..., 3] >= 0.0)
+    theirs = rotations.as_quat(canonical=True).reshape(2, 3, 4)
+    cosines = np.abs(np.sum(q * theirs, axis=-1))  # at half a turn the sign is anyone's
+    np.testing.assert_allclose(cosines, 1.0, atol=1e-14)
+    if angle < 3.0:
+        np.testing.assert_allclose(q, theirs, rtol=0, atol=1e-15)
+
+
+@settings(deadline=None)
 @given(angle=st.floats(min_value=0.0, max_value=3.0), seed=seeds)
 def test_order_and_side_of_twists_are_those_of_gtsam(angle: float, seed: int) -> None:
     xi = twist(angle, seed)
