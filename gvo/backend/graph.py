@@ -198,6 +198,8 @@ class PoseGraph:
             return [self.covariance(keys[0])]
         joint = _symmetric(self._isam.jointMarginalCovariance(keys).fullMatrix())
         blocks = [joint[row : row + 6, row : row + 6] for row in range(0, len(joint), 6)]
+        if is_definite(joint):
+            return blocks
         return [block if is_definite(block) else _repaired(block) for block in blocks]
 
     def joint_covariance(self, first: int, second: int) -> FloatArray:
