@@ -9,8 +9,9 @@ M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree"
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any, TypeAlias
 
 import gtsam
 import numpy as np
@@ -24,6 +25,13 @@ from gvo.types import FloatArray
 _FAR = 0.02
 _STILL = 1e-4
 _MAX_STEPS = 10
+# What was done to a graph since it was copied, and may have to be done again: the function, its
+# arguments, and a pose whose estimate was asked for afterwards.
+_Step: TypeAlias = tuple[Callable[..., object], tuple[Any, ...], int | None]
+_UPDATE, _MARGINALIZE = gtsam.ISAM2.update, gtsam.ISAM2.marginalizeLeaves
+# A graph is copied again after so many steps, a large one after its share of poses: a copy then
+# costs an update the same at any size.
+_N_REDONE = 32
 _MIN_EIGENVALUE = 1e-10
 _MAX_ROUNDING = 1e-6
 
@@ -59,6 +67,10 @@ class PoseGraph:
             # which costs what smoothing gains where edges are good to a tenth of a millimetre.
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         self._isam = gtsam.ISAM2(parameters)
+        self._n_poses = 0
+        self._saved: gtsam.ISAM2 | None = None
+        self._done: list[_Step] = []
+        self._is_guarded = False
 
     @property
     def can_be_hardened(self) -> bool:
@@ -83,19 +95,43 @@ class PoseGraph:
     def restored_on_error(self) -> Iterator[None]:
         """Put the graph back as it was when an update fails or is interrupted.
 
+        It is not copied before each update: that takes as long as the graph is large. From the
+        last copy on, what was done is done again.
+
         Raises
         ------
         SmoothingError
             In place of what GTSAM throws.
         """
-        before = gtsam.ISAM2(self._isam)
+        if self._saved is None or len(self._done) >= max(_N_REDONE, self._n_poses // _N_REDONE):
+            self._saved, self._done = gtsam.ISAM2(self._isam), []
+        before = self._saved, len(self._done), self._n_poses
+        self._is_guarded = True
         try:
             yield
         except BaseException as error:
-            self._isam = before
+            self._restore(*before)
             if isinstance(error, RuntimeError | IndexError):
                 raise SmoothingError(f"GTSAM: {first_line(error)}") from error
             raise
+        finally:
+            self._is_guarded = False
+
+    def _restore(self, saved: gtsam.ISAM2, n_done: int, n_poses: int) -> None:
+        del self._done[n_done:]
+        isam = gtsam.ISAM2(saved)
+        for function, arguments, key in self._done:
+            function(isam, *arguments)
+            if key is not None:
+                isam.calculateEstimatePose3(key)
+        self._isam, self._n_poses = isam, n_poses
+
+    def _note(self, step: _Step) -> None:
+        """Remember what was done to the graph, or that nobody will want it back."""
+        if self._is_guarded:
+            self._done.append(step)
+        else:
+            self._saved = None
 
     def update(
         self,
@@ -118,9 +154,17 @@ class PoseGraph:
             Keys to eliminate first, each in a group of its own: only so do they become leaves
             of the Bayes tree, which can be marginalized.
         """
-        if not leaving:
-            self._isam.update(factors, values)
-            return
+        constraints = self._constraints(factors, alive, leaving) if leaving else ()
+        self._isam.update(factors, values, *constraints)
+        self._n_poses += values.size()
+        # A whole graph carries small changes on where estimates are asked for.
+        key = next(iter(factors.keyVector()), None) if self._is_whole else None
+        self._note((_UPDATE, (factors, values, *constraints), key))
+
+    def _constraints(
+        self, factors: gtsam.NonlinearFactorGraph, alive: Collection[int], leaving: Sequence[int]
+    ) -> tuple[Any, ...]:
+        """Return what an update is told so that leaving poses become leaves of the Bayes tree."""
         n_leaving = len(leaving)
         groups = dict.fromkeys(alive, n_leaving)
         # Last comes what the factors tie, the new poses among them: its covariances are cheap
@@ -132,7 +176,7 @@ class PoseGraph:
             constrained.insert2(key, group)
         for key in alive:
             reeliminate.push_back(key)
-        self._isam.update(factors, values, [], constrained, None, reeliminate, False)
+        return [], constrained, None, reeliminate, False
 
     def settle(
         self,
@@ -179,6 +223,8 @@ class PoseGraph:
             leaf = gtsam.KeyList()
             leaf.push_back(key)
             self._isam.marginalizeLeaves(leaf)
+            self._n_poses -= 1
+            self._note((_MARGINALIZE, (leaf,), None))
 
     def pose3(self, key: int) -> gtsam.Pose3:
         """Return T_world_frame as GTSAM holds it."""

@@ -221,6 +221,50 @@ def test_whatever_interrupts_an_update_leaves_the_graph_as_it_was(
         assert str(caught.value) == "GTSAM: one thing"
 
 
+def go_on(graph: PoseGraph, key: int, *, is_whole: bool) -> None:
+    """Add a pose that wobbles, with a loop now and then; of a windowed graph the fourth leaves."""
+    wobble = gtsam.Pose3.Expmap(0.02 * np.sin(key * np.arange(1.0, 7.0)))
+    start = {key: graph.pose3(key - 1).compose(STEP).compose(wobble)}
+    factors = factors_of(between(key - 1, key, STEP.compose(wobble), 0.1))
+    if key % 7 == 0:
+        factors.add(between(key - 3, key, power(3), 0.02))
+    before = {key - 1: graph.pose3(key - 1), **start}
+    alive, leaving = (list(range(key - 4, key)), [key - 4]) if not is_whole else ([], [])
+    with graph.restored_on_error():
+        graph.update(factors, values_of(start), alive=alive, leaving=leaving)
+        graph.settle(before, alive=[*alive, key], leaving=leaving)
+        graph.marginalize(leaving)
+
+
+def fail_to_add(graph: PoseGraph, factor: Any) -> None:
+    with graph.restored_on_error():
+        graph.update(factors_of(factor), gtsam.Values())
+        raise RuntimeError("no")
+
+
+@pytest.mark.parametrize("is_whole", [False, True])
+def test_a_graph_is_seldom_copied_and_restored_all_the_same(
+    is_whole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copies, original = [], gtsam.ISAM2
+
+    def counted_copy(argument: Any) -> gtsam.ISAM2:
+        copies.append(isinstance(argument, original))
+        return original(argument)
+
+    graph, twin = chain(4, is_whole=is_whole), chain(4, is_whole=is_whole)
+    for key in range(4, 120):
+        go_on(graph, key, is_whole=is_whole)
+        with pytest.raises(SmoothingError):
+            fail_to_add(graph, between(key - 2, key, power(5), 1e-3))
+        with monkeypatch.context() as patch:
+            patch.setattr(gtsam, "ISAM2", counted_copy)
+            go_on(twin, key, is_whole=is_whole)
+        np.testing.assert_allclose(graph.positions(), twin.positions(), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(graph.covariance(key), twin.covariance(key), rtol=1e-9)
+    assert 2 <= sum(copies) <= 10
+
+
 def test_the_polish_goes_on_until_the_error_stands_still() -> None:
     original, told = gtsam.LevenbergMarquardtOptimizer, []
 
