@@ -53,9 +53,10 @@ N_THIRD = 2 * N_LAP - 2
 # Frames after the last third: what reads ahead is at work at the end of each.
 N_BEYOND = 8
 # What is held at the end of the third third and was not at that of the second: the counts of
-# durations and Python's own caches, of the size of some frames' numbers but of no frame's image.
+# durations, Python's own caches and the last few steps of the graph, of the size of some frames'
+# numbers but of no frame's image.
 MAX_GROWTH_BYTES = 30_000
-MAX_GROWTH_OBJECTS = 20
+MAX_GROWTH_OBJECTS = 60
 
 
 @pytest.fixture(scope="module")

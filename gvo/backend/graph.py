@@ -29,9 +29,10 @@ _MAX_STEPS = 10
 # arguments, and a pose whose estimate was asked for afterwards.
 _Step: TypeAlias = tuple[Callable[..., object], tuple[Any, ...], int | None]
 _UPDATE, _MARGINALIZE = gtsam.ISAM2.update, gtsam.ISAM2.marginalizeLeaves
-# A graph is copied again after so many steps, a large one after its share of poses: a copy then
+# A graph is copied again after so many steps, a large one after one for so many poses: a copy then
 # costs an update the same at any size.
-_N_REDONE = 32
+_N_REDONE = 8
+_POSES_PER_STEP = 32
 _MIN_EIGENVALUE = 1e-10
 _MAX_ROUNDING = 1e-6
 
@@ -103,7 +104,8 @@ class PoseGraph:
         SmoothingError
             In place of what GTSAM throws.
         """
-        if self._saved is None or len(self._done) >= max(_N_REDONE, self._n_poses // _N_REDONE):
+        n_redone = max(_N_REDONE, self._n_poses // _POSES_PER_STEP)
+        if self._saved is None or len(self._done) >= n_redone:
             self._saved, self._done = gtsam.ISAM2(self._isam), []
         before = self._saved, len(self._done), self._n_poses
         self._is_guarded = True
