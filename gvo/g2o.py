@@ -219,5 +219,5 @@ def convert_line(text: str) -> str:
 
 
 def _pose_fields(T: FloatArray) -> str:
-    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    quaternion = se3.quaternions(T[:3, :3])
     return " ".join(repr(float(value) + 0.0) for value in (*T[:3, 3], *quaternion))

@@ -18,10 +18,12 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 import gvo
+from gvo.config import FrontendConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.sources.recording import Source
@@ -32,6 +34,7 @@ WORLDS = {
     "room": ("handheld", "rgbd", 120),
     "stereo_room": ("handheld", "stereo", 120),
 }
+KINDS = get_args(FrontendConfig.model_fields["kind"].annotation)
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 SPAN_NS = 1_000_000_000
 
@@ -45,7 +48,7 @@ def main() -> None:
     parser.add_argument("recordings", type=Path, nargs="*", help="instead of rendered ones")
     parser.add_argument("--seeds", type=seeds, default="0-9", help="first and last, or one")
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
-    parser.add_argument("--frontends", nargs="+", choices=("klt", "descriptor"), default=[])
+    parser.add_argument("--frontends", nargs="+", choices=KINDS, default=[])
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     arguments = parser.parse_args()
     kinds = [f"frontend.kind={kind}" for kind in arguments.frontends]

@@ -56,7 +56,7 @@ N_BEYOND = 8
 # durations, Python's own caches and the last few steps of the graph, of the size of some frames'
 # numbers but of no frame's image.
 MAX_GROWTH_BYTES = 30_000
-MAX_GROWTH_OBJECTS = 60
+MAX_GROWTH_OBJECTS = 20
 
 
 @pytest.fixture(scope="module")

@@ -42,10 +42,7 @@ def find_faults(edges: Sequence[Edge]) -> list[str]:
 
 def place_fault(positions_world: FloatArray) -> str:
     """Return why positions, shape (..., 3), cannot be right; empty where they may be."""
-    largest = float(np.abs(positions_world).max())
-    if largest <= 2.0 * _MAX_COORDINATE_M:
-        return ""
-    return _divergence(largest)
+    return _divergence(float(np.abs(positions_world).max()))
 
 
 def pose_fault(T_world_frame: FloatArray) -> str:
@@ -53,12 +50,12 @@ def pose_fault(T_world_frame: FloatArray) -> str:
     rows = T_world_frame.tolist()
     if not math.isfinite(sum(map(sum, rows))):
         return "a pose is not finite"
-    largest = max(abs(row[3]) for row in rows)
-    return "" if largest <= 2.0 * _MAX_COORDINATE_M else _divergence(largest)
+    return _divergence(max(abs(row[3]) for row in rows))
 
 
 def _divergence(largest: float) -> str:
-    return f"a pose diverged to {largest:.3g} m"
+    is_far = not largest <= 2.0 * _MAX_COORDINATE_M  # nor is what is not a number near
+    return f"a pose diverged to {largest:.3g} m" if is_far else ""
 
 
 def sane_covariance(covariance: FloatArray) -> FloatArray:

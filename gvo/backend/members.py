@@ -85,6 +85,13 @@ class Members(dict[FrameId, Member]):
         old = islice(self.items(), max(len(self) + 1 - size, 0))
         return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
 
+    def tie_fault(self, frame_id: FrameId, edge: Edge, *, is_new: bool = False) -> str:
+        """Return which end of an edge is not there; empty where both are, or a new pose is one."""
+        if edge.reference_id == frame_id:
+            return "an edge of a pose to itself"
+        ends = [edge.reference_id] if is_new else [edge.reference_id, frame_id]
+        return next((absence(end) for end in ends if end not in self), "")
+
     def standing_ties(self, member: Member) -> Iterator[Tie]:
         """Yield the edges of a pose whose references are still in the window.
 

@@ -12,7 +12,6 @@ from gvo.backend.checks import find_faults, prior_fault
 from gvo.backend.factors import Measurement
 from gvo.backend.gating import Verdict, judge
 from gvo.backend.ledger import Ledger
-from gvo.backend.members import absence
 from gvo.backend.motion import Motion
 from gvo.backend.window_graph import WindowGraph
 from gvo.types import Edge, FrameId, PosePrior, PositionPrior, Prior
@@ -64,9 +63,9 @@ class Reception:
         self._n_keys += 1
         if prior is not None:
             self._receive_prior(arrival, prior)
-        valid = []
+        valid, members = [], self._graph.members
         for edge, fault in zip(edges, find_faults(edges), strict=True):
-            reason = self._reference_fault(frame_id, edge) or fault
+            reason = members.tie_fault(frame_id, edge, is_new=True) or fault
             if reason:
                 self.refuse(arrival, edge, reason)
             else:
@@ -99,11 +98,6 @@ class Reception:
                 is_gated=is_gated,
             )
         )
-
-    def _reference_fault(self, frame_id: FrameId, edge: Edge) -> str:
-        if edge.reference_id == frame_id:
-            return "an edge of a pose to itself"
-        return "" if edge.reference_id in self._graph.members else absence(edge.reference_id)
 
     def _receive_prior(self, arrival: Arrival, prior: Prior) -> None:
         if fault := prior_fault(prior):

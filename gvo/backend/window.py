@@ -209,7 +209,7 @@ class SlidingWindow:
         """
         self._members.find(frame_id)
         _as_edges(frame_id, [edge])
-        fault = self._tie_fault(frame_id, edge) or find_faults([edge])[0]
+        fault = self._members.tie_fault(frame_id, edge) or find_faults([edge])[0]
         gated = "" if fault else self._gate_loop(frame_id, edge)
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
@@ -366,14 +366,6 @@ class SlidingWindow:
             _check_prior(frame_id, prior)
         if len(edges) > 0 and last is None:
             raise ValueError(f"{frame_id!r} is the first pose and can have no edges, only a prior")
-
-    def _tie_fault(self, frame_id: FrameId, edge: Edge) -> str:
-        if edge.reference_id == frame_id:
-            return "an edge of a pose to itself"
-        for end in (edge.reference_id, frame_id):
-            if end not in self._members:
-                return absence(end)
-        return ""
 
     def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
         """Return why an edge between known poses is refused; empty where it fits them."""

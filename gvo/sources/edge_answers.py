@@ -10,8 +10,8 @@ import select
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from gvo.geometry import se3
 from gvo.sources.edge_lines import MAX_LINE, LineFormat
 from gvo.trajectory_files import COVARIANCE_HEADER
 from gvo.types import Estimate, Rejected
@@ -44,7 +44,7 @@ def format_estimate(
         What was refused beside what the estimate lists.
     """
     T = estimate.T_world_cam
-    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    quaternion = se3.quaternions(T[:3, :3])
     pose = [float(value) for value in (*T[:3, 3], *quaternion)]
     covariance = [float(value) for value in estimate.covariance[_UPPER]]
     reasons = [str(refusal) for refusal in (*estimate.rejected, *rejected)]
