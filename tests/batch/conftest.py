@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -23,8 +24,8 @@ from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory import Trajectory
 
 N_FRAMES = 8
-# Long enough to be stopped in the middle.
-N_LONG = 120
+# Long enough to be stopped in the middle, also where the machine is busy.
+N_LONG = 400
 NO_REPORT = BatchOptions(report=False)
 TABLES = (
     *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
@@ -174,6 +175,26 @@ class Cluster:
     def kill_worker(self, name: str) -> None:
         self.workers[name].send_signal(signal.SIGKILL)
         self.workers.pop(name).wait()
+
+    def worker_at(self, number: int) -> str:
+        """Return the name of the worker that has a recording of a batch, by its number there."""
+        with Client(self.address) as client:
+            (address,) = [
+                address
+                for address, keys in client.processing().items()
+                if any(key[1] == number for key in keys if isinstance(key, tuple))
+            ]
+            return str(client.scheduler_info(n_workers=-1)["workers"][address]["name"])
+
+    @contextmanager
+    def frozen(self, name: str) -> Iterator[None]:
+        """Let a worker do nothing for a while."""
+        worker = self.workers[name]
+        worker.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            worker.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         for process in reversed(self._processes):

