@@ -14,9 +14,11 @@ from gvo.sources.synthetic import SyntheticRecording
 from tests.browser import browser as browser
 from tests.rendered_walk import Walk
 
-# How long an example takes says something of the machine, nothing of the code.
-settings.register_profile("gvo", deadline=None)
-settings.load_profile("gvo")
+# How long an example takes says something of the machine, nothing of the code. The examples are the
+# same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=explore draws others.
+settings.register_profile("gvo", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gvo"))
 
 
 class Answer(NamedTuple):

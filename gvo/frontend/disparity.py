@@ -6,7 +6,6 @@ No keypoints of the right image are needed, so that any pixel can be measured, a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.stereo import parabola_minimum
-from gvo.types import BoolArray, FloatArray, ImageArray
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Grey values squared, over a patch: the gradients of a flat one are no less than noise.
 _MIN_ENERGY = 50.0
@@ -33,8 +32,9 @@ _MAX_UNLIKE = 0.2
 _UNLIKE_NOISE = 18.0
 # A rival disparity counts where the patch differs from it by hardly more than from the one found.
 _MAX_RIVALRY = 2.0
-# Fewer say nothing of the rows.
+# Fewer say nothing of the rows, more hardly anything new.
 _MIN_ROW_SHIFTS = 50
+_MAX_ROW_SHIFTS = 120
 
 
 def measure_disparities(
@@ -74,19 +74,19 @@ def measure_disparities(
     is_valid : ndarray of bool, shape (n,)
         False where a patch leaves the image or the best step is the last one searched.
     """
-    radius = config.patch_radius_px
+    radius, room = config.patch_radius_px, reach_px + 1
 
     def search(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
-        patches = _sample(images[0], u, v, radius + 1, radius)
-        v_right = v + row_offset_px
-        strips = _sample(images[1], u - start, v_right, radius + reach_px, radius)
-        offsets, is_minimum = parabola_minimum(_squared_differences(patches[:, :, 1:-1], strips))
-        found = start - (offsets - reach_px)
-        if config.subpixel == "none":
-            return np.rint(found), is_minimum
-        left = _Patches.of(patches, u, v_right)
-        found, _ = left.descend(images[1], found, n_steps=_N_STEPS, max_step=_MAX_FINE_STEP_PX)
-        return found, is_minimum
+        wide = _sample(images[0], u, v, radius + 1, radius)
+        columns = np.floor(u - start)
+        strips = _sample(images[1], columns, v + row_offset_px, radius + room, radius)
+        places, is_minimum = parabola_minimum(_squared_differences(wide[:, :, 1:-1], strips))
+        if config.subpixel != "none":
+            places, _ = _Patches.of(wide).descend(
+                strips, places, n_steps=_N_STEPS, max_step=_MAX_FINE_STEP_PX
+            )
+        found = u - (columns + places - room)
+        return np.rint(found) if config.subpixel == "none" else found, is_minimum
 
     return _measure_with_room(images[0].shape, pixels, predicted, radius, search)
 
@@ -116,30 +116,69 @@ def follow_disparities(
             reach_px=config.search_radius_px,
             row_offset_px=row_offset_px,
         )
-    radius = config.patch_radius_px
+    radius, room = config.patch_radius_px, config.search_radius_px + 1
 
     def follow(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
-        left = _Patches.of(_sample(images[0], u, v, radius + 1, radius), u, v + row_offset_px)
-        found, step = left.descend(images[1], start, n_steps=n_steps, max_step=_MAX_STEP_PX)
+        left = _Patches.of(_sample(images[0], u, v, radius + 1, radius))
+        columns = np.floor(u - start)
+        strips = _sample(images[1], columns, v + row_offset_px, radius + room, radius)
+        places, step = left.descend(
+            strips, u - start - columns + room, n_steps=n_steps, max_step=_MAX_STEP_PX
+        )
+        found = u - (columns + places - room)
         is_at_rest = np.abs(step) < _MAX_LAST_STEP_PX
         return found, is_at_rest & (np.abs(found - start) < config.search_radius_px)
 
     return _measure_with_room(images[0].shape, pixels, predicted, radius, follow)
 
 
-def are_alike(
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Likeness:
+    """How much the patches of left and right are alike at pixels and their disparities.
+
+    Parameters
+    ----------
+    unlike : ndarray of float64, shape (n,)
+        Variance of the difference, grey values squared; infinite where there is no disparity.
+    limits : ndarray of float64, shape (n,)
+        What it may be at a point that both cameras see.
+    """
+
+    unlike: FloatArray
+    limits: FloatArray
+
+    @property
+    def are_alike(self) -> BoolArray:
+        """Tell whether left and right show the same.
+
+        Where the depth breaks within a patch, its parts differ by more than one disparity aligns:
+        the disparity is that of neither surface. The error stays with the corner from frame to
+        frame, so that no residual shows it, and motions add it up.
+        """
+        return np.asarray(self.unlike <= self.limits)
+
+    def select(self, chosen: IntArray) -> Likeness:
+        """Return that of some pixels."""
+        return Likeness(unlike=self.unlike[chosen], limits=self.limits[chosen])
+
+    def rivals(self, found: Likeness) -> BoolArray:
+        """Tell where these disparities show the same as well as those that were found.
+
+        Windows of a house are all alike, and where the rows show one beside the other, nothing
+        tells which one the other camera saw: the depth is any of several, and mostly wrong.
+        """
+        return self.are_alike & (self.unlike <= _MAX_RIVALRY * found.unlike + _UNLIKE_NOISE)
+
+
+def compare_patches(
     images: tuple[ImageArray, ImageArray],
     pixels: FloatArray,
     disparities: FloatArray,
     config: StereoConfig,
     *,
     row_offset_px: float = 0.0,
-) -> BoolArray:
-    """Tell whether left and right show the same at pixels and their disparities.
-
-    Where the depth breaks within a patch, its parts differ by more than one disparity aligns: the
-    disparity is that of neither surface. The error stays with the corner from frame to frame, so
-    that no residual shows it, and motions add it up.
+) -> Likeness:
+    """Compare left and right at pixels and their disparities.
 
     Parameters
     ----------
@@ -148,7 +187,7 @@ def are_alike(
     pixels : ndarray of float64, shape (n, 2)
         In the left image.
     disparities : ndarray of float64, shape (n,)
-        Measured ones; False where they are not a number.
+        Measured ones, or not a number.
     config : StereoConfig
         Size of the patches.
     row_offset_px : float
@@ -156,67 +195,25 @@ def are_alike(
 
     Returns
     -------
-    ndarray of bool, shape (n,)
+    Likeness
     """
-    unlike, limits = _unlikeness(images, pixels, disparities, config, row_offset_px)
-    return np.asarray(unlike <= limits)
-
-
-def are_rivalled(
-    images: tuple[ImageArray, ImageArray],
-    pixels: FloatArray,
-    disparities: tuple[FloatArray, FloatArray],
-    config: StereoConfig,
-    *,
-    row_offset_px: float = 0.0,
-) -> BoolArray:
-    """Tell at which pixels another disparity shows the same as well as the one found.
-
-    Windows of a house are all alike, and where the rows show one beside the other, nothing tells
-    which one the other camera saw: the depth is any of several, and mostly wrong.
-
-    Parameters
-    ----------
-    images : tuple of two ndarrays of uint8, shape (height, width)
-        Rectified left and right.
-    pixels : ndarray of float64, shape (n, 2)
-        In the left image.
-    disparities : tuple of two ndarrays of float64, shape (n,)
-        What was found, and its rival; not a number where there is none.
-    config : StereoConfig
-        Size of the patches.
-    row_offset_px : float
-        By how much rows of the right image are larger.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-    """
-    (found, _), (rival, limits) = (
-        _unlikeness(images, pixels, each, config, row_offset_px) for each in disparities
-    )
-    return np.asarray((rival <= limits) & (rival <= _MAX_RIVALRY * found + _UNLIKE_NOISE))
-
-
-def _unlikeness(
-    images: tuple[ImageArray, ImageArray],
-    pixels: FloatArray,
-    disparities: FloatArray,
-    config: StereoConfig,
-    row_offset_px: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the variances of the differences of patches, and what alike ones may have."""
     radius = config.patch_radius_px
-    unlike, limits = np.full((2, len(pixels)), np.inf)
-    limits[:] = 0.0
+    unlike, limits = np.full(len(pixels), np.inf), np.zeros(len(pixels))
     chosen = np.flatnonzero(np.isfinite(disparities))
     if len(chosen) > 0:
         u, v = pixels[chosen].T
         left = _sample(images[0], u, v, radius, radius)
         right = _sample(images[1], u - disparities[chosen], v + row_offset_px, radius, radius)
-        limits[chosen] = _MAX_UNLIKE * left.var(axis=(1, 2)) + _UNLIKE_NOISE
-        unlike[chosen] = (right - left).var(axis=(1, 2))
-    return unlike, limits
+        limits[chosen] = _MAX_UNLIKE * _variances(left) + _UNLIKE_NOISE
+        unlike[chosen] = _variances(right - left)
+    return Likeness(unlike=unlike, limits=limits)
+
+
+def _variances(patches: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the variances, shape (n,), of patches; in a third of the time of `ndarray.var`."""
+    flat = patches.reshape(len(patches), -1)
+    centred = flat - (np.add.reduce(flat, axis=1) / flat.shape[1])[:, np.newaxis]
+    return np.asarray(np.einsum("ni,ni->n", centred, centred) / flat.shape[1])
 
 
 def measure_row_shift(
@@ -248,12 +245,14 @@ def measure_row_shift(
     """
     if len(pixels) < _MIN_ROW_SHIFTS:
         return None
+    every = -(-len(pixels) // _MAX_ROW_SHIFTS)
+    pixels, disparities = pixels[::every], disparities[::every]
     radius = config.patch_radius_px
     u, v = pixels.T
     # Transposed, a step along the rows becomes one across them.
     left = np.swapaxes(_sample(images[0], u, v, radius, radius + 1), 1, 2)
     right = _sample(images[1], u - disparities, v + row_offset_px, radius, radius)
-    steps = -_Patches.of(left, u, v).steps(np.swapaxes(right, 1, 2))
+    steps = -_Patches.of(left).curve(np.swapaxes(right, 1, 2))[:, 0]
     steps = steps[np.abs(steps) < _MAX_STEP_PX]
     return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
 
@@ -271,42 +270,78 @@ class _Patches:
     doi:10.1023/B:VISI.0000011205.11775.fd.
     """
 
-    u: FloatArray
-    v_right: FloatArray
     weights: NDArray[np.float32]
     at_rest: NDArray[np.float32]
 
     @classmethod
-    def of(cls, wide: NDArray[np.float32], u: FloatArray, v_right: FloatArray) -> _Patches:
-        """Make them of patches (n, s, s + 2) that are one column wider on either side.
+    def of(cls, wide: NDArray[np.float32]) -> _Patches:
+        """Make them of patches (n, s, s + 2) that are one column wider on either side."""
+        gradients = 0.5 * (wide[:, :, 2:] - wide[:, :, :-2])
+        gradients -= gradients.mean(axis=(1, 2), keepdims=True)
+        energies = np.einsum("nij,nij->n", gradients, gradients)
+        gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))[:, np.newaxis, np.newaxis]
+        at_rest = np.einsum("nij,nij->n", gradients, wide[:, :, 1:-1])
+        return cls(weights=gradients, at_rest=at_rest)
 
-        Their middles are at columns u of the left and on rows v_right of the right image.
+    def curve(self, strips: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return by how much disparities should grow at places in strips of the right image.
+
+        Parameters
+        ----------
+        strips : ndarray of float32, shape (n, s, m)
+
+        Returns
+        -------
+        ndarray of float32, shape (n, m - s + 1)
+            Between the places, where patches are interpolated, it is linear.
         """
-        n = len(wide)
-        gradients = (0.5 * (wide[:, :, 2:] - wide[:, :, :-2])).reshape(n, -1)
-        gradients -= gradients.mean(axis=1, keepdims=True)
-        energies = np.einsum("ni,ni->n", gradients, gradients)
-        gradients /= np.maximum(energies, np.float32(_MIN_ENERGY))[:, np.newaxis]
-        inner = wide[:, :, 1:-1].reshape(n, -1)
-        at_rest = np.einsum("ni,ni->n", gradients, inner)
-        return cls(u=u, v_right=v_right, weights=gradients, at_rest=at_rest)
-
-    def steps(self, right: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the growth of disparity that makes patches of the right image (n, s, s) alike."""
-        flat = right.reshape(len(right), -1)
-        return np.asarray(np.einsum("ni,ni->n", self.weights, flat) - self.at_rest)
+        products = correlate_rows(self.weights, strips)
+        products -= self.at_rest[:, np.newaxis]
+        return products
 
     def descend(
-        self, right: ImageArray, disparities: FloatArray, *, n_steps: int, max_step: float
+        self, strips: NDArray[np.float32], places: FloatArray, *, n_steps: int, max_step: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the disparities after some steps, and the last step."""
-        radius = math.isqrt(self.weights.shape[1]) // 2
-        step = np.zeros(len(disparities))
+        """Return the places in strips (n, s, m) where patches are after some steps, and the last.
+
+        A step is a growth of the disparity; places end with the strips.
+        """
+        curve = self.curve(strips)
+        n, n_places = curve.shape
+        firsts, flat = n_places * np.arange(n), curve.ravel()
+        step = np.zeros(n)
+        places = np.minimum(np.maximum(places, 0.0), n_places - 1.0)
         for _ in range(n_steps):
-            patches = _sample(right, self.u - disparities, self.v_right, radius, radius)
-            step = np.clip(self.steps(patches), -max_step, max_step)
-            disparities = disparities + step
-        return disparities, step
+            whole = np.minimum(places.astype(np.int64), n_places - 2)
+            before, after = flat[firsts + whole], flat[firsts + whole + 1]
+            step = before + (places - whole) * (after - before)
+            step = np.minimum(np.maximum(step, -max_step), max_step)
+            places = np.minimum(np.maximum(places - step, 0.0), n_places - 1.0)
+        return places, step
+
+
+def correlate_rows(
+    patches: NDArray[np.float32], strips: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the sums of products of patches with all places along wider strips.
+
+    Parameters
+    ----------
+    patches : ndarray of float32, shape (n, s, s)
+    strips : ndarray of float32, shape (n, s, m)
+
+    Returns
+    -------
+    ndarray of float32, shape (n, m - s + 1)
+    """
+    size, n_places = patches.shape[2], strips.shape[2] - patches.shape[2] + 1
+    # Every column of a patch with every column of its strip, of which the diagonals are summed:
+    # a sixth of the time of a loop over the pixels.
+    products: NDArray[np.float32] = np.matmul(np.swapaxes(patches, 1, 2), strips)
+    sums = products[:, 0, :n_places].copy()
+    for column in range(1, size):
+        sums += products[:, column, column : column + n_places]
+    return sums
 
 
 def _measure_with_room(

@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gvo.frontend.corners import halve
+from gvo.frontend.disparity import correlate_rows
 from gvo.frontend.stereo import parabola_minimum
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -100,12 +101,8 @@ def _correlate(
     patches = patches - patches.mean(axis=(1, 2), keepdims=True)
     energy = np.maximum(np.sum(patches**2, axis=(1, 2)), _MIN_ENERGY)
     padded = np.pad(right, ((radius, radius), (radius + n_steps, radius)), mode="edge")
-    strips = np.ascontiguousarray(sliding_window_view(padded, (size, size + n_steps))[pixels])
-    products = np.zeros((len(patches), n_steps + 1), dtype=np.float32)
-    term = np.empty_like(products)
-    for i, j in np.ndindex(size, size):
-        np.multiply(strips[:, i, j : j + n_steps + 1], patches[:, i, j, np.newaxis], out=term)
-        products += term
+    strips = sliding_window_view(padded, (size, size + n_steps))[pixels]
+    products = correlate_rows(patches, strips)
     energies = sliding_window_view(_energies(padded), n_steps + 1, axis=1)[pixels]
     return np.asarray(products / np.sqrt(energies * energy[:, np.newaxis]))
 

@@ -12,8 +12,7 @@ from gvo.frontend.corners import detect_corners
 from gvo.frontend.depth_consistency import check_depths
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.disparity import (
-    are_alike,
-    are_rivalled,
+    compare_patches,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
@@ -45,8 +44,8 @@ from gvo.types import (
 
 _MIN_DEPTH_M = 1e-3
 # Steps to the disparity of a corner, from the coarse search, and of a track, from its prediction.
-N_SEARCH_STEPS = 4
-_N_TRACK_STEPS = 3
+N_SEARCH_STEPS = 6
+_N_TRACK_STEPS = 4
 # Frames whose descriptors are kept, in case that the next one needs them too.
 _N_DESCRIBED = 3
 
@@ -275,7 +274,7 @@ class KltFrontend:
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=None if is_wide else T_reference_current,
             T_usual=T_usual,
-            with_offset=self.rig_offsets.is_learning and not is_wide,
+            with_offset=not is_wide and self.rig_offsets.awaits(current.stamp_ns),
         )
         if isinstance(result, Failure):
             return result
@@ -314,55 +313,37 @@ class KltFrontend:
     def _search_stereo(
         self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
     ) -> tuple[FloatArray, BoolArray]:
-        farthest = float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
-        rough, is_found, rivals = search_disparities((frame.left, frame.right), corners, farthest)
-        disparities, is_valid = follow_disparities(
-            (frame.left, frame.right),
-            corners,
-            rough,
-            self._config.stereo,
+        config, images = self._config.stereo, (frame.left, frame.right)
+        farthest = float(self.camera.depth_to_disparity(config.min_depth_m))
+        rough, is_found, rivals = search_disparities(images, corners, farthest)
+        # What the right image seems to show a second time is measured there as well.
+        doubtful = np.flatnonzero(is_found & np.isfinite(rivals))
+        n, both = len(corners), np.concatenate([corners, corners[doubtful]])
+        disparities, is_at_rest = follow_disparities(
+            images,
+            both,
+            np.concatenate([rough, rivals[doubtful]]),
+            config,
             n_steps=N_SEARCH_STEPS,
             row_offset_px=row_offset_px,
         )
-        note("klt.searched", rough=rough, is_found=is_found, found=disparities, is_at_rest=is_valid)
-        is_valid &= is_found
-        is_valid[is_valid] = are_alike(
-            (frame.left, frame.right),
-            corners[is_valid],
-            disparities[is_valid],
-            self._config.stereo,
-            row_offset_px=row_offset_px,
+        found, other = disparities[:n], disparities[n:]
+        note(
+            "klt.searched",
+            rough=rough,
+            is_found=is_found,
+            found=found,
+            is_at_rest=is_at_rest[:n],
         )
-        doubtful = np.flatnonzero(is_valid & np.isfinite(rivals))
-        is_valid[doubtful] = ~self._are_rivalled(
-            frame, corners[doubtful], (disparities[doubtful], rivals[doubtful]), row_offset_px
-        )
-        note("klt.compared", is_alike=is_valid)
-        return disparities, is_valid
-
-    def _are_rivalled(
-        self,
-        frame: StereoFrame,
-        corners: FloatArray,
-        disparities: tuple[FloatArray, FloatArray],
-        row_offset_px: float,
-    ) -> BoolArray:
-        """Tell the corners that the right image shows a second time."""
-        images, config = (frame.left, frame.right), self._config.stereo
-        found, rough = disparities
-        rivals, is_at_rest = follow_disparities(
-            images, corners, rough, config, n_steps=N_SEARCH_STEPS, row_offset_px=row_offset_px
-        )
+        measured = np.where(is_at_rest, disparities, np.nan)
+        likeness = compare_patches(images, both, measured, config, row_offset_px=row_offset_px)
+        is_valid = is_found & likeness.are_alike[:n]
+        is_rivalled = likeness.select(np.arange(n, len(both))).rivals(likeness.select(doubtful))
         # Those that come back to the disparity found were none.
-        is_rivalled = is_at_rest & (np.abs(rivals - found) > COARSE_ERROR_PX)
-        is_rivalled[is_rivalled] = are_rivalled(
-            images,
-            corners[is_rivalled],
-            (found[is_rivalled], rivals[is_rivalled]),
-            config,
-            row_offset_px=row_offset_px,
-        )
-        return np.asarray(is_rivalled)
+        is_rivalled &= np.abs(other - found[doubtful]) > COARSE_ERROR_PX
+        is_valid[doubtful[is_rivalled]] = False
+        note("klt.compared", is_alike=is_valid)
+        return found, is_valid
 
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool

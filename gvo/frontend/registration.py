@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -87,7 +88,7 @@ def register_correspondences(
             *(refined, correspondences, camera, config),
             start=start,
             T_usual=T_usual,
-            rng=_rng(config, stamps_ns),
+            make_rng=lambda: _rng(config, stamps_ns),
             with_offset=with_offset,
         )
         note("registration.verified", refined=refined)
@@ -113,14 +114,14 @@ def _verify(
     *,
     start: FloatArray | None,
     T_usual: FloatArray | None,
-    rng: np.random.Generator,
+    make_rng: Callable[[], np.random.Generator],
     with_offset: bool,
 ) -> Refinement | Failure:
     """Return the motion that the predictions speak for, at the last velocity and the usual one."""
     verified = verify_motion(
         *(refined, correspondences, camera, config),
         T_target_predicted=None if start is None else se3.invert(start),
-        rng=rng,
+        make_rng=make_rng,
         with_offset=with_offset,
     )
     if isinstance(verified, Failure) or T_usual is None:

@@ -14,6 +14,7 @@ doi:10.1098/rsta.1998.0224.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -53,7 +54,7 @@ def verify_motion(
     config: Config,
     *,
     T_target_predicted: FloatArray | None,
-    rng: np.random.Generator,
+    make_rng: Callable[[], np.random.Generator],
     with_offset: bool = False,
 ) -> Refinement | Failure:
     """Return the motion of the camera where matches agree on two.
@@ -70,8 +71,9 @@ def verify_motion(
         Sections `ransac` and `registration`.
     T_target_predicted : ndarray of float64, shape (4, 4), optional
         The motion expected, metres.
-    rng : Generator
-        Draws samples where nothing is expected.
+    make_rng : callable
+        Returns the generator that draws samples where nothing is expected: making one takes longer
+        than all the rest where the matches agree.
     with_offset : bool
         As in `refine_pose`.
 
@@ -81,7 +83,7 @@ def verify_motion(
         The first motion, the second one, or a failure where nothing tells which one it is.
     """
     n_needed = max(config.ransac.min_inliers, SIZEABLE * len(matches))
-    found = _find_other(first, matches, camera, config, T_target_predicted, rng, n_needed)
+    found = _find_other(first, matches, camera, config, T_target_predicted, make_rng, n_needed)
     if found is None:
         return first
     T_other, supporters = found
@@ -113,7 +115,7 @@ def _find_other(
     camera: StereoCamera,
     config: Config,
     T_target_predicted: FloatArray | None,
-    rng: np.random.Generator,
+    make_rng: Callable[[], np.random.Generator],
     n_needed: float,
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return a second motion, roughly, and the matches that fit it alone; None where few do."""
@@ -123,7 +125,7 @@ def _find_other(
     if np.count_nonzero(misfits) < n_needed:
         return None
     if T_target_predicted is None:
-        T_other = _by_samples(matches, misfits, camera, config, rng)
+        T_other = _by_samples(matches, misfits, camera, config, make_rng())
     else:
         T_other = _near_prediction(residuals, squared, misfits, T_target_predicted, n_needed)
     if T_other is None:

@@ -15,7 +15,7 @@ heteroskedasticity", Econometrica 48(4), 1980, doi:10.2307/1912934 (the covarian
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -32,6 +32,9 @@ from gvo.types import BoolArray, Failure, FloatArray
 
 # A step of three hundredths of a sigma no longer matters; this is its square.
 _CONVERGED = 1e-3
+# After a step that moves the residuals by less, root mean square in sigmas, that is by a pixel or
+# so, the derivatives are still right to a hundredth.
+_SHORT = 1.0
 # The variance of a parameter, as a multiple of what it is with the others known: beyond, a
 # direction of motion is open, and what closes it is rounding.
 _MAX_INFLATION = 1e10
@@ -121,17 +124,17 @@ def refine_pose(
         rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
         if isinstance(rough, Failure):
             return rough
-        chosen = residuals.within(rough.T, config.gate)
+        chosen = residuals.within(rough, config.gate)
         if np.count_nonzero(chosen) < np.count_nonzero(inliers) // 2:
             chosen = inliers
-        note("refinement.gated", T_target_source=rough.T, inliers=chosen)
+        note("refinement.gated", T_target_source=rough, inliers=chosen)
         every, residuals = residuals, residuals.select(chosen)
-        descent = _gauss_newton(rough.T, residuals, n_iterations=config.n_iterations)
-        if isinstance(descent, Failure):
-            return descent
+        T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
+        if isinstance(T, Failure):
+            return T
         # Many motions are multiplied up from this one: it shall be a rotation to the last digit.
-        descent = replace(descent, T=se3.normalize(descent.T))
-        return _with_covariance(descent, residuals, (chosen, every), with_offset=with_offset)
+        T = se3.normalize(T)
+        return _with_covariance(T, residuals, (chosen, every), with_offset=with_offset)
 
 
 def descend(
@@ -148,8 +151,8 @@ def descend(
         At most.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        descent = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
-    return None if isinstance(descent, Failure) else descent.T
+        T = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
+    return None if isinstance(T, Failure) else T
 
 
 def fit_covariance(
@@ -167,48 +170,46 @@ def fit_covariance(
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
-    unmoved = _Descent(T=T_target_source, last=None)
     chosen = residuals.select(inliers)
-    return _with_covariance(unmoved, chosen, (inliers, residuals), with_offset=with_offset)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Descent:
-    """Where steps led, and the linearization there; None where the last step still moved."""
-
-    T: FloatArray
-    last: Linearization | None
+    return _with_covariance(T_target_source, chosen, (inliers, residuals), with_offset=with_offset)
 
 
 def _gauss_newton(
     T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
-) -> _Descent | Failure:
+) -> FloatArray | Failure:
+    """Return where steps lead; after a short one the derivatives stay."""
+    max_gain = _SHORT**2 * residuals.columns.shape[1]
+    near: Linearization | None = None
     for _ in range(n_iterations):
-        at = residuals.linearize(T)
+        at = near or residuals.linearize(T)
         if isinstance(at, Failure):
             return at
+        g = residuals.gradient(T, near) if near else at.g
+        if isinstance(g, Failure):
+            return g
         # By LAPACK itself: numpy takes several times as long for so small a matrix.
-        _, step, info = dposv(at.H, at.g)
+        _, step, info = dposv(at.H, g)
         if info != 0 or not np.isfinite(step).all():
             return Failure(reason=_OPEN)
         # Not the exponential map but a retraction: the same to first order, and cheap.
         T = se3.make_transform(cv2.Rodrigues(step[:3])[0], step[3:]) @ T
         note("refinement.step", T_target_source=T, step=step)
-        if step @ at.g < _CONVERGED:
-            return _Descent(T=T, last=at)
-    return _Descent(T=T, last=None)
+        gain = step @ g
+        if gain < _CONVERGED:
+            break
+        near = at if gain < max_gain else None
+    return T
 
 
 def _with_covariance(
-    descent: _Descent,
+    T: FloatArray,
     residuals: StereoResiduals,
     inliers: tuple[BoolArray, StereoResiduals],
     *,
     with_offset: bool,
 ) -> Refinement | Failure:
-    """Finish a descent; `inliers` are chosen of all matches, whose residuals come with them."""
-    T, at = descent.T, descent.last
-    last = residuals.linearize(T) if at is None else at
+    """Finish a refinement; `inliers` are chosen of all matches, whose residuals come with them."""
+    last = residuals.linearize(T)
     if isinstance(last, Failure):
         return last
     _, H_inverse, info = dposv(last.H, _IDENTITY)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
 from gvo.frontend.disparity import (
-    are_alike,
+    compare_patches,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
@@ -162,10 +162,11 @@ def test_few_patches_say_nothing_of_rows() -> None:
 def test_patches_are_alike_at_the_right_disparity_whatever_the_exposure() -> None:
     known = np.full(len(grid()), 7.0)
     for gain in (0.9, 1.0):
-        assert are_alike(pair(7.0, gain=gain), grid(), known, CONFIG).all()
-    assert are_alike(pair(7.0), grid(), known + 3.0, CONFIG).mean() < 0.1
+        assert compare_patches(pair(7.0, gain=gain), grid(), known, CONFIG).are_alike.all()
+    assert compare_patches(pair(7.0), grid(), known + 3.0, CONFIG).are_alike.mean() < 0.1
     unknown = np.where(np.arange(len(known)) % 2 == 0, np.nan, known)
-    np.testing.assert_array_equal(are_alike(pair(7.0), grid(), unknown, CONFIG), unknown == 7.0)
+    is_alike = compare_patches(pair(7.0), grid(), unknown, CONFIG).are_alike
+    np.testing.assert_array_equal(is_alike, unknown == 7.0)
 
 
 def test_patches_across_a_step_of_depth_are_not_alike() -> None:
@@ -174,7 +175,7 @@ def test_patches_across_a_step_of_depth_are_not_alike() -> None:
     pixels = grid(step=3)
     is_at_step = np.abs(pixels[:, 1] - 59.5) < 4
     disparities = np.where(pixels[:, 1] < 60, 4.0, 9.0)
-    is_alike = are_alike(images, pixels, disparities, CONFIG)
+    is_alike = compare_patches(images, pixels, disparities, CONFIG).are_alike
     assert is_alike[is_at_step].mean() < 0.3
     is_far = np.abs(pixels[:, 1] - 59.5) > 8
     assert is_alike[is_far].mean() > 0.95
