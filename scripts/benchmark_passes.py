@@ -185,10 +185,11 @@ def run_whole(path: Path, settings: Sequence[str]) -> Round:
     warm_up = gvo.Odometry(source.info.camera, config)
     for frame in islice(usable_frames(source, config), N_WARM_UP):
         warm_up.track(frame)
+    run_recording = gvo.run_recording  # imports what it needs, as does the command at its start
     instants = _Instants()
     instants.note()
     with tempfile.TemporaryDirectory() as folder:
-        gvo.run_recording(source, folder, config=config, on_progress=instants.note)
+        run_recording(source, folder, config=config, on_progress=instants.note)
     n_frames = len(instants.wall_s) - 1
     peaks_mb = instants.peaks_mb
     return Round(

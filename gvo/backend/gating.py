@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import compress
 
 import gtsam
 import numpy as np
@@ -22,6 +23,7 @@ from gvo.types import BoolArray, Edge, FloatArray, FrameId, IntArray
 _AGREEMENT = 5.0
 _TRACE = 1e-9 * np.eye(6)
 _ZERO = np.zeros(6)
+_NOTHING = np.zeros((6, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,25 +75,27 @@ def judge(
     predictions = [_predict(measurement, pose_of) for measurement in measurements]
     if len(measurements) == 1:
         return Verdict(T_world_start=predictions[0], reasons=[""])
-    informations = np.array([measurement.gaussian.information() for measurement in measurements])
+    informations = [measurement.gaussian.information() for measurement in measurements]
     twists = _twists(predictions)
     reasons = [""] * len(measurements)
     mean, spread = _mean(twists, informations)
     if spread <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
         return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
-    covariances = np.array([measurement.edge.covariance for measurement in measurements])
+    covariances = [measurement.edge.covariance for measurement in measurements]
     distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
         voters = [*measurements, *map(Measurement.of, filter(None, [motion()]))]
         true_distances = _true_distances(voters, pose_of, relative_covariance)
         reasons = _outvoted(measurements, true_distances, gate=gate)
     if any(reasons):
-        left = [index for index, reason in enumerate(reasons) if not reason]
-        predictions, informations = [predictions[index] for index in left], informations[left]
+        is_left = [not reason for reason in reasons]
+        predictions = list(compress(predictions, is_left))
+        informations = list(compress(informations, is_left))
+        covariances = list(compress(covariances, is_left))
         twists = _twists(predictions)
-        distances = _distances(twists, covariances[left])
-    is_near = _are_near_medoid(distances)
-    mean, _ = _mean(twists[is_near], informations[is_near])
+        distances = _distances(twists, covariances)
+    is_near = _are_near_medoid(distances).tolist()
+    mean, _ = _mean(list(compress(twists, is_near)), list(compress(informations, is_near)))
     return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
 
 
@@ -166,17 +170,21 @@ def _are_near_medoid(distances: FloatArray) -> BoolArray:
     return np.asarray(distances[medoid] <= _AGREEMENT)
 
 
-def _mean(twists: FloatArray, informations: FloatArray) -> tuple[FloatArray, float]:
-    """Return the weighted mean, shape (6,), of twists (n, 6), and how far they lie around it.
+def _mean(
+    twists: Sequence[FloatArray], informations: Sequence[FloatArray]
+) -> tuple[FloatArray, float]:
+    """Return the weighted mean, shape (6,), of twists (6,), and how far they lie around it.
 
     By such a start a robust kernel weighs each edge near where it will be, not from where one of
     them was. The spread is the sum of the squared lengths of the deviations, in sigmas. No two of
     the twists are farther apart, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
     """
-    weighted = np.matmul(informations, twists[:, :, np.newaxis])[:, :, 0]
-    total = np.add.reduce(weighted)
-    mean = dposv(np.add.reduce(informations), total)[1]
-    return mean, float(np.vdot(weighted, twists) - np.vdot(total, mean))
+    # One by one: for a few edges that takes half the time of stacking them.
+    weighted = [information @ x for information, x in zip(informations, twists, strict=True)]
+    total = sum(weighted, _ZERO)
+    mean = dposv(sum(informations, _NOTHING), total)[1]
+    squares = sum(float(np.vdot(x, y)) for x, y in zip(twists, weighted, strict=True))
+    return mean, squares - float(np.vdot(total, mean))
 
 
 @lru_cache(maxsize=32)
@@ -185,21 +193,22 @@ def _pairs(n: int) -> tuple[IntArray, IntArray]:
     return rows, columns
 
 
-def _twists(predictions: Sequence[gtsam.Pose3]) -> FloatArray:
-    """Return the predictions as twists about the first, shape (n, 6)."""
+def _twists(predictions: Sequence[gtsam.Pose3]) -> list[FloatArray]:
+    """Return the predictions as twists about the first, shape (6,)."""
     first, *others = predictions
-    return np.array([_ZERO, *(first.localCoordinates(prediction) for prediction in others)])
+    return [_ZERO, *(first.localCoordinates(prediction) for prediction in others)]
 
 
-def _distances(twists: FloatArray, covariances: FloatArray) -> FloatArray:
+def _distances(twists: Sequence[FloatArray], covariances: Sequence[FloatArray]) -> FloatArray:
     """Return Mahalanobis distances, shape (n, n), between predictions of one pose.
 
     Differences of twists about one of them are exact where they agree, large where they do not.
     """
     rows, columns = _pairs(len(twists))
-    differences = twists[rows] - twists[columns]
+    stacked, spreads = np.array(twists), np.array(covariances)
+    differences = stacked[rows] - stacked[columns]
     distances = np.zeros((len(twists), len(twists)))
-    distances[rows, columns] = _mahalanobis(differences, covariances[rows] + covariances[columns])
+    distances[rows, columns] = _mahalanobis(differences, spreads[rows] + spreads[columns])
     return distances + distances.T
 
 

@@ -31,7 +31,7 @@ _Step: TypeAlias = tuple[Callable[..., object], tuple[Any, ...], int | None]
 _UPDATE, _MARGINALIZE = gtsam.ISAM2.update, gtsam.ISAM2.marginalizeLeaves
 # A graph is copied again after so many steps, a large one after one for so many poses: a copy then
 # costs an update the same at any size.
-_N_REDONE = 8
+_N_REDONE = 16
 _POSES_PER_STEP = 32
 _MIN_EIGENVALUE = 1e-10
 _MAX_ROUNDING = 1e-6

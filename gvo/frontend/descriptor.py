@@ -222,7 +222,7 @@ class DescriptorFrontend:
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=prior,
             T_usual=T_usual,
-            with_offset=self.rig_offsets.awaits(current.stamp_ns),
+            with_offset=self.rig_offsets.is_learning,
         )
         if isinstance(result, Failure):
             return result

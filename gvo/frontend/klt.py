@@ -132,9 +132,9 @@ class KltFrontend:
         reference, current : KltObservations
         prior : ndarray of float64, shape (4, 4), optional
             Predicted T_reference_current; tracks start at the pixels it predicts. Without it
-            they start at the previous pixels. Then, and where the prediction leads to nothing,
-            more levels of the pyramid are searched, without a prediction descriptors are matched
-            as well, and what this gives is the prediction of a second round.
+            they start at the previous pixels, more levels of the pyramid are searched,
+            descriptors are matched where that leads to nothing, and what this gives is the
+            prediction of a second round.
 
         Returns
         -------
@@ -150,26 +150,40 @@ class KltFrontend:
         prior: FloatArray | None,
         T_usual: FloatArray | None,
     ) -> RelativePose | Failure:
-        """Register, and heed the usual motion, (4, 4), in the round that starts from the prior."""
-        result: RelativePose | Failure | None = None
-        if prior is not None:
-            result = self._register_from(prior, reference, current, T_usual=T_usual)
-        if not isinstance(result, RelativePose | Contradiction):
-            start = np.eye(4) if prior is None else prior
-            rough = self._register_from(start, reference, current, is_wide=True)
-            if prior is None and not isinstance(rough, RelativePose | Contradiction):
-                rough = self._register_descriptors(reference, current)
-            if isinstance(rough, Failure):
-                return rough
-            result = self._register_from(rough.T_reference_current, reference, current)
-            # Nothing foretold it: what else it predicts must be there too.
-            result = check_view(result, reference.points_cam, self.camera)
+        """Register, and heed the usual motion, (4, 4), in the round that starts from the prior.
+
+        Where that leads to nothing more levels are searched here too: the camera may have moved
+        as never before. A keyframe, of which the prior is known well, is not worth that.
+        """
+        if prior is None:
+            result = self._register_widely(None, reference, current)
+        else:
+            is_step = T_usual is not None
+            result = self._register_from(
+                prior, reference, current, is_step=is_step, T_usual=T_usual
+            )
+            if is_step and not isinstance(result, RelativePose | Contradiction):
+                result = self._register_widely(prior, reference, current)
         result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
             row_shift_px = reference.find_corners().row_shift_px
             self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
         return result
+
+    def _register_widely(
+        self, prior: FloatArray | None, reference: KltObservations, current: KltObservations
+    ) -> RelativePose | Failure:
+        """Register in two rounds: over more levels of the pyramid, and from what that gives."""
+        start = np.eye(4) if prior is None else prior
+        rough = self._register_from(start, reference, current, is_wide=True)
+        if prior is None and not isinstance(rough, RelativePose | Contradiction):
+            rough = self._register_descriptors(reference, current)
+        if isinstance(rough, Failure):
+            return rough
+        result = self._register_from(rough.T_reference_current, reference, current, is_step=True)
+        # Nothing foretold it: what else it predicts must be there too.
+        return check_view(result, reference.points_cam, self.camera)
 
     def relocalize(
         self, reference: KltObservations, current: KltObservations
@@ -229,6 +243,7 @@ class KltFrontend:
         current: KltObservations,
         *,
         is_wide: bool = False,
+        is_step: bool = False,
         T_usual: FloatArray | None = None,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
@@ -274,7 +289,7 @@ class KltFrontend:
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
             start=None if is_wide else T_reference_current,
             T_usual=T_usual,
-            with_offset=not is_wide and self.rig_offsets.awaits(current.stamp_ns),
+            with_offset=is_step and self.rig_offsets.is_learning,
         )
         if isinstance(result, Failure):
             return result

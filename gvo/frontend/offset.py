@@ -111,13 +111,9 @@ class RigOffsets:
         """
         if result.offset_px is None or result.offset_sigma_px is None:
             return
-        if self.awaits(stamp_ns):
+        if self.is_learning and (self._last_ns is None or stamp_ns > self._last_ns):
             self._last_ns = stamp_ns
             self._pending = result.offset_px, _SIGMA_FACTOR * result.offset_sigma_px
-
-    def awaits(self, stamp_ns: int) -> bool:
-        """Tell whether a registration of a current frame would still count."""
-        return self.is_learning and (self._last_ns is None or stamp_ns > self._last_ns)
 
     def note_rows(self, shift_px: float | None, stamp_ns: int) -> None:
         """Take by how much the rows of a frame still differ; each frame counts once.
