@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import gtsam
 import numpy as np
 
-from gvo.backend.checks import is_definite
 from gvo.errors import SmoothingError
+from gvo.geometry.validity import is_definite
 from gvo.types import FloatArray
 
 # Radians and metres: a pose that an update moved farther than the first is updated again, until

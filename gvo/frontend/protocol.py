@@ -6,13 +6,11 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from gvo.geometry.validity import MIN_EIGENVALUE, is_plain_covariance, is_rigid
 from gvo.types import Failure, FloatArray, RelativePose
 
-# The largest deviation of R R^T from the identity that is still rounding.
-_MAX_SKEW = 1e-6
-# Of correlations: the largest asymmetry that is still rounding, and the smallest eigenvalue.
+# Of correlations: the largest asymmetry that is still rounding.
 _MAX_ASYMMETRY = 1e-6
-_MIN_EIGENVALUE = 1e-12
 
 
 class Stamped(Protocol):
@@ -132,27 +130,25 @@ def _checked(frontend: object, method: str, result: object) -> RelativePose | Fa
 
 def find_fault(result: RelativePose) -> str:
     """Return what is wrong with a relative pose, in one line; empty where nothing is."""
-    return (
-        _find_fault_of_array("T_reference_current", result.T_reference_current, (4, 4))
-        or _find_fault_of_array("the covariance", result.covariance, (6, 6))
-        or _find_fault_of_transform(result.T_reference_current)
-        or _find_fault_of_covariance(result.covariance)
-    )
-
-
-def _find_fault_of_array(name: str, array: object, shape: tuple[int, int]) -> str:
-    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-        return f"{name} is no array of float64 of shape {shape}"
-    return "" if np.isfinite(array).all() else f"{name} is not finite"
+    T, covariance = result.T_reference_current, result.covariance
+    for name, array, shape in (
+        ("T_reference_current", T, (4, 4)),
+        ("the covariance", covariance, (6, 6)),
+    ):
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+            return f"{name} is no array of float64 of shape {shape}"
+    if is_rigid(T) and is_plain_covariance(covariance):
+        return ""
+    for name, array in (("T_reference_current", T), ("the covariance", covariance)):
+        if not np.isfinite(array).all():
+            return f"{name} is not finite"
+    return _find_fault_of_transform(T) or _find_fault_of_covariance(covariance)
 
 
 def _find_fault_of_transform(T: FloatArray) -> str:
-    R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _MAX_SKEW or np.linalg.det(R) < 0:
-        return "T_reference_current holds no rotation"
     if np.any(T[3] != (0.0, 0.0, 0.0, 1.0)):
         return "the last row of T_reference_current is not (0, 0, 0, 1)"
-    return ""
+    return "" if is_rigid(T) else "T_reference_current holds no rotation"
 
 
 def _find_fault_of_covariance(covariance: FloatArray) -> str:
@@ -163,6 +159,6 @@ def _find_fault_of_covariance(covariance: FloatArray) -> str:
     correlations = covariance / np.sqrt(np.outer(variances, variances))
     if np.abs(correlations - correlations.T).max() > _MAX_ASYMMETRY:
         return "the covariance is not symmetric"
-    if np.linalg.eigvalsh(correlations)[0] <= _MIN_EIGENVALUE:
+    if np.linalg.eigvalsh(correlations)[0] <= MIN_EIGENVALUE:
         return "the covariance is not positive definite"
     return ""

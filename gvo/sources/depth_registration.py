@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.geometry.validity import is_rigid
 from gvo.sources.recording import DepthView
 from gvo.types import DepthArray, FloatArray, IntArray
 
@@ -138,9 +139,7 @@ def _close_gaps(painted: DepthArray, square: NDArray[np.uint8]) -> DepthArray:
 
 
 def _check_rigid(T: FloatArray) -> None:
-    R = T[:3, :3]
-    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0
-    if not is_rotation or not np.all(np.isfinite(T)):
+    if not is_rigid(T):
         raise ValueError(f"T_color_depth must be a rigid transform, got {T.tolist()}")
 
 

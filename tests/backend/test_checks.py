@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from gvo.backend.checks import (
     covariance_fault,
     find_faults,
-    is_definite,
     place_fault,
     pose_fault,
     prior_fault,
@@ -251,14 +250,3 @@ def test_a_stack_of_places_is_as_far_as_the_farthest() -> None:
 
 def test_no_edges_have_no_faults() -> None:
     assert find_faults([]) == []
-
-
-@settings(deadline=None, max_examples=20)
-@given(seed=seeds)
-def test_what_is_definite_is_told_as_eigenvalues_tell_it(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    vectors = np.linalg.qr(rng.normal(size=(6, 6)))[0]
-    for least, expected in ((1e-3, True), (-1e-3, False)):
-        eigenvalues = np.r_[rng.uniform(0.1, 2.0, 5), least]
-        symmetric = (vectors * rng.permutation(eigenvalues)) @ vectors.T
-        assert is_definite(0.5 * (symmetric + symmetric.T)) is expected
