@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from gvo.config import StereoConfig
 from gvo.frontend.disparity import (
     compare_patches,
+    correlate_rows,
     follow_disparities,
     measure_disparities,
     measure_row_shift,
@@ -179,3 +180,33 @@ def test_patches_across_a_step_of_depth_are_not_alike() -> None:
     assert is_alike[is_at_step].mean() < 0.3
     is_far = np.abs(pixels[:, 1] - 59.5) > 8
     assert is_alike[is_far].mean() > 0.95
+
+
+def test_what_is_shown_twice_is_its_own_rival() -> None:
+    """Stripes of a period of 12 pixels, at disparity 5: 17 is as good, 11 half a period off."""
+    columns = np.arange(160.0)
+    stripes = np.tile(128 + 60 * np.sin(2 * np.pi * columns / 12), (120, 1))
+    left = stripes.astype(np.uint8)
+    right = np.roll(stripes, -5, axis=1).astype(np.uint8)
+    pixels = np.column_stack([np.linspace(50, 120, 20), np.linspace(30, 90, 20)])
+    found, second, between, nowhere = (
+        compare_patches((left, right), pixels, np.full(20, disparity), CONFIG)
+        for disparity in (5.0, 17.0, 11.0, np.nan)
+    )
+    assert found.are_alike.all()
+    assert second.rivals(found).all()
+    assert not between.rivals(found).any()
+    assert not nowhere.rivals(found).any()
+    some = np.array([3, 1])
+    np.testing.assert_array_equal(second.select(some).unlike, second.unlike[some])
+
+
+def test_patches_are_correlated_with_every_place_of_a_strip() -> None:
+    rng = np.random.default_rng(0)
+    patches = rng.normal(size=(7, 5, 5)).astype(np.float32)
+    strips = rng.normal(size=(7, 5, 12)).astype(np.float32)
+    expected = [
+        [np.sum(p * s[:, k : k + 5]) for k in range(8)]
+        for p, s in zip(patches, strips, strict=True)
+    ]
+    np.testing.assert_allclose(correlate_rows(patches, strips), expected, atol=1e-5)

@@ -111,6 +111,24 @@ def test_normal_equations_are_those_of_the_inverse_covariances(seed: int) -> Non
 
 @settings(deadline=None, max_examples=20)
 @given(seed=seeds)
+def test_a_gradient_has_new_residuals_and_weights_and_the_derivatives_it_is_given(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    T = motion(rng)
+    residuals = StereoResiduals.of(T, random_matches(rng, T, 9), CAMERA, huber=1.5)
+    here = linearize(residuals, T)
+    near = linearize(residuals, se3.exp(0.01 * rng.normal(size=6)) @ T)
+    J = near.J / near.roots * here.roots
+    expected = np.einsum("kin,in->k", J, here.r)
+    for at, g in ((here, here.g), (near, expected)):
+        found = residuals.gradient(T, at)
+        assert not isinstance(found, Failure)
+        np.testing.assert_allclose(found, g, rtol=1e-9, atol=1e-9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=seeds)
 def test_the_gate_counts_sigmas_of_the_residual(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T = motion(rng)
@@ -210,3 +228,5 @@ def test_points_behind_the_camera_are_in_no_gate_and_have_no_derivative() -> Non
     assert np.isfinite(residuals.columns).all()
     np.testing.assert_array_equal(residuals.within(back, 1e9), ~is_behind)
     assert isinstance(residuals.linearize(back), Failure)
+    near = linearize(residuals, np.eye(4))
+    assert isinstance(residuals.gradient(back, near), Failure)
