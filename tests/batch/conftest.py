@@ -25,7 +25,7 @@ from gvo.trajectory import Trajectory
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.
-N_LONG = 400
+N_LONG = 250
 NO_REPORT = BatchOptions(report=False)
 TABLES = (
     *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
