@@ -6,11 +6,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from gvo.geometry.validity import MIN_EIGENVALUE, is_plain_covariance, is_rigid
+from gvo.geometry.validity import LAST_ROW, covariance_flaw, is_plain_covariance, is_rigid
 from gvo.types import Failure, FloatArray, RelativePose
-
-# Of correlations: the largest asymmetry that is still rounding.
-_MAX_ASYMMETRY = 1e-6
 
 
 class Stamped(Protocol):
@@ -142,23 +139,11 @@ def find_fault(result: RelativePose) -> str:
     for name, array in (("T_reference_current", T), ("the covariance", covariance)):
         if not np.isfinite(array).all():
             return f"{name} is not finite"
-    return _find_fault_of_transform(T) or _find_fault_of_covariance(covariance)
+    flaw = covariance_flaw(covariance)
+    return _find_fault_of_transform(T) or (f"the covariance is {flaw}" if flaw else "")
 
 
 def _find_fault_of_transform(T: FloatArray) -> str:
-    if np.any(T[3] != (0.0, 0.0, 0.0, 1.0)):
+    if T[3].tolist() != LAST_ROW:
         return "the last row of T_reference_current is not (0, 0, 0, 1)"
     return "" if is_rigid(T) else "T_reference_current holds no rotation"
-
-
-def _find_fault_of_covariance(covariance: FloatArray) -> str:
-    variances = np.diag(covariance)
-    if np.any(variances <= 0):
-        return "the covariance is not positive definite"
-    # Of correlations: rounding leaves elements that should be zero at any ratio to each other.
-    correlations = covariance / np.sqrt(np.outer(variances, variances))
-    if np.abs(correlations - correlations.T).max() > _MAX_ASYMMETRY:
-        return "the covariance is not symmetric"
-    if np.linalg.eigvalsh(correlations)[0] <= MIN_EIGENVALUE:
-        return "the covariance is not positive definite"
-    return ""

@@ -13,14 +13,15 @@ from scipy.linalg.lapack import dpotrf
 
 from gvo.types import FloatArray
 
-# The largest deviation of R R^T from the identity that is still rounding.
-MAX_SKEW = 1e-6
+# The largest deviation of R R^T from the identity, and the largest asymmetry of correlations, that
+# is still rounding.
+_MAX_SKEW = 1e-6
 # Of correlations: the smallest eigenvalue that is more than rounding.
-MIN_EIGENVALUE = 1e-12
-_LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+_MIN_EIGENVALUE = 1e-12
+LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 # A covariance times this is positive definite where all eigenvalues of its correlations are
 # larger.
-_LESS_DEFINITE = 1.0 - MIN_EIGENVALUE * np.eye(6)
+_LESS_DEFINITE = 1.0 - _MIN_EIGENVALUE * np.eye(6)
 
 
 def is_rigid(T: FloatArray) -> bool:
@@ -28,14 +29,14 @@ def is_rigid(T: FloatArray) -> bool:
     # What is not a number fails every comparison.
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last_row = T.tolist()
     return bool(
-        last_row == _LAST_ROW
+        last_row == LAST_ROW
         and math.isfinite(x + y + z)
-        and abs(a * a + b * b + c * c - 1.0) <= MAX_SKEW
-        and abs(d * d + e * e + f * f - 1.0) <= MAX_SKEW
-        and abs(g * g + h * h + i * i - 1.0) <= MAX_SKEW
-        and abs(a * d + b * e + c * f) <= MAX_SKEW
-        and abs(a * g + b * h + c * i) <= MAX_SKEW
-        and abs(d * g + e * h + f * i) <= MAX_SKEW
+        and abs(a * a + b * b + c * c - 1.0) <= _MAX_SKEW
+        and abs(d * d + e * e + f * f - 1.0) <= _MAX_SKEW
+        and abs(g * g + h * h + i * i - 1.0) <= _MAX_SKEW
+        and abs(a * d + b * e + c * f) <= _MAX_SKEW
+        and abs(a * g + b * h + c * i) <= _MAX_SKEW
+        and abs(d * g + e * h + f * i) <= _MAX_SKEW
         and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
     )
 
@@ -58,3 +59,17 @@ def is_plain_covariance(covariance: FloatArray) -> bool:
         and covariance.tobytes() == covariance.tobytes("F")
         and is_definite(covariance * _LESS_DEFINITE)
     )
+
+
+def covariance_flaw(covariance: FloatArray) -> str:
+    """Return what keeps a matrix of finite numbers from being a covariance; empty where nothing."""
+    variances = np.diag(covariance)
+    if variances.min() <= 0.0:
+        return "not positive definite"
+    # Of correlations: rounding leaves elements that should be zero at any ratio.
+    sigmas = np.sqrt(variances)
+    correlations = covariance / np.outer(sigmas, sigmas)
+    if np.abs(correlations - correlations.T).max() > _MAX_SKEW:
+        return "not symmetric"
+    is_sound = np.linalg.eigvalsh(correlations).min() > _MIN_EIGENVALUE
+    return "" if is_sound else "not positive definite"
