@@ -248,9 +248,14 @@ class WindowConfig(Section):
         5, "recent frames in the window; null: all frames (full smoothing)", ge=2, le=1000
     )
     n_keyframes: int = _parameter(12, "keyframes kept beside them", ge=0, le=100)
-    n_links: int = _parameter(3, "registrations per frame: predecessor and keyframes", ge=1, le=20)
+    n_links: int = _parameter(
+        3, "registrations per frame at most: predecessor and keyframes", ge=1, le=20
+    )
     min_overlap: float = _parameter(
         0.3, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
+    )
+    link_overlap: float = _parameter(
+        0.6, "of newer keyframes those are linked that share so much of the view", ge=0, le=1
     )
     keyframe_overlap: float = _parameter(
         0.9, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1

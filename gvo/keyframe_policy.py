@@ -7,7 +7,7 @@ far away. It is the share of the view that they have in common where points are 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from typing import TypeVar
 
 import numpy as np
@@ -54,29 +54,46 @@ def is_needed(scores: Mapping[_Id, float], config: WindowConfig) -> bool:
 
 
 def choose_links(
-    scores: Mapping[_Id, float], config: WindowConfig, *, exclude: Hashable = None
-) -> list[_Id]:
+    scores: Mapping[_Id, float],
+    config: WindowConfig,
+    *,
+    exclude: Hashable = None,
+    tied: Collection[Hashable] = (),
+) -> tuple[list[_Id], list[_Id]]:
     """Choose the kept frames to register the current frame against.
 
-    Half of them have the most in common with it, the others are the oldest that still have
-    enough: these hold the drift.
+    Half of them are the oldest that still have enough in common with it: these hold the drift.
+    The others have the most in common. A link of these pays only where it says more than the
+    steps do, which are known already: over many steps, and over most of the view.
 
     Parameters
     ----------
     scores : mapping of frame to float
         Oldest first.
     config : WindowConfig
-        `n_links`, of which one goes to the predecessor, and `min_overlap`.
+        `n_links`, of which one goes to the predecessor, `min_overlap` and `link_overlap`.
     exclude : hashable
         The predecessor.
+    tied : collection of hashable
+        Frames that a few registered steps tie to the current one.
+
+    Returns
+    -------
+    chosen : list of frames
+    spare : list of frames
+        Those that fill up the number, for where the chosen do not bear out the steps.
     """
     n = config.n_links - 1
     usable = [
         frame for frame, score in scores.items() if score >= config.min_overlap and frame != exclude
     ]
-    by_age, others = usable[: (n + 1) // 2], usable[(n + 1) // 2 :]
-    nearest = sorted(others, key=lambda frame: -scores[frame])
-    return by_age + nearest[: n - len(by_age)]
+    n_by_age = (n + 1) // 2
+    nearest = sorted(usable[n_by_age:], key=lambda frame: -scores[frame])
+    telling = [
+        frame for frame in nearest if scores[frame] >= config.link_overlap and frame not in tied
+    ]
+    chosen = (usable[:n_by_age] + telling)[:n]
+    return chosen, [frame for frame in nearest if frame not in chosen][: n - len(chosen)]
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Frontend, Stamped, register_checked, relocalize_checked
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.keyframe_policy import choose_links, choose_released, is_needed
+from gvo.keyframe_policy import choose_released, is_needed
 from gvo.keyframes import Keyframes
+from gvo.linking import link_keyframes, tie
 from gvo.segments import Segments, Sighting
 from gvo.types import (
     Edge,
@@ -129,6 +131,7 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
         self._segments = Segments()
+        self._tied_ns: list[int] = []
 
     @property
     def config(self) -> Config:
@@ -205,6 +208,7 @@ class Odometry:
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(observations)
+            self._tied_ns = tie(self._tied_ns, step)
         with watch.stage("links"):
             offered, scores = self._edges(observations, step)
             found = self._look_around(observations, step)
@@ -315,18 +319,19 @@ class Odometry:
             if stamp_ns in self._window and stamp_ns not in apart
         }
         scores = self._keyframes.scores(T_frame_keyframes)
-        chosen = choose_links(scores, self._config.window, exclude=step.reference_ns)
-        links: list[tuple[LinkKind, Edge | None]] = [
-            ("keyframe", self._link(ns, observations, se3.invert(T_frame_keyframes[ns])))
-            for ns in chosen
-        ]
-        links.append(("standstill", zero_motion_edge(step, self._config.window)))
-        return first + [(kind, edge) for kind, edge in links if edge is not None], scores
+        links = link_keyframes(
+            *(partial(self._link, observations), scores, T_frame_keyframes, step),
+            self._config.window,
+            tied_ns=self._tied_ns,
+        )
+        edges = first + [("keyframe", edge) for edge in links]
+        still = zero_motion_edge(step, self._config.window)
+        return edges if still is None else [*edges, ("standstill", still)], scores
 
     def _link(
         self,
-        stamp_ns: int,
         observations: Any,  # noqa: ANN401 - the front-end's own
+        stamp_ns: int,
         prior: FloatArray,
     ) -> Edge | None:
         keyframe = self._keyframes[stamp_ns]

@@ -78,16 +78,28 @@ def test_a_keyframe_is_needed_where_all_others_are_too_far(
 
 def test_links_go_to_the_oldest_and_to_the_nearest() -> None:
     scores = {5: 0.1, 10: 0.4, 20: 0.9, 30: 0.5, 40: 0.95, 50: 0.99}
-    assert choose_links(scores, configure(n_links=3), exclude=50) == [10, 40]
-    assert choose_links(scores, configure(n_links=5), exclude=50) == [10, 20, 40, 30]
-    assert choose_links(scores, configure(n_links=3)) == [10, 50]
-    assert choose_links(scores, configure(n_links=1), exclude=50) == []
-    assert choose_links({}, configure(n_links=3), exclude=0) == []
+    assert choose_links(scores, configure(n_links=3), exclude=50) == ([10, 40], [])
+    assert choose_links(scores, configure(n_links=5), exclude=50) == ([10, 20, 40], [30])
+    assert choose_links(scores, configure(n_links=3)) == ([10, 50], [])
+    assert choose_links(scores, configure(n_links=1), exclude=50) == ([], [])
+    assert choose_links({}, configure(n_links=3), exclude=0) == ([], [])
+
+
+def test_a_newer_keyframe_of_few_steps_or_little_overlap_is_spare() -> None:
+    scores = {10: 0.4, 20: 0.59, 30: 0.6, 40: 0.9}
+    assert choose_links(scores, configure(), tied=[40, 50]) == ([10, 30], [])
+    assert choose_links(scores, configure(), tied=[30, 40, 50]) == ([10], [40])
+    assert choose_links(scores, configure(link_overlap=0.61), tied=[40]) == ([10], [40])
+    assert choose_links(scores, configure(link_overlap=0.0), tied=[30, 40]) == ([10, 20], [])
+
+
+def test_the_oldest_keyframe_is_linked_whatever_ties_it() -> None:
+    assert choose_links({40: 0.3, 50: 0.5}, configure(), tied=[40, 50]) == ([40], [50])
 
 
 def test_frames_need_no_order_of_their_own() -> None:
     scores = {"zebra": 0.4, "ape": 0.9, ("a", 1): 0.9}
-    assert choose_links(scores, configure(n_links=3), exclude="none") == ["zebra", "ape"]
+    assert choose_links(scores, configure(), exclude="none") == (["zebra", "ape"], [])
     assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
 
 
@@ -96,14 +108,19 @@ def test_frames_need_no_order_of_their_own() -> None:
     scores=st.dictionaries(st.integers(0, 50), st.floats(0.0, 1.0), max_size=12),
     n_links=st.integers(1, 8),
     exclude=st.integers(0, 50),
+    tied=st.sets(st.integers(0, 50), max_size=4),
 )
 def test_links_are_near_once_each_and_not_to_the_predecessor(
-    scores: dict[int, float], n_links: int, exclude: int
+    scores: dict[int, float], n_links: int, exclude: int, tied: set[int]
 ) -> None:
-    links = choose_links(scores, configure(n_links=n_links), exclude=exclude)
-    usable = {frame for frame, score in scores.items() if score >= 0.3} - {exclude}
+    chosen, spare = choose_links(scores, configure(n_links=n_links), exclude=exclude, tied=tied)
+    links = chosen + spare
+    usable = [frame for frame, score in scores.items() if score >= 0.3 and frame != exclude]
     assert len(links) == len(set(links)) == min(n_links - 1, len(usable))
-    assert set(links) <= usable
+    assert set(links) <= set(usable)
+    assert chosen[:1] == usable[: n_links - 1][:1]
+    newer = set(chosen) - set(usable[: n_links // 2])
+    assert all(scores[frame] >= 0.6 and frame not in tied for frame in newer)
 
 
 @settings(deadline=None)

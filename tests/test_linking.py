@@ -1,0 +1,117 @@
+"""Which keyframes a frame is registered against, and when more of them are."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gvo.chain import RawStep
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.linking import link_keyframes, tie
+from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
+
+CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_overlap=0.6, gate=10.0)
+# The oldest is chosen, the other is spare: two steps ago, with little in common.
+SCORES = {10: 0.4, 80: 0.5}
+TIED = [70, 80, 90]
+SIGMA = 0.01
+
+
+def forward(distance_m: float) -> FloatArray:
+    return se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, distance_m]))
+
+
+def step_of(*, is_registered: bool = True, reference_ns: int | None = 90) -> RawStep:
+    covariance = SIGMA**2 * np.eye(6)
+    registration = RelativePose(
+        T_reference_current=forward(1.0),
+        covariance=covariance,
+        matches=np.zeros((0, 2), dtype=np.int64),
+        inliers=np.zeros(0, dtype=np.bool_),
+    )
+    return RawStep(
+        estimate=Estimate(
+            stamp_ns=100, T_world_cam=np.eye(4), covariance=covariance, status=Status.OK
+        ),
+        reference_ns=reference_ns,
+        T_reference_frame=forward(1.0),
+        covariance=covariance,
+        registration=registration if is_registered else None,
+    )
+
+
+class Registrations:
+    """Finds keyframes so far from where they are predicted, in sigmas of the difference."""
+
+    def __init__(self, **off_by: float | None) -> None:
+        self._off_by = off_by
+        self.asked: list[int] = []
+
+    def __call__(self, stamp_ns: int, prior: FloatArray) -> Edge | None:
+        self.asked.append(stamp_ns)
+        sigmas = self._off_by.get(f"of_{stamp_ns}", 0.0)
+        if sigmas is None:
+            return None
+        return Edge(
+            reference_id=stamp_ns,
+            T_reference_frame=prior @ forward(sigmas * SIGMA * np.sqrt(2.0)),
+            covariance=SIGMA**2 * np.eye(6),
+        )
+
+
+def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
+    poses = {ns: forward(-0.1 * (100 - ns)) for ns in SCORES}
+    config = CONFIG.model_copy(update=changes)
+    links = link_keyframes(measure, SCORES, poses, step, config, tied_ns=TIED)
+    return [link.reference_id for link in links]
+
+
+def test_a_link_that_bears_out_the_step_is_enough() -> None:
+    measure = Registrations(of_10=9.9)
+    assert linked(measure, step_of()) == measure.asked == [10]
+
+
+@pytest.mark.parametrize("sigmas", [10.1, -10.1, 1e6])
+def test_a_link_that_contradicts_the_step_calls_another_one(sigmas: float) -> None:
+    measure = Registrations(of_10=sigmas)
+    assert linked(measure, step_of()) == measure.asked == [10, 80]
+
+
+def test_a_link_that_fails_is_stood_in_for() -> None:
+    measure = Registrations(of_10=None)
+    assert linked(measure, step_of()) == [80]
+    assert measure.asked == [10, 80]
+
+
+def test_a_step_without_registration_wants_all_links_there_are() -> None:
+    measure = Registrations()
+    assert linked(measure, step_of(is_registered=False)) == measure.asked == [10, 80]
+
+
+def test_without_a_gate_nothing_contradicts() -> None:
+    measure = Registrations(of_10=1e6)
+    assert linked(measure, step_of(), gate=None) == [10]
+
+
+def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
+    priors: dict[int, FloatArray] = {}
+
+    def measure(stamp_ns: int, prior: FloatArray) -> None:
+        priors[stamp_ns] = prior
+
+    link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, tied_ns=[])
+    np.testing.assert_allclose(priors[10], forward(9.0), atol=1e-12)
+
+
+def test_registered_steps_tie_the_last_few_frames() -> None:
+    tied: list[int] = []
+    for ns in range(1, 8):
+        tied = tie(tied, step_of(reference_ns=ns))
+    assert tied == [4, 5, 6, 7]
+
+
+def test_a_step_without_registration_ties_nothing() -> None:
+    assert tie([1, 2, 3], step_of(is_registered=False, reference_ns=4)) == []
+    assert tie([], step_of(reference_ns=None)) == []
+    assert tie([], step_of(reference_ns=3)) == [3]
