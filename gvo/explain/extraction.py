@@ -99,10 +99,9 @@ _Matches = tuple[FloatArray, FloatArray, FloatArray, Sorting]
 
 def _corners(watch: WatchedFrame, config: Config) -> _Matches:
     """Sort the corners of `KltFrontend` by its tests."""
-    final, searched, compared = (
-        find_event(watch.events, name) for name in ("klt.corners", "klt.searched", "klt.compared")
-    )
-    if final is None or searched is None or compared is None:
+    final = find_event(watch.events, "klt.corners")
+    searched = find_event(watch.events, "corners.searched")
+    if final is None or searched is None:
         raise ValueError("the front-end did not tell of its corners")
     pixels, disparities = final.values["corners"], final.values["disparities"]
     is_placed = np.isfinite(disparities)
@@ -111,7 +110,7 @@ def _corners(watch: WatchedFrame, config: Config) -> _Matches:
             "coarse correlation too weak": searched.values["is_found"],
             "patch leaves an image": is_placed,
             "no rest of the steps": searched.values["is_at_rest"],
-            "left and right unlike": compared.values["is_alike"],
+            "left and right unlike": searched.values["are_reliable"],
             "depth out of range": final.values["is_valid"],
         },
         len(pixels),

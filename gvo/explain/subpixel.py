@@ -10,8 +10,8 @@ from gvo.config import Config, StereoConfig
 from gvo.explain.extraction import find_event
 from gvo.explain.values import StereoStep, SubpixelStep
 from gvo.explain.watch import WatchedFrame
+from gvo.frontend.corner_disparities import N_SEARCH_STEPS
 from gvo.frontend.disparity import follow_disparities
-from gvo.frontend.klt import N_SEARCH_STEPS
 from gvo.types import FloatArray, ImageArray, RgbdFrame
 
 # Of the curve of squared differences around the end, pixels.
@@ -30,7 +30,7 @@ def explain_subpixel(
     energies = [_gradient(frame.left, stereo.pixels[i], config.stereo) for i in kept]
     chosen = kept[np.argsort(energies, kind="stable")[len(kept) // 2]]
     pixel, disparity = stereo.pixels[chosen], float(stereo.disparities[chosen])
-    searched = find_event(watch.events, "klt.searched")
+    searched = find_event(watch.events, "corners.searched")
     is_fitted = config.stereo.subpixel == "parabola"
     if searched is not None:
         method, row = "gauss-newton", pixel[1] + watch.row_offset_px

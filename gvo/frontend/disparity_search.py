@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gvo.frontend.corners import halve
-from gvo.frontend.disparity import correlate_rows
+from gvo.frontend.patches import correlate_rows
 from gvo.frontend.stereo import parabola_minimum
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 

@@ -8,16 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from gvo.config import Config
+from gvo.frontend.corner_disparities import measure_corners
 from gvo.frontend.corners import detect_corners
 from gvo.frontend.depth_consistency import check_depths
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.disparity import (
-    compare_patches,
-    follow_disparities,
-    measure_disparities,
-    measure_row_shift,
-)
-from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
+from gvo.frontend.disparity import follow_disparities, measure_disparities
 from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.registration import register_correspondences
@@ -43,8 +38,7 @@ from gvo.types import (
 )
 
 _MIN_DEPTH_M = 1e-3
-# Steps to the disparity of a corner, from the coarse search, and of a track, from its prediction.
-N_SEARCH_STEPS = 6
+# Steps from a prediction to the disparity of a track.
 _N_TRACK_STEPS = 4
 # Frames whose descriptors are kept, in case that the next one needs them too.
 _N_DESCRIBED = 3
@@ -97,15 +91,15 @@ class KltFrontend:
         corners = detect_corners(image_of(frame), self._config.klt)
         row_shift_px = None
         if isinstance(frame, StereoFrame):
-            disparities, is_valid = self._search_stereo(frame, corners, row_offset_px)
-            is_valid &= self._is_in_range(disparities, offset_px)
-            row_shift_px = measure_row_shift(
+            measured = measure_corners(
                 (frame.left, frame.right),
-                corners[is_valid],
-                disparities[is_valid],
+                corners,
                 self._config.stereo,
+                max_disparity=self._max_disparity(),
                 row_offset_px=row_offset_px,
             )
+            disparities, row_shift_px = measured.disparities, measured.row_shift_px
+            is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
         note("klt.corners", corners=corners, disparities=disparities, is_valid=is_valid)
@@ -325,41 +319,6 @@ class KltFrontend:
             self.camera,
         )
 
-    def _search_stereo(
-        self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
-    ) -> tuple[FloatArray, BoolArray]:
-        config, images = self._config.stereo, (frame.left, frame.right)
-        farthest = float(self.camera.depth_to_disparity(config.min_depth_m))
-        rough, is_found, rivals = search_disparities(images, corners, farthest)
-        # What the right image seems to show a second time is measured there as well.
-        doubtful = np.flatnonzero(is_found & np.isfinite(rivals))
-        n, both = len(corners), np.concatenate([corners, corners[doubtful]])
-        disparities, is_at_rest = follow_disparities(
-            images,
-            both,
-            np.concatenate([rough, rivals[doubtful]]),
-            config,
-            n_steps=N_SEARCH_STEPS,
-            row_offset_px=row_offset_px,
-        )
-        found, other = disparities[:n], disparities[n:]
-        note(
-            "klt.searched",
-            rough=rough,
-            is_found=is_found,
-            found=found,
-            is_at_rest=is_at_rest[:n],
-        )
-        measured = np.where(is_at_rest, disparities, np.nan)
-        likeness = compare_patches(images, both, measured, config, row_offset_px=row_offset_px)
-        is_valid = is_found & likeness.are_alike[:n]
-        is_rivalled = likeness.select(np.arange(n, len(both))).rivals(likeness.select(doubtful))
-        # Those that come back to the disparity found were none.
-        is_rivalled &= np.abs(other - found[doubtful]) > COARSE_ERROR_PX
-        is_valid[doubtful[is_rivalled]] = False
-        note("klt.compared", is_alike=is_valid)
-        return found, is_valid
-
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool
     ) -> tuple[FloatArray, BoolArray]:
@@ -386,6 +345,9 @@ class KltFrontend:
             )
         note("klt.followed", disparities=disparities, is_at_rest=is_valid)
         return disparities, is_valid & self._is_in_range(disparities, offset_px)
+
+    def _max_disparity(self) -> float:
+        return float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
 
     def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:
         return is_in_depth_range(disparities - offset_px, self.camera, self._config.stereo)

@@ -7,13 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.disparity import (
-    compare_patches,
-    correlate_rows,
-    follow_disparities,
-    measure_disparities,
-    measure_row_shift,
-)
+from gvo.frontend.disparity import follow_disparities, measure_disparities
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
 
@@ -138,75 +132,3 @@ def test_whole_disparities_are_found_from_a_prediction_too() -> None:
     predicted = np.full(len(grid()), 6.0)
     found, is_valid = follow_disparities(pair(7.3), grid(), predicted, config, n_steps=3)
     np.testing.assert_array_equal(np.unique(found[is_valid]), [7.0])
-
-
-@pytest.mark.parametrize("shift", [-1.2, -0.4, 0.0, 0.3, 1.0])
-def test_rows_that_differ_are_measured_and_taken_off(shift: float) -> None:
-    images = image(), image(-7.3, shift)
-    pixels, known = grid(), 0.0
-    for _ in range(3):
-        found, is_valid = measure_disparities(
-            images, pixels, np.full(len(pixels), 7.0), CONFIG, reach_px=3, row_offset_px=known
-        )
-        left = measure_row_shift(
-            images, pixels[is_valid], found[is_valid], CONFIG, row_offset_px=known
-        )
-        assert left is not None
-        known += left
-    assert known == pytest.approx(shift, abs=0.03)
-
-
-def test_few_patches_say_nothing_of_rows() -> None:
-    assert measure_row_shift(pair(3.0), grid()[:20], np.full(20, 3.0), CONFIG) is None
-
-
-def test_patches_are_alike_at_the_right_disparity_whatever_the_exposure() -> None:
-    known = np.full(len(grid()), 7.0)
-    for gain in (0.9, 1.0):
-        assert compare_patches(pair(7.0, gain=gain), grid(), known, CONFIG).are_alike.all()
-    assert compare_patches(pair(7.0), grid(), known + 3.0, CONFIG).are_alike.mean() < 0.1
-    unknown = np.where(np.arange(len(known)) % 2 == 0, np.nan, known)
-    is_alike = compare_patches(pair(7.0), grid(), unknown, CONFIG).are_alike
-    np.testing.assert_array_equal(is_alike, unknown == 7.0)
-
-
-def test_patches_across_a_step_of_depth_are_not_alike() -> None:
-    rows = np.arange(SHAPE[0])
-    images = pair(np.where(rows < 60, 4.0, 9.0))
-    pixels = grid(step=3)
-    is_at_step = np.abs(pixels[:, 1] - 59.5) < 4
-    disparities = np.where(pixels[:, 1] < 60, 4.0, 9.0)
-    is_alike = compare_patches(images, pixels, disparities, CONFIG).are_alike
-    assert is_alike[is_at_step].mean() < 0.3
-    is_far = np.abs(pixels[:, 1] - 59.5) > 8
-    assert is_alike[is_far].mean() > 0.95
-
-
-def test_what_is_shown_twice_is_its_own_rival() -> None:
-    """Stripes of a period of 12 pixels, at disparity 5: 17 is as good, 11 half a period off."""
-    columns = np.arange(160.0)
-    stripes = np.tile(128 + 60 * np.sin(2 * np.pi * columns / 12), (120, 1))
-    left = stripes.astype(np.uint8)
-    right = np.roll(stripes, -5, axis=1).astype(np.uint8)
-    pixels = np.column_stack([np.linspace(50, 120, 20), np.linspace(30, 90, 20)])
-    found, second, between, nowhere = (
-        compare_patches((left, right), pixels, np.full(20, disparity), CONFIG)
-        for disparity in (5.0, 17.0, 11.0, np.nan)
-    )
-    assert found.are_alike.all()
-    assert second.rivals(found).all()
-    assert not between.rivals(found).any()
-    assert not nowhere.rivals(found).any()
-    some = np.array([3, 1])
-    np.testing.assert_array_equal(second.select(some).unlike, second.unlike[some])
-
-
-def test_patches_are_correlated_with_every_place_of_a_strip() -> None:
-    rng = np.random.default_rng(0)
-    patches = rng.normal(size=(7, 5, 5)).astype(np.float32)
-    strips = rng.normal(size=(7, 5, 12)).astype(np.float32)
-    expected = [
-        [np.sum(p * s[:, k : k + 5]) for k in range(8)]
-        for p, s in zip(patches, strips, strict=True)
-    ]
-    np.testing.assert_allclose(correlate_rows(patches, strips), expected, atol=1e-5)

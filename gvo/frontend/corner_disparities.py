@@ -1,0 +1,184 @@
+"""Disparities of corners, of which nothing is known yet, and which of them can be relied on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.config import StereoConfig
+from gvo.frontend.disparity import MAX_LAST_STEP_PX, MAX_STEP_PX, have_room
+from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
+from gvo.frontend.patches import (
+    Likeness,
+    Patches,
+    interpolate_strips,
+    sample_patches,
+    squared_differences,
+)
+from gvo.frontend.stereo import parabola_minimum
+from gvo.trace import note
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+
+# Steps from the coarse search to the disparity.
+N_SEARCH_STEPS = 6
+# Fewer say nothing of the rows, more hardly anything new.
+_MIN_ROW_SHIFTS = 50
+_MAX_ROW_SHIFTS = 120
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CornerDisparities:
+    """What the right image tells of corners in the left one.
+
+    Parameters
+    ----------
+    disparities : ndarray of float64, shape (n,)
+        Pixels; not a number where none was measured.
+    are_reliable : ndarray of bool, shape (n,)
+        Left and right show the same there, and nowhere else along the row.
+    row_shift_px : float or None
+        By how much the rows of left and right still differ; None where too few patches tell.
+    """
+
+    disparities: FloatArray
+    are_reliable: BoolArray
+    row_shift_px: float | None
+
+
+def measure_corners(
+    images: tuple[ImageArray, ImageArray],
+    corners: FloatArray,
+    config: StereoConfig,
+    *,
+    max_disparity: float,
+    row_offset_px: float = 0.0,
+) -> CornerDisparities:
+    """Search for corners of the left image along the whole row, and measure where they are.
+
+    Patches are cut once: those of the left image, and strips of the right one around what the
+    coarse search found. What that seems to show a second time is measured in the same way, as
+    windows of a house are all alike: where two disparities are as good, either may be wrong.
+
+    Parameters
+    ----------
+    images : tuple of two ndarrays of uint8, shape (height, width)
+        Rectified left and right.
+    corners : ndarray of float64, shape (n, 2)
+        Whole pixels in the left image.
+    config : StereoConfig
+        Size of the patches, how far to search on either side, sub-pixel steps or none.
+    max_disparity : float
+        Pixels.
+    row_offset_px : float
+        By how much rows of the right image are larger.
+
+    Returns
+    -------
+    CornerDisparities
+    """
+    rough, is_found, rivals = search_disparities(images, corners, max_disparity)
+    shape, radius = images[0].shape, config.patch_radius_px
+    placed = np.flatnonzero(is_found & have_room(shape, corners, rough, radius))
+    doubtful = np.flatnonzero(have_room(shape, corners[placed], rivals[placed], radius))
+    owners = np.concatenate([np.arange(len(placed)), doubtful])
+    starts = np.concatenate([rough[placed], rivals[placed[doubtful]]])
+    # One pixel wider on all sides, for the gradients along rows and across them.
+    left = sample_patches(images[0], corners[placed, 0], corners[placed, 1], radius + 1, radius + 1)
+    found, right, is_at_rest = _search_strips(
+        (left, images[1]), corners[placed], owners, starts, config, row_offset_px=row_offset_px
+    )
+    likeness = Likeness.of(left[owners, 1:-1, 1:-1], right).where(is_at_rest)
+    n = len(placed)
+    is_rivalled = likeness.select(np.arange(n, len(owners))).rivals(likeness.select(doubtful))
+    # Those that come back to the disparity found were none.
+    is_rivalled &= np.abs(found[n:] - found[doubtful]) > COARSE_ERROR_PX
+    is_reliable = likeness.are_alike[:n].copy()
+    is_reliable[doubtful[is_rivalled]] = False
+
+    disparities = np.full(len(corners), np.nan)
+    disparities[placed] = found[:n]
+    are_reliable = _scatter(is_reliable, placed, len(corners))
+    note(
+        "corners.searched",
+        rough=rough,
+        is_found=is_found,
+        is_at_rest=_scatter(is_at_rest[:n], placed, len(corners)),
+        are_reliable=are_reliable,
+    )
+    return CornerDisparities(
+        disparities=disparities,
+        are_reliable=are_reliable,
+        row_shift_px=measure_row_shift(left, right, np.flatnonzero(is_reliable)),
+    )
+
+
+def _search_strips(
+    images: tuple[NDArray[np.float32], ImageArray],
+    pixels: FloatArray,
+    owners: IntArray,
+    starts: FloatArray,
+    config: StereoConfig,
+    *,
+    row_offset_px: float,
+) -> tuple[FloatArray, NDArray[np.float32], BoolArray]:
+    """Look for left patches in the right image around so many disparities of their owners.
+
+    Returns the disparities found, the patches of the right image there, and where the search
+    came to rest.
+    """
+    left, right_image = images
+    radius, room = config.patch_radius_px, config.search_radius_px + 1
+    u, v = pixels[owners].T
+    columns = np.floor(u - starts)
+    zeros = u - columns + room  # the places of disparity zero
+    strips = sample_patches(right_image, columns, v + row_offset_px, radius + room, radius)
+    if config.subpixel == "none":
+        places, is_at_rest = parabola_minimum(squared_differences(left[owners, 1:-1, 1:-1], strips))
+        places = np.clip(zeros - np.rint(zeros - places), 0, 2 * room)
+    else:
+        places, step = (
+            Patches.of(left[:, 1:-1])
+            .take(owners)
+            .descend(strips, zeros - starts, n_steps=N_SEARCH_STEPS, max_step=MAX_STEP_PX)
+        )
+        is_at_rest = np.abs(step) < MAX_LAST_STEP_PX
+        is_at_rest &= np.abs(zeros - places - starts) < config.search_radius_px
+    return zeros - places, interpolate_strips(strips, places, 2 * radius + 1), is_at_rest
+
+
+def measure_row_shift(
+    left: NDArray[np.float32], right: NDArray[np.float32], chosen: IntArray
+) -> float | None:
+    """Measure by how much the rows of left and right still differ.
+
+    Parameters
+    ----------
+    left : ndarray of float32, shape (n, s + 2, s + 2)
+        Patches, one pixel wider on all sides.
+    right : ndarray of float32, shape (m, s, s), m >= n
+        At their disparities.
+    chosen : ndarray of int64
+        The patches to believe.
+
+    Returns
+    -------
+    float or None
+        Median of what is left, pixels; None where too few patches show it.
+    """
+    if len(chosen) < _MIN_ROW_SHIFTS:
+        return None
+    chosen = chosen[:: -(-len(chosen) // _MAX_ROW_SHIFTS)]
+    # Transposed, a step along the rows becomes one across them.
+    tall = np.swapaxes(left[chosen, :, 1:-1], 1, 2)
+    steps = -Patches.of(tall).curve(np.swapaxes(right[chosen], 1, 2))[:, 0]
+    steps = steps[np.abs(steps) < MAX_STEP_PX]
+    return float(np.median(steps)) if len(steps) >= _MIN_ROW_SHIFTS else None
+
+
+def _scatter(flags: BoolArray, places: IntArray, n: int) -> BoolArray:
+    """Return n flags: those given at their places, and False."""
+    scattered = np.zeros(n, dtype=np.bool_)
+    scattered[places] = flags
+    return scattered

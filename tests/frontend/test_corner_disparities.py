@@ -1,0 +1,103 @@
+"""Disparities of corners of which nothing is known, on images whose disparities are exact."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvo.config import StereoConfig
+from gvo.frontend.corner_disparities import CornerDisparities, measure_corners
+from gvo.types import FloatArray, ImageArray
+from tests.frontend.analytic import SHAPE, grid, image
+
+CONFIG = StereoConfig(patch_radius_px=5)
+
+
+def measure(
+    images: tuple[ImageArray, ImageArray],
+    corners: FloatArray | None = None,
+    *,
+    row_offset_px: float = 0.0,
+    config: StereoConfig = CONFIG,
+) -> CornerDisparities:
+    chosen = grid() if corners is None else corners
+    return measure_corners(images, chosen, config, max_disparity=40.0, row_offset_px=row_offset_px)
+
+
+@settings(deadline=None, max_examples=15)
+@given(disparity=st.floats(0.0, 20.0), gain=st.floats(0.95, 1.0))
+def test_they_are_right_to_hundredths_without_a_prediction(disparity: float, gain: float) -> None:
+    found = measure((image(), image(-disparity, gain=gain)))
+    assert found.are_reliable.mean() > 0.6
+    errors = found.disparities[found.are_reliable] - disparity
+    assert abs(np.median(errors)) < 0.03
+    assert np.quantile(np.abs(errors), 0.8) < 0.1
+
+
+def test_whole_disparities_are_whole() -> None:
+    config = StereoConfig(patch_radius_px=5, subpixel="none")
+    found = measure((image(), image(-7.3)), config=config)
+    np.testing.assert_array_equal(np.unique(found.disparities[found.are_reliable]), [7.0])
+
+
+def test_nothing_is_measured_in_flat_images() -> None:
+    flat = np.full(SHAPE, 90, dtype=np.uint8)
+    found = measure((flat, flat))
+    assert not found.are_reliable.any()
+    assert np.isnan(found.disparities).all()
+    assert found.row_shift_px is None
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (12, 200), (200, 12), (40, 40)])
+def test_no_corners_and_small_images_are_no_fault(shape: tuple[int, int]) -> None:
+    tiny = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    found = measure((tiny, tiny), np.array([[1.0, 1.0], [2.0, 2.0]]))
+    assert not found.are_reliable.any()
+    nothing = measure((tiny, tiny), np.zeros((0, 2)))
+    assert nothing.disparities.shape == nothing.are_reliable.shape == (0,)
+
+
+def test_patches_that_leave_an_image_are_not_measured() -> None:
+    corners = np.array([(4.0, 60.0), (100.0, 4.0), (100.0, 116.0), (14.0, 60.0), (100.0, 60.0)])
+    found = measure((image(), image(-10.0)), corners)
+    assert np.isnan(found.disparities[:4]).all()
+    assert found.disparities[4] == pytest.approx(10.0, abs=0.05)
+    assert found.are_reliable.tolist() == [False] * 4 + [True]
+
+
+def test_what_the_right_image_shows_twice_is_not_reliable() -> None:
+    """Stripes of a period of 24 pixels: every disparity is as good 24 pixels farther away."""
+    columns = np.arange(240.0)
+    rng = np.random.default_rng(0)
+    stripes = np.tile(128 + 50 * np.sin(2 * np.pi * columns / 24), (120, 1))
+    stripes += rng.normal(0.0, 1.0, stripes.shape)
+    images = stripes.astype(np.uint8), np.roll(stripes, -8, axis=1).astype(np.uint8)
+    inner = grid()[(grid()[:, 0] > 60) & (grid()[:, 0] < 180)]
+    found = measure(images, inner)
+    assert found.are_reliable.mean() < 0.1
+    once = measure((image(), image(-8.0)), inner)
+    assert once.are_reliable.mean() > 0.7
+
+
+def test_corners_across_a_step_of_depth_are_not_reliable() -> None:
+    rows = np.arange(SHAPE[0])
+    corners = grid(step=3)
+    found = measure((image(), image(-np.where(rows < 60, 4.0, 9.0))), corners)
+    is_at_step = np.abs(corners[:, 1] - 59.5) < 4
+    assert found.are_reliable[is_at_step].mean() < 0.3
+    assert found.are_reliable[np.abs(corners[:, 1] - 59.5) > 10].mean() > 0.6
+
+
+@pytest.mark.parametrize("shift", [-1.2, -0.4, 0.0, 0.3, 1.0])
+def test_rows_that_differ_are_measured_and_taken_off(shift: float) -> None:
+    images, known = (image(), image(-7.3, shift)), 0.0
+    for _ in range(3):
+        left = measure(images, row_offset_px=known).row_shift_px
+        assert left is not None
+        known += left
+    assert known == pytest.approx(shift, abs=0.03)
+
+
+def test_few_patches_say_nothing_of_rows() -> None:
+    assert measure((image(), image(-7.3)), grid()[:20]).row_shift_px is None
+    assert measure((image(), image(-7.3)), grid()).row_shift_px is not None
