@@ -252,7 +252,7 @@ class WindowConfig(Section):
         3, "registrations per frame at most: predecessor and keyframes", ge=1, le=20
     )
     min_overlap: float = _parameter(
-        0.3, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
+        0.4, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
     )
     link_overlap: float = _parameter(
         0.6, "of newer keyframes those are linked that share so much of the view", ge=0, le=1

@@ -55,7 +55,7 @@ def judge_links(
     accepted = {id(edge) for edge in window.edges(frame_id)}
     is_there = frame_id in window
     known = [edge for _, edge in offered if is_there and edge.reference_id in window]
-    chi2 = dict(zip(map(id, known), _chi2(known, frame_id, window), strict=True))
+    chi2 = {id(edge): _chi2(edge, frame_id, window) for edge in known}
     return tuple(
         FrameLink(
             reference_ns=int(edge.reference_id),  # type: ignore[call-overload]
@@ -67,13 +67,7 @@ def judge_links(
     )
 
 
-def _chi2(edges: Sequence[Edge], frame_id: int, window: SlidingWindow) -> list[float]:
-    if not edges:
-        return []
-    T_world_frame = window.pose(frame_id)
-    T_world_references = np.stack([window.pose(edge.reference_id) for edge in edges])
-    measured = np.stack([edge.T_reference_frame for edge in edges])
-    residuals = se3.log(se3.invert(measured) @ se3.invert(T_world_references) @ T_world_frame)
-    covariances = np.stack([edge.covariance for edge in edges])
-    whitened = np.linalg.solve(covariances, residuals[..., np.newaxis])[..., 0]
-    return [float(value) for value in np.einsum("ni,ni->n", residuals, whitened)]
+def _chi2(edge: Edge, frame_id: int, window: SlidingWindow) -> float:
+    T_reference_frame = se3.invert(window.pose(edge.reference_id)) @ window.pose(frame_id)
+    residual = se3.log(se3.invert(edge.T_reference_frame) @ T_reference_frame)
+    return float(residual @ np.linalg.solve(edge.covariance, residual))

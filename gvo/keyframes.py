@@ -9,7 +9,6 @@ import numpy as np
 
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import ObservationsT
-from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.keyframe_policy import proximity
 from gvo.types import FloatArray
@@ -97,9 +96,11 @@ def _overlap(
     """Return the share of points that another camera sees, at about the same distance."""
     if len(points_keyframe) == 0:
         return 0.0
-    points = se3.transform_points(T_current_keyframe, points_keyframe)
-    zoom = points[:, 2] / points_keyframe[:, 2]
-    points = points[(zoom > 1.0 / _MAX_ZOOM) & (zoom < _MAX_ZOOM)]
-    u, v = camera.project(points).T
-    is_in_view = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    T = T_current_keyframe
+    x, y, z = T[:3, :3] @ points_keyframe.T + T[:3, 3:]
+    zoom = z / points_keyframe[:, 2]
+    is_in_view = (zoom > 1.0 / _MAX_ZOOM) & (zoom < _MAX_ZOOM)
+    # The limits of the image times z, which is positive where the zoom is right.
+    u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
+    is_in_view &= (u >= 0.0) & (u < camera.width * z) & (v >= 0.0) & (v < camera.height * z)
     return float(np.count_nonzero(is_in_view)) / len(points_keyframe)

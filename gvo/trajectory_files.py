@@ -127,10 +127,9 @@ def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
         `stamp tx ty tz qx qy qz qw` with qw >= 0; nanometres, and twelve decimals of the
         quaternion.
     """
-    quaternion = se3.quaternions(T_world_cam[:3, :3]).tolist()
     # adding zero turns -0.0 into 0.0
     t = " ".join(f"{round(value, 9) + 0.0:.9f}" for value in T_world_cam[:3, 3].tolist())
-    q = " ".join(f"{round(value, 12) + 0.0:.12f}" for value in quaternion)
+    q = " ".join(f"{round(value, 12) + 0.0:.12f}" for value in se3.quaternion(T_world_cam[:3, :3]))
     return f"{format_stamp(stamp_ns)} {t} {q}"
 
 

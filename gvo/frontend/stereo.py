@@ -140,9 +140,9 @@ def is_in_depth_range(
     disparities: FloatArray, camera: StereoCamera, config: StereoConfig
 ) -> BoolArray:
     """Tell which disparities, shape (n,), mean a depth between the limits."""
-    depths = camera.disparity_to_depth(np.where(disparities > 0, disparities, np.nan))
-    with np.errstate(invalid="ignore"):
-        return np.asarray((depths >= config.min_depth_m) & (depths <= config.max_depth_m))
+    nearest, farthest = config.min_depth_m, config.max_depth_m
+    is_far_enough = (disparities > 0.0) & (disparities <= camera.depth_to_disparity(nearest))
+    return np.asarray(is_far_enough & (disparities >= camera.depth_to_disparity(farthest)))
 
 
 def _patch_ssd(

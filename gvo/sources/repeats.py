@@ -9,7 +9,7 @@ import numpy as np
 from gvo.errors import GvoError
 from gvo.types import FaultyFrame, Frame, ImageArray, StereoFrame
 
-_ROW_STEP = 16
+_ROW_STEP = 64
 
 
 def refuse_repeats(
