@@ -7,7 +7,7 @@ far away. It is the share of the view that they have in common where points are 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from typing import TypeVar
 
 import numpy as np
@@ -57,43 +57,46 @@ def choose_links(
     scores: Mapping[_Id, float],
     config: WindowConfig,
     *,
+    n_steps: Mapping[_Id, int],
     exclude: Hashable = None,
-    tied: Collection[Hashable] = (),
 ) -> tuple[list[_Id], list[_Id]]:
     """Choose the kept frames to register the current frame against.
 
-    Half of them are the oldest that still have enough in common with it: these hold the drift.
-    The others have the most in common. A link of these pays only where it says more than the
-    steps do, which are known already: over many steps, and over most of the view.
+    Of those that are worth it, half are the oldest, which hold the drift, and the others have the
+    most in common with it. What a link tells beyond the steps, which are known already, grows
+    with the number of these, whose errors add up, and with the points that both frames see: the
+    product has to exceed `link_gain`.
 
     Parameters
     ----------
     scores : mapping of frame to float
         Oldest first.
     config : WindowConfig
-        `n_links`, of which one goes to the predecessor, `min_overlap` and `link_overlap`.
+        `n_links`, of which one goes to the predecessor, `min_overlap` and `link_gain`.
+    n_steps : mapping of frame to int
+        Steps from each to the current frame.
     exclude : hashable
         The predecessor.
-    tied : collection of hashable
-        Frames that a few registered steps tie to the current one.
 
     Returns
     -------
     chosen : list of frames
     spare : list of frames
-        Those that fill up the number, for where the chosen do not bear out the steps.
+        Those that fill up the number, nearest first, for where the steps are in doubt.
     """
     n = config.n_links - 1
     usable = [
         frame for frame, score in scores.items() if score >= config.min_overlap and frame != exclude
     ]
-    n_by_age = (n + 1) // 2
-    nearest = sorted(usable[n_by_age:], key=lambda frame: -scores[frame])
-    telling = [
-        frame for frame in nearest if scores[frame] >= config.link_overlap and frame not in tied
-    ]
-    chosen = (usable[:n_by_age] + telling)[:n]
-    return chosen, [frame for frame in nearest if frame not in chosen][: n - len(chosen)]
+    telling = [frame for frame in usable if n_steps[frame] * scores[frame] >= config.link_gain]
+    by_age, others = telling[: (n + 1) // 2], telling[(n + 1) // 2 :]
+    chosen = (by_age + _nearest_first(others, scores))[:n]
+    rest = [frame for frame in usable if frame not in chosen]
+    return chosen, _nearest_first(rest, scores)[: n - len(chosen)]
+
+
+def _nearest_first(frames: list[_Id], scores: Mapping[_Id, float]) -> list[_Id]:
+    return sorted(frames, key=lambda frame: -scores[frame])
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from gvo.backend.gating import disagreement
 from gvo.chain import RawStep
@@ -11,24 +11,13 @@ from gvo.geometry import se3
 from gvo.keyframe_policy import choose_links
 from gvo.types import Edge, FloatArray
 
-# Over so many steps the sum of their noise stays below that of a link, which sees the current
-# frame through the same noisy pixels as the last step.
-_N_TIED = 4
+# Registered steps whose errors add up to that of a step which only goes on as before.
+_N_UNKNOWN = 1000
 
 
-def tie(tied_ns: Sequence[int], step: RawStep) -> list[int]:
-    """Return the frames that a few registered steps tie to the current one, newest last.
-
-    Parameters
-    ----------
-    tied_ns : sequence of int
-        Those of the frame before.
-    step : RawStep
-        To the current frame.
-    """
-    if step.reference_ns is None or not step.is_registered:
-        return []
-    return [*tied_ns, step.reference_ns][-_N_TIED:]
+def count_steps(step: RawStep) -> int:
+    """Return by how many registered steps the errors of the chain grow."""
+    return 1 if step.is_registered else _N_UNKNOWN
 
 
 def link_keyframes(
@@ -38,9 +27,11 @@ def link_keyframes(
     step: RawStep,
     config: WindowConfig,
     *,
-    tied_ns: Sequence[int],
+    n_steps: Mapping[int, int],
 ) -> list[Edge]:
-    """Register a frame against keyframes; more of them where the first do not bear out its step.
+    """Register a frame against keyframes that tell more than its steps do.
+
+    Where the step is none, or none of the keyframes bears it out, others are asked as well.
 
     Parameters
     ----------
@@ -54,13 +45,16 @@ def link_keyframes(
     step : RawStep
         Of the frame.
     config : WindowConfig
-    tied_ns : sequence of int
-        Frames that a few registered steps tie to it.
+    n_steps : mapping of int to int
+        Steps since each keyframe, `count_steps`.
     """
-    chosen, spare = choose_links(scores, config, exclude=step.reference_ns, tied=tied_ns)
+    chosen, spare = choose_links(scores, config, n_steps=n_steps, exclude=step.reference_ns)
     predicted = {ns: se3.invert(T_frame_keyframes[ns]) for ns in [*chosen, *spare]}
     links = {ns: measure(ns, predicted[ns]) for ns in chosen}
-    if not any(_bears_out(link, predicted[ns], step, config) for ns, link in links.items()):
+    are_asked = not step.is_registered or bool(links)
+    if are_asked and not any(
+        _bears_out(link, predicted[ns], step, config) for ns, link in links.items()
+    ):
         links |= {ns: measure(ns, predicted[ns]) for ns in spare}
     return [link for link in links.values() if link is not None]
 
@@ -71,6 +65,5 @@ def _bears_out(
     """Tell whether a link agrees with the step that its prediction comes from."""
     if link is None or not step.is_registered:
         return False
-    return config.gate is None or not disagreement(
-        link, T_keyframe_frame, step.covariance, gate=config.gate
-    )
+    gate = config.gate
+    return gate is None or not disagreement(link, T_keyframe_frame, step.covariance, gate=gate)

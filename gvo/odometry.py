@@ -24,7 +24,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.keyframe_policy import choose_released, is_needed
 from gvo.keyframes import Keyframes
-from gvo.linking import link_keyframes, tie
+from gvo.linking import count_steps, link_keyframes
 from gvo.segments import Segments, Sighting
 from gvo.types import (
     Edge,
@@ -131,7 +131,8 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
         self._segments = Segments()
-        self._tied_ns: list[int] = []
+        self._n_steps = 0
+        self._kept_at: dict[int, int] = {}  # number of steps by keyframe
 
     @property
     def config(self) -> Config:
@@ -208,7 +209,7 @@ class Odometry:
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(observations)
-            self._tied_ns = tie(self._tied_ns, step)
+            self._n_steps += count_steps(step)
         with watch.stage("links"):
             offered, scores = self._edges(observations, step)
             found = self._look_around(observations, step)
@@ -322,7 +323,7 @@ class Odometry:
         links = link_keyframes(
             *(partial(self._link, observations), scores, T_frame_keyframes, step),
             self._config.window,
-            tied_ns=self._tied_ns,
+            n_steps={ns: self._n_steps - self._kept_at[ns] for ns in scores},
         )
         edges = first + [("keyframe", edge) for edge in links]
         still = zero_motion_edge(step, self._config.window)
@@ -407,6 +408,8 @@ class Odometry:
         for stamp_ns in self._keyframes.stamps_ns:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
+        kept_ns = self._keyframes.stamps_ns
+        self._kept_at = {ns: self._kept_at.get(ns, self._n_steps) for ns in kept_ns}
 
     def _hold_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""

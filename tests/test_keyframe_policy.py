@@ -1,5 +1,6 @@
 """The policy of keyframes over scores."""
 
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ def configure(**changes: Any) -> WindowConfig:
         "n_keyframes": 3,
         "n_links": 3,
         "min_overlap": 0.3,
+        "link_gain": 2.5,
         "keyframe_overlap": 0.75,
         "keyframe_distance_m": 2.0,
         "keyframe_angle_deg": 20.0,
@@ -76,30 +78,38 @@ def test_a_keyframe_is_needed_where_all_others_are_too_far(
     assert is_needed(scores, configure()) == expected
 
 
+def choose(
+    scores: Mapping[Any, float], n_steps: int = 100, *, exclude: Hashable = None, **changes: Any
+) -> tuple[list[Any], list[Any]]:
+    since = dict.fromkeys(scores, n_steps)
+    return choose_links(scores, configure(**changes), n_steps=since, exclude=exclude)
+
+
 def test_links_go_to_the_oldest_and_to_the_nearest() -> None:
     scores = {5: 0.1, 10: 0.4, 20: 0.9, 30: 0.5, 40: 0.95, 50: 0.99}
-    assert choose_links(scores, configure(n_links=3), exclude=50) == ([10, 40], [])
-    assert choose_links(scores, configure(n_links=5), exclude=50) == ([10, 20, 40], [30])
-    assert choose_links(scores, configure(n_links=3)) == ([10, 50], [])
-    assert choose_links(scores, configure(n_links=1), exclude=50) == ([], [])
-    assert choose_links({}, configure(n_links=3), exclude=0) == ([], [])
+    assert choose(scores, n_links=3, exclude=50) == ([10, 40], [])
+    assert choose(scores, n_links=5, exclude=50) == ([10, 20, 40, 30], [])
+    assert choose(scores, n_links=3) == ([10, 50], [])
+    assert choose(scores, n_links=1, exclude=50) == ([], [])
+    assert choose({}, n_links=3, exclude=0) == ([], [])
 
 
-def test_a_newer_keyframe_of_few_steps_or_little_overlap_is_spare() -> None:
-    scores = {10: 0.4, 20: 0.59, 30: 0.6, 40: 0.9}
-    assert choose_links(scores, configure(), tied=[40, 50]) == ([10, 30], [])
-    assert choose_links(scores, configure(), tied=[30, 40, 50]) == ([10], [40])
-    assert choose_links(scores, configure(link_overlap=0.61), tied=[40]) == ([10], [40])
-    assert choose_links(scores, configure(link_overlap=0.0), tied=[30, 40]) == ([10, 20], [])
-
-
-def test_the_oldest_keyframe_is_linked_whatever_ties_it() -> None:
-    assert choose_links({40: 0.3, 50: 0.5}, configure(), tied=[40, 50]) == ([40], [50])
+def test_links_go_where_many_steps_or_many_points_lie_between() -> None:
+    scores = {10: 0.4, 20: 0.5, 30: 0.9}
+    n_steps = {10: 8, 20: 5, 30: 2}
+    # Products of 3.2, 2.5 and 1.8.
+    for gain, expected in (
+        (0.0, ([10, 30], [])),
+        (2.5, ([10, 20], [])),
+        (2.6, ([10], [30])),
+        (3.3, ([], [30, 20])),
+    ):
+        assert choose_links(scores, configure(link_gain=gain), n_steps=n_steps) == expected
 
 
 def test_frames_need_no_order_of_their_own() -> None:
     scores = {"zebra": 0.4, "ape": 0.9, ("a", 1): 0.9}
-    assert choose_links(scores, configure(), exclude="none") == (["zebra", "ape"], [])
+    assert choose(scores, exclude="none") == (["zebra", "ape"], [])
     assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
 
 
@@ -108,19 +118,18 @@ def test_frames_need_no_order_of_their_own() -> None:
     scores=st.dictionaries(st.integers(0, 50), st.floats(0.0, 1.0), max_size=12),
     n_links=st.integers(1, 8),
     exclude=st.integers(0, 50),
-    tied=st.sets(st.integers(0, 50), max_size=4),
+    n_steps=st.integers(1, 20),
 )
 def test_links_are_near_once_each_and_not_to_the_predecessor(
-    scores: dict[int, float], n_links: int, exclude: int, tied: set[int]
+    scores: dict[int, float], n_links: int, exclude: int, n_steps: int
 ) -> None:
-    chosen, spare = choose_links(scores, configure(n_links=n_links), exclude=exclude, tied=tied)
-    links = chosen + spare
-    usable = [frame for frame, score in scores.items() if score >= 0.3 and frame != exclude]
-    assert len(links) == len(set(links)) == min(n_links - 1, len(usable))
-    assert set(links) <= set(usable)
-    assert chosen[:1] == usable[: n_links - 1][:1]
-    newer = set(chosen) - set(usable[: n_links // 2])
-    assert all(scores[frame] >= 0.6 and frame not in tied for frame in newer)
+    chosen, spare = choose(scores, n_steps, n_links=n_links, exclude=exclude)
+    usable = {frame for frame, score in scores.items() if score >= 0.3} - {exclude}
+    assert len(chosen + spare) == len({*chosen, *spare}) == min(n_links - 1, len(usable))
+    assert {*chosen, *spare} <= usable
+    assert all(n_steps * scores[frame] >= 2.5 for frame in chosen)
+    worth_it = [frame for frame in usable if n_steps * scores[frame] >= 2.5]
+    assert len(chosen) == min(n_links - 1, len(worth_it))
 
 
 @settings(deadline=None)

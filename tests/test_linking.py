@@ -8,13 +8,13 @@ import pytest
 from gvo.chain import RawStep
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.linking import link_keyframes, tie
+from gvo.linking import count_steps, link_keyframes
 from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
 
-CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_overlap=0.6, gate=10.0)
-# The oldest is chosen, the other is spare: two steps ago, with little in common.
+CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_gain=2.5, gate=10.0)
+# The first is chosen, the other is spare: two steps ago.
 SCORES = {10: 0.4, 80: 0.5}
-TIED = [70, 80, 90]
+N_STEPS = {10: 9, 80: 2}
 SIGMA = 0.01
 
 
@@ -63,7 +63,7 @@ class Registrations:
 def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
     poses = {ns: forward(-0.1 * (100 - ns)) for ns in SCORES}
     config = CONFIG.model_copy(update=changes)
-    links = link_keyframes(measure, SCORES, poses, step, config, tied_ns=TIED)
+    links = link_keyframes(measure, SCORES, poses, step, config, n_steps=N_STEPS)
     return [link.reference_id for link in links]
 
 
@@ -100,18 +100,16 @@ def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
     def measure(stamp_ns: int, prior: FloatArray) -> None:
         priors[stamp_ns] = prior
 
-    link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, tied_ns=[])
+    link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, n_steps={10: 9})
     np.testing.assert_allclose(priors[10], forward(9.0), atol=1e-12)
 
 
-def test_registered_steps_tie_the_last_few_frames() -> None:
-    tied: list[int] = []
-    for ns in range(1, 8):
-        tied = tie(tied, step_of(reference_ns=ns))
-    assert tied == [4, 5, 6, 7]
+def test_steps_that_tell_as_much_are_not_questioned() -> None:
+    measure = Registrations()
+    assert linked(measure, step_of(), link_gain=4.0) == measure.asked == []
+    assert linked(measure, step_of(is_registered=False), link_gain=4.0) == [80, 10]
 
 
-def test_a_step_without_registration_ties_nothing() -> None:
-    assert tie([1, 2, 3], step_of(is_registered=False, reference_ns=4)) == []
-    assert tie([], step_of(reference_ns=None)) == []
-    assert tie([], step_of(reference_ns=3)) == [3]
+def test_a_step_without_registration_counts_as_very_many() -> None:
+    assert count_steps(step_of()) == 1
+    assert count_steps(step_of(is_registered=False)) > 100

@@ -189,9 +189,9 @@ def _links_caption(explanation: FrameExplanation) -> str:
     text = (
         f"{n_accepted} edges tie the frame to earlier ones (blue frames); {window.n_links} "
         "registrations at most are tried (window.n_links). Overlap is the share of a keyframe's "
-        f"points in view: below {window.min_overlap:g} it is let go (window.min_overlap), newer "
-        f"ones of at least {window.link_overlap:g} are linked (window.link_overlap), and "
-        f"where all are below {window.keyframe_overlap:g} the frame becomes a keyframe itself "
+        f"points in view: below {window.min_overlap:g} it is let go (window.min_overlap), "
+        f"times the steps since it must be {window.link_gain:g} to be linked (window.link_gain), "
+        f"and where all are below {window.keyframe_overlap:g} the frame becomes a keyframe itself "
         "(window.keyframe_overlap), as this one "
         f"{'did' if explanation.became_keyframe else 'did not'}. "
         "Chi2 is the squared distance of the edge from the window's poses in sigmas; of 6 degrees "
