@@ -14,8 +14,12 @@ from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
 from gvo.geometry import se3
 from gvo.types import Contradiction, Estimate, Failure, FloatArray, RelativePose, Status
 
-# The usual velocity is the median of those of so many seconds.
+# The usual velocity, and its usual change from step to step, are the medians of so many seconds.
 _USUAL_S = 1.0
+# A step is steady where no component changes by more than so many times what is usual. Of normal
+# errors that is 3.4 sigma; fewer changes than so many tell nothing of what is usual.
+_STEADY = 5.0
+_MIN_CHANGES = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,6 +40,8 @@ class RawStep:
     reason : str
         Why there is no registration; empty where there is one.
     n_matches, n_inliers : int
+    is_steady : bool
+        The velocity changed no more than it did from step to step in the last second.
     """
 
     estimate: Estimate
@@ -46,6 +52,7 @@ class RawStep:
     reason: str = ""
     n_matches: int = 0
     n_inliers: int = 0
+    is_steady: bool = False
 
     @property
     def is_registered(self) -> bool:
@@ -88,6 +95,7 @@ class RawChain(Generic[ObservationsT]):
         self._anchor: _Link[ObservationsT] | None = None
         self._velocity: FloatArray | None = None
         self._velocities: list[tuple[int, FloatArray]] = []
+        self._changes: list[tuple[int, FloatArray]] = []
 
     @property
     def anchor_ns(self) -> int | None:
@@ -201,8 +209,11 @@ class RawChain(Generic[ObservationsT]):
             ),
         )
         span_s = 1e-9 * (current.stamp_ns - link.observations.stamp_ns)
-        self._velocity = se3.log(result.T_reference_current) / span_s
-        self._note_velocity(current.stamp_ns, self._velocity)
+        velocity = se3.log(result.T_reference_current) / span_s
+        sigmas = np.sqrt(np.diagonal(result.covariance)) / span_s
+        is_steady = self._note_change(current.stamp_ns, velocity, sigmas)
+        self._velocity = velocity
+        self._velocities = _of_last_second(self._velocities, (current.stamp_ns, velocity))
         self._predecessor = self._anchor = _link_of(current, estimate)
         return RawStep(
             estimate=estimate,
@@ -212,11 +223,20 @@ class RawChain(Generic[ObservationsT]):
             registration=result,
             n_matches=result.n_matches,
             n_inliers=result.n_inliers,
+            is_steady=is_steady,
         )
 
-    def _note_velocity(self, stamp_ns: int, velocity: FloatArray) -> None:
-        kept = [*self._velocities, (stamp_ns, velocity)]
-        self._velocities = [(ns, each) for ns, each in kept if 1e-9 * (stamp_ns - ns) <= _USUAL_S]
+    def _note_change(self, stamp_ns: int, velocity: FloatArray, sigmas: FloatArray) -> bool:
+        """Note the change of the velocity, and tell whether changes like that are usual."""
+        if self._velocity is None:
+            return False
+        change = np.abs(velocity - self._velocity)
+        known = np.sort([each for _, each in self._changes], axis=0)
+        self._changes = _of_last_second(self._changes, (stamp_ns, change))
+        if len(known) < _MIN_CHANGES:
+            return False
+        usual = np.maximum(known[len(known) // 2], sigmas)
+        return bool((change <= _STEADY * usual).all())
 
     def _coast(
         self,
@@ -244,6 +264,13 @@ class RawChain(Generic[ObservationsT]):
             n_matches=failure.n_matches,
             n_inliers=failure.n_inliers,
         )
+
+
+def _of_last_second(
+    noted: list[tuple[int, FloatArray]], newest: tuple[int, FloatArray]
+) -> list[tuple[int, FloatArray]]:
+    kept = [*noted, newest]
+    return [(ns, each) for ns, each in kept if 1e-9 * (newest[0] - ns) <= _USUAL_S]
 
 
 def _with_observations(

@@ -255,7 +255,7 @@ class WindowConfig(Section):
         0.4, "a keyframe leaves when a smaller share of its points is in view", ge=0, le=1
     )
     link_gain: float = _parameter(
-        2.5, "a keyframe is linked where steps since, times its share in view, are more", ge=0
+        2.5, "a keyframe is linked where steps since, times its share in view, are no less", ge=0
     )
     keyframe_overlap: float = _parameter(
         0.9, "a frame becomes a keyframe when it overlaps all others less", ge=0, le=1

@@ -65,7 +65,7 @@ def choose_links(
     Of those that are worth it, half are the oldest, which hold the drift, and the others have the
     most in common with it. What a link tells beyond the steps, which are known already, grows
     with the number of these, whose errors add up, and with the points that both frames see: the
-    product has to exceed `link_gain`.
+    product has to be at least `link_gain`.
 
     Parameters
     ----------

@@ -15,9 +15,19 @@ from gvo.types import Edge, FloatArray
 _N_UNKNOWN = 1000
 
 
-def count_steps(step: RawStep) -> int:
-    """Return by how many registered steps the errors of the chain grow."""
-    return 1 if step.is_registered else _N_UNKNOWN
+def count_steps(step: RawStep, n_steps: Mapping[int, int]) -> int:
+    """Return over how many registered steps the errors of the chain have added up.
+
+    Parameters
+    ----------
+    step : RawStep
+        To the current frame.
+    n_steps : mapping of int to int
+        The same of earlier frames, by stamp; of that which the step starts from at least.
+    """
+    if step.reference_ns is None:
+        return 0
+    return n_steps[step.reference_ns] + (1 if step.is_registered else _N_UNKNOWN)
 
 
 def link_keyframes(
@@ -31,7 +41,8 @@ def link_keyframes(
 ) -> list[Edge]:
     """Register a frame against keyframes that tell more than its steps do.
 
-    Where the step is none, or none of the keyframes bears it out, others are asked as well.
+    Where the step was not registered, or changes the velocity as never before, or none of these
+    keyframes bears it out, others are asked, one after the other until one does.
 
     Parameters
     ----------
@@ -46,23 +57,33 @@ def link_keyframes(
         Of the frame.
     config : WindowConfig
     n_steps : mapping of int to int
-        Steps since each keyframe, `count_steps`.
+        Steps since each keyframe.
     """
     chosen, spare = choose_links(scores, config, n_steps=n_steps, exclude=step.reference_ns)
     predicted = {ns: se3.invert(T_frame_keyframes[ns]) for ns in [*chosen, *spare]}
-    links = {ns: measure(ns, predicted[ns]) for ns in chosen}
-    are_asked = not step.is_registered or bool(links)
-    if are_asked and not any(
-        _bears_out(link, predicted[ns], step, config) for ns, link in links.items()
-    ):
-        links |= {ns: measure(ns, predicted[ns]) for ns in spare}
-    return [link for link in links.values() if link is not None]
+    links = [measure(ns, predicted[ns]) for ns in chosen]
+    is_borne_out = any(
+        _bears_out(link, predicted[ns], step, config)
+        for ns, link in zip(chosen, links, strict=True)
+    )
+    if not chosen and step.is_registered and step.is_steady:
+        spare = []
+    for ns in spare:
+        if is_borne_out:
+            break
+        links.append(measure(ns, predicted[ns]))
+        is_borne_out = _bears_out(links[-1], predicted[ns], step, config)
+    return [link for link in links if link is not None]
 
 
 def _bears_out(
     link: Edge | None, T_keyframe_frame: FloatArray, step: RawStep, config: WindowConfig
 ) -> bool:
-    """Tell whether a link agrees with the step that its prediction comes from."""
+    """Tell whether a link agrees with the step that its prediction comes from.
+
+    What the poses of the window have drifted since counts against the step too: then another
+    keyframe is asked for nothing, which is better than that one is not asked.
+    """
     if link is None or not step.is_registered:
         return False
     gate = config.gate

@@ -131,8 +131,8 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
         self._segments = Segments()
-        self._n_steps = 0
-        self._kept_at: dict[int, int] = {}  # number of steps by keyframe
+        # Over how many steps the errors of the chain had added up at a frame, by stamp.
+        self._n_steps: dict[int, int] = {}
 
     @property
     def config(self) -> Config:
@@ -209,7 +209,7 @@ class Odometry:
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(observations)
-            self._n_steps += count_steps(step)
+            self._n_steps[frame.stamp_ns] = count_steps(step, self._n_steps)
         with watch.stage("links"):
             offered, scores = self._edges(observations, step)
             found = self._look_around(observations, step)
@@ -222,6 +222,7 @@ class Odometry:
             joins = self._note_segments(step, causal)
             self._update_keyframes(observations, scores, causal)
             self._hold_anchor()
+            self._hold_counts(frame.stamp_ns)
         if not self._is_own:
             self._hold_frame(frame)
         n_points = _count_points(observations)
@@ -320,11 +321,11 @@ class Odometry:
             if stamp_ns in self._window and stamp_ns not in apart
         }
         scores = self._keyframes.scores(T_frame_keyframes)
-        links = link_keyframes(
-            *(partial(self._link, observations), scores, T_frame_keyframes, step),
-            self._config.window,
-            n_steps={ns: self._n_steps - self._kept_at[ns] for ns in scores},
-        )
+        measure = partial(self._link, observations)
+        n_now = self._n_steps[observations.stamp_ns]
+        n_steps = {ns: n_now - self._n_steps[ns] for ns in scores}
+        config = self._config.window
+        links = link_keyframes(measure, scores, T_frame_keyframes, step, config, n_steps=n_steps)
         edges = first + [("keyframe", edge) for edge in links]
         still = zero_motion_edge(step, self._config.window)
         return edges if still is None else [*edges, ("standstill", still)], scores
@@ -408,8 +409,6 @@ class Odometry:
         for stamp_ns in self._keyframes.stamps_ns:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
-        kept_ns = self._keyframes.stamps_ns
-        self._kept_at = {ns: self._kept_at.get(ns, self._n_steps) for ns in kept_ns}
 
     def _hold_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
@@ -418,6 +417,10 @@ class Odometry:
             self._window.release(previous)
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
+
+    def _hold_counts(self, stamp_ns: int) -> None:
+        needed = {stamp_ns, self._anchor_ns, *self._keyframes.stamps_ns}
+        self._n_steps = {ns: n for ns, n in self._n_steps.items() if ns in needed}
 
     def _hold_frame(self, frame: Stamped) -> None:
         held = {**self._frames, frame.stamp_ns: frame}

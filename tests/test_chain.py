@@ -267,3 +267,29 @@ def test_the_flow_is_handed_on() -> None:
     stamps = stamps_of(3)
     chain = RawChain(Spoilt(stamps[2], flow_px=2.5), SETTINGS)
     assert [chain.advance(observe(stamp)).flow_px for stamp in stamps] == [None, None, 2.5]
+
+
+def test_a_step_is_steady_where_the_velocity_changes_as_it_used_to() -> None:
+    """Sigmas are 0.02 m and more: jumps of 0.04 m to and fro are usual, 0.5 m once are not."""
+
+    def pose(stamp_ns: int) -> FloatArray:
+        index = stamp_ns // STEP_NS
+        T = steady(stamp_ns)
+        T[:3, 3] += 0.04 * (index % 2) + 0.5 * (index >= 12)
+        return T
+
+    steps, _ = run([i * STEP_NS for i in range(24)], set(), pose)
+    are_steady = [step.is_steady for step in steps]
+    # The first frame, the first velocity, and three changes that tell what is usual.
+    assert are_steady[:5] == [False] * 5
+    assert all(are_steady[5:12])
+    # The jump, and the return to the velocity before it.
+    assert are_steady[12:14] == [False, False]
+    assert all(are_steady[14:])
+
+
+def test_a_step_that_only_goes_on_is_not_called_steady() -> None:
+    steps, _ = run([i * STEP_NS for i in range(12)], {9 * STEP_NS})
+    assert steps[8].is_steady
+    assert not steps[9].is_steady
+    assert steps[10].is_steady

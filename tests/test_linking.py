@@ -22,7 +22,9 @@ def forward(distance_m: float) -> FloatArray:
     return se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, distance_m]))
 
 
-def step_of(*, is_registered: bool = True, reference_ns: int | None = 90) -> RawStep:
+def step_of(
+    *, is_registered: bool = True, is_steady: bool = True, reference_ns: int | None = 90
+) -> RawStep:
     covariance = SIGMA**2 * np.eye(6)
     registration = RelativePose(
         T_reference_current=forward(1.0),
@@ -38,6 +40,7 @@ def step_of(*, is_registered: bool = True, reference_ns: int | None = 90) -> Raw
         T_reference_frame=forward(1.0),
         covariance=covariance,
         registration=registration if is_registered else None,
+        is_steady=is_steady,
     )
 
 
@@ -104,12 +107,23 @@ def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
     np.testing.assert_allclose(priors[10], forward(9.0), atol=1e-12)
 
 
-def test_steps_that_tell_as_much_are_not_questioned() -> None:
+def test_steady_steps_that_tell_as_much_are_not_questioned() -> None:
     measure = Registrations()
     assert linked(measure, step_of(), link_gain=4.0) == measure.asked == []
-    assert linked(measure, step_of(is_registered=False), link_gain=4.0) == [80, 10]
 
 
-def test_a_step_without_registration_counts_as_very_many() -> None:
-    assert count_steps(step_of()) == 1
-    assert count_steps(step_of(is_registered=False)) > 100
+def test_an_unsteady_step_is_checked_until_a_keyframe_bears_it_out() -> None:
+    unsteady = step_of(is_steady=False)
+    assert linked(Registrations(), unsteady, link_gain=4.0) == [80]
+    assert linked(Registrations(of_80=1e6), unsteady, link_gain=4.0) == [80, 10]
+    assert linked(Registrations(of_80=None), unsteady, link_gain=4.0) == [10]
+    unregistered = step_of(is_registered=False)
+    assert linked(Registrations(), unregistered, link_gain=4.0) == [80, 10]
+
+
+def test_steps_are_counted_from_where_they_start() -> None:
+    counts = {80: 7, 90: 8}
+    assert count_steps(step_of(), counts) == 9
+    assert count_steps(step_of(reference_ns=80), counts) == 8
+    assert count_steps(step_of(is_registered=False), counts) > 100
+    assert count_steps(step_of(reference_ns=None), {}) == 0

@@ -420,6 +420,30 @@ def test_its_keyframes_are_chosen_by_distance() -> None:
     assert max(result.n_links for result in results) == 3
 
 
+class OnceWrongFrontend(ScanFrontend):
+    """Registers one pair of consecutive scans wrong by a metre and a half, and is sure of it."""
+
+    def register(
+        self, reference: Scan, current: Scan, prior: FloatArray | None
+    ) -> RelativePose | Failure:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure) or self.pairs[-1] != (20 * STEP_NS, 21 * STEP_NS):
+            return result
+        wrong = result.T_reference_current @ se3.exp(np.array([0.0, 0.0, 0.0, 1.5, 0.0, 0.0]))
+        return RelativePose(T_reference_current=wrong, covariance=result.covariance)
+
+
+@pytest.mark.parametrize("step_m", [0.4, 0.8, 1.0, 1.2])
+def test_keyframes_outvote_a_wrong_step_also_where_they_are_lost_soon(step_m: float) -> None:
+    odometry = Odometry(frontend=OnceWrongFrontend())
+    for index in range(40):
+        T = se3.exp(np.array([0.0, 0.0, 0.0, step_m * index, 0.0, 0.0]))
+        result = odometry.track(Scan(index * STEP_NS, T))
+        error_m = np.linalg.norm(result.causal.T_world_cam[:3, 3] - T[:3, 3])
+        assert error_m < 0.3  # what the chain drifts by
+    assert np.linalg.norm(result.raw.T_world_cam[:3, 3] - T[:3, 3]) > 1.3
+
+
 def test_an_empty_scan_is_coasted_over() -> None:
     results, _ = run_scans(12, empty=6)
     assert [r.status for r in results[5:8]] == [Status.OK, Status.COASTING, Status.RESUMED]

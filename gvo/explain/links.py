@@ -122,7 +122,7 @@ def _keyframe(
     score: float | None,
 ) -> KeyframeLink:
     is_accepted = offered is not None and offered.is_accepted
-    reason = "" if is_accepted else "steps and other links say as much"
+    reason = "" if is_accepted else "steps, or other keyframes, tell as much"
     if score is not None and score < before.min_overlap:
         reason = "too little overlap"
     if isinstance(registration, Failure):

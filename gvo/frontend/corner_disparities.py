@@ -90,28 +90,31 @@ def measure_corners(
         (left, images[1]), corners[placed], owners, starts, config, row_offset_px=row_offset_px
     )
     likeness = Likeness.of(left[owners, 1:-1, 1:-1], right).where(is_at_rest)
-    n = len(placed)
-    is_rivalled = likeness.select(np.arange(n, len(owners))).rivals(likeness.select(doubtful))
-    # Those that come back to the disparity found were none.
-    is_rivalled &= np.abs(found[n:] - found[doubtful]) > COARSE_ERROR_PX
-    is_reliable = likeness.are_alike[:n].copy()
-    is_reliable[doubtful[is_rivalled]] = False
+    is_reliable = _are_unrivalled(likeness, found, doubtful)
 
+    n = len(placed)
     disparities = np.full(len(corners), np.nan)
     disparities[placed] = found[:n]
     are_reliable = _scatter(is_reliable, placed, len(corners))
-    note(
-        "corners.searched",
-        rough=rough,
-        is_found=is_found,
-        is_at_rest=_scatter(is_at_rest[:n], placed, len(corners)),
-        are_reliable=are_reliable,
-    )
+    is_at_rest = _scatter(is_at_rest[:n], placed, len(corners))
+    searched = {"rough": rough, "is_found": is_found, "is_at_rest": is_at_rest}
+    note("corners.searched", **searched, are_reliable=are_reliable)
     return CornerDisparities(
         disparities=disparities,
         are_reliable=are_reliable,
         row_shift_px=measure_row_shift(left, right, np.flatnonzero(is_reliable)),
     )
+
+
+def _are_unrivalled(likeness: Likeness, found: FloatArray, doubtful: IntArray) -> BoolArray:
+    """Tell which of n patches are alike, and unlike the second ones of some, which come after."""
+    n = len(found) - len(doubtful)
+    is_rivalled = likeness.select(np.arange(n, len(found))).rivals(likeness.select(doubtful))
+    # Those that come back to the disparity found were none.
+    is_rivalled &= np.abs(found[n:] - found[doubtful]) > COARSE_ERROR_PX
+    is_reliable = likeness.are_alike[:n].copy()
+    is_reliable[doubtful[is_rivalled]] = False
+    return is_reliable
 
 
 def _search_strips(

@@ -197,7 +197,7 @@ class Likeness:
     Parameters
     ----------
     unlike : ndarray of float32, shape (n,)
-        Variance of the difference, grey values squared; infinite where there is no disparity.
+        Variance of the difference, grey values squared; by `where` infinite where there is none.
     limits : ndarray of float32, shape (n,)
         What it may be at a point that both cameras see.
     """

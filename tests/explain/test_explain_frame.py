@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gvo.config import Config, load_configuration
 from gvo.errors import GvoError
 from gvo.explain import FrameExplanation, explain_frame
 from gvo.geometry import se3
+from gvo.keyframe_policy import choose_links
 from gvo.keyframes import Keyframes
 from gvo.odometry import FrameResult, Odometry
 from gvo.sources.frames import frames
@@ -152,14 +154,21 @@ def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
         seen.append(original(self, T))
         return seen[-1]
 
+    chosen_links: list[tuple[list[int], list[int]]] = []
+
+    def choose(*arguments: Any, **options: Any) -> tuple[list[int], list[int]]:
+        chosen_links.append(choose_links(*arguments, **options))
+        return chosen_links[-1]
+
     monkeypatch.setattr(Keyframes, "scores", scores)
+    monkeypatch.setattr("gvo.linking.choose_links", choose)
     explanation = explain_frame(recording("stereo"), LAST, config=configuration(kind))
     chosen_by, shown = seen[-2:]
     assert chosen_by == shown
     linked = {link.reference_ns for link in explanation.links if link.kind == "keyframe"}
-    usable = [ns for ns, score in shown.items() if score >= explanation.config.window.min_overlap]
+    (chosen, spare), *_ = chosen_links[-2:]
+    assert set(chosen) <= linked <= {*chosen, *spare}
     assert linked
-    assert linked <= set(usable)
 
 
 def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> None:
