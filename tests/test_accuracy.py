@@ -45,7 +45,7 @@ LIMITS = {
     XYZ: Limits(raw_ate_m=0.0145, smoothed_ate_m=0.0120),
     ROOM: Limits(raw_ate_m=0.029, smoothed_ate_m=0.0253, gain=0.95),
     DRIVE: Limits(raw_ate_m=0.022, smoothed_ate_m=0.0215, t_pct=0.185, path_error=0.0013),
-    HAND: Limits(raw_ate_m=0.0043, smoothed_ate_m=0.0015, gain=0.95),
+    HAND: Limits(raw_ate_m=0.0022, smoothed_ate_m=0.00138, gain=0.95),
     HAND_RGBD: Limits(raw_ate_m=0.0024, smoothed_ate_m=0.0026),
 }
 N_FRAMES = {DRIVE: 50, HAND: 60, HAND_RGBD: 60}
