@@ -8,16 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
-from gvo.frontend.disparity import MAX_LAST_STEP_PX, MAX_STEP_PX, have_room
+from gvo.frontend.disparity import MAX_STEP_PX, Strips, have_room
 from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
-from gvo.frontend.patches import (
-    Likeness,
-    Patches,
-    interpolate_strips,
-    sample_patches,
-    squared_differences,
-)
-from gvo.frontend.stereo import parabola_minimum
+from gvo.frontend.patches import Likeness, Patches, interpolate_strips, sample_patches
 from gvo.trace import note
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -132,23 +125,20 @@ def _search_strips(
     came to rest.
     """
     left, right_image = images
-    radius, room = config.patch_radius_px, config.search_radius_px + 1
+    radius, reach_px = config.patch_radius_px, config.search_radius_px
     u, v = pixels[owners].T
-    columns = np.floor(u - starts)
-    zeros = u - columns + room  # the places of disparity zero
-    strips = sample_patches(right_image, columns, v + row_offset_px, radius + room, radius)
+    strips = Strips.cut(
+        right_image, u, v + row_offset_px, starts, radius_px=radius, reach_px=reach_px
+    )
     if config.subpixel == "none":
-        places, is_at_rest = parabola_minimum(squared_differences(left[owners, 1:-1, 1:-1], strips))
-        places = np.clip(zeros - np.rint(zeros - places), 0, 2 * room)
+        places, is_at_rest = strips.search(left[owners, 1:-1, 1:-1])
+        whole = strips.places(np.rint(strips.disparities(places)))
+        places = np.clip(whole, 0, 2 * (reach_px + 1))
     else:
-        places, step = (
-            Patches.of(left[:, 1:-1])
-            .take(owners)
-            .descend(strips, zeros - starts, n_steps=N_SEARCH_STEPS, max_step=MAX_STEP_PX)
-        )
-        is_at_rest = np.abs(step) < MAX_LAST_STEP_PX
-        is_at_rest &= np.abs(zeros - places - starts) < config.search_radius_px
-    return zeros - places, interpolate_strips(strips, places, 2 * radius + 1), is_at_rest
+        patches = Patches.of(left[:, 1:-1]).take(owners)
+        places, is_at_rest = strips.follow(patches, n_steps=N_SEARCH_STEPS)
+    right = interpolate_strips(strips.values, places, 2 * radius + 1)
+    return strips.disparities(places), right, is_at_rest
 
 
 def measure_row_shift(

@@ -7,8 +7,10 @@ No keypoints of the right image are needed, so that any pixel can be measured, a
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.patches import Patches, sample_patches, squared_differences
@@ -20,7 +22,7 @@ _N_STEPS = 3
 _MAX_FINE_STEP_PX = 0.5
 # The same from a prediction: each at most so long, the last one as good as none.
 MAX_STEP_PX = 1.5
-MAX_LAST_STEP_PX = 0.3
+_MAX_LAST_STEP_PX = 0.3
 
 
 def measure_disparities(
@@ -60,19 +62,20 @@ def measure_disparities(
     is_valid : ndarray of bool, shape (n,)
         False where a patch leaves the image or the best step is the last one searched.
     """
-    radius, room = config.patch_radius_px, reach_px + 1
+    radius = config.patch_radius_px
 
     def search(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
         wide = sample_patches(images[0], u, v, radius + 1, radius)
-        columns = np.floor(u - start)
-        strips = sample_patches(images[1], columns, v + row_offset_px, radius + room, radius)
-        places, is_minimum = parabola_minimum(squared_differences(wide[:, :, 1:-1], strips))
-        if config.subpixel != "none":
-            places, _ = Patches.of(wide).descend(
-                strips, places, n_steps=_N_STEPS, max_step=_MAX_FINE_STEP_PX
-            )
-        found = u - (columns + places - room)
-        return np.rint(found) if config.subpixel == "none" else found, is_minimum
+        strips = Strips.cut(
+            images[1], u, v + row_offset_px, start, radius_px=radius, reach_px=reach_px
+        )
+        places, is_minimum = strips.search(wide[:, :, 1:-1])
+        if config.subpixel == "none":
+            return np.rint(strips.disparities(places)), is_minimum
+        places, _ = Patches.of(wide).descend(
+            strips.values, places, n_steps=_N_STEPS, max_step=_MAX_FINE_STEP_PX
+        )
+        return strips.disparities(places), is_minimum
 
     return _measure_with_room(images[0].shape, pixels, predicted, radius, search)
 
@@ -102,20 +105,76 @@ def follow_disparities(
             reach_px=config.search_radius_px,
             row_offset_px=row_offset_px,
         )
-    radius, room = config.patch_radius_px, config.search_radius_px + 1
+    radius, reach_px = config.patch_radius_px, config.search_radius_px
 
     def follow(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
         left = Patches.of(sample_patches(images[0], u, v, radius + 1, radius))
-        columns = np.floor(u - start)
-        strips = sample_patches(images[1], columns, v + row_offset_px, radius + room, radius)
-        places, step = left.descend(
-            strips, u - start - columns + room, n_steps=n_steps, max_step=MAX_STEP_PX
+        strips = Strips.cut(
+            images[1], u, v + row_offset_px, start, radius_px=radius, reach_px=reach_px
         )
-        found = u - (columns + places - room)
-        is_at_rest = np.abs(step) < MAX_LAST_STEP_PX
-        return found, is_at_rest & (np.abs(found - start) < config.search_radius_px)
+        places, is_at_rest = strips.follow(left, n_steps=n_steps)
+        return strips.disparities(places), is_at_rest
 
     return _measure_with_room(images[0].shape, pixels, predicted, radius, follow)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Strips:
+    """Strips of the right image around the disparities where patches are looked for.
+
+    Parameters
+    ----------
+    values : ndarray of float32, shape (n, s, m)
+        A patch of side s may lie at m - s + 1 places.
+    u, columns : ndarray of float64, shape (n,)
+        Column of the pixel in the left image, and of the middle place in the right one.
+    starts : ndarray of float64, shape (n,)
+        The disparities.
+    reach_px : int
+        How far to search on either side of them.
+    """
+
+    values: NDArray[np.float32]
+    u: FloatArray
+    columns: FloatArray
+    starts: FloatArray
+    reach_px: int
+
+    @classmethod
+    def cut(
+        cls,
+        image: ImageArray,
+        u: FloatArray,
+        rows: FloatArray,
+        starts: FloatArray,
+        *,
+        radius_px: int,
+        reach_px: int,
+    ) -> Strips:
+        """Cut them out of the right image, for patches of a half size, at rows of it."""
+        columns = np.floor(u - starts)
+        values = sample_patches(image, columns, rows, radius_px + reach_px + 1, radius_px)
+        return cls(values=values, u=u, columns=columns, starts=starts, reach_px=reach_px)
+
+    def disparities(self, places: FloatArray) -> FloatArray:
+        """Return the disparities, shape (n,), of places."""
+        return self.u - (self.columns + places - (self.reach_px + 1))
+
+    def places(self, disparities: FloatArray) -> FloatArray:
+        """Return the places, shape (n,), of disparities; `disparities` the other way round."""
+        return self.u - disparities - self.columns + (self.reach_px + 1)
+
+    def search(self, patches: NDArray[np.float32]) -> tuple[FloatArray, BoolArray]:
+        """Return where left patches (n, s, s) differ least, and whether that is a minimum."""
+        return parabola_minimum(squared_differences(patches, self.values))
+
+    def follow(self, patches: Patches, *, n_steps: int) -> tuple[FloatArray, BoolArray]:
+        """Return where steps lead from the start, and whether they come to rest within reach."""
+        places, step = patches.descend(
+            self.values, self.places(self.starts), n_steps=n_steps, max_step=MAX_STEP_PX
+        )
+        is_near = np.abs(self.disparities(places) - self.starts) < self.reach_px
+        return places, is_near & (np.abs(step) < _MAX_LAST_STEP_PX)
 
 
 def _measure_with_room(
