@@ -62,10 +62,10 @@ def explain(
     depth: Depth = None,
 ) -> None:
     """Show one frame from image to pose, step by step, as pictures."""
-    from gvo.explain import explain_frame
-    from gvo.outputs.explanation import open_folder, write_explanation
+    from gvo.diagnostics.explain import explain_frame
     from gvo.run_tally import Progress
     from gvo.sources.excerpt import make_excerpt
+    from gvo.viz.explanation import open_folder, write_explanation
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, None, every)

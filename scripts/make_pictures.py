@@ -24,16 +24,16 @@ from PIL import Image
 import gvo
 from gvo.config import Config
 from gvo.demo import write_demo_bag
+from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
-from gvo.explain import explain_frame
 from gvo.odometry import Odometry
-from gvo.outputs.explanation.extraction import draw_stereo
 from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.report import write_run_report
 from gvo.outputs.run_record import read_run
 from gvo.run_outputs import RunOutputs
 from gvo.view import serve
 from gvo.view.player import Player
+from gvo.viz.explanation.extraction import draw_stereo
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

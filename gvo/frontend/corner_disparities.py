@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.disparity import MAX_STEP_PX, Strips, have_room
 from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
 from gvo.frontend.patches import Likeness, Patches, interpolate_strips, sample_patches
-from gvo.trace import note
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Steps from the coarse search to the disparity.

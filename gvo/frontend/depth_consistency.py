@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.trace import note
 from gvo.types import Contradiction, DepthArray, Failure, FloatArray, RelativePose
 
 # Points along each side of the grid that is compared.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.offset import RigOffsets
@@ -17,7 +18,6 @@ from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparit
 from gvo.frontend.temporal import match_temporal, predict_pixels
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.trace import note
 from gvo.types import (
     Contradiction,
     Failure,

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.corner_disparities import measure_corners
 from gvo.frontend.corners import detect_corners
@@ -23,7 +24,6 @@ from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.trace import note
 from gvo.types import (
     BoolArray,
     Contradiction,

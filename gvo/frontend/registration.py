@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.usual_motion import heed_usual_motion
 from gvo.frontend.verification import verify_motion
@@ -15,7 +16,6 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
 from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
-from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray, IntArray, RelativePose
 
 # Wrong matches never agree in such numbers by chance: samples could only find the same motion.

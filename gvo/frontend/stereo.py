@@ -6,6 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
 from gvo.frontend.matching import (
@@ -15,7 +16,6 @@ from gvo.frontend.matching import (
     mutual_best,
 )
 from gvo.geometry.camera import StereoCamera
-from gvo.trace import note
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 

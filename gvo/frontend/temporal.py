@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gvo._trace import note
 from gvo.frontend.matching import best_ratios, descriptor_distances, mutual_best
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.trace import note
 from gvo.types import FloatArray, IntArray, Observations
 
 

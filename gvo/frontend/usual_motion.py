@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.verification import N_STEPS, NEARER, SIZEABLE, flow_px
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.refinement import Refinement, descend, refine_pose
-from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray
 
 # The median of the squared length of three residuals of variance one, and what a recording of

@@ -20,13 +20,13 @@ from functools import partial
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import ransac_rigid
 from gvo.geometry.refinement import Refinement, descend, refine_pose
 from gvo.geometry.residuals import StereoResiduals
-from gvo.trace import note
 from gvo.types import BoolArray, Contradiction, Failure, FloatArray
 
 # A second motion counts from such a share of all matches on: below, it is a car in the distance,

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import RansacConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.umeyama import fit_rigid, fit_rigid_triples
-from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 # Hypotheses that are fitted and counted together, so that calls do not cost more than arithmetic.

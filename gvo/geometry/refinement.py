@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from gvo._trace import note
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.disparity_offset import DisparityOffset, estimate_disparity_offset
 from gvo.geometry.residuals import Linearization, StereoResiduals
-from gvo.trace import note
 from gvo.types import BoolArray, Failure, FloatArray
 
 # A step of three hundredths of a sigma no longer matters; this is its square.

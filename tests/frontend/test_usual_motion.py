@@ -10,7 +10,7 @@ import pytest
 import gvo
 from gvo.chain import RawChain
 from gvo.config import Config, WindowConfig
-from gvo.explain.watch import WatchedFrontend
+from gvo.diagnostics.explain.watch import WatchedFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend
 from gvo.frontend.protocol import register_checked

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from gvo._trace import Event, watched
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
 from gvo.geometry.residuals import StereoResiduals
-from gvo.trace import Event, watched
 from gvo.types import BoolArray, Failure, FloatArray
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gvo.config import Config, load_configuration
+from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import GvoError
-from gvo.explain import FrameExplanation, explain_frame
 from gvo.geometry import se3
 from gvo.keyframe_policy import choose_links
 from gvo.keyframes import Keyframes

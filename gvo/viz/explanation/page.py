@@ -6,8 +6,8 @@ import base64
 import html
 from collections.abc import Sequence
 
-from gvo.explain.values import FrameExplanation
-from gvo.outputs.explanation.sheet import Picture
+from gvo.diagnostics.explain.values import FrameExplanation
+from gvo.viz.explanation.sheet import Picture
 
 _STYLE = """
 body { font-family: sans-serif; max-width: 1300px; margin: 1em auto; padding: 0 1em;

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from gvo.explain.watch import Registration
-from gvo.trace import Event
+from gvo._trace import Event
+from gvo.diagnostics.explain.watch import Registration
 from gvo.types import RelativePose
 
 _TRACKS = "attempt.tracks"

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import Config, StereoConfig
-from gvo.explain.extraction import find_event
-from gvo.explain.values import StereoStep, SubpixelStep
-from gvo.explain.watch import WatchedFrame
+from gvo.diagnostics.explain.extraction import find_event
+from gvo.diagnostics.explain.values import StereoStep, SubpixelStep
+from gvo.diagnostics.explain.watch import WatchedFrame
 from gvo.frontend.corner_disparities import N_SEARCH_STEPS
 from gvo.frontend.disparity import follow_disparities
 from gvo.types import FloatArray, ImageArray, RgbdFrame

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from gvo._trace import Event, watched
 from gvo.config import Config
-from gvo.explain.attempts import Attempt
-from gvo.explain.extraction import find_event
-from gvo.explain.values import ConsensusStep, RefinementStep, SampleSearch
+from gvo.diagnostics.explain.attempts import Attempt
+from gvo.diagnostics.explain.extraction import find_event
+from gvo.diagnostics.explain.values import ConsensusStep, RefinementStep, SampleSearch
 from gvo.frontend.registration import search_consensus
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -18,7 +19,6 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus
 from gvo.geometry.refinement import Refinement
 from gvo.geometry.residuals import StereoResiduals, whiten_in_place
-from gvo.trace import Event, watched
 from gvo.types import Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.explain.values import (
+from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,
     RefinementStep,
@@ -14,8 +14,9 @@ from gvo.explain.values import (
     TemporalStep,
 )
 from gvo.frontend.klt_observations import image_of
-from gvo.outputs.explanation.extraction import draw_reasons
-from gvo.outputs.explanation.sheet import (
+from gvo.types import BoolArray, FloatArray
+from gvo.viz.explanation.extraction import draw_reasons
+from gvo.viz.explanation.sheet import (
     AFTER,
     BEFORE,
     KEPT,
@@ -34,7 +35,6 @@ from gvo.outputs.explanation.sheet import (
     show_image,
     split,
 )
-from gvo.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from gvo.explain import explain_frame
-from gvo.outputs.explanation import write_explanation
+from gvo.diagnostics.explain import explain_frame
 from gvo.sources.recording import Sensor
 from gvo.sources.synthetic import SyntheticRecording, WorldName
+from gvo.viz.explanation import write_explanation
 from tests.browser import Browser
 
 _PICTURES = "return [...document.images].map(i => [i.alt, i.naturalWidth, i.clientWidth])"

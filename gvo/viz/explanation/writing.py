@@ -6,21 +6,21 @@ import json
 from pathlib import Path
 from tempfile import TemporaryFile
 
+from gvo.diagnostics.explain.values import FrameExplanation
 from gvo.errors import ConfigurationError
-from gvo.explain.values import FrameExplanation
-from gvo.outputs.explanation.extraction import (
+from gvo.viz.explanation.extraction import (
     draw_depth,
     draw_depth_keypoints,
     draw_histograms,
     draw_keypoints,
     draw_stereo,
 )
-from gvo.outputs.explanation.motion import draw_consensus, draw_matches, draw_residuals
-from gvo.outputs.explanation.numbers import explanation_json
-from gvo.outputs.explanation.page import explanation_page
-from gvo.outputs.explanation.pose import draw_links, draw_pose
-from gvo.outputs.explanation.sheet import Picture, words_only
-from gvo.outputs.explanation.subpixel import draw_subpixel
+from gvo.viz.explanation.motion import draw_consensus, draw_matches, draw_residuals
+from gvo.viz.explanation.numbers import explanation_json
+from gvo.viz.explanation.page import explanation_page
+from gvo.viz.explanation.pose import draw_links, draw_pose
+from gvo.viz.explanation.sheet import Picture, words_only
+from gvo.viz.explanation.subpixel import draw_subpixel
 
 
 def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:

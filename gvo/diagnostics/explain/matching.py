@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gvo.config import Config
-from gvo.explain.attempts import Attempt
-from gvo.explain.extraction import best_candidates, depth_tests, distance_tests, have
-from gvo.explain.values import Sorting, TemporalStep
+from gvo.diagnostics.explain.attempts import Attempt
+from gvo.diagnostics.explain.extraction import best_candidates, depth_tests, distance_tests, have
+from gvo.diagnostics.explain.values import Sorting, TemporalStep
 from gvo.frontend.rgbd import sample_depth
 from gvo.types import BoolArray, FloatArray, Frame, IntArray, RgbdFrame
 

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.explain.values import (
+from gvo.diagnostics.explain.values import (
     DepthStep,
     FrameExplanation,
     KeypointStep,
     Sorting,
     StereoStep,
 )
-from gvo.outputs.explanation.sheet import (
+from gvo.types import FloatArray, ImageArray, StereoFrame
+from gvo.viz.explanation.sheet import (
     BEFORE,
     KEPT,
     LIMIT,
@@ -30,7 +31,6 @@ from gvo.outputs.explanation.sheet import (
     reason_style,
     show_image,
 )
-from gvo.types import FloatArray, ImageArray, StereoFrame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from gvo.config import Config
+from gvo.diagnostics.explain.attempts import attempts_of, describe, n_chain_calls
+from gvo.diagnostics.explain.extraction import explain_depth, explain_keypoints, explain_stereo
+from gvo.diagnostics.explain.links import Before, explain_links
+from gvo.diagnostics.explain.matching import explain_temporal
+from gvo.diagnostics.explain.motion import explain_consensus, explain_refinement
+from gvo.diagnostics.explain.subpixel import explain_subpixel
+from gvo.diagnostics.explain.values import FrameExplanation
+from gvo.diagnostics.explain.watch import Registration, WatchedFrontend
 from gvo.errors import RecordingError
-from gvo.explain.attempts import attempts_of, describe, n_chain_calls
-from gvo.explain.extraction import explain_depth, explain_keypoints, explain_stereo
-from gvo.explain.links import Before, explain_links
-from gvo.explain.matching import explain_temporal
-from gvo.explain.motion import explain_consensus, explain_refinement
-from gvo.explain.subpixel import explain_subpixel
-from gvo.explain.values import FrameExplanation
-from gvo.explain.watch import Registration, WatchedFrontend
 from gvo.frontend.protocol import Stamped
 from gvo.keyframes import Keyframes
 from gvo.odometry import FrameResult, Odometry

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo.explain.values import FrameExplanation, KeyframeLink
-from gvo.outputs.explanation.sheet import (
+from gvo.diagnostics.explain.values import FrameExplanation, KeyframeLink
+from gvo.types import FloatArray, RelativePose
+from gvo.viz.explanation.sheet import (
     AFTER,
     BEFORE,
     KEPT,
@@ -19,7 +20,6 @@ from gvo.outputs.explanation.sheet import (
     show_image,
     words_only,
 )
-from gvo.types import FloatArray, RelativePose
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

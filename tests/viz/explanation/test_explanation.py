@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from gvo.config import Config, RegistrationConfig
+from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import ConfigurationError
-from gvo.explain import FrameExplanation, explain_frame
-from gvo.outputs.explanation import open_folder, write_explanation
-from gvo.outputs.explanation.motion import draw_residuals
-from gvo.outputs.explanation.pose import position_covariance
-from gvo.outputs.explanation.sheet import close_sheet, open_sheet
 from gvo.sources.recording import Sensor
 from gvo.sources.synthetic import SyntheticRecording
+from gvo.viz.explanation import open_folder, write_explanation
+from gvo.viz.explanation.motion import draw_residuals
+from gvo.viz.explanation.pose import position_covariance
+from gvo.viz.explanation.sheet import close_sheet, open_sheet
 
 STEREO = [
     "01_keypoints",

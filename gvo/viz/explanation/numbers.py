@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo.explain.values import (
+from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,
     KeyframeLink,

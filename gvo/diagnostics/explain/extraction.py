@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gvo._trace import Event
 from gvo.config import Config, DepthConfig, FeaturesConfig, StereoConfig
-from gvo.explain.values import DepthStep, KeypointStep, Sorting, StereoStep
-from gvo.explain.watch import WatchedFrame
+from gvo.diagnostics.explain.values import DepthStep, KeypointStep, Sorting, StereoStep
+from gvo.diagnostics.explain.watch import WatchedFrame
 from gvo.frontend.corners import detect_corners
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.klt_observations import image_of
@@ -14,7 +15,6 @@ from gvo.frontend.matching import best_ratios
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo import candidate_pairs
 from gvo.geometry.camera import StereoCamera
-from gvo.trace import Event
 from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray, RgbdFrame
 
 # A budget that no image fills.

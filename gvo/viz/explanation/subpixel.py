@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.explain.values import FrameExplanation, SubpixelStep
-from gvo.outputs.explanation.sheet import (
+from gvo.diagnostics.explain.values import FrameExplanation, SubpixelStep
+from gvo.viz.explanation.sheet import (
     AFTER,
     BEFORE,
     LIMIT,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from gvo._trace import Event, watched
 from gvo.config import Config
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Stamped
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.trace import Event, watched
 from gvo.types import Failure, FloatArray, Frame, RelativePose
 
 

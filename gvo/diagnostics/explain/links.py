@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from gvo.explain.values import KeyframeLink
-from gvo.explain.watch import Registration
+from gvo.diagnostics.explain.values import KeyframeLink
+from gvo.diagnostics.explain.watch import Registration
 from gvo.frame_links import FrameLink
 from gvo.frontend.klt_observations import image_of
 from gvo.frontend.protocol import Stamped

@@ -1,0 +1,1 @@
+"""Diagnostics: check a recording before a run, explain one of its frames."""
