@@ -13,14 +13,12 @@ if TYPE_CHECKING:
     from gvo.backend.window import SlidingWindow
     from gvo.config import Config, WindowConfig, load_configuration
     from gvo.errors import GvoError
-    from gvo.evaluation import Evaluation, evaluate
     from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
     from gvo.odometry import FrameResult, Odometry
     from gvo.outputs.bag_writer import convert
     from gvo.outputs.converting import convert_recording
     from gvo.outputs.plots import plot_trajectories
-    from gvo.outputs.tables import format_evaluations
     from gvo.run_inputs import asked_truth, choose_frame, read_ground_truth
     from gvo.run_outputs import RunOutputs
     from gvo.runs import RunResult, run_recording
@@ -28,8 +26,9 @@ if TYPE_CHECKING:
     from gvo.sources.frames import frames
     from gvo.sources.opening import RecordingOptions, open_recording
     from gvo.sources.synthetic import SyntheticRecording
-    from gvo.trajectory import Trajectory
-    from gvo.trajectory_files import read_trajectory
+    from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
+    from gvo.trajectory.formats import read_trajectory
+    from gvo.trajectory.trajectory import Trajectory
     from gvo.types import (
         Edge,
         Estimate,
@@ -50,14 +49,12 @@ _MODULES = {
     "gvo.backend.window": ("SlidingWindow",),
     "gvo.config": ("Config", "WindowConfig", "load_configuration"),
     "gvo.errors": ("GvoError",),
-    "gvo.evaluation": ("Evaluation", "evaluate"),
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry": ("FrameResult", "Odometry"),
     "gvo.outputs.bag_writer": ("convert",),
     "gvo.outputs.converting": ("convert_recording",),
     "gvo.outputs.plots": ("plot_trajectories",),
-    "gvo.outputs.tables": ("format_evaluations",),
     "gvo.run_inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
     "gvo.run_outputs": ("RunOutputs",),
     "gvo.runs": ("RunResult", "run_recording"),
@@ -65,8 +62,9 @@ _MODULES = {
     "gvo.sources.frames": ("frames",),
     "gvo.sources.opening": ("RecordingOptions", "open_recording"),
     "gvo.sources.synthetic": ("SyntheticRecording",),
-    "gvo.trajectory": ("Trajectory",),
-    "gvo.trajectory_files": ("read_trajectory",),
+    "gvo.trajectory.evaluation": ("Evaluation", "evaluate", "format_evaluations"),
+    "gvo.trajectory.formats": ("read_trajectory",),
+    "gvo.trajectory.trajectory": ("Trajectory",),
     "gvo.types": (
         "Edge",
         "Estimate",

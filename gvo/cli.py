@@ -41,7 +41,7 @@ from gvo.version import __version__
 
 if TYPE_CHECKING:
     from gvo.config import Config
-    from gvo.trajectory import Trajectory
+    from gvo.trajectory.trajectory import Trajectory
 
 app = typer.Typer(
     name="gvo",
@@ -353,9 +353,8 @@ def compare(
     ] = None,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
-    from gvo.evaluation import evaluate
-    from gvo.outputs.tables import evaluations_json, format_evaluations
     from gvo.run_inputs import read_compared
+    from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
 
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)

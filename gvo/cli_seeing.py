@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from gvo.config import Config
     from gvo.sources.recording import Source
-    from gvo.trajectory import Trajectory
+    from gvo.trajectory.trajectory import Trajectory
 
 _DEFAULT_PORT = 8080
 # How often the page looks for signals.

@@ -19,7 +19,7 @@ from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.sources.tf import TfBuffer
 from gvo.sources.tf_paths import bare, list_names
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, Failure, FloatArray, IntArray
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]

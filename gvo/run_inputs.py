@@ -17,8 +17,8 @@ from gvo.sources.recording import Source
 from gvo.sources.tf import TfBuffer
 from gvo.sources.truth_frames import FramedTruth
 from gvo.sources.truth_specs import FileTruth, parse_truth
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 

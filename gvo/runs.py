@@ -13,7 +13,6 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
-from gvo.evaluation import Evaluation
 from gvo.output_frame import OutputFrame
 from gvo.outputs.run_folder import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
@@ -28,9 +27,10 @@ from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
 from gvo.sources.truth_frames import FramedTruth
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import MAX_DIFFERENCE_NS
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
+from gvo.trajectory.evaluation import Evaluation
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.truth_comparison import TruthComparison
 from gvo.types import Failure
 

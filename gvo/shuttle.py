@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gvo.closing import Closing, close
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.output_frame import OutputFrame
@@ -20,8 +19,9 @@ from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 from gvo.sources.backwards import ThereAndBack
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 
 

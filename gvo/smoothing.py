@@ -13,19 +13,18 @@ from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.edge_chain import EdgeChain
 from gvo.errors import GvoError, RecordingError, TrajectoryError
-from gvo.evaluation import Evaluation, evaluate
 from gvo.outputs.graph_file import GraphFile
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.outputs.smoothings import SmoothingComparison
-from gvo.outputs.tables import evaluations_json
 from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.sources.edges import EdgeEvent, EdgeSource, Event, PoseEvent
 from gvo.sources.pose_graphs import PoseGraphSource
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, Rejected, Status
 from gvo.version import __version__
 

@@ -13,7 +13,7 @@ from gvo.smoothing import POSES_HEADER, Smoother, SmoothingNotes, conclude
 from gvo.sources.edge_answers import CSV_HEADER, format_error, format_estimate
 from gvo.sources.edge_lines import LineFormat, Request, detect_format, is_header, parse_line
 from gvo.sources.edges import EdgeEvent, InputFaults, PoseEvent
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, Rejected
 
 

@@ -23,7 +23,7 @@ _EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 def report(result: RunResult, out: Path) -> NoReturn:
     """Print what a run of odometry gave, and end with its exit code."""
-    from gvo.outputs.tables import format_evaluations
+    from gvo.trajectory.evaluation import format_evaluations
 
     for note in result.notes:
         typer.echo(note)
@@ -59,7 +59,7 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     is_stdout_taken : bool
         Print to standard error: the answers went to standard output.
     """
-    from gvo.outputs.tables import format_evaluations
+    from gvo.trajectory.evaluation import format_evaluations
 
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)

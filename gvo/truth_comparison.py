@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo.evaluation import Evaluation, evaluate
 from gvo.sources.truth_frames import FramedTruth
-from gvo.trajectory import Trajectory
+from gvo.trajectory.evaluation import Evaluation, evaluate
+from gvo.trajectory.trajectory import Trajectory
 
 # A truth that stands while the estimate moves is none of it.
 _MIN_EXTENT_M = 0.1

@@ -31,8 +31,8 @@ from mutation import (  # type: ignore[import-not-found]
 )
 
 ROOT = Path(__file__).resolve().parent.parent
-PATHS = ("gvo/geometry", "gvo/backend", "gvo/evaluation.py")
-TESTS = ("tests/geometry", "tests/backend", "tests/test_evaluation.py")
+PATHS = ("gvo/geometry", "gvo/backend", "gvo/trajectory/evaluation.py")
+TESTS = ("tests/geometry", "tests/backend", "tests/trajectory/test_evaluation.py")
 MIN_COVERAGE = 0.95
 MIN_KILLED = 0.85
 RESULTS = Path(tempfile.gettempdir()) / "gvo-mutation.json"

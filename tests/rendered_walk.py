@@ -14,7 +14,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.sources.worlds.motion import look_around
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from tests.sources.pose_bags import PoseBag
 

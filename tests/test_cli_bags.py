@@ -20,7 +20,7 @@ import gvo
 from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
 from gvo.sources.recording import StampedImage
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
 from tests.rendered_walk import (
     CAMERA,

@@ -13,7 +13,7 @@ from gvo.outputs.bag_writer import convert
 from gvo.outputs.folder_writer import write_folder
 from gvo.sources.recording import StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from tests.conftest import Command
 from tests.sources.conftest import Item, ListSource, Tiny
 

@@ -23,7 +23,7 @@ from gvo.outputs.bag_writer import convert
 from gvo.outputs.converting import convert_recording
 from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
 
 _CONTAINERS = ("a.bag", "a.mcap", "a.db3", "folder")

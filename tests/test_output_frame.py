@@ -12,7 +12,7 @@ from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.output_frame import OutputFrame, parse_initial_pose
 from gvo.sources.tf import TfBuffer
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FloatArray, Status
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

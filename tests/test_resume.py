@@ -31,7 +31,7 @@ from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from tests.conftest import Command
 
 N = 12

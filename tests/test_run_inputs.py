@@ -20,8 +20,8 @@ from gvo.run_inputs import (
 )
 from gvo.sources.recording import Source
 from gvo.sources.truth_frames import FramedTruth
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import write_tum
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 from tests.rendered_walk import (
     CAMERA,

@@ -19,7 +19,7 @@ from gvo.run_tally import Progress
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 

@@ -17,8 +17,8 @@ from gvo.geometry import se3
 from gvo.run_inputs import asked_truth, choose_frame
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_covariances, write_kitti
+from gvo.trajectory.formats import read_covariances, write_kitti
+from gvo.trajectory.trajectory import Trajectory
 from tests.rendered_walk import (
     CAMERA,
     N_FRAMES,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.evaluation import evaluate
 from gvo.geometry.camera import StereoCamera
 from gvo.outputs.shuttle_table import format_closings
 from gvo.run_tally import Progress
@@ -22,8 +21,9 @@ from gvo.shuttle import ShuttleResult, shuttle
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.opening import open_recording
 from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.evaluation import evaluate
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 _N_FRAMES = 6
 

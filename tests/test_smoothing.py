@@ -13,15 +13,15 @@ import pytest
 import gvo
 from gvo.config import Config, WindowConfig
 from gvo.errors import RecordingError
-from gvo.g2o import format_edge, format_vertex
 from gvo.geometry import se3
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.smoothing import configuration_for, smooth_edges
 from gvo.sources.edge_inputs import open_edges
 from gvo.sources.edges import EdgeSource, Event, InputFaults, PoseEvent
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_covariances, write_tum
+from gvo.trajectory.formats import read_covariances, write_tum
+from gvo.trajectory.g2o import format_edge, format_vertex
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Edge, FloatArray
 
 TRAJECTORIES = ("raw", "causal", "smoothed")

@@ -15,7 +15,7 @@ from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
 from gvo.run_inputs import asked_truth, choose_frame
 from gvo.sources.truth_frames import FramedTruth
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.truth_comparison import TruthComparison
 from gvo.types import FloatArray
 from tests.rendered_walk import (

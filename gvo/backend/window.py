@@ -12,7 +12,6 @@ import numpy as np
 from gvo.backend.arrival import ORIGIN, Arrival
 from gvo.backend.checks import find_faults, prior_fault
 from gvo.backend.comparison import MeasurementLog
-from gvo.backend.export import g2o_lines
 from gvo.backend.gating import disagreement
 from gvo.backend.graph import first_line
 from gvo.backend.ledger import Ledger, WindowCounts
@@ -26,6 +25,7 @@ from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.keyframe_policy import choose_released, is_needed, proximity
+from gvo.trajectory.g2o import g2o_lines
 from gvo.types import (
     Edge,
     Estimate,

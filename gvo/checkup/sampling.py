@@ -13,7 +13,7 @@ from gvo.errors import GvoError
 from gvo.sources.frames import frames, paired
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.sync import Pair
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, IntArray
 
 # Pairs that are formed only to look at them, where none is near enough for odometry.

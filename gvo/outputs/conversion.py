@@ -14,7 +14,7 @@ from gvo.geometry.camera import Calibration
 from gvo.sources.bag import BagSource
 from gvo.sources.frames import ImagePreparer, make_preparers
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 BODY_FRAME = "body"

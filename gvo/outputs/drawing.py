@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gvo.errors import TrajectoryError
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from gvo.outputs.folder_calibrations import write_sensor_yaml
 from gvo.outputs.folder_streams import FolderStreams
 from gvo.outputs.image_files import encode_png
 from gvo.sources.recording import Source, StampedImage
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import write_euroc
+from gvo.trajectory.formats import write_euroc
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 

@@ -15,8 +15,8 @@ from gvo.outputs.folder_streams import FolderStreams
 from gvo.outputs.image_files import encode_png
 from gvo.sources.frames import paired
 from gvo.sources.recording import Source, StampedImage
-from gvo.trajectory import Trajectory, format_stamp
-from gvo.trajectory_files import write_kitti
+from gvo.trajectory.formats import write_kitti
+from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import FaultyFrame
 
 

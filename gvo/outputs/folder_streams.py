@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gvo.errors import RecordingError
 from gvo.outputs.conversion import LeftOut, choose_preparers
 from gvo.sources.recording import Source, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 
 class FolderStreams(ABC):

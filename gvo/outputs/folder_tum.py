@@ -15,8 +15,8 @@ from gvo.outputs.image_files import encode_png
 from gvo.sources.pixels import MILLIMETRES
 from gvo.sources.recording import Source, StampedImage
 from gvo.sources.tum import DEFAULT_SCALE, published_calibration
-from gvo.trajectory import Trajectory, format_stamp
-from gvo.trajectory_files import write_tum
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import DepthArray
 
 _SCALES = (MILLIMETRES, DEFAULT_SCALE)

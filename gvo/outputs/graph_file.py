@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gvo.errors import RecordingError
-from gvo.g2o import format_vertex
+from gvo.trajectory.g2o import format_vertex
 from gvo.types import Estimate
 
 GRAPH = "smoothed.g2o"

@@ -13,8 +13,8 @@ import numpy as np
 from gvo.errors import ConfigurationError
 from gvo.outputs.drawing import METADATA, broken, ground_plane, plain, save_figure
 from gvo.outputs.palette import REFERENCE_STYLE, Style, styles_of
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import AlignMode, alignment, pair
+from gvo.trajectory.alignment import AlignMode, alignment, pair
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -16,13 +16,13 @@ from gvo.closable import Closable
 from gvo.errors import OutputError
 from gvo.odometry import FrameResult
 from gvo.outputs.line_file import LineFile, RewrittenFile, replace_text
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import (
+from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
     format_tum_line,
     write_tum,
 )
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, IntArray, Status
 
 SUMMARY = "summary.json"

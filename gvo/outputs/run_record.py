@@ -17,8 +17,8 @@ from gvo.bounded_text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.outputs.run_folder import TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory import StampsFrom, Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
 COUNTS = ("keypoints", "points", "matches", "inliers", "links", "edges", "rejected")

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.closing import Closing
 from gvo.errors import RecordingError
 from gvo.outputs.palette import ESTIMATES, OTHERS
+from gvo.trajectory.round_trip import Closing
 from gvo.types import FloatArray
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gvo.closing import Closing
+from gvo.trajectory.round_trip import Closing
 
 _HEADER = (
     "",

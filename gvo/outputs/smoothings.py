@@ -10,8 +10,8 @@ import numpy as np
 
 from gvo.backend.comparison import MeasurementLog, Smoothing
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import write_tum
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate
 
 _ROUNDING = 1e-6

@@ -18,7 +18,7 @@ from gvo.geometry.camera import Calibration
 from gvo.output_frame import OutputFrame
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.version import __version__
 
 # In which the first images of both streams are looked for.

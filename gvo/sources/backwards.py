@@ -14,7 +14,7 @@ from gvo.errors import RecordingError
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames, pair_limit_key
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 
 MAX_PIECE_BYTES = 256_000_000

@@ -36,7 +36,7 @@ from gvo.sources.topics import (
 )
 from gvo.sources.truth_frames import FramedTruth, find_framed_truth
 from gvo.sources.truth_specs import BagTruthSpec
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.sources.edge_lines import MAX_LINE, LineFormat
-from gvo.trajectory_files import COVARIANCE_HEADER
+from gvo.trajectory.formats import COVARIANCE_HEADER
 from gvo.types import Estimate, Rejected
 
 CSV_HEADER = (

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from gvo.bounded_text import shortened
 from gvo.geometry import se3
 from gvo.sources.pose_streams import StepSigma
-from gvo.trajectory_rows import MAX_POSITION_M
+from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
 LineFormat: TypeAlias = Literal["csv", "json"]

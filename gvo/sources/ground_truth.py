@@ -15,7 +15,7 @@ from gvo.sources.position_topics import POSITION_TYPES, read_positions
 from gvo.sources.tf import TfBuffer, read_tf
 from gvo.sources.topics import Topic
 from gvo.sources.truth_specs import BagTruthSpec, TfTruth
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 
 TRUTH_FRAMES = TfTruth(parent="world", child="ground_truth")

@@ -17,8 +17,8 @@ from gvo.sources.pixels import FULL_RANGE, GreyRange
 from gvo.sources.recording import RecordingInfo
 from gvo.sources.stereo_pairs import stereo_baseline
 from gvo.sources.tables import read_rows, read_stamp
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 _PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))

@@ -34,7 +34,7 @@ from gvo.sources.pixels import (
 )
 from gvo.sources.rvl import decode_rvl
 from gvo.sources.tf_paths import bare
-from gvo.trajectory_rows import MAX_POSITION_M
+from gvo.trajectory.formats import MAX_POSITION_M
 from gvo.types import DepthArray, Failure, FloatArray, ImageArray
 
 _NORM_TOLERANCE = 1e-2  # of quaternions

@@ -11,8 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from gvo.errors import TrajectoryError
-from gvo.g2o import MEASUREMENT_TAGS, TAGS, Fix, Line, Measurement, Vertex, convert_line, parse_line
 from gvo.sources.edges import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
+from gvo.trajectory.g2o import (
+    MEASUREMENT_TAGS,
+    TAGS,
+    Fix,
+    Line,
+    Measurement,
+    Vertex,
+    convert_line,
+    parse_line,
+)
 from gvo.types import Edge, FloatArray, PosePrior
 
 _SECOND_NS = 1_000_000_000

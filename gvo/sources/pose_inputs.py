@@ -18,8 +18,8 @@ from gvo.sources.opening import is_bag
 from gvo.sources.tf import read_tf
 from gvo.sources.truth_frames import in_frame
 from gvo.sources.truth_specs import parse_bag_truth
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
 
 _MARK = "#"

@@ -14,8 +14,8 @@ import numpy as np
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.sources.edges import Event, InputFaults, PoseEvent, anchor
-from gvo.trajectory import StampsFrom, Trajectory
-from gvo.trajectory_files import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import Edge, FloatArray
 
 MAX_GAP = 5.0

@@ -16,7 +16,7 @@ from gvo.sources.messages import stamp_of, transform_of
 from gvo.sources.pose_streams import PoseSample
 from gvo.sources.tf_paths import bare
 from gvo.sources.topics import Topic, describe_topics, find_topic
-from gvo.trajectory import StampsFrom
+from gvo.trajectory.trajectory import StampsFrom
 from gvo.types import Failure, FloatArray
 
 _TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"

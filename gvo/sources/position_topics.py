@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from gvo.errors import RecordingError
+from gvo.geometry.geodesy import local_enu
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.edges import InputFaults
-from gvo.sources.geodesy import local_enu
 from gvo.sources.messages import stamp_of
 from gvo.sources.tf_paths import bare
 from gvo.sources.topics import Topic

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, stereo_camera
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 Sensor = Literal["stereo", "rgbd"]

@@ -23,7 +23,7 @@ from gvo.sources.worlds.motion import drive, look_around
 from gvo.sources.worlds.room import room
 from gvo.sources.worlds.street import street
 from gvo.sources.worlds.traffic import traffic, traffic_drive
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import DepthArray, FloatArray, ImageArray, IntArray
 
 WorldName: TypeAlias = Literal["driving", "handheld", "traffic", "facade", "mirror", "wall"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gvo.bounded_text import cut, read_text
 from gvo.errors import RecordingError
-from gvo.trajectory import parse_stamp
+from gvo.trajectory.trajectory import parse_stamp
 
 _MAX_REASON = 300  # characters
 _Row = tuple[int, list[str]]

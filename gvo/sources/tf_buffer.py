@@ -20,8 +20,8 @@ from gvo.sources.tf_paths import (
     list_names,
 )
 from gvo.sources.tf_samples import SampleLog
-from gvo.trajectory import format_stamp
-from gvo.trajectory_rows import MAX_POSITION_M
+from gvo.trajectory.formats import MAX_POSITION_M
+from gvo.trajectory.trajectory import format_stamp
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 _SQUARED_NORM_TOLERANCE = 1e-2  # of quaternions, as in tf2

@@ -13,7 +13,7 @@ from gvo.sources.obvious_truth import find_obvious_truth
 from gvo.sources.tf import TfBuffer, read_tf
 from gvo.sources.tf_paths import bare
 from gvo.sources.truth_specs import BagTruthSpec
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, Failure, FloatArray
 
 

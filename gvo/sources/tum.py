@@ -24,8 +24,8 @@ from gvo.sources.folders import FolderSource, StampedPath
 from gvo.sources.pixels import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
 from gvo.sources.recording import RecordingInfo
 from gvo.sources.tables import read_rows, read_stamp
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 DEFAULT_SCALE = 5000.0
 """Counts per metre of the benchmark's depth images."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from gvo.trajectory import Trajectory
+    from gvo.trajectory.trajectory import Trajectory
     from gvo.view.player import Player
     from gvo.view.server import ViewServer
 

@@ -9,8 +9,8 @@ import viser
 
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.outputs.run_record import RunRecord, read_run
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import alignment, pair
+from gvo.trajectory.alignment import alignment, pair
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.view.layers import COLOURS
 from gvo.view.numbers import frame_rows, legend_html, numbers_html, pose_rows

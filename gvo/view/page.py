@@ -10,7 +10,7 @@ import viser
 
 from gvo.config import describe_configuration
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray
 from gvo.view.controls import ParameterControls
 from gvo.view.layers import COLOURS

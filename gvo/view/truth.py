@@ -6,8 +6,8 @@ import numpy as np
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import alignment, associate
+from gvo.trajectory.alignment import alignment, associate
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 
 _NOTHING = np.zeros((0, 3))

@@ -21,7 +21,7 @@ import gvo
 from gvo.batch import BatchOptions
 from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.

@@ -15,7 +15,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
 from gvo.sources.synthetic import SyntheticRecording, WorldName
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 N_FRAMES = 40
 Change = Callable[[NDArray[Any]], NDArray[Any]]

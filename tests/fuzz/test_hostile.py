@@ -19,8 +19,6 @@ from rosbags.rosbag1 import Writer
 from gvo.bounded_text import cut, read_text
 from gvo.config import load_configuration
 from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
-from gvo.g2o import Measurement
-from gvo.g2o import parse_line as parse_g2o_line
 from gvo.outputs.run_record import read_run
 from gvo.sources.bag_reader import BagReader, typestore
 from gvo.sources.calibration_files import read_cameras
@@ -34,7 +32,9 @@ from gvo.sources.salvage import inflate
 from gvo.sources.salvage.mcap import MAGIC
 from gvo.sources.salvage.sqlite import SqliteScan
 from gvo.sources.truth_specs import parse_truth
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.g2o import Measurement
+from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.types import Failure
 from gvo.yaml_text import MAX_VALUES
 from tests.fuzz.bags import TARGETS as BAG_TARGETS

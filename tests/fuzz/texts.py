@@ -9,8 +9,6 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.errors import GvoError
-from gvo.g2o import convert_line
-from gvo.g2o import parse_line as parse_g2o_line
 from gvo.output_frame import parse_initial_pose
 from gvo.outputs.run_folder import RunFolder
 from gvo.smoothing import POSES_HEADER, Smoother
@@ -22,8 +20,10 @@ from gvo.sources.opening import open_recording
 from gvo.sources.pose_graphs import PoseGraphSource
 from gvo.sources.recording import StampedImage
 from gvo.sources.truth_specs import parse_bag_truth, parse_truth
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import COVARIANCE_HEADER, read_covariances, read_trajectory
+from gvo.trajectory.formats import COVARIANCE_HEADER, read_covariances, read_trajectory
+from gvo.trajectory.g2o import convert_line
+from gvo.trajectory.g2o import parse_line as parse_g2o_line
+from gvo.trajectory.trajectory import Trajectory
 from tests.fuzz.mutations import mutate_text
 from tests.fuzz.target import Folder, Target
 

@@ -8,8 +8,12 @@ from scipy.spatial.transform import Rotation
 from gvo.config import RegistrationConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.disparity_offset import DisparityOffset, estimate_disparity_offset
-from gvo.geometry.refinement import Refinement, refine_pose
+from gvo.geometry.refinement import (
+    DisparityOffset,
+    Refinement,
+    estimate_disparity_offset,
+    refine_pose,
+)
 from gvo.geometry.residuals import Linearization, StereoResiduals
 from gvo.types import FloatArray
 

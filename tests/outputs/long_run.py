@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry.se3 import make_transform
 from gvo.outputs.run_record import EdgeTable, FrameTable, RunRecord, TimingTable
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import IntArray
 
 _SIGMAS = np.array([0.002, 0.002, 0.002, 0.05, 0.05, 0.05])

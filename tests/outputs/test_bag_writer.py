@@ -23,7 +23,7 @@ from gvo.sources.frames import frames
 from gvo.sources.opening import open_recording
 from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, StereoFrame
 
 _KINDS = pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3", "folder"])

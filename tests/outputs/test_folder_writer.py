@@ -22,8 +22,8 @@ from gvo.outputs.folder_writer import Layout, write_folder
 from gvo.sources.frames import frames
 from gvo.sources.opening import RecordingOptions, open_recording
 from gvo.sources.recording import DepthView, Source, StampedImage
-from gvo.trajectory import Trajectory, format_stamp
-from gvo.trajectory_files import read_trajectory, write_euroc, write_tum
+from gvo.trajectory.formats import read_trajectory, write_euroc, write_tum
+from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import FaultyFrame, FloatArray, RgbdFrame
 from tests.sources.conftest import Item, ListSource, Tiny
 

@@ -11,7 +11,7 @@ import pytest
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.geometry import se3
 from gvo.outputs.plots import plot_trajectories
-from gvo.trajectory import StampsFrom, Trajectory
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
 
 BLACK, RAW, CAUSAL, SMOOTHED, FREE = (
     (0, 0, 0),
@@ -149,7 +149,7 @@ def test_nothing_to_draw_is_refused(tmp_path: Path) -> None:
 def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     program = (
         "import sys; import gvo.outputs.plots as plots; assert 'matplotlib' not in sys.modules;"
-        "import matplotlib, numpy as np; from gvo.trajectory import Trajectory;"
+        "import matplotlib, numpy as np; from gvo.trajectory.trajectory import Trajectory;"
         "one = Trajectory(stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None]);"
         f"plots.plot_trajectories({str(tmp_path / 'p.svg')!r}, None, {{'raw': one}});"
         "assert 'matplotlib.pyplot' not in sys.modules;"

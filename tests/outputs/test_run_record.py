@@ -12,7 +12,7 @@ from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.outputs.run_record import RunRecord, read_run
 from gvo.runs import run_recording
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory_files import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_covariances, read_trajectory
 
 N = 6
 

@@ -38,8 +38,8 @@ from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.run_rerun import RunRerun
 from gvo.run_loop import RunLoop
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RelativePose, Status, StereoFrame
 
 _N_FRAMES = 12

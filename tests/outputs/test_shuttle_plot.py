@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvo.closing import Closing, close
 from gvo.errors import RecordingError
 from gvo.outputs import shuttle_plot
 from gvo.outputs.shuttle_plot import plot_shuttle
-from gvo.trajectory import Trajectory
+from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.trajectory import Trajectory
 
 _N = 9000
 

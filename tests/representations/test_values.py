@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.representations.drawings import MAX_POINTS, ellipse_drawing, path_drawing
 from gvo.representations.values import card
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FloatArray, Status
 
 _any_number = st.floats(allow_nan=True, allow_infinity=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 
 _WIDTH, _HEIGHT = 48, 32

@@ -19,7 +19,7 @@ from gvo.sources.backwards import ThereAndBack
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames
 from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 
 _CAMERA = PinholeCamera(fx=10.0, fy=10.0, cx=3.5, cy=2.5, width=8, height=6)

@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gvo.errors import TrajectoryError
-from gvo.g2o import format_edge, format_vertex
 from gvo.geometry import se3
 from gvo.sources.edges import EdgeEvent, Event, PoseEvent
 from gvo.sources.pose_graphs import PoseGraphSource
+from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.types import FloatArray, PosePrior
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from gvo.errors import GvoError, RecordingError, TrajectoryError
-from gvo.evaluation import Evaluation, evaluate
 from gvo.geometry import se3
 from gvo.sources.pose_inputs import is_in_bag, read_pose_input, read_poses
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import write_tum
+from gvo.trajectory.evaluation import Evaluation, evaluate
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory
 from tests.sources.pose_bags import ODOMETRY, STAMPED, PoseBag
 
 T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))

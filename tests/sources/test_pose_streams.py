@@ -18,8 +18,8 @@ from gvo.sources.pose_streams import (
     TrajectoryStream,
     step_covariance,
 )
-from gvo.trajectory import StampsFrom, Trajectory
-from gvo.trajectory_files import write_covariances, write_kitti, write_tum
+from gvo.trajectory.formats import write_covariances, write_kitti, write_tum
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import FloatArray, PosePrior
 
 SECOND = 1_000_000_000

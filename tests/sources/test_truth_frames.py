@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.evaluation import evaluate
 from gvo.geometry import se3
 from gvo.sources.bag_reader import BagReader
 from gvo.sources.ground_truth import BagTruth
 from gvo.sources.tf import TfBuffer, read_tf
 from gvo.sources.truth_frames import FramedTruth, find_framed_truth, in_frame
 from gvo.sources.truth_specs import TfTruth, TopicTruth
-from gvo.trajectory import Trajectory
+from gvo.trajectory.evaluation import evaluate
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 from tests.sources.pose_bags import ODOMETRY, STAMPED, PoseBag
 

@@ -21,8 +21,8 @@ from gvo.runs import run_recording
 from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.testing.faults import FaultySource, NamedFault
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import read_trajectory
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 
 _SCALE = 0.4

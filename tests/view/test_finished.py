@@ -13,7 +13,7 @@ from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.outputs.run_folder import RunFolder
 from gvo.outputs.run_record import RunRecord, read_run
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
 from gvo.view import serve, serve_run
 from gvo.view.finished import FinishedPage, aligned_truth, start_sigmas, world_up

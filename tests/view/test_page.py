@@ -11,7 +11,7 @@ import pytest
 
 from gvo.config import Config, load_configuration
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.view.page import Page
 from gvo.view.server import ViewServer
 from tests.view.fakes import FakePlayer, moment_of, pose_of, stamps_of

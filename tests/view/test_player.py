@@ -15,7 +15,7 @@ from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, RgbdFrame
 from gvo.view.moments import Moment
 from gvo.view.player import Player

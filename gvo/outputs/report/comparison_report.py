@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gvo.evaluation import Evaluation
 from gvo.outputs.report.errors import drift_plot, error_plots
 from gvo.outputs.report.measures import compare
 from gvo.outputs.report.page import facts_html, plots_html, table_html, write_page
 from gvo.outputs.report.paths import World, lines_of, path_plots
 from gvo.outputs.report.sheets import settings, write_plots
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import AlignMode
+from gvo.trajectory.alignment import AlignMode
+from gvo.trajectory.evaluation import Evaluation
+from gvo.trajectory.trajectory import Trajectory
 
 _HEADER = (
     "estimate",

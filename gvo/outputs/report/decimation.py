@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gvo.outputs.drawing import gaps_before
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 
 N_COLUMNS = 1000

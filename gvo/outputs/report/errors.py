@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M
 from gvo.outputs.palette import Style, styles_of
 from gvo.outputs.report.measures import Comparison, Drift, drift, drift_lengths
 from gvo.outputs.report.sheets import WIDE, Plot, arrange, draw_curve, elapsed, new_figure
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M
 from gvo.types import FloatArray
 
 if TYPE_CHECKING:

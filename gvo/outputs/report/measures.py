@@ -9,10 +9,10 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from gvo.errors import TrajectoryError
-from gvo.evaluation import KITTI_SEGMENTS_M, KITTI_STEP, segment_errors
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import MAX_GAP_NS, AlignMode, alignment, pair
+from gvo.trajectory.alignment import MAX_GAP_NS, AlignMode, alignment, pair
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, KITTI_STEP, segment_errors
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
 N_DOF = 6

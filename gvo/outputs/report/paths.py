@@ -13,7 +13,7 @@ from gvo.outputs.drawing import is_of_camera, plain
 from gvo.outputs.palette import REFERENCE_STYLE, Style, styles_of
 from gvo.outputs.report.decimation import display_path
 from gvo.outputs.report.sheets import HALF, Plot, arrange, fit_left, new_figure
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 if TYPE_CHECKING:

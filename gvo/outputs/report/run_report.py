@@ -28,7 +28,7 @@ from gvo.outputs.report.page import (
 from gvo.outputs.report.paths import Line, World, lines_of, path_plots
 from gvo.outputs.report.sheets import Plot, settings, write_plots
 from gvo.outputs.run_record import RunRecord
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 _TRUTH_SECTIONS = {
     "errors_over_time": "Errors over time",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 Kind: TypeAlias = Literal["image", "depth"]
 

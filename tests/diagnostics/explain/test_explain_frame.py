@@ -18,7 +18,7 @@ from gvo.odometry import FrameResult, Odometry
 from gvo.sources.frames import frames
 from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
 
 KINDS = ("klt", "descriptor")

@@ -14,7 +14,7 @@ from gvo.outputs.report.decimation import (
     kept_of_dots,
     simplified,
 )
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from gvo.evaluation import KITTI_SEGMENTS_M, evaluate
 from gvo.geometry import se3
 from gvo.outputs.report.measures import (
     chi2_bound,
@@ -16,7 +15,8 @@ from gvo.outputs.report.measures import (
     drift,
     drift_lengths,
 )
-from gvo.trajectory import Trajectory
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, evaluate
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 
 COVARIANCE = np.diag([1e-4, 4e-4, 1e-4, 1e-2, 1e-2, 9e-2])

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from gvo.outputs.report.paths import World, lines_of, path_plots
 from gvo.outputs.report.sheets import settings
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 
 MAP_GRID = (512_345.2, 4_600_123.5, -33.0)
 

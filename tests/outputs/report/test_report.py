@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from gvo.errors import ConfigurationError
-from gvo.evaluation import evaluate
 from gvo.geometry import se3
 from gvo.outputs.report import write_comparison_report, write_run_report
 from gvo.outputs.report.decimation import kept_of_curve
@@ -20,8 +19,9 @@ from gvo.outputs.report.sheets import draw_curve, new_figure
 from gvo.outputs.run_record import read_run
 from gvo.runs import run_recording
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import write_covariances, write_tum
+from gvo.trajectory.evaluation import evaluate
+from gvo.trajectory.formats import write_covariances, write_tum
+from gvo.trajectory.trajectory import Trajectory
 
 SECTIONS = [
     "above",

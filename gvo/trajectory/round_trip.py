@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo.g2o import (
+from gvo.geometry import se3
+from gvo.trajectory.g2o import (
     Fix,
     Measurement,
     Vertex,
@@ -19,7 +20,6 @@ from gvo.g2o import (
     format_vertex,
     parse_line,
 )
-from gvo.geometry import se3
 
 EXAMPLES = (
     "sphere2500.txt",

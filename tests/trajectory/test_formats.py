@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
-from gvo.trajectory_files import (
+from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
     format_tum_line,
@@ -21,6 +20,7 @@ from gvo.trajectory_files import (
     write_kitti,
     write_tum,
 )
+from gvo.trajectory.trajectory import Trajectory
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 GOOD = "1.0 0 0 0 0 0 0 1\n"

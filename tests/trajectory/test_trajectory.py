@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory, format_stamp
+from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import Estimate
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from gvo.closing import Closing, close
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
+from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 _TURN_NS = 1_700_000_000_000_000_000

@@ -19,6 +19,7 @@ doi:10.1109/ICRA.2011.5979949.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -26,8 +27,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.trajectory_rows import MAX_POSITION_M
-from gvo.types import FloatArray
+from gvo.trajectory.formats import MAX_POSITION_M
+from gvo.types import FloatArray, FrameId, GraphEdge
 
 _UPPER = np.triu_indices(6)
 _UNIT_INFORMATION = [f"{float(i == j)}" for i, j in zip(*_UPPER, strict=True)]
@@ -216,6 +217,38 @@ def convert_line(text: str) -> str:
     upper = " ".join(numbers[i] for i in order[np.ix_(_SWAPPED, _SWAPPED)][_UPPER])
     T = line.T_reference_frame
     return f"EDGE_SE3:QUAT {line.reference_id} {line.frame_id} {_pose_fields(T)} {upper}"
+
+
+def g2o_lines(poses: Mapping[FrameId, FloatArray], graph: Sequence[GraphEdge]) -> Iterator[str]:
+    """Yield vertices and edges, without line ends.
+
+    Frames that are named by whole numbers keep them; others are numbered in their order, the
+    name behind the vertex as a comment. Priors, for which the format has no line that all
+    readers know, are left out.
+
+    Parameters
+    ----------
+    poses : mapping of hashable to ndarray of float64, shape (4, 4)
+        T_world_frame.
+    graph : sequence of GraphEdge
+    """
+    is_numbered = all(
+        isinstance(frame_id, int | np.integer) and frame_id >= 0 for frame_id in poses
+    )
+    numbers = {
+        frame_id: frame_id if is_numbered else number for number, frame_id in enumerate(poses)
+    }
+    for frame_id, T in poses.items():
+        comment = "" if is_numbered else f"  # {frame_id!r}"
+        yield f"{format_vertex(str(numbers[frame_id]), T)}{comment}"
+    for edge in graph:
+        if edge.reference_id is not None:
+            yield format_edge(
+                str(numbers[edge.reference_id]),
+                str(numbers[edge.frame_id]),
+                edge.T_reference_frame,
+                edge.covariance,
+            )
 
 
 def _pose_fields(T: FloatArray) -> str:

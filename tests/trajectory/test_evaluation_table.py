@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gvo.evaluation import Evaluation
-from gvo.outputs.tables import evaluations_json, format_evaluations
+from gvo.trajectory.evaluation import Evaluation, evaluations_json, format_evaluations
 
 FULL = Evaluation(
     name="smoothed",

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory, format_stamp
+from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import FloatArray, IntArray
 
 AlignMode = Literal["none", "origin", "se3", "sim3"]

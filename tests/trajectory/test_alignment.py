@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory import StampsFrom, Trajectory
-from gvo.trajectory_alignment import (
+from gvo.trajectory.alignment import (
     MAX_GAP_NS,
     AlignMode,
     Similarity,
@@ -18,6 +17,7 @@ from gvo.trajectory_alignment import (
     associate,
     pair,
 )
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 stamp_lists = st.lists(st.integers(0, 200), min_size=1, max_size=30, unique=True).map(sorted)

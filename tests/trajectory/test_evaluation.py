@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.errors import TrajectoryError
-from gvo.evaluation import Evaluation, evaluate, relative_errors, segment_errors
 from gvo.geometry import se3
-from gvo.trajectory import Trajectory
-from gvo.trajectory_alignment import AlignMode, Similarity
-from gvo.trajectory_files import read_trajectory, write_kitti, write_tum
+from gvo.trajectory.alignment import AlignMode, Similarity
+from gvo.trajectory.evaluation import Evaluation, evaluate, relative_errors, segment_errors
+from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
+from gvo.trajectory.trajectory import Trajectory
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 

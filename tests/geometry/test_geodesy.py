@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from gvo.sources.geodesy import (
+from gvo.geometry.geodesy import (
     FLATTENING,
     SEMI_MAJOR_AXIS,
     enu_of_ecef,
