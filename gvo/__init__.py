@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gvo.errors import GvoError
     from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
-    from gvo.odometry import FrameResult, Odometry
+    from gvo.odometry.odometry import Odometry
     from gvo.outputs.bag_writer import convert
     from gvo.outputs.converting import convert_recording
     from gvo.outputs.plots import plot_trajectories
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         Estimate,
         Failure,
         FaultyFrame,
+        FrameResult,
         GraphEdge,
         PosePrior,
         PositionPrior,
@@ -51,7 +52,7 @@ _MODULES = {
     "gvo.errors": ("GvoError",),
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
-    "gvo.odometry": ("FrameResult", "Odometry"),
+    "gvo.odometry.odometry": ("Odometry",),
     "gvo.outputs.bag_writer": ("convert",),
     "gvo.outputs.converting": ("convert_recording",),
     "gvo.outputs.plots": ("plot_trajectories",),
@@ -70,6 +71,7 @@ _MODULES = {
         "Estimate",
         "Failure",
         "FaultyFrame",
+        "FrameResult",
         "GraphEdge",
         "PosePrior",
         "PositionPrior",

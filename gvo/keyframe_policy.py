@@ -2,7 +2,7 @@
 
 A score tells how much the current frame has in common with a kept one: 1 at the same place, 0
 far away. It is the share of the view that they have in common where points are known
-(`gvo.keyframes`), else `proximity`. All scores come by frame, the oldest first.
+(`gvo.odometry.keyframes`), else `proximity`. All scores come by frame, the oldest first.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import cv2
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError, ResumeError
 from gvo.frontend.factory import make_frontend
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.output_frame import OutputFrame
 from gvo.outputs.smoothings import SmoothingComparison
 from gvo.resuming.frontend import RepeatableFrontend
@@ -25,7 +25,7 @@ from gvo.run_tally import Progress, RunTally
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames
 from gvo.sources.recording import Source
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
 
 
 class Output(Protocol):

@@ -10,9 +10,8 @@ import numpy as np
 
 from gvo.backend.ledger import WindowCounts
 from gvo.backend.polish import Polish
-from gvo.frontend.offset import RigOffsets
-from gvo.odometry import FrameResult
-from gvo.types import FaultyFrame, SegmentJoin, Status
+from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.types import FaultyFrame, FrameResult, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
 # With more poses that only continue a velocity, a trajectory is in parts made up.

@@ -11,8 +11,8 @@ from typing import Any
 
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
-from gvo.edge_chain import EdgeChain
 from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.odometry.chain import EdgeChain
 from gvo.outputs.graph_file import GraphFile
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder

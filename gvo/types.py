@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -462,3 +462,84 @@ class Estimate:
         return estimate_html(
             self.stamp_ns, self.T_world_cam, self.covariance, status=self.status.value
         )
+
+
+LinkKind: TypeAlias = Literal["step", "keyframe", "standstill"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameLink:
+    """An edge from an earlier frame to the newest one, after the window took it.
+
+    Parameters
+    ----------
+    reference_ns : int
+        Stamp of the earlier frame.
+    kind : {"step", "keyframe", "standstill"}
+        To the frame that the raw chain goes on from, to a keyframe, or without motion.
+    chi2 : float or None
+        Squared norm of the whitened residual, of 6 degrees of freedom: about 6 where the stated
+        covariances are right; None where the earlier frame left the window with the update.
+    is_accepted : bool
+        False where the window refused the edge.
+    """
+
+    reference_ns: int
+    kind: LinkKind
+    chi2: float | None
+    is_accepted: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameResult:
+    """What one frame gave.
+
+    Parameters
+    ----------
+    raw, causal : Estimate
+        The pose by the chain of frame-to-frame registrations, and by the window.
+    finished : tuple of Estimate
+        Smoothed poses of frames that left the window with this one.
+    status : Status
+        What ties the frame to earlier ones in the window; the raw chain's own is `raw.status`.
+    reason : str
+        Why the chain could not register the frame; empty where it could.
+    n_keypoints, n_points, n_matches, n_inliers, n_links : int
+        Keypoints, those measured in 3-D, matches of the chain's registration and those that it
+        rests on (0 where a front-end of one's own does not count them), edges that went into
+        the window.
+    registration : RelativePose or None
+        Against the frame that the raw chain goes on from; None where there is none.
+    links : tuple of FrameLink
+        The edges that were offered to the window with the frame.
+    keyframes_ns : tuple of int
+        Stamps of the kept frames, oldest first; of this one too, where it became one.
+    segment : int
+        Counted from 0; another one begins when the camera is lost.
+    joins : tuple of SegmentJoin
+        Segments that found their place among earlier ones with this frame.
+    stage_ms : dict of str to float
+        Milliseconds by stage.
+    """
+
+    raw: Estimate
+    causal: Estimate
+    finished: tuple[Estimate, ...]
+    status: Status
+    reason: str
+    n_keypoints: int
+    n_points: int
+    n_matches: int
+    n_inliers: int
+    n_links: int
+    registration: RelativePose | None = None
+    links: tuple[FrameLink, ...] = ()
+    keyframes_ns: tuple[int, ...] = ()
+    segment: int = 0
+    joins: tuple[SegmentJoin, ...] = ()
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the frame, nanoseconds."""
+        return self.raw.stamp_ns

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 import gvo
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.output_frame import OutputFrame
 from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.run_overlay import RunOverlay, film_width
@@ -22,7 +22,7 @@ from gvo.outputs.video import open_sink
 from gvo.run_loop import RunLoop, one_opencv_thread
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
-from gvo.types import FaultyFrame, Frame
+from gvo.types import FaultyFrame, Frame, FrameResult
 
 Spent = tuple[float, float]  # milliseconds per frame: wall, CPU
 

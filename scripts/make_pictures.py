@@ -26,7 +26,7 @@ from gvo.config import Config
 from gvo.demo import write_demo_bag
 from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
-from gvo.odometry import Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.report import write_run_report
 from gvo.outputs.run_record import read_run

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from gvo.odometry import FrameResult
 from gvo.run_tally import RunTally
-from gvo.types import Estimate, FaultyFrame, SegmentJoin, Status
+from gvo.types import Estimate, FaultyFrame, FrameResult, SegmentJoin, Status
 
 
 def counted(n_ok: int, n_coasting: int) -> RunTally:

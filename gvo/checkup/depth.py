@@ -11,8 +11,8 @@ from gvo.checkup.misregistration import estimate_misregistration
 from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
-from gvo.frontend.corners import detect_corners
 from gvo.frontend.rgbd import sample_depth
+from gvo.frontend.tracking import detect_corners
 from gvo.types import DepthArray, Failure, RgbdFrame
 
 # Values within this of the median tell the step there.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
-from gvo.frontend.corners import detect_corners
+from gvo.frontend.tracking import detect_corners
 from gvo.types import BoolArray, FaultyFrame, FloatArray, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _BLACK, _WHITE = 2, 253

@@ -10,12 +10,11 @@ import numpy as np
 from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.features import FeatureExtractor, Features
-from gvo.frontend.offset import RigOffsets
-from gvo.frontend.registration import register_correspondences
-from gvo.frontend.relocalization import check_view, relocalize_observations
+from gvo.frontend.matching import match_temporal, predict_pixels
+from gvo.frontend.registration import check_view, register_correspondences, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.stereo import is_in_depth_range, match_stereo, refine_disparities
-from gvo.frontend.temporal import match_temporal, predict_pixels
+from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import (

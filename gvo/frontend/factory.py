@@ -7,8 +7,7 @@ from typing import Any
 
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
-from gvo.frontend.klt import KltFrontend
-from gvo.frontend.klt_observations import KltObservations
+from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 

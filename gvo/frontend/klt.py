@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.corner_disparities import measure_corners
-from gvo.frontend.corners import detect_corners
-from gvo.frontend.depth_consistency import check_depths
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.disparity import follow_disparities, measure_disparities
-from gvo.frontend.klt_observations import KltCorners, KltObservations, image_of
-from gvo.frontend.offset import RigOffsets
-from gvo.frontend.registration import register_correspondences
-from gvo.frontend.relocalization import check_view, relocalize_observations
-from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.stereo import is_in_depth_range
-from gvo.frontend.tracking import track_pixels
+from gvo.frontend.registration import check_view, register_correspondences, relocalize_observations
+from gvo.frontend.rgbd import check_depths, sample_depth
+from gvo.frontend.stereo.corners import measure_corners
+from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
+from gvo.frontend.stereo.matching import is_in_depth_range
+from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.frontend.tracking import detect_corners, track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -30,6 +27,7 @@ from gvo.types import (
     Failure,
     FloatArray,
     Frame,
+    ImageArray,
     IntArray,
     Observations,
     RelativePose,
@@ -355,3 +353,83 @@ class KltFrontend:
     def _measure_depth(self, frame: RgbdFrame, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
         depths, is_valid = sample_depth(frame.depth, pixels, self._config.depth)
         return self.camera.depth_to_disparity(np.where(is_valid, depths, np.nan)), is_valid
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KltCorners:
+    """The corners of a frame that are measured in 3-D.
+
+    Parameters
+    ----------
+    keypoints : ndarray of float64, shape (n, 2)
+        Pixels (u, v) in the left or colour image.
+    disparities : ndarray of float64, shape (n,)
+        Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
+    points_cam : ndarray of float64, shape (n, 3)
+        Points in the `cam` frame, metres, by what was known of the disparities' offset then.
+    n_keypoints : int
+        Corners detected, measured or not.
+    row_shift_px : float or None
+        By how much the rows of left and right still differ; None where that is not known.
+    """
+
+    keypoints: FloatArray
+    disparities: FloatArray
+    points_cam: FloatArray
+    n_keypoints: int
+    row_shift_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KltObservations:
+    """A frame that others' corners are followed into, and its own corners.
+
+    Parameters
+    ----------
+    frame : StereoFrame or RgbdFrame
+    find_corners : callable
+        Returns its KltCorners. They may still be looked for on another thread: only when the
+        next frame comes are they needed.
+    """
+
+    frame: Frame
+    find_corners: Callable[[], KltCorners]
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the frame, nanoseconds."""
+        return self.frame.stamp_ns
+
+    @property
+    def image(self) -> ImageArray:
+        """The image that is tracked in, left or colour."""
+        return image_of(self.frame)
+
+    @property
+    def keypoints(self) -> FloatArray:
+        """Pixels (u, v) of the corners, shape (n, 2)."""
+        return self.find_corners().keypoints
+
+    @property
+    def disparities(self) -> FloatArray:
+        """Disparities of the corners as measured, shape (n,)."""
+        return self.find_corners().disparities
+
+    @property
+    def points_cam(self) -> FloatArray:
+        """The corners as points in the `cam` frame, metres, shape (n, 3)."""
+        return self.find_corners().points_cam
+
+    @property
+    def n_keypoints(self) -> int:
+        """Corners detected, measured or not."""
+        return self.find_corners().n_keypoints
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.keypoints)
+
+
+def image_of(frame: Frame) -> ImageArray:
+    """Return the image that is tracked in, left or colour."""
+    return frame.left if isinstance(frame, StereoFrame) else frame.image

@@ -8,12 +8,11 @@ from typing import Final
 import numpy as np
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.odometry import FrameResult
 from gvo.outputs.depth_colours import HEIGHT_PX as FOOTER_PX
 from gvo.outputs.depth_colours import DepthScale, colour_bar
 from gvo.outputs.palette import INLIERS, OUTLIERS, STATUSES
 from gvo.outputs.strokes import BLACK, WHITE, bgr, shortened, text_width, write
-from gvo.types import FaultyFrame, FloatArray, ImageArray, Status
+from gvo.types import FaultyFrame, FloatArray, FrameResult, ImageArray, Status
 
 HEADER_PX: Final = 44
 MIN_WIDTH_PX: Final = 640

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry import FrameResult
 from gvo.outputs.depth_colours import DepthScale, in_groups, paint_depth, table
 from gvo.outputs.overlay_layout import Layout, write_footer, write_header
 from gvo.outputs.palette import INLIERS, OUTLIERS
@@ -28,6 +27,7 @@ from gvo.types import (
     FaultyFrame,
     FloatArray,
     Frame,
+    FrameResult,
     ImageArray,
     RelativePose,
     RgbdFrame,

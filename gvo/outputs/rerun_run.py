@@ -14,7 +14,6 @@ import numpy as np
 import rerun as rr
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.odometry import FrameResult
 from gvo.outputs import rerun_layout as place
 from gvo.outputs import rerun_scene as scene
 from gvo.outputs.overlays import compose_overlay
@@ -25,6 +24,7 @@ from gvo.types import (
     Estimate,
     FloatArray,
     Frame,
+    FrameResult,
     ImageArray,
     RelativePose,
     Status,

@@ -13,12 +13,11 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from gvo.frame_links import FrameLink
 from gvo.geometry.camera import PinholeCamera
 from gvo.outputs import palette
 from gvo.outputs.bag_messages import pose_numbers
 from gvo.outputs.image_files import encode_jpeg
-from gvo.types import Estimate, FloatArray, ImageArray, RelativePose, Status
+from gvo.types import Estimate, FloatArray, FrameLink, ImageArray, RelativePose, Status
 
 Colour: TypeAlias = tuple[int, int, int]
 

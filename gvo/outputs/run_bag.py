@@ -45,7 +45,6 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from gvo.closable import Closable
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.odometry import FrameResult
 from gvo.outputs.bag_messages import BagWriter, Header, write_transforms
 from gvo.outputs.compressed_messages import write_picture
 from gvo.outputs.overlays import draw_matches
@@ -63,6 +62,7 @@ from gvo.types import (
     FaultyFrame,
     FloatArray,
     Frame,
+    FrameResult,
     ImageArray,
     RelativePose,
     Status,

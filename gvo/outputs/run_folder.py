@@ -14,7 +14,6 @@ import numpy as np
 
 from gvo.closable import Closable
 from gvo.errors import OutputError
-from gvo.odometry import FrameResult
 from gvo.outputs.line_file import LineFile, RewrittenFile, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
@@ -23,7 +22,7 @@ from gvo.trajectory.formats import (
     write_tum,
 )
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, IntArray, Status
+from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Status
 
 SUMMARY = "summary.json"
 JOURNAL = "journal.bin"

@@ -42,9 +42,8 @@ from gvo.closable import Closable
 from gvo.config import Config, describe_configuration
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry.camera import PinholeCamera
-from gvo.odometry import FrameResult
 from gvo.outputs.run_frames import RunFrames
-from gvo.types import Estimate, FaultyFrame, Frame, Status
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Status
 
 if TYPE_CHECKING:
     from gvo.outputs.rerun_run import RerunWriter

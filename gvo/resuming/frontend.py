@@ -9,9 +9,9 @@ from weakref import WeakSet
 from gvo.errors import ResumeError
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
-from gvo.frontend.offset import RigOffsets
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import StereoCamera
-from gvo.keyframes import sample_points
+from gvo.odometry.keyframes import sample_points
 from gvo.resuming.records import Call, FrameRecord, Learnt
 from gvo.types import Failure, FloatArray, Frame, RelativePose
 

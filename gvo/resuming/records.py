@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from gvo.frontend.offset import check_state
+from gvo.frontend.stereo.offsets import check_state
 from gvo.types import Failure, FaultyFrame, FloatArray, RelativePose
 
 Learnt: TypeAlias = tuple[tuple[float | int | None, ...], ...]

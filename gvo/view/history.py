@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.frame_links import FrameLink
-from gvo.odometry import FrameResult
 from gvo.types import (
     Estimate,
     FloatArray,
+    FrameLink,
+    FrameResult,
     ImageArray,
     IntArray,
     Rejected,

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.frame_links import FrameLink
-from gvo.odometry import FrameResult
-from gvo.types import FloatArray, ImageArray, Status
+from gvo.types import FloatArray, FrameLink, FrameResult, ImageArray, Status
 from gvo.view.clouds import Cloud
 
 

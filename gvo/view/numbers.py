@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from gvo.odometry import FrameResult
 from gvo.trajectory.trajectory import format_stamp
-from gvo.types import FloatArray
+from gvo.types import FloatArray, FrameResult
 from gvo.view.ellipsoids import position_sigmas
 from gvo.view.layers import COLOURS
 

@@ -9,11 +9,11 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from gvo.config import Config
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.outputs.overlays import compose_overlay
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.recording import Source
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, StereoFrame
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, StereoFrame
 from gvo.view.clouds import empty_cloud, frame_cloud
 from gvo.view.moments import Entry
 from gvo.view.pictures import draw_fault, small_picture

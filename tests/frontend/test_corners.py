@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gvo.config import KltConfig
-from gvo.frontend.corners import detect_corners
+from gvo.frontend.tracking import detect_corners
 from gvo.types import ImageArray
 from tests.frontend.analytic import SHAPE, image
 

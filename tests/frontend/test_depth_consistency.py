@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gvo.config import Config, DepthConfig
-from gvo.frontend.depth_consistency import check_depths, compare_depths
 from gvo.frontend.descriptor import as_stereo
+from gvo.frontend.rgbd import check_depths, compare_depths
 from gvo.geometry import se3
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose

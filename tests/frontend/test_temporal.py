@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gvo.frontend.temporal import match_temporal, predict_pixels
+from gvo.frontend.matching import match_temporal, predict_pixels
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray, IntArray, Observations
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import gvo
-from gvo.chain import RawChain
 from gvo.config import Config, WindowConfig
 from gvo.diagnostics.explain.watch import WatchedFrontend
 from gvo.frontend.factory import make_frontend
@@ -18,6 +17,7 @@ from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
+from gvo.odometry.chain import RawChain
 from gvo.resuming.frontend import RepeatableFrontend
 from gvo.types import Failure, FloatArray, RelativePose
 

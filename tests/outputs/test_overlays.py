@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry import FrameResult
 from gvo.outputs.depth_colours import HEIGHT_PX, DepthScale, table
 from gvo.outputs.image_files import encode_jpeg
 from gvo.outputs.overlay_layout import HEADER_PX
@@ -22,6 +21,7 @@ from gvo.outputs.strokes import shortened, text_width
 from gvo.types import (
     Estimate,
     FaultyFrame,
+    FrameResult,
     RelativePose,
     RgbdFrame,
     Status,

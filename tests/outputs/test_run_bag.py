@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.se3 import make_transform
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.outputs.bag_messages import BagWriter
 from gvo.outputs.run_bag import N_SHOWN_POSES, RunBag
 from gvo.outputs.run_frames import RunFrames
@@ -32,6 +32,7 @@ from gvo.types import (
     FaultyFrame,
     FloatArray,
     Frame,
+    FrameResult,
     RelativePose,
     RgbdFrame,
     Status,

@@ -26,10 +26,8 @@ from rerun.chunk import RrdReader
 
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
-from gvo.frame_links import FrameLink
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import exp, make_transform
-from gvo.odometry import FrameResult
 from gvo.output_frame import OutputFrame
 from gvo.outputs import rerun_run
 from gvo.outputs.palette import COUNTS, LINKS, STAGES
@@ -40,7 +38,16 @@ from gvo.run_loop import RunLoop
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FloatArray, RelativePose, Status, StereoFrame
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    FrameLink,
+    FrameResult,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
 
 _N_FRAMES = 12
 _ESTIMATES = ("raw", "causal", "smoothed")

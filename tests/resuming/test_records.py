@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.offset import RigOffsets
-from gvo.keyframes import sample_points
+from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.odometry.keyframes import sample_points
 from gvo.resuming.records import Call, FaultyRecord, FrameRecord, decode, encode
 from gvo.types import Failure, FaultyFrame, RelativePose
 

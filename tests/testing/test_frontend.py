@@ -12,8 +12,7 @@ import gvo
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.klt import KltFrontend
-from gvo.frontend.klt_observations import KltObservations
+from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
 from gvo.sources.recording import Sensor
 from gvo.testing import ContractError, check_frontend

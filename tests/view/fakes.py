@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
-from gvo.frame_links import FrameLink
 from gvo.geometry.camera import PinholeCamera
-from gvo.odometry import FrameResult
-from gvo.types import Estimate, FloatArray, IntArray, Status
+from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, IntArray, Status
 from gvo.view.moments import Moment
 
 PERIOD_NS = 100_000_000

@@ -12,8 +12,15 @@ from hypothesis.extra.numpy import arrays
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera
-from gvo.odometry import FrameResult
-from gvo.types import Estimate, FloatArray, RelativePose, RgbdFrame, Status, StereoFrame
+from gvo.types import (
+    Estimate,
+    FloatArray,
+    FrameResult,
+    RelativePose,
+    RgbdFrame,
+    Status,
+    StereoFrame,
+)
 from gvo.view import clouds
 from gvo.view.clouds import Cloud, KeyframeClouds, frame_cloud, put_together, thin
 from gvo.view.history import History

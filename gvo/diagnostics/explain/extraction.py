@@ -8,12 +8,12 @@ from gvo._trace import Event
 from gvo.config import Config, DepthConfig, FeaturesConfig, StereoConfig
 from gvo.diagnostics.explain.values import DepthStep, KeypointStep, Sorting, StereoStep
 from gvo.diagnostics.explain.watch import WatchedFrame
-from gvo.frontend.corners import detect_corners
 from gvo.frontend.features import FeatureExtractor, Features
-from gvo.frontend.klt_observations import image_of
+from gvo.frontend.klt import image_of
 from gvo.frontend.matching import best_ratios
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.stereo import candidate_pairs
+from gvo.frontend.stereo.matching import candidate_pairs
+from gvo.frontend.tracking import detect_corners
 from gvo.geometry.camera import StereoCamera
 from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray, RgbdFrame
 

@@ -16,12 +16,12 @@ from gvo.diagnostics.explain.values import FrameExplanation
 from gvo.diagnostics.explain.watch import Registration, WatchedFrontend
 from gvo.errors import RecordingError
 from gvo.frontend.protocol import Stamped
-from gvo.keyframes import Keyframes
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.keyframes import Keyframes
+from gvo.odometry.odometry import Odometry
 from gvo.sources.excerpt import Excerpt
 from gvo.sources.frames import frames
 from gvo.sources.recording import Source
-from gvo.types import FaultyFrame, Frame, Status
+from gvo.types import FaultyFrame, Frame, FrameResult, Status
 
 Progress = Callable[[int, int, int], None]
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 from gvo.diagnostics.explain.values import KeyframeLink
 from gvo.diagnostics.explain.watch import Registration
-from gvo.frame_links import FrameLink
-from gvo.frontend.klt_observations import image_of
+from gvo.frontend.klt import image_of
 from gvo.frontend.protocol import Stamped
 from gvo.geometry import se3
-from gvo.keyframes import Keyframes
-from gvo.odometry import FrameResult
-from gvo.types import Failure, FloatArray, Frame, RelativePose
+from gvo.odometry.keyframes import Keyframes
+from gvo.types import Failure, FloatArray, Frame, FrameLink, FrameResult, RelativePose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

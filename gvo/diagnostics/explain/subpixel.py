@@ -10,8 +10,8 @@ from gvo.config import Config, StereoConfig
 from gvo.diagnostics.explain.extraction import find_event
 from gvo.diagnostics.explain.values import StereoStep, SubpixelStep
 from gvo.diagnostics.explain.watch import WatchedFrame
-from gvo.frontend.corner_disparities import N_SEARCH_STEPS
-from gvo.frontend.disparity import follow_disparities
+from gvo.frontend.stereo.corners import N_SEARCH_STEPS
+from gvo.frontend.stereo.disparity import follow_disparities
 from gvo.types import FloatArray, ImageArray, RgbdFrame
 
 # Of the curve of squared differences around the end, pixels.

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import Config
-from gvo.frontend.offset import RigOffsets
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.odometry import FrameResult
 from gvo.types import (
     BoolArray,
     DepthArray,
     Failure,
     FloatArray,
     Frame,
+    FrameResult,
     ImageArray,
     IntArray,
     RelativePose,

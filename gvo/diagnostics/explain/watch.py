@@ -8,8 +8,8 @@ from typing import Any
 from gvo._trace import Event, watched
 from gvo.config import Config
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Stamped
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Failure, FloatArray, Frame, RelativePose
 

@@ -13,7 +13,7 @@ from gvo.diagnostics.explain.values import (
     SampleSearch,
     TemporalStep,
 )
-from gvo.frontend.klt_observations import image_of
+from gvo.frontend.klt import image_of
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.explanation.extraction import draw_reasons
 from gvo.viz.explanation.sheet import (

@@ -13,13 +13,13 @@ from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.keyframe_policy import choose_links
-from gvo.keyframes import Keyframes
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.keyframes import Keyframes
+from gvo.odometry.odometry import Odometry
 from gvo.sources.frames import frames
 from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FaultyFrame
+from gvo.types import FaultyFrame, FrameResult
 
 KINDS = ("klt", "descriptor")
 SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
@@ -161,7 +161,7 @@ def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
         return chosen_links[-1]
 
     monkeypatch.setattr(Keyframes, "scores", scores)
-    monkeypatch.setattr("gvo.linking.choose_links", choose)
+    monkeypatch.setattr("gvo.odometry.keyframes.choose_links", choose)
     explanation = explain_frame(recording("stereo"), LAST, config=configuration(kind))
     chosen_by, shown = seen[-2:]
     assert chosen_by == shown

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.chain import RawStep
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.linking import count_steps, link_keyframes
+from gvo.odometry.chain import RawStep
+from gvo.odometry.keyframes import count_steps, link_keyframes
 from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
 
 CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_gain=2.5, gate=10.0)

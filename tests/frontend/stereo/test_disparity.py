@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.disparity import follow_disparities, measure_disparities
+from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
 

@@ -5,9 +5,9 @@ import pytest
 
 import gvo
 from gvo.backend.window import SlidingWindow
-from gvo.frame_links import LinkKind, judge_links
 from gvo.geometry import se3
-from gvo.types import Edge
+from gvo.odometry.keyframes import judge_links
+from gvo.types import Edge, LinkKind
 
 Offered = list[tuple[LinkKind, Edge]]
 

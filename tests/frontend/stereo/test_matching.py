@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
-from gvo.frontend.stereo import (
+from gvo.frontend.stereo.matching import (
     candidate_pairs,
     match_stereo,
     parabola_minimum,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gvo.frontend.patches import (
+from gvo.frontend.stereo.patches import (
     Likeness,
     correlate_rows,
     interpolate_strips,

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
-from gvo.odometry import FrameResult, Odometry
+from gvo.odometry.odometry import Odometry
 from gvo.sources.frames import frames
 from gvo.sources.recording import Sensor
 from gvo.sources.synthetic import SyntheticRecording
-from gvo.types import Estimate, Frame, RgbdFrame, StereoFrame
+from gvo.types import Estimate, Frame, FrameResult, RgbdFrame, StereoFrame
 
 N_FRAMES = 8
 SECTIONS = (

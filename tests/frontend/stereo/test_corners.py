@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.config import StereoConfig
-from gvo.frontend.corner_disparities import CornerDisparities, measure_corners
+from gvo.frontend.stereo.corners import CornerDisparities, measure_corners
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,83 +13,28 @@ import numpy as np
 
 from gvo.backend.comparison import MeasurementLog
 from gvo.backend.window import SlidingWindow
-from gvo.chain import RawChain, RawStep
 from gvo.config import Config, WindowConfig
-from gvo.frame_links import FrameLink, LinkKind, judge_links
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend, renew_frontend
-from gvo.frontend.offset import RigOffsets
 from gvo.frontend.protocol import Frontend, Stamped, register_checked, relocalize_checked
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.keyframe_policy import choose_released, is_needed
-from gvo.keyframes import Keyframes
-from gvo.linking import count_steps, link_keyframes
-from gvo.segments import Segments, Sighting
+from gvo.odometry.chain import RawChain, RawStep
+from gvo.odometry.keyframes import Keyframes, count_steps, judge_links, link_keyframes
+from gvo.odometry.segments import Segments, Sighting
 from gvo.types import (
     Edge,
     Estimate,
     Failure,
     FloatArray,
+    FrameResult,
+    LinkKind,
     RelativePose,
     SegmentJoin,
     Status,
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameResult:
-    """What one frame gave.
-
-    Parameters
-    ----------
-    raw, causal : Estimate
-        The pose by the chain of frame-to-frame registrations, and by the window.
-    finished : tuple of Estimate
-        Smoothed poses of frames that left the window with this one.
-    status : Status
-        What ties the frame to earlier ones in the window; the raw chain's own is `raw.status`.
-    reason : str
-        Why the chain could not register the frame; empty where it could.
-    n_keypoints, n_points, n_matches, n_inliers, n_links : int
-        Keypoints, those measured in 3-D, matches of the chain's registration and those that it
-        rests on (0 where a front-end of one's own does not count them), edges that went into
-        the window.
-    registration : RelativePose or None
-        Against the frame that the raw chain goes on from; None where there is none.
-    links : tuple of FrameLink
-        The edges that were offered to the window with the frame.
-    keyframes_ns : tuple of int
-        Stamps of the kept frames, oldest first; of this one too, where it became one.
-    segment : int
-        Counted from 0; another one begins when the camera is lost.
-    joins : tuple of SegmentJoin
-        Segments that found their place among earlier ones with this frame.
-    stage_ms : dict of str to float
-        Milliseconds by stage.
-    """
-
-    raw: Estimate
-    causal: Estimate
-    finished: tuple[Estimate, ...]
-    status: Status
-    reason: str
-    n_keypoints: int
-    n_points: int
-    n_matches: int
-    n_inliers: int
-    n_links: int
-    registration: RelativePose | None = None
-    links: tuple[FrameLink, ...] = ()
-    keyframes_ns: tuple[int, ...] = ()
-    segment: int = 0
-    joins: tuple[SegmentJoin, ...] = ()
-    stage_ms: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame, nanoseconds."""
-        return self.raw.stamp_ns
 
 
 class Odometry:

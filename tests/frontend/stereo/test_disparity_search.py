@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.frontend.disparity_search import COARSE_ERROR_PX, search_disparities
+from gvo.frontend.stereo.corners import COARSE_ERROR_PX, search_disparities
 from gvo.types import FloatArray, ImageArray
 from tests.frontend.analytic import SHAPE, grid, image
 

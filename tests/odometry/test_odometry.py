@@ -10,18 +10,19 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.chain import RawStep
 from gvo.config import Config, WindowConfig
 from gvo.frontend.klt import KltFrontend
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.odometry import FrameResult, Odometry, zero_motion_edge
+from gvo.odometry.chain import RawStep
+from gvo.odometry.odometry import Odometry, zero_motion_edge
 from gvo.types import (
     DepthArray,
     Estimate,
     Failure,
     FloatArray,
     Frame,
+    FrameResult,
     ImageArray,
     RelativePose,
     RgbdFrame,

@@ -8,7 +8,7 @@ import pytest
 
 from gvo.config import WindowConfig
 from gvo.geometry.camera import StereoCamera
-from gvo.keyframes import Keyframes
+from gvo.odometry.keyframes import Keyframes
 from gvo.types import FloatArray, Observations
 
 CAMERA = StereoCamera(fx=100.0, fy=100.0, cx=50.0, cy=40.0, width=100, height=80, baseline=0.1)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.chain import RawChain, RawStep
 from gvo.config import WindowConfig
 from gvo.geometry import se3
+from gvo.odometry.chain import RawChain, RawStep
 from gvo.types import Failure, FloatArray, Observations, RelativePose, Status
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.config import Config, WindowConfig
-from gvo.edge_chain import EdgeChain
 from gvo.geometry import se3
+from gvo.odometry.chain import EdgeChain
 from gvo.outputs.run_folder import RunFolder
 from gvo.smoothing import POSES_HEADER, Smoother
 from gvo.sources.edges import PoseEvent

@@ -8,9 +8,9 @@ import pytest
 
 from gvo.config import Config
 from gvo.geometry import se3
-from gvo.odometry import FrameResult, Odometry
-from gvo.segments import Segments
-from gvo.types import Failure, FloatArray, RelativePose, SegmentJoin, Status
+from gvo.odometry.odometry import Odometry
+from gvo.odometry.segments import Segments
+from gvo.types import Failure, FloatArray, FrameResult, RelativePose, SegmentJoin, Status
 
 STEP_NS = 100_000_000
 SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import gvo
 from gvo.config import Config, StereoConfig
-from gvo.frontend.offset import OffsetFilter, RigOffsets
+from gvo.frontend.stereo.offsets import OffsetFilter, RigOffsets
 from gvo.sources.sensor_noise import SensorNoise
 from gvo.types import FaultyFrame, RelativePose, StereoFrame
 

@@ -1,7 +1,7 @@
 """Disparities of single pixels, found along the row of the right image.
 
 No keypoints of the right image are needed, so that any pixel can be measured, around what
-`gvo.frontend.disparity_search` or the motion so far predicts.
+`gvo.frontend.stereo.corners` or the motion so far predicts.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
-from gvo.frontend.patches import Patches, sample_patches, squared_differences
-from gvo.frontend.stereo import parabola_minimum
+from gvo.frontend.stereo.matching import parabola_minimum
+from gvo.frontend.stereo.patches import Patches, sample_patches, squared_differences
 from gvo.types import BoolArray, FloatArray, ImageArray
 
 # Steps of the fine search after the parabola: the last moves by less than 0.01 pixels.

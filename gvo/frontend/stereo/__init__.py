@@ -1,0 +1,1 @@
+"""Stereo: matches along rows, sub-pixel disparities, offsets of the rig."""

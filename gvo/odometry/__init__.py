@@ -1,0 +1,1 @@
+"""Odometry: the raw chain, keyframes and segments, driving front-end and back-end."""
