@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from gvo.version import __version__
 
 if TYPE_CHECKING:
-    from gvo.backend.comparison import MeasurementLog
     from gvo.backend.window import SlidingWindow
     from gvo.config import Config, WindowConfig, load_configuration
     from gvo.errors import GvoError
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     )
 
 _MODULES = {
-    "gvo.backend.comparison": ("MeasurementLog",),
     "gvo.backend.window": ("SlidingWindow",),
     "gvo.config": ("Config", "WindowConfig", "load_configuration"),
     "gvo.errors": ("GvoError",),
@@ -96,7 +94,6 @@ __all__ = [
     "Frontend",
     "GraphEdge",
     "GvoError",
-    "MeasurementLog",
     "Odometry",
     "PinholeCamera",
     "PosePrior",

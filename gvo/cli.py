@@ -51,10 +51,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_Compare = Annotated[
-    bool,
-    typer.Option("--compare", help="Also smooth by full iSAM2 and batch; print the difference."),
-]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
@@ -156,7 +152,6 @@ def run(
     right: Right = None,
     color: Color = None,
     depth: Depth = None,
-    compare_smoothing: _Compare = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where a run into DIR was interrupted.")
     ] = False,
@@ -194,7 +189,6 @@ def run(
             starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
             outputs=outputs,
-            compare_smoothing=compare_smoothing,
             resume=resume,
             on_progress=both(show, check),
         )
@@ -265,7 +259,6 @@ def smooth(
     ] = _KeyframePolicy.DISTANCE,
     config: ConfigFile = None,
     set_: Settings = None,
-    compare_smoothing: _Compare = False,
 ) -> None:
     """Smooth the edges or poses of any front-end."""
     from gvo.run_inputs import read_ground_truth
@@ -275,7 +268,7 @@ def smooth(
     parameters = load(config, set_)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
     if "-" in inputs:
-        _refuse_with_lines(inputs, topic=topic, sigma=sigma, compare=compare_smoothing)
+        _refuse_with_lines(inputs, topic=topic, sigma=sigma)
         _smooth_lines(out, config=parameters, keyframes=keyframes, ground_truth=truth)
     sigmas = [parse_sigma(text) for text in sigma or []]
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
@@ -288,7 +281,6 @@ def smooth(
             config=parameters,
             keyframes=keyframes.value,
             ground_truth=truth,
-            compare_smoothing=compare_smoothing,
             on_progress=both(show, check),
         )
     report_smoothed(result, out)

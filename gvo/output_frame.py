@@ -220,24 +220,6 @@ class OutputFrame:
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
         )
 
-    def place(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory of the frame, as `apply` does with its estimates.
-
-        Parameters
-        ----------
-        trajectory : Trajectory
-            Estimated, of the camera, in the world of the first camera.
-
-        Returns
-        -------
-        Trajectory
-            T_world_frame, without covariances.
-        """
-        T_frame_cam = np.array([self.T_frame_cam(int(stamp)) for stamp in trajectory.stamps_ns])
-        T_camera = self._T_world_cam_first @ trajectory.T_world_cam
-        T_world_frame = T_camera @ se3.invert(T_frame_cam.reshape(-1, 4, 4))
-        return replace(trajectory, T_world_cam=T_world_frame, covariances=None)
-
     def convert(self, trajectory: Trajectory) -> Trajectory:
         """Return the trajectory of the frame that belongs to one of the camera.
 

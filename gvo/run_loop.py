@@ -16,7 +16,6 @@ from gvo.errors import OutputError, RecordingError, ResumeError
 from gvo.frontend.factory import make_frontend
 from gvo.odometry.odometry import Odometry
 from gvo.output_frame import OutputFrame
-from gvo.outputs.smoothings import SmoothingComparison
 from gvo.resuming.frontend import RepeatableFrontend
 from gvo.resuming.journal import Journal
 from gvo.resuming.records import FaultyRecord, FrameRecord, Record
@@ -56,8 +55,6 @@ class RunLoop:
         Whose poses are written.
     excerpt : Excerpt, optional
         Which frames are read; all where omitted.
-    comparison : SmoothingComparison, optional
-        Is given all that is measured and smoothed, of the camera.
     first_pose : callable, optional
         Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
     items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
@@ -81,7 +78,6 @@ class RunLoop:
         frame: OutputFrame,
         *,
         excerpt: Excerpt | None = None,
-        comparison: SmoothingComparison | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
         items: Iterable[Frame | FaultyFrame] | None = None,
         journal: Journal | None = None,
@@ -89,7 +85,6 @@ class RunLoop:
         self.source = source
         self.config = config
         self.frame = frame
-        self.comparison = comparison
         self.tally = RunTally()
         self.n_repeated = 0
         self._excerpt = excerpt or Excerpt()
@@ -97,13 +92,12 @@ class RunLoop:
         self._items = items
         self._read_ms = 0.0
         self._first_ns: int | None = None
-        log = None if comparison is None else comparison.log
         camera = source.info.camera
         self._journal = journal
         self._frontend: RepeatableFrontend | None = None
         if journal is not None:
             self._frontend = RepeatableFrontend(make_frontend(camera, config))
-        self._odometry = Odometry(camera, config, frontend=self._frontend, log=log)
+        self._odometry = Odometry(camera, config, frontend=self._frontend)
 
     @property
     def is_excerpt(self) -> bool:
@@ -272,8 +266,6 @@ class RunLoop:
             output.add_frame(item, placed)
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
-        if self.comparison is not None:
-            self.comparison.add(estimates)
         return tuple(self.frame.apply(estimate) for estimate in estimates)
 
 

@@ -15,7 +15,6 @@ from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.output_frame import OutputFrame
 from gvo.outputs.run_folder import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
-from gvo.outputs.smoothings import SmoothingComparison
 from gvo.resuming.beginning import Beginning, Complete, begin, identity
 from gvo.resuming.header import describe_run
 from gvo.run_inputs import initial_pose, own_truth
@@ -79,7 +78,6 @@ def run_recording(
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
-    compare_smoothing: bool = False,
     resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
@@ -103,9 +101,6 @@ def run_recording(
         Which frames are read; all where omitted.
     outputs : RunOutputs, optional
         What is written besides; the report where omitted.
-    compare_smoothing : bool
-        Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
-        all of them in memory.
     resume : bool
         Go on where a run in the folder was interrupted, see `docs/resume.md`; where there is
         none, begin, and where it is complete, leave it as it is. Else it is replaced.
@@ -146,7 +141,6 @@ def run_recording(
             config,
             frame,
             excerpt=excerpt,
-            comparison=SmoothingComparison() if compare_smoothing else None,
             first_pose=partial(initial_pose, truth) if starts_at_truth else None,
             journal=begun.journal,
         )
@@ -261,11 +255,6 @@ def _conclude(
     elif isinstance(compared, _Fault):
         warnings.append(f"not compared with the ground truth: {compared.reason}")
     summary = summarize(loop, compared, warnings)
-    if loop.comparison is not None:
-        measure = None if found is None else found.measure
-        summary["smoothing"] = loop.comparison.conclude(
-            folder.path, measure=measure, place=loop.frame.place
-        )
     if found is not None:
         folder.write_truth(found.truth.trajectory)
     is_partly = loop.tally.is_partly or (is_asked and found is None)

@@ -16,7 +16,6 @@ from gvo.odometry.chain import EdgeChain
 from gvo.outputs.graph_file import GraphFile
 from gvo.outputs.plots import plot_trajectories
 from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
-from gvo.outputs.smoothings import SmoothingComparison
 from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
@@ -78,7 +77,6 @@ class SmoothingNotes:
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     broken_off: str = ""
-    comparison: SmoothingComparison | None = None
 
 
 class Smoother:
@@ -93,8 +91,6 @@ class Smoother:
         As of `SlidingWindow`.
     graph_file : GraphFile, optional
         Gets the smoothed poses too.
-    comparison : SmoothingComparison, optional
-        Told what goes into the window.
     """
 
     def __init__(
@@ -104,10 +100,8 @@ class Smoother:
         *,
         keyframes: Keeping = "distance",
         graph_file: GraphFile | None = None,
-        comparison: SmoothingComparison | None = None,
     ) -> None:
-        log = None if comparison is None else comparison.log
-        self.window = SlidingWindow(config.window, keyframes=keyframes, log=log)
+        self.window = SlidingWindow(config.window, keyframes=keyframes)
         self.statuses: Counter[Status] = Counter()
         self._folder = folder
         self._graph_file = graph_file
@@ -163,7 +157,6 @@ def smooth_edges(
     config: Config | None = None,
     keyframes: Keeping = "distance",
     ground_truth: Trajectory | None = None,
-    compare_smoothing: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Smooth the edges of an input and write a run folder.
@@ -181,9 +174,6 @@ def smooth_edges(
         Which poses stay in the window when they are no longer recent: none, or by distance.
     ground_truth : Trajectory, optional
         True poses of the same frame.
-    compare_smoothing : bool
-        Smooth the same edges also by full iSAM2 and in a batch, and tell the difference; keeps
-        all of them in memory.
     on_progress : callable, optional
         Called after each pose and each edge.
 
@@ -198,11 +188,8 @@ def smooth_edges(
     """
     config, decisions = configuration_for(source, config or Config())
     notes = SmoothingNotes(decisions=[*source.decisions, *decisions])
-    comparison = SmoothingComparison() if compare_smoothing else None
-    with _opened(Path(out), source, comparison) as (folder, graph_file):
-        smoother = Smoother(
-            folder, config, keyframes=keyframes, graph_file=graph_file, comparison=comparison
-        )
+    with _opened(Path(out), source) as (folder, graph_file):
+        smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
         try:
             for event in _events(source, notes):
                 smoother.take(event)
@@ -213,17 +200,13 @@ def smooth_edges(
             smoother.finish()
     notes.warnings += source.faults.warnings()
     truth = _with_stamps(ground_truth, source, folder)
-    notes.comparison = comparison
     return conclude(source.name, folder, smoother, config=config, notes=notes, truth=truth)
 
 
 @contextmanager
-def _opened(
-    out: Path, source: EdgeSource, comparison: SmoothingComparison | None
-) -> Iterator[tuple[RunFolder, GraphFile | None]]:
+def _opened(out: Path, source: EdgeSource) -> Iterator[tuple[RunFolder, GraphFile | None]]:
     """Open the files of a run, and complete them also where it is interrupted."""
-    watch = None if comparison is None else comparison.add
-    with RunFolder(out, columns=POSES_HEADER, watch=watch) as folder:
+    with RunFolder(out, columns=POSES_HEADER) as folder:
         if not isinstance(source, PoseGraphSource):
             yield folder, None
             return
@@ -287,9 +270,6 @@ def conclude(
             warnings.append(f"not compared with the ground truth: {error}")
             is_partly = True
     summary = _summary(name, smoother, notes)
-    if notes.comparison is not None:
-        measure = _measure(truth) if truth is not None and evaluations else None
-        summary["smoothing"] = notes.comparison.conclude(folder.path, measure=measure)
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     folder.write_summary(summary | {"configuration": config.model_dump()})
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
@@ -299,10 +279,6 @@ def conclude(
         exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
-
-
-def _measure(truth: Trajectory) -> Callable[[Trajectory], float]:
-    return lambda estimate: evaluate(truth, estimate, name="").ate_m
 
 
 def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:

@@ -31,7 +31,6 @@ def report(result: RunResult, out: Path) -> NoReturn:
         typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False)
-    _print_smoothings(result)
     frames, tracked = result.summary["frames"], result.summary["tracked"]
     offsets = result.summary["rig_offsets"]
     if offsets is not None:
@@ -68,7 +67,6 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
         errors = summary["polish"]
         text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} polished"
         typer.echo(text, err=is_stdout_taken)
-    _print_smoothings(result)
     counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
     typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
@@ -81,13 +79,6 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
         return ""
     n_joined = sum(segment["joined_to"] is not None for segment in segments)
     return f", {len(segments)} segments, {n_joined} of them joined to another"
-
-
-def _print_smoothings(result: RunResult) -> None:
-    if "smoothing" in result.summary:
-        from gvo.outputs.smoothings import format_smoothings
-
-        typer.echo(format_smoothings(result.summary["smoothing"]), nl=False)
 
 
 def warn(warnings: Sequence[str]) -> None:

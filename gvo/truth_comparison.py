@@ -65,11 +65,6 @@ class TruthComparison:
             )
         return warnings
 
-    def measure(self, estimate: Trajectory) -> float:
-        """Return the absolute trajectory error of another estimate, metres."""
-        comparable = self.truth.comparable(estimate)
-        return evaluate(self.truth.trajectory, comparable, name="").ate_m
-
 
 def _extent(trajectory: Trajectory) -> float:
     """Return the diagonal of the box around the positions, metres."""

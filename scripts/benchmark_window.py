@@ -1,14 +1,21 @@
-"""Measure what the sliding window costs beside GTSAM alone, and whether it ages.
+"""Measure what the sliding window costs beside GTSAM alone, what it gives away, whether it ages.
 
-`--window` feeds one simulated stream, three edges per pose, to the window and to iSAM2 driven
-directly with the same parameters, a fixed lag and one marginal covariance per update. What the
-window does beyond that is in its time: it checks and gates the edges, keeps a snapshot, and gives
-the covariance of each pose that leaves. `--soak` feeds a window for a long life, with outliers,
-gaps, loops, priors and edges that are none, and fails where an update or the memory has grown.
+By itself the script runs odometry over a recording and smooths the edges that the window accepted
+in other ways: by iSAM2 without marginalization, and in a batch by Levenberg-Marquardt. Printed are
+half the chi-square of all edges, how far it and the positions (RMS) are from those of the batch,
+the ATE, and the CPU time per pose, covariances included.
 
-Example: python scripts/benchmark.py --window; python scripts/benchmark.py --soak 100000
+`benchmark.py --window` feeds one simulated stream, three edges per pose, to the window and to
+iSAM2 driven directly with the same parameters, a fixed lag and one marginal covariance per update.
+What the window does beyond that is in its time: it checks and gates the edges, keeps a snapshot,
+and gives the covariance of each pose that leaves. `benchmark.py --soak` feeds a window for a long
+life, with outliers, gaps, loops, priors and edges that are none, and fails where an update or the
+memory has grown.
+
+Example: python scripts/benchmark_window.py room.bag; python scripts/benchmark.py --window
 """
 
+import argparse
 import math
 import resource
 import time
@@ -19,14 +26,17 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal, Protocol, get_args
 
+import benchmark_tables as tables  # type: ignore[import-not-found]  # beside this one
 import gtsam
 import numpy as np
 
 import gvo
+from gvo.backend.factors import Factors, Measurement
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.run_summary import peak_memory_mb
-from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
+from gvo.sources.recording import Source
+from gvo.types import Edge, FaultyFrame, FloatArray, PosePrior, PositionPrior, Prior
 
 STEP_NS = 100_000_000
 SIZE = 5
@@ -370,3 +380,151 @@ def resident_memory_mb() -> float:
     if not statm.exists():
         return peak_memory_mb()
     return int(statm.read_text().split()[1]) * resource.getpagesize() / 2**20
+
+
+SMOOTHINGS_HEADER = (
+    "smoothing", "error", "above least [%]", "off least [m]", "ATE RMSE [m]", "ms per pose"
+)  # fmt: skip
+# A chain alone has no error but that of rounding.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackedPose:
+    """A pose of odometry, its accepted edges, and the keyframes after it."""
+
+    stamp_ns: int
+    edges: tuple[Edge, ...]
+    kept_ns: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Smoothing:
+    """One way of smoothing: T_world_frame by stamp, and the seconds it took."""
+
+    name: str
+    poses: dict[int, FloatArray]
+    elapsed_s: float
+
+
+def compare_smoothings(path: Path, settings: Sequence[str]) -> None:
+    """Print what the window's edges give in a window, without marginalization, and in a batch."""
+    config = gvo.load_configuration(None, settings)
+    source = gvo.open_recording(path, config=config)
+    tracked = track(source, config)
+    smoothings = smooth_whole(tracked, config.window)
+    if config.window.size is not None:
+        smoothings.insert(0, smooth_in_window(tracked, config.window))
+    graph = edge_graph(tracked, config.window)
+    truth = source.ground_truth()
+    rows = [smoothing_row(smoothing, smoothings[-1], graph, truth) for smoothing in smoothings]
+    print(tables.markdown_table(SMOOTHINGS_HEADER, rows), end="")
+
+
+def track(source: Source, config: gvo.Config) -> list[TrackedPose]:
+    """Run odometry over a recording; return what its window accepted."""
+    odometry, tracked = gvo.Odometry(source.info.camera, config), []
+    for frame in gvo.frames(source, config):
+        if isinstance(frame, FaultyFrame):
+            continue
+        odometry.track(frame)
+        window, stamp_ns = odometry.window, frame.stamp_ns
+        kept_ns = tuple(stamp for stamp in window.kept() if isinstance(stamp, int))
+        edges = window.edges(stamp_ns)
+        tracked.append(TrackedPose(stamp_ns=stamp_ns, edges=edges, kept_ns=kept_ns))
+    return tracked
+
+
+def replay(tracked: Sequence[TrackedPose], config: WindowConfig) -> gvo.SlidingWindow:
+    """Return a window that was given the same edges and keyframes."""
+    window = gvo.SlidingWindow(config.model_copy(update={"gate": None}))
+    for pose in tracked:
+        window.add_pose(pose.stamp_ns, pose.stamp_ns, pose.edges)
+        for stamp_ns in {*window.kept()}.difference(pose.kept_ns):
+            window.release(stamp_ns)
+        for stamp_ns in pose.kept_ns:
+            window.keep(stamp_ns)
+    return window
+
+
+def smooth_in_window(tracked: Sequence[TrackedPose], config: WindowConfig) -> Smoothing:
+    """Smooth in a window of the configured size."""
+    start = time.process_time()
+    estimates = replay(tracked, config).finish()
+    elapsed_s = time.process_time() - start
+    return Smoothing(name="window", poses=poses_of(estimates), elapsed_s=elapsed_s)
+
+
+def smooth_whole(tracked: Sequence[TrackedPose], config: WindowConfig) -> list[Smoothing]:
+    """Smooth by iSAM2 without marginalization, and on from there in a batch."""
+    start = time.process_time()
+    window = replay(tracked, config.model_copy(update={"size": None}))
+    incremental_s = time.process_time() - start
+    poses = {pose.stamp_ns: window.pose(pose.stamp_ns) for pose in tracked}
+    start = time.process_time()
+    estimates = window.finish()
+    batch_s = time.process_time() - start
+    return [
+        Smoothing(name="full iSAM2", poses=poses, elapsed_s=incremental_s),
+        Smoothing(name="batch LM", poses=poses_of(estimates), elapsed_s=batch_s),
+    ]
+
+
+def poses_of(estimates: Sequence[gvo.Estimate]) -> dict[int, FloatArray]:
+    """Return T_world_frame by stamp."""
+    return {estimate.stamp_ns: estimate.T_world_cam for estimate in estimates}
+
+
+def edge_graph(tracked: Sequence[TrackedPose], config: WindowConfig) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of all edges, the stamps as keys."""
+    graph, factors = gtsam.NonlinearFactorGraph(), Factors(config)
+    for pose in tracked:
+        for edge in pose.edges:
+            graph.add(factors.between(edge.reference_id, pose.stamp_ns, Measurement.of(edge)))
+    return graph
+
+
+def smoothing_row(
+    smoothing: Smoothing,
+    least: Smoothing,
+    graph: gtsam.NonlinearFactorGraph,
+    truth: gvo.Trajectory | None,
+) -> list[str]:
+    """Return a row of the table."""
+    error, least_error = edge_error(graph, smoothing), edge_error(graph, least)
+    above_percent = 100.0 * (error / least_error - 1.0) if error > ROUNDING else 0.0
+    trajectory = trajectory_of(smoothing)
+    offsets = trajectory.positions - trajectory_of(least).positions
+    off_m = np.sqrt(np.mean(np.sum(offsets**2, axis=1)))
+    ate = "-" if truth is None else f"{gvo.evaluate(truth, trajectory, name='').ate_m:.4f}"
+    ms_per_pose = 1e3 * smoothing.elapsed_s / len(smoothing.poses)
+    numbers = [f"{error:.6g}", f"{above_percent:.3f}", f"{off_m:.4f}", ate, f"{ms_per_pose:.2f}"]
+    return [smoothing.name, *numbers]
+
+
+def edge_error(graph: gtsam.NonlinearFactorGraph, smoothing: Smoothing) -> float:
+    """Return half the chi-square of all edges (of their kernels' costs)."""
+    values = gtsam.Values()
+    for stamp_ns, T_world_frame in smoothing.poses.items():
+        values.insert(stamp_ns, gtsam.Pose3(T_world_frame))
+    return float(graph.error(values))
+
+
+def trajectory_of(smoothing: Smoothing) -> gvo.Trajectory:
+    """Return the poses as a trajectory, by stamp."""
+    stamps_ns = np.array(sorted(smoothing.poses), dtype=np.int64)
+    T = se3.normalize(np.array([smoothing.poses[stamp_ns] for stamp_ns in stamps_ns.tolist()]))
+    return gvo.Trajectory(stamps_ns=stamps_ns, T_world_cam=T)
+
+
+def main() -> None:
+    """Parse the arguments and compare the smoothings of a recording."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recording", type=Path, help="bag or data-set folder")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    arguments = parser.parse_args()
+    compare_smoothings(arguments.recording, arguments.set)
+
+
+if __name__ == "__main__":
+    main()

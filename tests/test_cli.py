@@ -244,20 +244,6 @@ def test_smooth_tells_what_it_decides_for_a_pose_graph(command: Command, tmp_pat
     assert (tmp_path / "out/smoothed.g2o").read_text().splitlines()[-1] == edge.strip()
 
 
-def test_smooth_prints_the_price_of_the_window(command: Command, tmp_path: Path) -> None:
-    poses = write_poses(tmp_path / "poses.txt")
-    others = tmp_path / "others.txt"
-    others.write_text("".join(f"{i} {i * i} {0.3 * (i % 3)} {i} 0 0 0 1\n" for i in range(20)))
-    answer = command("smooth", poses, others, "--out", tmp_path / "out", "--compare")
-    assert answer.code == 0, answer.err
-    rows = [line.split("  ")[0] for line in answer.out.splitlines()]
-    assert {"window", "full iSAM2", "batch LM"} <= set(rows)
-    smoothing = json.loads((tmp_path / "out/summary.json").read_text())["smoothing"]
-    assert [row["smoothing"] for row in smoothing] == ["window", "full iSAM2", "batch LM"]
-    assert smoothing[-1]["error"] > 0.1
-    assert smoothing[0]["above_least_pct"] >= -1e-6
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

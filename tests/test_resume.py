@@ -337,21 +337,6 @@ def test_poses_of_another_frame_from_another_start_go_on(tmp_path: Path) -> None
     reference.assert_same(out)
 
 
-def test_smoothing_is_compared_over_all_frames(drive: Reference, tmp_path: Path) -> None:
-    drive.resume(tmp_path / "whole", resume=False, compare_smoothing=True)
-    with pytest.raises(KeyboardInterrupt):
-        drive.resume(tmp_path / "out", compare_smoothing=True, on_progress=interrupt_at(7))
-    drive.resume(tmp_path / "out", compare_smoothing=True)
-    ways = [counts_of(tmp_path / name)["smoothing"] for name in ("whole", "out")]
-    assert _without_times(ways[0]) == _without_times(ways[1])
-
-
-def _without_times(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _without_times(value[name]) for name in value if name != "ms_per_pose"}
-    return [_without_times(each) for each in value] if isinstance(value, list) else value
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -129,6 +129,24 @@ def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
     assert all(float(number) > 0.0 for row in rows for number in row[1:])
 
 
+def test_the_edges_of_a_run_are_smoothed_in_other_ways(room_bag: Path) -> None:
+    compared = run("benchmark_window", room_bag)
+    assert compared.returncode == 0, compared.stderr
+    rows = table(compared.stdout.splitlines(), "smoothing")
+    assert list(rows) == ["window", "full iSAM2", "batch LM"]
+    numbers = {name: [float(cell) for cell in row] for name, row in rows.items()}
+    least = numbers["batch LM"]
+    assert least[1:3] == [0.0, 0.0]
+    for error, above_percent, off_m, ate_m, ms_per_pose in numbers.values():
+        assert error >= least[0] > 1.0
+        assert above_percent == pytest.approx(100.0 * (error / least[0] - 1.0), abs=0.01)
+        assert 0.0 <= off_m < 0.01
+        assert ate_m == pytest.approx(least[3], abs=0.01)
+        assert ms_per_pose > 0.0
+    whole = run("benchmark_window", room_bag, "--set", "window.size=null")
+    assert list(table(whole.stdout.splitlines(), "smoothing")) == ["full iSAM2", "batch LM"]
+
+
 @pytest.mark.recorded
 def test_a_data_set_folder_becomes_a_bag(gvo_data: Path, tmp_path: Path) -> None:
     converted = run("convert_dataset", gvo_data / "euroc_mh01_start", tmp_path / "e.mcap")

@@ -58,7 +58,6 @@ def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed:
     assert right.ate_m == pytest.approx(0.0, abs=1e-9)
     assert right.rpe_m == pytest.approx(0.0, abs=1e-9)
     assert mistaken.ate_m == pytest.approx(ate_by_hand(wrong[:, :3, 3], poses[:, :3, 3]), abs=1e-9)
-    assert found.measure(estimate(wrong)) == pytest.approx(mistaken.ate_m, abs=1e-12)
 
 
 @given(seeds)
@@ -76,7 +75,6 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
     assert right.ate_m == pytest.approx(0.0, abs=1e-9)
     wrong_points = wrong[:, :3, :3] @ LEVER + wrong[:, :3, 3]
     assert mistaken.ate_m == pytest.approx(ate_by_hand(wrong_points, points), abs=1e-9)
-    assert found.measure(estimate(wrong)) == pytest.approx(mistaken.ate_m, abs=1e-12)
     np.testing.assert_allclose(found.estimates["wrong"].T_world_cam[:, :3, 3], wrong_points)
     # without its place on the camera, the same positions hold an error that is none
     unknown = replace(truth, T_frame_point=np.eye(4))

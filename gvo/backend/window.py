@@ -11,7 +11,6 @@ import numpy as np
 
 from gvo.backend.arrival import ORIGIN, Arrival
 from gvo.backend.checks import find_faults, prior_fault
-from gvo.backend.comparison import MeasurementLog
 from gvo.backend.gating import disagreement
 from gvo.backend.graph import first_line
 from gvo.backend.ledger import Ledger, WindowCounts
@@ -62,8 +61,6 @@ class SlidingWindow:
     keyframes : {"manual", "distance"}
         Who keeps poses: the caller by `keep` and `release`, or the window, by distance and angle
         (`window.keyframe_distance_m`, `window.keyframe_angle_deg`, `window.n_keyframes`).
-    log : MeasurementLog, optional
-        Is given all that goes in, to compare ways of smoothing it; grows with every pose.
 
     Examples
     --------
@@ -78,11 +75,7 @@ class SlidingWindow:
     """
 
     def __init__(
-        self,
-        config: WindowConfig | None = None,
-        *,
-        keyframes: Keeping = "manual",
-        log: MeasurementLog | None = None,
+        self, config: WindowConfig | None = None, *, keyframes: Keeping = "manual"
     ) -> None:
         if keyframes not in get_args(Keeping):
             raise ValueError(f"keyframes must be one of {get_args(Keeping)}, got {keyframes!r}")
@@ -90,7 +83,7 @@ class SlidingWindow:
             _check_config(config)
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
-        self._graph = WindowGraph(self._config, log)
+        self._graph = WindowGraph(self._config)
         self._members = self._graph.members
         self._ledger = Ledger()
         self._clock = StatusClock(self._config.lost_after_s)

@@ -11,7 +11,6 @@ import numpy as np
 
 from gvo.backend.arrival import Arrival
 from gvo.backend.checks import place_fault, pose_fault, sane_covariance
-from gvo.backend.comparison import MeasurementLog
 from gvo.backend.factors import Factors, Measurement
 from gvo.backend.graph import PoseGraph, definite, first_line
 from gvo.backend.members import Member, Members, Tie
@@ -33,13 +32,10 @@ class WindowGraph:
     ----------
     config : WindowConfig
         Number of recent poses, robust kernel.
-    log : MeasurementLog, optional
-        Is given all that goes in.
     """
 
-    def __init__(self, config: WindowConfig, log: MeasurementLog | None = None) -> None:
+    def __init__(self, config: WindowConfig) -> None:
         self._config = config
-        self._log = log
         self._factors = Factors(config)
         self._finished: list[Estimate] = []
         self.members = Members()
@@ -103,8 +99,6 @@ class WindowGraph:
             _check_result(T_world_frame)
             finished = list(map(self._estimate, leaving, others))
             self._isam.marginalize(keys)
-        if self._log is not None:
-            self._log.add(factors, values, keys={arrival.frame_id: arrival.key}, leaving=keys)
         self._finished += finished
         for frame_id in leaving:
             del self.members[frame_id]
@@ -178,8 +172,6 @@ class WindowGraph:
             estimate = self._estimate(frame_id)
             _check_result(estimate.T_world_cam)
             self._check_others()
-        if self._log is not None:
-            self._log.add(factors, gtsam.Values(), keys={})
         return estimate
 
     def _check_others(self) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from gvo.backend.comparison import MeasurementLog
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.descriptor import as_stereo
@@ -48,8 +47,6 @@ class Odometry:
     config : Config, optional
     frontend : Frontend, optional
         Any object with `extract` and `register`, in place of what `frontend.kind` names.
-    log : MeasurementLog, optional
-        Is given all that goes into the window, to compare ways of smoothing it.
 
     Raises
     ------
@@ -63,7 +60,6 @@ class Odometry:
         config: Config | None = None,
         *,
         frontend: Frontend[Any] | None = None,
-        log: MeasurementLog | None = None,
     ) -> None:
         self._config = self._next_config = config or Config()
         self._frontend = _choose_frontend(camera, self._config, frontend)
@@ -72,7 +68,7 @@ class Odometry:
         # The last frame and the last registered one, in case that they are extracted again.
         self._frames: dict[int, Stamped] = {}
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
-        self._window = SlidingWindow(self._config.window, log=log)
+        self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._anchor_ns: int | None = None
         self._segments = Segments()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -75,8 +75,6 @@ class RunFolder(Closable):
         summary and picture removed.
     columns : sequence of str
         Of the table of frames; the first is `stamp_ns`.
-    watch : callable, optional
-        Is given the smoothed poses too.
     goes_on : bool
         The run in the folder was interrupted and goes on: what it wrote is given once more from
         its start, and the lines that are there stand. `settle` is to be called after that.
@@ -99,11 +97,9 @@ class RunFolder(Closable):
         path: Path,
         *,
         columns: Sequence[str] = FRAMES_HEADER,
-        watch: Callable[[Iterable[Estimate]], None] | None = None,
         goes_on: bool = False,
     ) -> None:
         self.path = path
-        self._watch = watch
         self._goes_on = goes_on
         self.is_settled = not goes_on
         self._is_writable = True
@@ -184,11 +180,8 @@ class RunFolder(Closable):
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses that are final."""
-        estimates = tuple(estimates)
         for estimate in estimates:
             self._add_pose("smoothed", estimate)
-        if self._watch is not None:
-            self._watch(estimates)
 
     def _add_pose(self, name: str, estimate: Estimate) -> None:
         pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)

@@ -1,16 +1,13 @@
 """What the window answers at its borders: beside its measurements, not by them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 
-from gvo.backend import comparison
-from gvo.backend.comparison import MeasurementLog
 from gvo.backend.graph import PoseGraph
 from gvo.backend.ledger import Ledger
 from gvo.backend.window import SlidingWindow
@@ -31,9 +28,9 @@ def power(n: int) -> FloatArray:
     return se3.normalize(np.linalg.matrix_power(STEP, n))
 
 
-def walk(config: WindowConfig, n: int, *, log: MeasurementLog | None = None) -> SlidingWindow:
+def walk(config: WindowConfig, n: int) -> SlidingWindow:
     """Return a window that was given n poses, each seen from the one before."""
-    window = SlidingWindow(config, log=log)
+    window = SlidingWindow(config)
     for frame in range(n):
         edges = [edge(frame - 1, STEP)] if frame else []
         window.add_pose(frame, frame * STEP_NS, edges)
@@ -198,98 +195,3 @@ def test_a_refusal_is_gated_only_where_it_is_called_so() -> None:
     assert (counts.n_poses, counts.n_edges, counts.n_rejected, counts.n_gated) == (3, 3, 2, 1)
     assert counts.first_rejected == str(first)
     assert (counts.n_priors, counts.n_coasting, counts.n_restored, counts.n_rebuilt) == (0,) * 4
-
-
-# The log does again what the window did.
-
-
-Call = tuple[str, object]
-
-
-@contextmanager
-def recorded() -> Iterator[list[Call]]:
-    """Note what pose graphs are told to do where poses leave."""
-    calls: list[Call] = []
-    update, settle, marginalize = PoseGraph.update, PoseGraph.settle, PoseGraph.marginalize
-
-    def noted_update(self: Any, factors: Any, values: Any, **options: Any) -> None:
-        if options.get("leaving"):
-            there = sorted(options["alive"]), list(options["leaving"])
-            calls.append(("update", (*there, factors.size(), list(values.keys()))))
-        update(self, factors, values, **options)
-
-    def noted_settle(self: Any, before: Any, **options: Any) -> tuple[Any, bool]:
-        if options.get("leaving"):
-            places = {key: np.round(pose.matrix(), 5).tolist() for key, pose in before.items()}
-            there = sorted(options["alive"]), list(options["leaving"])
-            calls.append(("settle", (*there, places)))
-        return settle(self, before, **options)
-
-    def noted_marginalize(self: Any, keys: Sequence[int]) -> None:
-        if keys:
-            calls.append(("marginalize", list(keys)))
-        marginalize(self, keys)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PoseGraph, "update", noted_update)
-        patch.setattr(PoseGraph, "settle", noted_settle)
-        patch.setattr(PoseGraph, "marginalize", noted_marginalize)
-        yield calls
-
-
-def logged(n: int) -> tuple[MeasurementLog, list[Estimate], list[Call]]:
-    """Return the log of a window of three and a keyframe, its poses, and what its graph did."""
-    log = MeasurementLog()
-    window = SlidingWindow(WindowConfig(size=3, kernel="none", gate=None), log=log)
-    with recorded() as calls:
-        for frame in range(n):
-            edges = [edge(frame - k, power(k)) for k in (1, 2) if frame - k >= 0]
-            window.add_pose(frame, frame * STEP_NS, edges)
-            if frame == 1:
-                window.keep(1)
-    return log, window.finish(), calls
-
-
-def test_the_window_is_timed_at_what_it_did() -> None:
-    log, smoothed, of_window = logged(9)
-    with recorded() as of_log:
-        rows = log.compare(smoothed)
-    assert [row.name for row in rows] == ["window", "full iSAM2", "batch LM"]
-    # The window gave away what it held by its end; the log ends with the last update.
-    assert len(of_window) >= 12
-    assert of_log == of_window
-
-
-def test_elapsed_seconds_are_those_of_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, smoothed, _ = logged(6)
-    ticks = iter(range(100, 200))
-    clock = SimpleNamespace(perf_counter=lambda: float(next(ticks)))
-    monkeypatch.setattr(comparison, "time", clock)
-    assert [row.elapsed_s for row in log.compare(smoothed)] == [1.0, 1.0, 1.0]
-
-
-def test_without_marginalization_the_graph_is_a_whole_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    log, smoothed, _ = logged(6)
-    made = []
-
-    class Watched(PoseGraph):
-        def __init__(self, *, is_whole: bool = False, is_hardened: bool = False) -> None:
-            made.append((is_whole, is_hardened))
-            super().__init__(is_whole=is_whole, is_hardened=is_hardened)
-
-    monkeypatch.setattr(comparison, "PoseGraph", Watched)
-    log.compare(smoothed)
-    assert made == [(True, False), (False, False)]
-
-
-def test_poses_that_the_log_never_saw_are_of_no_account() -> None:
-    log, smoothed, _ = logged(6)
-    (expected, *_) = log.compare(smoothed)
-    stranger = Estimate(
-        frame_id="x", stamp_ns=0, T_world_cam=np.full((4, 4), 9.0), covariance=np.eye(6)
-    )
-    (found, *_) = log.compare([stranger, *smoothed])
-    assert found.error == expected.error
-    assert list(found.poses) == list(range(6))
