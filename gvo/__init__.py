@@ -14,17 +14,16 @@ if TYPE_CHECKING:
     from gvo.errors import GvoError
     from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
+    from gvo.io.convert.bag_writer import convert
+    from gvo.io.convert.convert import convert_recording
+    from gvo.io.excerpt import Excerpt
+    from gvo.io.frames import frames
+    from gvo.io.opening import RecordingOptions, open_recording
+    from gvo.io.poses.inputs import asked_truth, choose_frame, read_ground_truth
+    from gvo.io.synthetic.recording import SyntheticRecording
     from gvo.odometry.odometry import Odometry
-    from gvo.outputs.bag_writer import convert
-    from gvo.outputs.converting import convert_recording
-    from gvo.outputs.plots import plot_trajectories
-    from gvo.run_inputs import asked_truth, choose_frame, read_ground_truth
     from gvo.run_outputs import RunOutputs
     from gvo.runs import RunResult, run_recording
-    from gvo.sources.excerpt import Excerpt
-    from gvo.sources.frames import frames
-    from gvo.sources.opening import RecordingOptions, open_recording
-    from gvo.sources.synthetic import SyntheticRecording
     from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
     from gvo.trajectory.formats import read_trajectory
     from gvo.trajectory.trajectory import Trajectory
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
         Status,
         StereoFrame,
     )
+    from gvo.viz.plots import plot_trajectories
 
 _MODULES = {
     "gvo.backend.window": ("SlidingWindow",),
@@ -51,16 +51,16 @@ _MODULES = {
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry.odometry": ("Odometry",),
-    "gvo.outputs.bag_writer": ("convert",),
-    "gvo.outputs.converting": ("convert_recording",),
-    "gvo.outputs.plots": ("plot_trajectories",),
-    "gvo.run_inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
+    "gvo.io.convert.bag_writer": ("convert",),
+    "gvo.io.convert.convert": ("convert_recording",),
+    "gvo.viz.plots": ("plot_trajectories",),
+    "gvo.io.poses.inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
     "gvo.run_outputs": ("RunOutputs",),
     "gvo.runs": ("RunResult", "run_recording"),
-    "gvo.sources.excerpt": ("Excerpt",),
-    "gvo.sources.frames": ("frames",),
-    "gvo.sources.opening": ("RecordingOptions", "open_recording"),
-    "gvo.sources.synthetic": ("SyntheticRecording",),
+    "gvo.io.excerpt": ("Excerpt",),
+    "gvo.io.frames": ("frames",),
+    "gvo.io.opening": ("RecordingOptions", "open_recording"),
+    "gvo.io.synthetic.recording": ("SyntheticRecording",),
     "gvo.trajectory.evaluation": ("Evaluation", "evaluate", "format_evaluations"),
     "gvo.trajectory.formats": ("read_trajectory",),
     "gvo.trajectory.trajectory": ("Trajectory",),

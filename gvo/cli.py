@@ -157,11 +157,11 @@ def run(
     ] = False,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
-    from gvo.output_frame import parse_initial_pose
-    from gvo.run_inputs import asked_truth, choose_frame
+    from gvo.io.excerpt import make_excerpt
+    from gvo.io.poses.base_frame import parse_initial_pose
+    from gvo.io.poses.inputs import asked_truth, choose_frame
     from gvo.run_outputs import RunOutputs
     from gvo.runs import run_recording
-    from gvo.sources.excerpt import make_excerpt
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)
@@ -212,7 +212,7 @@ def check_(
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.checkup import check_recording, format_checkup
-    from gvo.run_inputs import count_calibration_changes, read_transforms
+    from gvo.io.poses.inputs import count_calibration_changes, read_transforms
 
     parameters = load(config, set_)
     topics = {"left": left, "right": right, "color": color, "depth": depth}
@@ -261,9 +261,9 @@ def smooth(
     set_: Settings = None,
 ) -> None:
     """Smooth the edges or poses of any front-end."""
-    from gvo.run_inputs import read_ground_truth
+    from gvo.io.edges.opening import open_edges, parse_sigma
+    from gvo.io.poses.inputs import read_ground_truth
     from gvo.smoothing import configuration_for, smooth_edges
-    from gvo.sources.edge_inputs import open_edges, parse_sigma
 
     parameters = load(config, set_)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
@@ -298,8 +298,8 @@ def _smooth_lines(
     out: Path, *, config: Config, keyframes: _KeyframePolicy, ground_truth: Trajectory | None
 ) -> NoReturn:
     """Answer standard input line by line; nothing else goes to standard output."""
+    from gvo.io.edges.lines import read_lines
     from gvo.smoothing_lines import smooth_lines
-    from gvo.sources.edge_answers import read_lines
 
     def answer(line: str) -> None:
         sys.stdout.write(f"{line}\n")
@@ -345,7 +345,7 @@ def compare(
     ] = None,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
-    from gvo.run_inputs import read_compared
+    from gvo.io.poses.inputs import read_compared
     from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
 
     truth, trajectories, notes = read_compared(reference, estimates)
@@ -367,11 +367,11 @@ def compare(
     else:
         typer.echo(format_evaluations(evaluations), nl=False)
     if plot is not None:
-        from gvo.outputs.plots import plot_trajectories
+        from gvo.viz.plots import plot_trajectories
 
         plot_trajectories(plot, truth, trajectories, align=align.value)
     if report_file is not None or plots is not None:
-        from gvo.outputs.report import write_comparison_report
+        from gvo.viz.report import write_comparison_report
 
         write_comparison_report(
             report_file, truth, trajectories, evaluations, align=align.value, plots=plots
@@ -396,7 +396,7 @@ def convert(
     set_: Settings = None,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
-    from gvo.outputs.converting import convert_recording
+    from gvo.io.convert.convert import convert_recording
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}

@@ -82,8 +82,8 @@ def batch(
 ) -> None:
     """Run many recordings, or many parameters: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
-    from gvo.sources.excerpt import make_excerpt
-    from gvo.sources.opening import RecordingOptions
+    from gvo.io.excerpt import make_excerpt
+    from gvo.io.opening import RecordingOptions
 
     if scheduler is not None and workers is not None:
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
@@ -187,8 +187,8 @@ def _clock(seconds: float) -> str:
 
 def _report(table: pd.DataFrame, out: str) -> NoReturn:
     """Print what a batch gave, and end with its exit code."""
+    from gvo.io.run_folder.writer import REPORT
     from gvo.outputs.batch_rows import RunStatus
-    from gvo.outputs.run_folder import REPORT
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}

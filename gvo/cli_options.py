@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from gvo.config import Config
-    from gvo.sources.recording import Source
+    from gvo.io.recording import Source
 
 Settings = Annotated[
     list[str] | None,
@@ -55,7 +55,7 @@ def open_source(
     topics: Mapping[str, str | None],
 ) -> Source:
     """Open what the options name."""
-    from gvo.sources.opening import RecordingOptions, open_recording
+    from gvo.io.opening import RecordingOptions, open_recording
 
     options = RecordingOptions(calibration=tuple(calibration or ()), **topics)
     return open_recording(recordings, config=config, options=options)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from gvo.config import Config
-    from gvo.sources.recording import Source
+    from gvo.io.recording import Source
     from gvo.trajectory.trajectory import Trajectory
 
 _DEFAULT_PORT = 8080
@@ -63,8 +63,8 @@ def explain(
 ) -> None:
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.diagnostics.explain import explain_frame
+    from gvo.io.excerpt import make_excerpt
     from gvo.run_tally import Progress
-    from gvo.sources.excerpt import make_excerpt
     from gvo.viz.explanation import open_folder, write_explanation
 
     parameters = load(config, set_)
@@ -143,7 +143,7 @@ def _refuse_for_a_run(folder: Path, given: Mapping[str, object]) -> None:
 
 def _find_truth(source: Source) -> Trajectory | None:
     """Return what the recording itself names its ground truth; it is not needed to watch."""
-    from gvo.run_inputs import own_truth
+    from gvo.io.poses.inputs import own_truth
     from gvo.types import Failure
 
     try:
@@ -169,9 +169,9 @@ def shuttle(
     depth: Depth = None,
 ) -> None:
     """Drive a recording there and back: the drift without a ground truth."""
+    from gvo.io.excerpt import make_excerpt
     from gvo.outputs.shuttle_table import format_closings
     from gvo.shuttle import shuttle as run_shuttle
-    from gvo.sources.excerpt import make_excerpt
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.outputs.bag_writer import convert
+from gvo.io.convert.bag_writer import convert
+from gvo.io.opening import open_recording
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_tally import Progress
 from gvo.runs import RunResult, run_recording
-from gvo.sources.opening import open_recording
-from gvo.sources.synthetic import SyntheticRecording
 
 BAG_NAME = "drive.mcap"
 N_FRAMES = 100

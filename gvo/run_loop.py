@@ -14,16 +14,16 @@ import cv2
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError, ResumeError
 from gvo.frontend.factory import make_frontend
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.output_frame import OutputFrame
 from gvo.resuming.frontend import RepeatableFrontend
 from gvo.resuming.journal import Journal
 from gvo.resuming.records import FaultyRecord, FrameRecord, Record
 from gvo.resuming.skipping import skip_done
 from gvo.run_tally import Progress, RunTally
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames
-from gvo.sources.recording import Source
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
 
 

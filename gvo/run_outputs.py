@@ -8,10 +8,10 @@ from pathlib import Path
 
 from gvo.config import Config
 from gvo.errors import ConfigurationError, RecordingError
-from gvo.output_frame import OutputFrame
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
 from gvo.outputs.run_frames import RunFrames
 from gvo.run_loop import Output
-from gvo.sources.recording import Source
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

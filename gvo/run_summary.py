@@ -7,11 +7,11 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from gvo.output_frame import OutputFrame
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.truth import TruthComparison
 from gvo.resuming.beginning import State
 from gvo.run_loop import RunLoop
 from gvo.trajectory.evaluation import Evaluation, evaluations_json
-from gvo.truth_comparison import TruthComparison
 from gvo.types import Failure, Status
 from gvo.version import __version__
 

@@ -13,24 +13,23 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
-from gvo.output_frame import OutputFrame
-from gvo.outputs.run_folder import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.inputs import initial_pose, own_truth
+from gvo.io.poses.truth import FramedTruth, TruthComparison
+from gvo.io.recording import Source
+from gvo.io.run_folder.writer import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
 from gvo.resuming.beginning import Beginning, Complete, begin, identity
 from gvo.resuming.header import describe_run
-from gvo.run_inputs import initial_pose, own_truth
 from gvo.run_loop import Output, RunLoop
 from gvo.run_outputs import RunOutputs
 from gvo.run_progress import RunningSummary
 from gvo.run_summary import summarize
 from gvo.run_tally import Progress
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import Source
-from gvo.sources.truth_frames import FramedTruth
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.truth_comparison import TruthComparison
 from gvo.types import Failure
 
 EXIT_COMPLETE = 0
@@ -295,9 +294,9 @@ def _draw(
     plots: Path | None,
 ) -> None:
     """Draw the picture and write the report."""
-    from gvo.outputs.plots import plot_trajectories
-    from gvo.outputs.report import write_run_report
-    from gvo.outputs.run_record import read_run
+    from gvo.io.run_folder.reader import read_run
+    from gvo.viz.plots import plot_trajectories
+    from gvo.viz.report import write_run_report
 
     if isinstance(compared, TruthComparison):
         plot_trajectories(folder.path / PICTURE, compared.truth.trajectory, compared.estimates)

@@ -9,20 +9,20 @@ from typing import Any
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.output_frame import OutputFrame
-from gvo.outputs.run_folder import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
-from gvo.outputs.shuttle_plot import plot_shuttle
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
+from gvo.io.run_folder.writer import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
 from gvo.run_loop import RunLoop
 from gvo.run_summary import summarize
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 from gvo.sources.backwards import ThereAndBack
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import Source
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.round_trip import Closing, close
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
+from gvo.viz.plots import plot_shuttle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,20 +12,19 @@ from typing import Any
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.io.edges.events import EdgeEvent, EdgeSource, Event, PoseEvent
+from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
+from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder
 from gvo.odometry.chain import EdgeChain
-from gvo.outputs.graph_file import GraphFile
-from gvo.outputs.plots import plot_trajectories
-from gvo.outputs.run_folder import PICTURE, TRAJECTORIES, RunFolder
 from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
-from gvo.sources.edges import EdgeEvent, EdgeSource, Event, PoseEvent
-from gvo.sources.pose_graphs import PoseGraphSource
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, Rejected, Status
 from gvo.version import __version__
+from gvo.viz.plots import plot_trajectories
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""

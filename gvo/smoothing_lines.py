@@ -7,12 +7,20 @@ from pathlib import Path
 
 from gvo.backend.window import Keeping
 from gvo.config import Config
-from gvo.outputs.run_folder import RunFolder
+from gvo.io.edges.events import EdgeEvent, InputFaults, PoseEvent
+from gvo.io.edges.lines import (
+    CSV_HEADER,
+    LineFormat,
+    Request,
+    detect_format,
+    format_error,
+    format_estimate,
+    is_header,
+    parse_line,
+)
+from gvo.io.run_folder.writer import RunFolder
 from gvo.runs import RunResult
 from gvo.smoothing import POSES_HEADER, Smoother, SmoothingNotes, conclude
-from gvo.sources.edge_answers import CSV_HEADER, format_error, format_estimate
-from gvo.sources.edge_lines import LineFormat, Request, detect_format, is_header, parse_line
-from gvo.sources.edges import EdgeEvent, InputFaults, PoseEvent
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, Rejected
 
@@ -31,7 +39,7 @@ def smooth_lines(
     Parameters
     ----------
     lines : iterable of str
-        CSV or JSON, told by the first one; see `gvo.sources.edge_lines`.
+        CSV or JSON, told by the first one; see `gvo.io.edges.lines`.
     answer : callable
         Gets the answer to each line that holds anything, without its line end: the estimate of
         the line's pose, or `{"error": ...}`.

@@ -14,15 +14,15 @@ import time
 from pathlib import Path
 
 import gvo
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.output_frame import OutputFrame
-from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.run_overlay import RunOverlay, film_width
 from gvo.outputs.video import open_sink
 from gvo.run_loop import RunLoop, one_opencv_thread
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import Source
 from gvo.types import FaultyFrame, Frame, FrameResult
+from gvo.viz.overlay import compose_overlay
 
 Spent = tuple[float, float]  # milliseconds per frame: wall, CPU
 

@@ -22,9 +22,9 @@ from rosbags.highlevel import AnyReader
 
 import gvo
 from gvo.geometry.camera import rectification_maps
+from gvo.io.bag.source import BagSource
+from gvo.io.recording import Source
 from gvo.run_loop import one_opencv_thread
-from gvo.sources.bag import BagSource
-from gvo.sources.recording import Source
 
 Maps: TypeAlias = list[Any]
 

@@ -26,7 +26,7 @@ import gvo
 from gvo.config import FrontendConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.sources.recording import Source
+from gvo.io.recording import Source
 from gvo.types import FaultyFrame, FloatArray, Frame
 
 WORLDS = {

@@ -13,8 +13,8 @@ import sys
 from pathlib import Path
 
 import gvo
+from gvo.io.edges.opening import open_edges, parse_sigma
 from gvo.smoothing import smooth_edges
-from gvo.sources.edge_inputs import open_edges, parse_sigma
 
 
 def main() -> int:

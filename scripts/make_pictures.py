@@ -26,14 +26,14 @@ from gvo.config import Config
 from gvo.demo import write_demo_bag
 from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
+from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
-from gvo.outputs.overlays import compose_overlay
-from gvo.outputs.report import write_run_report
-from gvo.outputs.run_record import read_run
 from gvo.run_outputs import RunOutputs
 from gvo.view import serve
 from gvo.view.player import Player
 from gvo.viz.explanation.extraction import draw_stereo
+from gvo.viz.overlay import compose_overlay
+from gvo.viz.report import write_run_report
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

@@ -24,13 +24,13 @@ import gvo
 from gvo.config import load_configuration
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.synthetic.recording import SensorNoise, expose
+from gvo.io.synthetic.rendering import render_image, to_uint8
+from gvo.io.synthetic.worlds.motion import CAMERA_HEIGHT_M, LAP_M, heading, road_point
+from gvo.io.synthetic.worlds.street import street
 from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
-from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.sources.rendering import render_image, to_uint8
-from gvo.sources.sensor_noise import SensorNoise, expose
-from gvo.sources.worlds.motion import CAMERA_HEIGHT_M, LAP_M, heading, road_point
-from gvo.sources.worlds.street import street
 from gvo.types import FloatArray, ImageArray
 
 # A length of lap that goes into a tenth of 10,000 or 2,000 frames: all tenths see the same road.

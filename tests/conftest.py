@@ -10,7 +10,7 @@ from hypothesis import settings
 
 import gvo
 from gvo.cli import main
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.synthetic.recording import SyntheticRecording
 from tests.browser import browser as browser
 from tests.rendered_walk import Walk
 

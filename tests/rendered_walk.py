@@ -11,12 +11,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.se3 import make_transform
-from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
-from gvo.sources.worlds.motion import look_around
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.synthetic.worlds.motion import look_around
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
-from tests.sources.pose_bags import PoseBag
+from tests.io.pose_bags import PoseBag
 
 N_FRAMES = 16
 CAMERA = "camera_left_optical"

@@ -9,7 +9,7 @@ import pytest
 
 import gvo
 from gvo.geometry.camera import StereoCamera
-from gvo.sources.recording import Source
+from gvo.io.recording import Source
 from gvo.types import Frame
 
 KITTI = "kitti_06_start"

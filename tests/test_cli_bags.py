@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
-from gvo.sources.recording import StampedImage
+from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
+from tests.io.pose_bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
     LEFT,
@@ -39,7 +40,6 @@ from tests.rendered_walk import (
     true_poses,
     truth_stamps,
 )
-from tests.sources.pose_bags import ODOMETRY, PoseBag
 
 Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]

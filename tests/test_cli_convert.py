@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.geometry.se3 import make_transform
-from gvo.outputs.bag_writer import convert
-from gvo.outputs.folder_writer import write_folder
-from gvo.sources.recording import StampedImage
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.folder_writer import write_folder
+from gvo.io.recording import StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
 from tests.conftest import Command
-from tests.sources.conftest import Item, ListSource, Tiny
+from tests.io.conftest import Item, ListSource, Tiny
 
 _TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
 

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.geometry.camera import Calibration, stereo_camera
 from gvo.geometry.lens import DistortionModel
-from gvo.outputs.bag_writer import convert
-from gvo.outputs.converting import convert_recording
-from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.convert import convert_recording
+from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
 

@@ -11,9 +11,9 @@ import pytest
 
 import gvo
 from gvo.config import load_configuration
-from gvo.outputs.converting import convert_recording
-from gvo.outputs.folder_writer import Layout
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.convert.convert import convert_recording
+from gvo.io.convert.folder_writer import Layout
+from gvo.io.synthetic.recording import SyntheticRecording
 
 PROGRAM = Path(__file__).parent / "audited_commands.py"
 # What a run measures of the machine it runs on, and the number of threads that it was given.

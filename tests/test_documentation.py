@@ -16,9 +16,9 @@ import pytest
 import gvo
 from gvo.config import CheckConfig, Config, describe_configuration
 from gvo.geometry.lens import N_COEFFICIENTS
-from gvo.sources.bag_reader import BagReader
-from gvo.sources.encodings import DEPTHS, IMAGES
-from tests.sources.pose_bags import PoseBag
+from gvo.io.bag.image_encodings import DEPTHS, IMAGES
+from gvo.io.bag.reader import BagReader
+from tests.io.pose_bags import PoseBag
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -9,7 +9,7 @@ import pytest
 
 from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
 from gvo.geometry import se3
-from gvo.sources.worlds.traffic import bus_path
+from gvo.io.synthetic.worlds.deceptive import bus_path
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
 
 TIED = (Status.OK, Status.RESUMED)

@@ -23,14 +23,14 @@ import gvo
 from gvo.config import Config
 from gvo.errors import ConfigurationError, OutputError, RecordingError, ResumeError
 from gvo.geometry import se3
-from gvo.output_frame import OutputFrame
-from gvo.outputs.run_folder import JOURNAL
-from gvo.outputs.run_record import read_run
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.run_folder.reader import read_run
+from gvo.io.run_folder.writer import JOURNAL
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.resuming.journal import Journal
 from gvo.run_tally import Progress
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from tests.conftest import Command
 
@@ -491,7 +491,7 @@ def test_a_picture_that_cannot_be_drawn_takes_nothing_from_the_run(
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gvo.outputs.plots.plot_trajectories", fail)
+    monkeypatch.setattr("gvo.viz.plots.plot_trajectories", fail)
     result = drive.resume(tmp_path / "out", resume=False, outputs=gvo.RunOutputs())
     assert result.exit_code == 3
     assert "No space left" in result.warnings[-1]
@@ -511,7 +511,7 @@ def test_a_full_disk_leaves_whole_lines_and_the_run_goes_on_when_there_is_room(
     limit = (drive.killed / "7" / name).stat().st_size - 40
     full = _FullDisk(name, limit)
     with monkeypatch.context() as patch:
-        patch.setattr("gvo.outputs.line_file.io.FileIO", full.make)
+        patch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
         patch.setattr("gvo.resuming.record_file.io.FileIO", full.make)
         with pytest.raises(OutputError, match=f"{name}.*No space left.*--resume goes on") as caught:
             drive.resume(out, resume=is_resumed)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.output_frame import OutputFrame
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_loop import RunLoop
 from gvo.run_tally import Progress
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand

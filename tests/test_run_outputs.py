@@ -7,7 +7,7 @@ import pytest
 
 import gvo
 from gvo.errors import ConfigurationError
-from gvo.output_frame import OutputFrame
+from gvo.io.poses.base_frame import OutputFrame
 from gvo.run_outputs import name_frames
 from tests.rendered_walk import CAMERA, T_BASE_CAM, Walk
 

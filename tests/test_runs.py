@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.run_inputs import asked_truth, choose_frame
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.poses.inputs import asked_truth, choose_frame
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
+from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
     N_FRAMES,
@@ -34,7 +35,6 @@ from tests.rendered_walk import (
     true_poses,
     truth_stamps,
 )
-from tests.sources.pose_bags import PoseBag
 
 NO_REPORT = gvo.RunOutputs(report=False)
 

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 import gvo
-from gvo.outputs.converting import convert_recording
-from gvo.outputs.report import write_comparison_report, write_run_report
-from gvo.outputs.run_record import read_run
-from gvo.sources.recording import RecordingInfo
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.convert.convert import convert_recording
+from gvo.io.recording import RecordingInfo
+from gvo.io.run_folder.reader import read_run
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.viz.report import write_comparison_report, write_run_report
 
 ROOT = Path(__file__).parent.parent
 PROGRAMS = [*sorted((ROOT / "gvo").rglob("*.py")), *sorted((ROOT / "scripts").rglob("*.py"))]

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.camera import StereoCamera
+from gvo.io.excerpt import Excerpt
+from gvo.io.opening import open_recording
+from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.outputs.shuttle_table import format_closings
 from gvo.run_tally import Progress
 from gvo.shuttle import ShuttleResult, shuttle
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.opening import open_recording
-from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory

@@ -14,11 +14,11 @@ import gvo
 from gvo.config import Config, WindowConfig
 from gvo.errors import RecordingError
 from gvo.geometry import se3
+from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
+from gvo.io.edges.opening import open_edges
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.smoothing import configuration_for, smooth_edges
-from gvo.sources.edge_inputs import open_edges
-from gvo.sources.edges import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 import gvo
 from gvo.errors import RecordingError
+from gvo.io.edges.lines import CSV_HEADER
 from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.smoothing_lines import smooth_lines
-from gvo.sources.edge_answers import CSV_HEADER
 
 
 def run(lines: list[str], out: Path) -> tuple[RunResult, list[str]]:

@@ -14,8 +14,8 @@ import pytest
 
 import gvo
 from gvo.frontend.klt import KltFrontend
+from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.run_tally import Progress
-from gvo.sources.worlds.motion import LAP_M
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 BENCHMARK = SCRIPTS / "benchmark.py"

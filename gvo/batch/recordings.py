@@ -14,8 +14,8 @@ from gvo.batch.storage import Place, is_url
 from gvo.batch.tasks import MARK
 from gvo.bounded_text import read_text
 from gvo.errors import RecordingError
-from gvo.outputs.run_folder import REPORT
-from gvo.sources.opening import BAG_SUFFIXES, FOLDER_MARKERS
+from gvo.io.opening import BAG_SUFFIXES, FOLDER_MARKERS
+from gvo.io.run_folder.writer import REPORT
 
 _LIST_SUFFIX = ".txt"
 _PATTERN = re.compile(r"[*?\[]")

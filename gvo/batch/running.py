@@ -22,11 +22,11 @@ from gvo.batch.tasks import MARK, Task, TaskOptions
 from gvo.batch.variants import Variant, differences, name_variants
 from gvo.config import Config
 from gvo.errors import OutputError
+from gvo.io.excerpt import Excerpt
+from gvo.io.opening import RecordingOptions
+from gvo.io.run_folder.line_file import replace_text
+from gvo.io.run_folder.writer import REPORT
 from gvo.outputs.batch_rows import BatchRow
-from gvo.outputs.line_file import replace_text
-from gvo.outputs.run_folder import REPORT
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.opening import RecordingOptions
 from gvo.version import __version__
 
 # How often the table is written while the batch goes.

@@ -8,9 +8,9 @@ import numpy as np
 
 from gvo.checkup.report import Finding, Limits, judged, measured, unknown
 from gvo.config import CheckConfig
-from gvo.sources.ground_truth import TRUTH_FRAMES
-from gvo.sources.tf import TfBuffer
-from gvo.sources.tf_paths import bare
+from gvo.io.poses.ground_truth import TRUTH_FRAMES
+from gvo.io.poses.tf import TfBuffer
+from gvo.io.poses.tf_paths import bare
 from gvo.types import Failure, IntArray
 
 _N_NAMED = 5

@@ -16,8 +16,8 @@ from gvo.checkup.timing import check_timing
 from gvo.config import Config
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.sources.recording import RecordingInfo, Source
-from gvo.sources.tf import TfBuffer
+from gvo.io.poses.tf import TfBuffer
+from gvo.io.recording import RecordingInfo, Source
 from gvo.types import Failure
 
 # Cameras with eyes closer or wider than that exist, but are mostly a unit gone wrong.

@@ -10,9 +10,9 @@ import numpy as np
 
 from gvo.config import Config, SyncConfig
 from gvo.errors import GvoError
-from gvo.sources.frames import frames, paired
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.sources.sync import Pair
+from gvo.io.frames import frames, paired
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.sync import Pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, IntArray
 

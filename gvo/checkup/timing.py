@@ -10,8 +10,8 @@ import numpy as np
 from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
 from gvo.checkup.sampling import StreamStamps, Survey
 from gvo.config import CheckConfig, Config
-from gvo.sources.frames import pair_limit_key
-from gvo.sources.recording import RecordingInfo, Sensor
+from gvo.io.frames import pair_limit_key
+from gvo.io.recording import RecordingInfo, Sensor
 from gvo.types import FloatArray, IntArray
 
 # An interval this many periods long is a gap, not jitter.

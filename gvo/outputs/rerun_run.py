@@ -16,7 +16,6 @@ import rerun as rr
 from gvo.geometry.camera import PinholeCamera
 from gvo.outputs import rerun_layout as place
 from gvo.outputs import rerun_scene as scene
-from gvo.outputs.overlays import compose_overlay
 from gvo.outputs.rerun_stream import RerunStream
 from gvo.outputs.run_frames import ESTIMATES, RunFrames
 from gvo.outputs.run_tracks import Track
@@ -30,6 +29,7 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
+from gvo.viz.overlay import compose_overlay
 
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""

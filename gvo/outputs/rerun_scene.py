@@ -14,10 +14,10 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.outputs import palette
-from gvo.outputs.bag_messages import pose_numbers
-from gvo.outputs.image_files import encode_jpeg
+from gvo.io.convert.bag_messages import pose_numbers
+from gvo.io.images import encode_jpeg
 from gvo.types import Estimate, FloatArray, FrameLink, ImageArray, RelativePose, Status
+from gvo.viz import palette
 
 Colour: TypeAlias = tuple[int, int, int]
 

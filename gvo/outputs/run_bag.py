@@ -45,9 +45,7 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from gvo.closable import Closable
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.outputs.bag_messages import BagWriter, Header, write_transforms
-from gvo.outputs.compressed_messages import write_picture
-from gvo.outputs.overlays import draw_matches
+from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_transforms
 from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.run_messages import (
     write_diagnostics,
@@ -68,6 +66,7 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
+from gvo.viz.overlay import draw_matches
 
 SUFFIXES: Final = (".mcap", ".bag")
 N_SHOWN_POSES: Final = 500

@@ -29,8 +29,8 @@ from typing import Final
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.outputs.bag_messages import FramePose
-from gvo.sources.tf_paths import bare
+from gvo.io.convert.bag_messages import FramePose
+from gvo.io.poses.tf_paths import bare
 from gvo.types import Estimate, FloatArray
 
 ESTIMATES: Final = ("raw", "causal", "smoothed")

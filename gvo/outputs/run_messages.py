@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.outputs.bag_messages import BagWriter, Header, pose_numbers
+from gvo.io.convert.bag_messages import BagWriter, Header, pose_numbers
 from gvo.outputs.run_tracks import Twist
 from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
 

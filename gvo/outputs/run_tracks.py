@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.outputs.bag_messages import pose_numbers
+from gvo.io.convert.bag_messages import pose_numbers
 from gvo.types import Estimate, FloatArray, IntArray
 
 _N_NUMBERS = 7

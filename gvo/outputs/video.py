@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from gvo.errors import ConfigurationError, RecordingError
-from gvo.outputs.image_files import encode_png
+from gvo.io.images import encode_png
 from gvo.outputs.webm import PERIOD_NS, finish_webm
 from gvo.types import ImageArray
 

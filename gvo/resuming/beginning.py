@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 
 from gvo.bounded_text import read_text
 from gvo.errors import ResumeError
-from gvo.outputs.run_folder import JOURNAL, SUMMARY, RunFolder
+from gvo.io.run_folder.writer import JOURNAL, SUMMARY, RunFolder
 from gvo.resuming.header import find_difference
 from gvo.resuming.journal import Journal
 from gvo.resuming.record_file import refuse_busy

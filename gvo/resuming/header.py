@@ -15,9 +15,9 @@ import numpy as np
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry.camera import Calibration
-from gvo.output_frame import OutputFrame
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.version import __version__
 

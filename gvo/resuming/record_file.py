@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gvo.closable import Closable
 from gvo.errors import RunBusyError
-from gvo.outputs.line_file import append_whole
+from gvo.io.run_folder.line_file import append_whole
 
 _MAGIC = b"gvo journal 1\n"
 # Length and CRC-32 of what follows.

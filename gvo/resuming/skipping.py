@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 
 from gvo.errors import RecordingError, ResumeError
-from gvo.sources.sync import Pair
+from gvo.io.sync import Pair
 from gvo.types import FaultyFrame
 
 _OTHER = "this is not the recording of that run, or it was changed: run without --resume"

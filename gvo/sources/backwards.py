@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames, pair_limit_key
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames, pair_limit_key
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from gvo.errors import RecordingError, TrajectoryError
-from gvo.outputs.run_record import RunRecord, read_run
+from gvo.io.run_folder.reader import RunRecord, read_run
 from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray

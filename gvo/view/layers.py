@@ -8,9 +8,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from gvo.outputs.palette import ESTIMATES, LINKS, OTHERS, REFERENCE, REFUSED
 from gvo.types import FloatArray
 from gvo.view.growing import Pieces
+from gvo.viz.palette import ESTIMATES, LINKS, OTHERS, REFERENCE, REFUSED
 
 COLOURS = {
     **ESTIMATES,

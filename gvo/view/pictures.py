@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.outputs.overlays import draw_matches
 from gvo.types import ImageArray
+from gvo.viz.overlay import draw_matches
 
 MAX_WIDTH_PX = 480
 

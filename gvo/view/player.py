@@ -14,9 +14,9 @@ from gvo.closable import Closable
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.io.excerpt import Excerpt
+from gvo.io.recording import RecordingInfo, Source
 from gvo.run_loop import one_opencv_thread
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import RecordingInfo, Source
 from gvo.view.history import History
 from gvo.view.moments import Moment
 from gvo.view.tracking import OpenSource, Tracking
@@ -53,7 +53,7 @@ class Player(Closable):
 
     Examples
     --------
-    >>> from gvo.sources.synthetic import SyntheticRecording
+    >>> from gvo.io.synthetic.recording import SyntheticRecording
     >>> recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
     >>> with Player(lambda config: recording, Config()) as player:
     ...     player.seek(2)

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from gvo.config import Config
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames, paired
-from gvo.sources.recording import Source
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames, paired
+from gvo.io.recording import Source
 from gvo.types import FaultyFrame, Frame
 
 _SECTIONS = ("sync", "images", "runtime")

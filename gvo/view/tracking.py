@@ -9,15 +9,15 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from gvo.config import Config
+from gvo.io.excerpt import Excerpt
+from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.outputs.overlays import compose_overlay
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.recording import Source
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, StereoFrame
 from gvo.view.clouds import empty_cloud, frame_cloud
 from gvo.view.moments import Entry
 from gvo.view.pictures import draw_fault, small_picture
 from gvo.view.reading import is_read_differently, read_frames
+from gvo.viz.overlay import compose_overlay
 
 OpenSource: TypeAlias = Callable[[Config], Source]
 

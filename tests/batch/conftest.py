@@ -19,8 +19,8 @@ from distributed import Client, LocalCluster
 
 import gvo
 from gvo.batch import BatchOptions
-from gvo.sources.recording import RecordingInfo, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 
 N_FRAMES = 8

@@ -14,7 +14,7 @@ import pytest
 
 from gvo.batch import BatchProgress
 from gvo.cli_batch import _clock, _words
-from gvo.outputs.run_record import read_run
+from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import (
     GVO,
     Cluster,

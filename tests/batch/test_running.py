@@ -17,7 +17,7 @@ from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.running import make_tasks
 from gvo.batch.variants import make_variants
 from gvo.errors import OutputError, RecordingError
-from gvo.sources.excerpt import Excerpt
+from gvo.io.excerpt import Excerpt
 from tests.batch.conftest import NO_REPORT, assert_same_run, copy_of, state_of
 
 FORCED = BatchOptions(report=False, force=True)

@@ -12,11 +12,11 @@ import pytest
 
 import gvo
 from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
+from gvo.io.excerpt import Excerpt
+from gvo.io.run_folder.writer import JOURNAL
 from gvo.outputs.batch_rows import BatchRow
-from gvo.outputs.run_folder import JOURNAL
 from gvo.resuming.record_file import RecordFile
 from gvo.run_tally import Progress
-from gvo.sources.excerpt import Excerpt
 from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of
 
 CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])

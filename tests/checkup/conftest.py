@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gvo.checkup import Checkup, Finding, check_recording
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
-from gvo.sources.synthetic import SyntheticRecording, WorldName
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.trajectory.trajectory import Trajectory
 
 N_FRAMES = 40

@@ -10,7 +10,7 @@ import pytest
 from gvo.checkup.frame_tree import check_frame_tree
 from gvo.checkup.report import Finding
 from gvo.config import CheckConfig
-from gvo.sources.tf import TfBuffer
+from gvo.io.poses.tf import TfBuffer
 
 S = 1_000_000_000
 STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)

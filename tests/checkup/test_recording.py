@@ -371,7 +371,7 @@ def test_only_the_samples_are_decoded(bench: Any) -> None:
 @pytest.mark.recorded
 @pytest.mark.parametrize("name", ["kitti_06_start", "euroc_mh01_start"])
 def test_recorded_stereo_is_healthy(gvo_data: Path, bench: Any, name: str) -> None:
-    from gvo.sources.opening import open_recording
+    from gvo.io.opening import open_recording
 
     checkup = check_recording(open_recording(gvo_data / name), Config(), n_samples=6)
     assert bench.complaints(checkup) == set()
@@ -379,7 +379,7 @@ def test_recorded_stereo_is_healthy(gvo_data: Path, bench: Any, name: str) -> No
 
 @pytest.mark.recorded
 def test_a_free_running_kinect_is_usable_with_its_known_flaws(gvo_data: Path, bench: Any) -> None:
-    from gvo.sources.opening import open_recording
+    from gvo.io.opening import open_recording
 
     source = open_recording(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
     checkup = check_recording(source, Config())
@@ -393,7 +393,7 @@ def test_a_free_running_kinect_is_usable_with_its_known_flaws(gvo_data: Path, be
 def test_depth_that_is_not_registered_is_found_in_a_recorded_sequence(
     gvo_data: Path, bench: Any
 ) -> None:
-    from gvo.sources.opening import open_recording
+    from gvo.io.opening import open_recording
 
     checkup = check_recording(open_recording(gvo_data / "sevenscenes_start"), Config())
     finding = bench.find(checkup, "depth: misregistration")

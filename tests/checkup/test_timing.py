@@ -16,7 +16,7 @@ from gvo.checkup.sampling import StreamStamps, Survey
 from gvo.checkup.timing import check_timing
 from gvo.config import Config
 from gvo.geometry.camera import Calibration, PinholeCamera
-from gvo.sources.recording import RecordingInfo
+from gvo.io.recording import RecordingInfo
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333

@@ -7,7 +7,7 @@ from gvo.config import Config, DepthConfig
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.rgbd import check_depths, compare_depths
 from gvo.geometry import se3
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose
 
 RECORDING = SyntheticRecording("handheld", "rgbd", n_frames=31, scale=1.0)

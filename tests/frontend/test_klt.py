@@ -13,7 +13,7 @@ from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
-from gvo.sources.recording import Sensor
+from gvo.io.recording import Sensor
 from gvo.types import (
     Failure,
     FaultyFrame,

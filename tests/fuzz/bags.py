@@ -13,16 +13,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from gvo.errors import GvoError
-from gvo.sources.bag import BagSource
-from gvo.sources.bag_folder import find_files
-from gvo.sources.bag_reader import TF_TYPE, BagReader, typestore
+from gvo.io.bag.reader import TF_TYPE, BagReader, find_files, typestore
+from gvo.io.bag.source import BagSource
+from gvo.io.bag.topics import COMPRESSED_TYPE
+from gvo.io.poses.tf import read_tf
 from gvo.sources.salvage.mcap import McapScan
 from gvo.sources.salvage.ros1 import Ros1Scan
 from gvo.sources.salvage.scan import Salvage
 from gvo.sources.salvage.sqlite import SqliteScan
 from gvo.sources.salvage.window import DamageError
-from gvo.sources.tf import read_tf
-from gvo.sources.topics import COMPRESSED_TYPE
 from tests.fuzz.messages import make_messages, serialise
 from tests.fuzz.mutations import mutate_bytes, mutate_text
 from tests.fuzz.target import Folder, Target

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo.sources.bag_reader import TF_TYPE, BagMessage, typestore
-from gvo.sources.calibration import make_calibration, make_rgbd_calibration
-from gvo.sources.messages import (
+from gvo.io.bag.messages import (
     camera_fields,
     decode_compressed,
     decode_depth,
@@ -16,8 +14,10 @@ from gvo.sources.messages import (
     stamp_of,
     transform_of,
 )
-from gvo.sources.tf_buffer import TfBuffer
-from gvo.sources.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.io.bag.reader import TF_TYPE, BagMessage, typestore
+from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
+from gvo.io.poses.tf_buffer import TfBuffer
 from tests.fuzz.target import Choices, Target
 
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"

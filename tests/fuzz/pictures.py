@@ -7,19 +7,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.sources.encodings import DEPTHS, IMAGES
-from gvo.sources.image_headers import check_density, check_size, is_jpeg_complete, read_header
-from gvo.sources.messages import (
+from gvo.io.bag.image_encodings import DEPTHS, IMAGES, decode_rvl
+from gvo.io.bag.messages import (
     decode_compressed,
     decode_compressed_depth,
     decode_depth,
     decode_grey_or_color,
 )
-from gvo.sources.pixels import GreyRange
-from gvo.sources.rvl import decode_rvl
+from gvo.io.images import GreyRange, check_density, check_size, is_jpeg_complete, read_header
 from tests.fuzz.mutations import mutate_picture
 from tests.fuzz.target import Choices, Target
-from tests.sources.rvl_coder import encode_rvl
+from tests.io.rvl_coder import encode_rvl
 
 _FORMATS = (
     "jpeg",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo.outputs.run_record import read_run
+from gvo.io.run_folder.reader import read_run
 from gvo.resuming.journal import Journal
 from gvo.resuming.record_file import MAX_RECORD, RecordFile
 from gvo.resuming.records import Call, FaultyRecord, FrameRecord, encode

@@ -7,8 +7,8 @@ import numpy as np
 
 from gvo.config import Config, describe_configuration, load_configuration
 from gvo.errors import GvoError
-from gvo.sources.calibration_files import read_cameras
-from gvo.sources.recording import Sensor
+from gvo.io.calibration.files import read_cameras
+from gvo.io.recording import Sensor
 from gvo.types import FloatArray
 from tests.fuzz.mutations import mutate_text
 from tests.fuzz.target import Folder, Target

@@ -19,19 +19,17 @@ from rosbags.rosbag1 import Writer
 from gvo.bounded_text import cut, read_text
 from gvo.config import load_configuration
 from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
-from gvo.outputs.run_record import read_run
-from gvo.sources.bag_reader import BagReader, typestore
-from gvo.sources.calibration_files import read_cameras
-from gvo.sources.edge_answers import read_lines
-from gvo.sources.edge_lines import MAX_LINE, parse_line
-from gvo.sources.image_headers import MAX_PIXELS, read_header
-from gvo.sources.messages import decode_compressed, transform_of
-from gvo.sources.pixels import decode_image, read_image
-from gvo.sources.rvl import decode_rvl
+from gvo.io.bag.image_encodings import decode_rvl
+from gvo.io.bag.messages import decode_compressed, transform_of
+from gvo.io.bag.reader import BagReader, typestore
+from gvo.io.calibration.files import read_cameras
+from gvo.io.edges.lines import MAX_LINE, parse_line, read_lines
+from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
+from gvo.io.poses.ground_truth import parse_truth
+from gvo.io.run_folder.reader import read_run
 from gvo.sources.salvage import inflate
 from gvo.sources.salvage.mcap import MAGIC
 from gvo.sources.salvage.sqlite import SqliteScan
-from gvo.sources.truth_specs import parse_truth
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
@@ -225,7 +223,7 @@ def test_floats_that_call_themselves_rgb_are_refused() -> None:
 def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
     used = "import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     code = (
-        "import numpy as np, struct\nfrom gvo.sources.rvl import decode_rvl\n"
+        "import numpy as np, struct\nfrom gvo.io.bag.image_encodings import decode_rvl\n"
         f"{used}\n"
         "data = np.full(30_000_000, 0x11, np.uint8)\n"
         "data[:8] = np.frombuffer(struct.pack('<II', 4, 4), np.uint8)\n"
@@ -277,7 +275,7 @@ def test_an_mcap_chunk_inflates_to_no_more_than_it_claims(tmp_path: Path) -> Non
     path = as_file(tmp_path, _lying_mcap(bytes(64 << 20)), "bomb.mcap")
     code = (
         "import resource, sys\nfrom pathlib import Path\n"
-        "from gvo.sources.bag_reader import BagReader\n"
+        "from gvo.io.bag.reader import BagReader\n"
         "used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024\n"
         f"before = used()\nreader = BagReader(Path({str(path)!r}))\n"
         "n = len(list(reader.messages(['/a'])))\nprint(n, used() - before)"

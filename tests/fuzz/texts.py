@@ -9,17 +9,17 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.errors import GvoError
-from gvo.output_frame import parse_initial_pose
-from gvo.outputs.run_folder import RunFolder
+from gvo.io.edges.events import InputFaults
+from gvo.io.edges.lines import detect_format, parse_line
+from gvo.io.edges.opening import open_edges, parse_sigma
+from gvo.io.edges.pose_graph import PoseGraphSource
+from gvo.io.opening import open_recording
+from gvo.io.poses.base_frame import parse_initial_pose
+from gvo.io.poses.ground_truth import parse_bag_truth, parse_truth
+from gvo.io.recording import StampedImage
+from gvo.io.run_folder.writer import RunFolder
 from gvo.smoothing import POSES_HEADER, Smoother
 from gvo.smoothing_lines import _answer_all as answer_lines
-from gvo.sources.edge_inputs import open_edges, parse_sigma
-from gvo.sources.edge_lines import detect_format, parse_line
-from gvo.sources.edges import InputFaults
-from gvo.sources.opening import open_recording
-from gvo.sources.pose_graphs import PoseGraphSource
-from gvo.sources.recording import StampedImage
-from gvo.sources.truth_specs import parse_bag_truth, parse_truth
 from gvo.trajectory.formats import COVARIANCE_HEADER, read_covariances, read_trajectory
 from gvo.trajectory.g2o import convert_line
 from gvo.trajectory.g2o import parse_line as parse_g2o_line

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from gvo.config import Config, WindowConfig
 from gvo.geometry import se3
+from gvo.io.edges.events import PoseEvent
+from gvo.io.run_folder.writer import RunFolder
 from gvo.odometry.chain import EdgeChain
-from gvo.outputs.run_folder import RunFolder
 from gvo.smoothing import POSES_HEADER, Smoother
-from gvo.sources.edges import PoseEvent
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, Status
 
 SECOND = 1_000_000_000

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend
+from gvo.io.frames import frames
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.sources.frames import frames
-from gvo.sources.recording import Sensor
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.types import Estimate, Frame, FrameResult, RgbdFrame, StereoFrame
 
 N_FRAMES = 8

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.sources.conftest import Tiny
+from tests.io.conftest import Tiny
 
 
 @pytest.fixture(scope="session")

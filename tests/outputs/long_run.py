@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.se3 import make_transform
-from gvo.outputs.run_record import EdgeTable, FrameTable, RunRecord, TimingTable
+from gvo.io.run_folder.reader import EdgeTable, FrameTable, RunRecord, TimingTable
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import IntArray
 

@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.se3 import make_transform
+from gvo.io.convert.bag_messages import BagWriter
+from gvo.io.frames import frames
+from gvo.io.poses.tf import TfBuffer
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.outputs.bag_messages import BagWriter
 from gvo.outputs.run_bag import N_SHOWN_POSES, RunBag
 from gvo.outputs.run_frames import RunFrames
-from gvo.sources.frames import frames
-from gvo.sources.recording import Sensor
-from gvo.sources.synthetic import SyntheticRecording
-from gvo.sources.tf import TfBuffer
 from gvo.types import (
     Estimate,
     FaultyFrame,

@@ -14,13 +14,13 @@ import pytest
 import gvo
 from gvo.config import Config
 from gvo.errors import ConfigurationError, RecordingError
+from gvo.io.frames import frames
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.odometry.odometry import Odometry
-from gvo.outputs.overlays import compose_faulty, compose_overlay
 from gvo.outputs.run_overlay import RunOverlay, film_width
-from gvo.sources.frames import frames
-from gvo.sources.recording import Sensor
-from gvo.sources.synthetic import SyntheticRecording, WorldName
 from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
+from gvo.viz.overlay import compose_faulty, compose_overlay
 
 _N_FRAMES = 11
 _Run = tuple[SyntheticRecording, list[tuple[Frame, FrameResult]]]

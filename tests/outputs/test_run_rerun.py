@@ -28,14 +28,13 @@ from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import exp, make_transform
-from gvo.output_frame import OutputFrame
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.run_folder.writer import RunFolder
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.outputs import rerun_run
-from gvo.outputs.palette import COUNTS, LINKS, STAGES
-from gvo.outputs.run_folder import RunFolder
 from gvo.outputs.run_frames import RunFrames
 from gvo.outputs.run_rerun import RunRerun
 from gvo.run_loop import RunLoop
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import (
@@ -48,6 +47,7 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
+from gvo.viz.palette import COUNTS, LINKS, STAGES
 
 _N_FRAMES = 12
 _ESTIMATES = ("raw", "causal", "smoothed")

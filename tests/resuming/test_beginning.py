@@ -8,8 +8,8 @@ import pytest
 
 import gvo
 from gvo.errors import ResumeError, RunBusyError
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_tally import Progress
-from gvo.sources.synthetic import SyntheticRecording
 
 N = 6
 NO_REPORT = gvo.RunOutputs(report=False)

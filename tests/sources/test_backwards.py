@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames
+from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.sources.backwards import ThereAndBack
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames
-from gvo.sources.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 
@@ -166,7 +166,7 @@ def test_images_of_no_more_than_the_limit_are_held(monkeypatch: pytest.MonkeyPat
         def __del__(self) -> None:
             alive.append(-1)
 
-    monkeypatch.setattr("gvo.sources.frames.StereoFrame", Counted)
+    monkeypatch.setattr("gvo.io.frames.StereoFrame", Counted)
     shuttle = ThereAndBack(Numbered(["sound"] * 30), _CONFIGS[1], max_bytes=5 * _FRAME_BYTES)
     assert sum(1 for _ in shuttle) == 59
     # five of the piece, and those on their way: one read, one mirrored, one with the reader

@@ -16,10 +16,10 @@ from gvo.checkup import check_recording
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry import se3
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_outputs import RunOutputs
 from gvo.runs import run_recording
-from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.testing.faults import FaultySource, NamedFault
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import gvo
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera
-from gvo.sources.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.testing.faults import (
     FAULTS,
     Banded,

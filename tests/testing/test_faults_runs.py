@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.sources.recording import Sensor
+from gvo.io.recording import Sensor
 from gvo.testing.faults import (
     FAULTS,
     Elsewhere,

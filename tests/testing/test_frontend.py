@@ -14,7 +14,7 @@ from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
-from gvo.sources.recording import Sensor
+from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
 from gvo.testing.fingerprint import fingerprint
 from gvo.types import Failure, FaultyFrame, FloatArray, Frame, Observations, RelativePose

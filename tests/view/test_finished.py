@@ -11,8 +11,8 @@ import pytest
 
 from gvo.errors import GvoError
 from gvo.geometry import se3
-from gvo.outputs.run_folder import RunFolder
-from gvo.outputs.run_record import RunRecord, read_run
+from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.run_folder.writer import RunFolder
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
 from gvo.view import serve, serve_run

@@ -7,8 +7,8 @@ import pytest
 
 import gvo
 from gvo.config import Config, load_configuration
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_outputs import RunOutputs
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.view import serve
 from gvo.view.player import Player
 from tests.browser import Browser

@@ -10,11 +10,11 @@ import pytest
 
 from gvo.config import Config
 from gvo.errors import RecordingError
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FrameResult, RgbdFrame
 from gvo.view.moments import Moment

@@ -16,11 +16,11 @@ from gvo.diagnostics.explain.values import FrameExplanation
 from gvo.diagnostics.explain.watch import Registration, WatchedFrontend
 from gvo.errors import RecordingError
 from gvo.frontend.protocol import Stamped
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames
+from gvo.io.recording import Source
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
-from gvo.sources.excerpt import Excerpt
-from gvo.sources.frames import frames
-from gvo.sources.recording import Source
 from gvo.types import FaultyFrame, Frame, FrameResult, Status
 
 Progress = Callable[[int, int, int], None]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.outputs.palette import ESTIMATES, REFUSED
 from gvo.outputs.report.batch_axes import logarithmic_axis
 from gvo.outputs.report.batch_values import N_LABEL, Batch, shown
-from gvo.outputs.report.sheets import WIDE, Plot, arrange, new_figure
 from gvo.types import BoolArray, FloatArray
+from gvo.viz.palette import ESTIMATES, REFUSED
+from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

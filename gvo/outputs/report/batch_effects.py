@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from gvo.outputs.palette import ESTIMATES, REFUSED
 from gvo.outputs.report.batch_axes import logarithmic_axis
 from gvo.outputs.report.batch_values import (
     Batch,
@@ -15,9 +14,10 @@ from gvo.outputs.report.batch_values import (
     shown,
     value_text,
 )
-from gvo.outputs.report.page import table_html
-from gvo.outputs.report.sheets import WIDE, Plot, arrange, new_figure
 from gvo.parameter_effects import ParameterEffect, ValueEffect, parameter_effects
+from gvo.viz.palette import ESTIMATES, REFUSED
+from gvo.viz.report.page import table_html
+from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

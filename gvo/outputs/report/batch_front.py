@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from gvo.outputs.palette import ESTIMATES
 from gvo.outputs.report.batch_axes import logarithmic_axis
 from gvo.outputs.report.batch_values import N_LABEL, Batch, number_text, printable, shown
-from gvo.outputs.report.page import table_html
-from gvo.outputs.report.sheets import WIDE, Plot, arrange, new_figure
 from gvo.parameter_effects import VariantMean
+from gvo.viz.palette import ESTIMATES
+from gvo.viz.report.page import table_html
+from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

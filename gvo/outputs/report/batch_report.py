@@ -14,8 +14,8 @@ from gvo.outputs.report.batch_effects import effect_sheets
 from gvo.outputs.report.batch_front import front_sheet
 from gvo.outputs.report.batch_table import runs_html
 from gvo.outputs.report.batch_values import Batch, printable
-from gvo.outputs.report.page import facts_html, list_html, plots_html, write_page
-from gvo.outputs.report.sheets import Plot, settings, write_plots
+from gvo.viz.report.page import facts_html, list_html, plots_html, write_page
+from gvo.viz.report.sheets import Plot, settings, write_plots
 
 _MAX_LISTED = 20
 

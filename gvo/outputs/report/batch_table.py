@@ -11,9 +11,9 @@ from urllib.parse import quote, urlsplit
 
 import numpy as np
 
+from gvo.io.run_folder.writer import REPORT
 from gvo.outputs.batch_rows import BatchRow
 from gvo.outputs.report.batch_values import Batch, number_text, printable
-from gvo.outputs.run_folder import REPORT
 from gvo.types import FloatArray
 
 _SCHEMES = ("http", "https")

@@ -11,9 +11,9 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.outputs.batch_rows import BatchRow, Value
-from gvo.outputs.drawing import plain
 from gvo.parameter_effects import Runs, VariantMean, accuracy_front
 from gvo.types import BoolArray, FloatArray
+from gvo.viz.plots import plain
 
 DEFAULT = "default"
 N_LABEL = 40

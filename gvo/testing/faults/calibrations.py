@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gvo.geometry.camera import Calibration
-from gvo.sources.recording import RecordingInfo
+from gvo.io.recording import RecordingInfo
 from gvo.testing.faults.fault import Fault
 from gvo.types import FloatArray
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 
-from gvo.sources.recording import Source
+from gvo.io.recording import Source
 from gvo.testing.faults.delivery import (
     BrokenOff,
     Dropped,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.testing.faults.fault import Fault, ImageFault, Shot
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.sources.recording import RecordingInfo, Source, StampedImage
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 
 Kind: TypeAlias = Literal["image", "depth"]

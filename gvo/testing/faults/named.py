@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
-from gvo.sources.recording import Sensor, Source
+from gvo.io.recording import Sensor, Source
 from gvo.testing.faults.fault import Fault, FaultySource, PixelFault
 
 Group: TypeAlias = Literal[

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from gvo.sources.recording import RecordingInfo
+from gvo.io.recording import RecordingInfo
 from gvo.testing.faults.fault import Fault, Shot
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gvo.outputs.palette import INLIERS, OUTLIERS
 from gvo.types import FloatArray, ImageArray
+from gvo.viz.palette import INLIERS, OUTLIERS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

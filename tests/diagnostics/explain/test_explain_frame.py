@@ -12,12 +12,12 @@ from gvo.config import Config, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import GvoError
 from gvo.geometry import se3
+from gvo.io.frames import frames
+from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.keyframe_policy import choose_links
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
-from gvo.sources.frames import frames
-from gvo.sources.recording import RecordingInfo, Sensor, Source, StampedImage
-from gvo.sources.synthetic import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, FrameResult
 

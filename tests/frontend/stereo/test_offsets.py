@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import gvo
 from gvo.config import Config, StereoConfig
 from gvo.frontend.stereo.offsets import OffsetFilter, RigOffsets
-from gvo.sources.sensor_noise import SensorNoise
+from gvo.io.synthetic.recording import SensorNoise
 from gvo.types import FaultyFrame, RelativePose, StereoFrame
 
 N_FRAMES = 20

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.errors import RecordingError
-from gvo.sources.bag_file import BagFile
+from gvo.io.bag.file import BagFile
 from gvo.sources.salvage.mcap import McapScan
 from gvo.sources.salvage.ros1 import Ros1Scan
 from gvo.sources.salvage.scan import Salvage

@@ -12,8 +12,8 @@ import pytest
 from gvo.config import Config, RegistrationConfig
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import ConfigurationError
-from gvo.sources.recording import Sensor
-from gvo.sources.synthetic import SyntheticRecording
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.viz.explanation import open_folder, write_explanation
 from gvo.viz.explanation.motion import draw_residuals
 from gvo.viz.explanation.pose import position_covariance

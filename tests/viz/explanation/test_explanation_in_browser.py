@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from gvo.diagnostics.explain import explain_frame
-from gvo.sources.recording import Sensor
-from gvo.sources.synthetic import SyntheticRecording, WorldName
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.viz.explanation import write_explanation
 from tests.browser import Browser
 

@@ -1,0 +1,1 @@
+"""Cameras and poses in ROS bags: files, topics, messages, calibrations."""

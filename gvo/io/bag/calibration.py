@@ -1,0 +1,383 @@
+"""Calibration and extrinsics of a bag's cameras."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from gvo.errors import CalibrationError, RecordingError
+from gvo.geometry import se3
+from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.io.bag.cameras import BagCamera, image_frame, read_bag_cameras, recorded_depth_scale
+from gvo.io.bag.messages import transform_of
+from gvo.io.bag.reader import BagMessage, BagReader
+from gvo.io.bag.topics import CameraTopics
+from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
+from gvo.io.calibration.files import CalibrationPaths, read_cameras
+from gvo.io.calibration.stereo_pair import (
+    has_baseline,
+    pair_of_baseline,
+    pair_of_extrinsics,
+    stereo_baseline,
+)
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.recording import DepthView
+from gvo.types import Failure, FloatArray
+
+TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
+
+# The topics of one stream of a bag that librealsense wrote.
+_REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/image/data")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Extrinsics:
+    """Where one camera stands as seen from another.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+        Maps coordinates of the source to the target camera, metres.
+    origin : str
+        What told it.
+    """
+
+    T_target_source: FloatArray
+    origin: str
+
+
+def find_extrinsics(
+    reader: BagReader, target: BagCamera, source: BagCamera
+) -> Extrinsics | Failure:
+    """Find the transform between two cameras of a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag; the topics of transforms are read.
+    target, source : BagCamera
+        The cameras.
+
+    Returns
+    -------
+    Extrinsics or Failure
+        By the tf between the frames that their `CameraInfo` name; where these are empty, by the
+        `tf` topics beside the streams of librealsense, which map their reference to each stream.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    """
+    frames = (target.fields.frame_id, source.fields.frame_id)
+    if not all(frames):
+        return _of_realsense(reader, target, source)
+    if frames[0] == frames[1]:
+        return Failure(reason=f"both CameraInfo name the frame {frames[0]}")
+    buffer = read_tf(reader, frames=frames)
+    found = _lookup(buffer, frames, target.stamp_ns)
+    if isinstance(found, Failure):
+        return found
+    return Extrinsics(T_target_source=found, origin=f"tf {frames[0]} -> {frames[1]}")
+
+
+def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
+    """Look a mount up at a stamp, or where it is known: `CameraInfo` may come before tf."""
+    found = buffer.lookup(*frames, stamp_ns)
+    if not isinstance(found, Failure):
+        return found
+    stamps_ns = buffer.edge_stamps_ns(*frames)
+    T, is_known = buffer.lookup_many(*frames, stamps_ns)
+    known = np.flatnonzero(is_known)
+    if len(known) == 0:
+        return found
+    return np.asarray(T[known[np.argmin(np.abs(stamps_ns[known] - stamp_ns))]])
+
+
+def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Extrinsics | Failure:
+    streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
+    references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
+    common = sorted(references[0] & references[1])
+    if not common:
+        return Failure(reason="the CameraInfo name no frame")
+    names = [f"{stream[1]}/tf/{common[0]}" for stream in streams if stream is not None]
+    T_stream_reference = {}
+    for message in reader.messages(names):
+        T_stream_reference[message.topic.name] = _transform(message)
+    if len(T_stream_reference) != len(set(names)):
+        return Failure(reason=f"{names[0]} or {names[1]} yields no message")
+    T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)
+    T_target_source = T_target_reference @ se3.invert(T_source_reference)
+    return Extrinsics(T_target_source=T_target_source, origin=" and ".join(names))
+
+
+def _references(reader: BagReader, stream: str) -> set[str]:
+    start = f"{stream}/tf/"
+    return {
+        topic.name.removeprefix(start)
+        for topic in reader.topics
+        if topic.name.startswith(start) and topic.type == TRANSFORM_TYPE
+    }
+
+
+def _transform(message: BagMessage) -> FloatArray:
+    content = message.decode()
+    T = transform_of(content.translation, content.rotation)
+    if isinstance(T, Failure):
+        raise RecordingError(
+            f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
+        )
+    return T
+
+
+_REGISTERED = re.compile(r"(?<!un)(aligned|registered)")
+# Of the focal length and of the image size: calibrations of one camera differ by less.
+_TOLERANCE = 0.02
+_SAME_PLACE_M = 1e-6
+_SAME_PIXEL_PX = 0.5
+_REMEDY = "give a topic of depth registered to colour by --depth"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthChoice:
+    """How depth gets to colour.
+
+    Parameters
+    ----------
+    view : DepthView, optional
+        Of depth that has to be registered; None where it is, or where that is not known.
+    decisions : tuple of str
+        What was found, a line each.
+    """
+
+    view: DepthView | None = None
+    decisions: tuple[str, ...] = ()
+
+
+def choose_depth_view(
+    reader: BagReader, color: tuple[BagCamera, Calibration], depth: BagCamera
+) -> DepthChoice:
+    """Tell whether depth has to be registered to colour.
+
+    It is registered already where the name of the topic says so, and where both cameras have one
+    frame, one size and the same intrinsics.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag; the topics of transforms are read where they are needed.
+    color : tuple of BagCamera and Calibration
+        The colour camera.
+    depth : BagCamera
+        The camera that the `CameraInfo` of the depth describes.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    """
+    if _REGISTERED.search(depth.image.base.lower()):
+        return DepthChoice()
+    camera, color_calibration = color
+    try:
+        calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
+    except CalibrationError as error:
+        return DepthChoice(decisions=(f"depth: taken as registered to colour: {error}",))
+    difference = _difference(color_calibration, calibration)
+    frames = (camera.fields.frame_id, depth.fields.frame_id)
+    if frames[0] and frames[0] == frames[1]:
+        found: Extrinsics | Failure = Extrinsics(
+            T_target_source=np.eye(4), origin=f"one frame {frames[0]}"
+        )
+    else:
+        found = find_extrinsics(reader, camera, depth)
+    if isinstance(found, Failure):
+        return DepthChoice(decisions=_advice(difference, frames, found))
+    if not difference and np.allclose(found.T_target_source, np.eye(4), atol=_SAME_PLACE_M):
+        return DepthChoice()
+    distance = float(np.linalg.norm(found.T_target_source[:3, 3]))
+    line = f"depth: of a camera {distance:.4f} m from colour by {found.origin}, registered to it"
+    if difference:
+        line += f" ({difference})"
+    view = DepthView(calibration=calibration, T_color_depth=found.T_target_source)
+    return DepthChoice(view=view, decisions=(line,))
+
+
+def _difference(color: Calibration, depth: Calibration) -> str:
+    """Say how two cameras differ; empty where they do not."""
+    if (depth.width, depth.height) != (color.width, color.height):
+        return f"images of {depth.width}x{depth.height} pixels, colour {color.width}x{color.height}"
+    first, second = color.pinhole(), depth.pinhole()
+    for name, limit in (
+        ("fx", _TOLERANCE * first.fx),
+        ("fy", _TOLERANCE * first.fy),
+        ("cx", _TOLERANCE * first.width),
+        ("cy", _TOLERANCE * first.height),
+    ):
+        of_color, of_depth = float(getattr(first, name)), float(getattr(second, name))
+        if abs(of_depth - of_color) > limit:
+            return f"{name} {of_depth:.1f} against {of_color:.1f} px"
+    if not _is_one_lens(color, depth):
+        return "another lens"
+    return ""
+
+
+def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
+    """Tell whether raw images of both are rectified alike, or need not be rectified."""
+    maps = [rectification_maps(camera) for camera in (color, depth)]
+    if maps[1] is None or maps[0] is None:
+        # Depth without a lens of its own is what drivers give that register it to raw colour.
+        return maps[1] is None
+    return all(np.allclose(a, b, atol=_SAME_PIXEL_PX) for a, b in zip(*maps, strict=True))
+
+
+def _advice(difference: str, frames: tuple[str, str], why: Failure) -> tuple[str, ...]:
+    if difference:
+        return (f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}",)
+    if all(frames):
+        return (
+            f"depth: taken as registered to colour, though its frame is {frames[1]} and that of "
+            f"colour {frames[0]} ({why.reason}); if it is not, {_REMEDY}",
+        )
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BagCalibration:
+    """What was found.
+
+    Parameters
+    ----------
+    calibrations : tuple of Calibration
+        Of left and right, or of the colour camera.
+    decisions : tuple of str
+        What was chosen, a line each.
+    depth_scale : float, optional
+        Counts per metre, where a file or the bag says so.
+    depth_view : DepthView, optional
+        Of depth that has to be registered to colour.
+    frame_id : str
+        Of the first camera in `/tf`; empty where nothing names it.
+    T_body_cam : ndarray of float64, shape (4, 4), optional
+        Maps the rectified first camera to the body that a file names, metres.
+    """
+
+    calibrations: tuple[Calibration, ...]
+    decisions: tuple[str, ...]
+    depth_scale: float | None = None
+    depth_view: DepthView | None = None
+    frame_id: str = ""
+    T_body_cam: FloatArray | None = None
+
+
+def calibrations_of_messages(reader: BagReader, topics: CameraTopics, where: str) -> BagCalibration:
+    """Read the first `CameraInfo` of a stereo pair, or of the colour camera.
+
+    A raw pair whose P hold no baseline is rectified by the transform between the cameras. Later
+    messages are not read, which would take a pass over the bag: `camera_info_changes` does.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag; only topics of `CameraInfo` are read, and where they do not say all, transforms
+        and an image.
+    topics : CameraTopics
+        The image topics.
+    where : str
+        The bag, for messages.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    CalibrationError
+        When a `CameraInfo` is missing or describes no usable camera.
+    """
+    first, second = read_bag_cameras(reader, topics, where)
+    frame_id = first.fields.frame_id or image_frame(reader, topics.first)
+    is_rectified = topics.first.is_rectified
+    state = "rectified" if is_rectified else "raw, rectified by D, R and P"
+    if second is not None and topics.sensor == "stereo":
+        pair, baseline = _stereo_pair(reader, (first, second), where)
+        names = f"{first.info_name} + {second.info_name}"
+        decisions = (f"calibration: {names}; the images are {state}", *first.notes, *second.notes)
+        return BagCalibration(
+            calibrations=pair, decisions=(*decisions, baseline), frame_id=frame_id
+        )
+    decisions = (f"calibration: {first.info_name}; the images are {state}", *first.notes)
+    color = make_rgbd_calibration(first.fields, is_rectified=is_rectified)
+    choice = DepthChoice()
+    if second is not None:
+        choice = choose_depth_view(reader, (first, color), second)
+    return BagCalibration(
+        calibrations=(color,),
+        decisions=(*decisions, *choice.decisions),
+        depth_scale=recorded_depth_scale(reader, topics.second),
+        depth_view=choice.view,
+        frame_id=frame_id,
+    )
+
+
+def calibrations_of_file(
+    paths: CalibrationPaths, topics: CameraTopics, reader: BagReader | None = None
+) -> BagCalibration:
+    """Read the calibration of a stereo pair, or of the colour camera, from files.
+
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        See `gvo.io.calibration.files.read_cameras`.
+    topics : CameraTopics
+        The image topics; their names say whether the images are rectified.
+    reader : BagReader, optional
+        The bag, whose images name the camera's frame.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    CalibrationError
+        When a file is malformed or describes another kind of camera.
+    """
+    found = read_cameras(paths, sensor=topics.sensor, is_rectified=topics.first.is_rectified)
+    decisions = [f"calibration: {found.origin}"]
+    if topics.first.is_rectified and not found.calibrations[0].is_rectified:
+        decisions[0] += "; the images are taken as raw, as there, whatever the topics are called"
+    if topics.sensor == "stereo":
+        baseline = stereo_baseline(found.pair, found.origin)
+        decisions.append(f"baseline: {baseline:.4f} m from {found.baseline_from} of {found.origin}")
+    return BagCalibration(
+        calibrations=found.calibrations,
+        decisions=tuple(decisions),
+        depth_scale=found.depth_scale,
+        frame_id="" if reader is None else image_frame(reader, topics.first),
+        T_body_cam=found.T_body_cam,
+    )
+
+
+def _stereo_pair(
+    reader: BagReader, cameras: tuple[BagCamera, BagCamera], where: str
+) -> tuple[tuple[Calibration, Calibration], str]:
+    """Return left and right, and the line that says where the baseline comes from."""
+    left, right = (
+        make_calibration(camera.fields, is_rectified=camera.image.is_rectified)
+        for camera in cameras
+    )
+    if has_baseline(left, right) or (left.width, left.height) != (right.width, right.height):
+        baseline = stereo_baseline((left, right), where)
+        return (left, right), f"baseline: {baseline:.4f} m from P of {cameras[1].info_name}"
+    found = find_extrinsics(reader, *cameras)
+    if isinstance(found, Failure):
+        raise CalibrationError(
+            f"{where}: the baseline must be positive, got none from P of {cameras[1].info_name}, "
+            f"nor from tf: {found.reason}; give --calibration FILE of the pair"
+        )
+    origin = f"{where}: {found.origin}"
+    if left.is_rectified:
+        pair = pair_of_baseline((left, right), found.T_target_source, origin)
+    else:
+        pair = pair_of_extrinsics((left, right), found.T_target_source, origin)
+    baseline = stereo_baseline(pair, origin)
+    return pair, f"baseline: {baseline:.4f} m from {found.origin}"

@@ -1,0 +1,279 @@
+"""ROS messages of images, calibrations and transforms, decoded."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gvo.bounded_text import cut
+from gvo.geometry import se3
+from gvo.io.bag.image_encodings import (
+    BAYER,
+    DEPTHS,
+    IMAGES,
+    RawImage,
+    convert_to_bgr,
+    decode_rvl,
+    find_encoding,
+    stored_pixels,
+)
+from gvo.io.calibration.camera_info import CameraFields, RegionOfInterest
+from gvo.io.images import (
+    FULL_RANGE,
+    GreyRange,
+    decode_image,
+    depth_from_counts,
+    depth_from_metres,
+    is_png,
+    to_8_bit,
+)
+from gvo.io.poses.tf_paths import bare
+from gvo.trajectory.formats import MAX_POSITION_M
+from gvo.types import DepthArray, Failure, FloatArray, ImageArray
+
+_NORM_TOLERANCE = 1e-2  # of quaternions
+_COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
+
+
+class StampMessage(Protocol):
+    """`builtin_interfaces/Time`."""
+
+    sec: int
+    nanosec: int
+
+
+class HeaderMessage(Protocol):
+    """`std_msgs/Header`."""
+
+    stamp: StampMessage
+    frame_id: str
+
+
+class ImageMessage(RawImage, Protocol):
+    """`sensor_msgs/Image`."""
+
+    header: HeaderMessage
+
+
+class CompressedImageMessage(Protocol):
+    """`sensor_msgs/CompressedImage`."""
+
+    header: HeaderMessage
+    format: str
+    data: NDArray[np.uint8]
+
+
+def stamp_of(header: HeaderMessage) -> int:
+    """Return the stamp of a header in nanoseconds.
+
+    Parameters
+    ----------
+    header : std_msgs/Header
+        Of ROS 1 or ROS 2.
+    """
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def transform_of(translation: Any, rotation: Any) -> FloatArray | Failure:  # noqa: ANN401
+    """Return the matrix of a transform or pose, shape (4, 4).
+
+    Parameters
+    ----------
+    translation : geometry_msgs/Vector3 or geometry_msgs/Point
+        Metres.
+    rotation : geometry_msgs/Quaternion
+        Of length one, up to a hundredth.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4), or Failure
+        The failure says what is wrong with the numbers.
+    """
+    t = np.array([getattr(translation, axis) for axis in "xyz"], dtype=np.float64)
+    quaternion_xyzw = np.array([getattr(rotation, axis) for axis in "xyzw"])
+    if not np.all(np.isfinite(t)):
+        return Failure(reason="the position is not finite")
+    if np.any(np.abs(t) > MAX_POSITION_M):
+        return Failure(reason=f"the position is beyond {MAX_POSITION_M:g} m")
+    norm = math.hypot(*quaternion_xyzw)
+    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        return Failure(reason=f"the quaternion has the norm {norm:.3g}, expected 1")
+    return se3.make_transform(np.asarray(Rotation.from_quat(quaternion_xyzw).as_matrix()), t)
+
+
+def decode_grey_or_color(
+    message: ImageMessage, where: str, grey_range: GreyRange = FULL_RANGE
+) -> ImageArray:
+    """Return the pixels of an `Image` message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/Image
+        Of an encoding in `gvo.io.bag.image_encodings.IMAGES`.
+    where : str
+        The topic, for messages.
+    grey_range : GreyRange
+        Of encodings with 16 bits.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width) or (height, width, 3)
+        Grey, or colour in BGR order.
+
+    Raises
+    ------
+    RecordingError
+        When the encoding is unknown, size and data do not belong together, or 16 bits would
+        become nearly black.
+    """
+    encoding = find_encoding(message.encoding, IMAGES, where)
+    pixels = stored_pixels(message, encoding, where)
+    if encoding.to_bgr is not None:
+        pixels = convert_to_bgr(pixels, encoding.to_bgr, f"{where} ({message.encoding})")
+    return to_8_bit(pixels, where, grey_range)
+
+
+def decode_depth(message: ImageMessage, scale: float, where: str) -> DepthArray:
+    """Return metres (h, w), NaN = unknown, of an `Image` message of depth.
+
+    Parameters
+    ----------
+    message : sensor_msgs/Image
+        16UC1 or mono16 counts, or 32FC1 metres.
+    scale : float
+        Counts per metre.
+    where : str
+        The topic, for messages.
+
+    Raises
+    ------
+    RecordingError
+        When the encoding is no depth, or size and data do not belong together.
+    """
+    encoding = find_encoding(message.encoding, DEPTHS, where)
+    pixels = stored_pixels(message, encoding, where)
+    if encoding.dtype == "f4":
+        return depth_from_metres(pixels)
+    return depth_from_counts(pixels, scale, where)
+
+
+def decode_compressed(
+    message: CompressedImageMessage, where: str, grey_range: GreyRange = FULL_RANGE
+) -> ImageArray:
+    """Return the pixels of a `CompressedImage` message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CompressedImage
+        PNG, JPEG, TIFF, BMP or PNM; its `format` in any of the forms of `image_transport`:
+        "jpeg", "rgb8; jpeg compressed bgr8", "bayer_rggb8; png compressed ".
+    where : str
+        The topic, for messages.
+    grey_range : GreyRange
+        Of images with 16 bits.
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w) or (h, w, 3)
+        Grey, or colour in BGR order.
+
+    Raises
+    ------
+    RecordingError
+        When the image is damaged or of another format.
+    """
+    encoding, _, transport = message.format.partition(";")
+    where_format = f"{where} ({cut(message.format, 40)})"
+    pixels = decode_image(np.asarray(message.data), where_format)
+    bayer = BAYER.get(encoding.strip())
+    if bayer is not None and bayer.to_bgr is not None and pixels.ndim == 2:
+        # The transport compresses a mosaic as if it were grey.
+        pixels = convert_to_bgr(pixels, bayer.to_bgr, where_format)
+    elif "compressed rgb" in transport and pixels.ndim == 3 and pixels.shape[2] == 3:
+        # Early releases gave RGB to an encoder that expects BGR, and said so.
+        pixels = convert_to_bgr(pixels, cv2.COLOR_RGB2BGR, where_format)
+    return to_8_bit(pixels, where, grey_range)
+
+
+def decode_compressed_depth(
+    message: CompressedImageMessage, scale: float, where: str
+) -> DepthArray:
+    """Return metres (h, w), NaN = unknown, of a `CompressedImage` message of depth.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CompressedImage
+        A 16-bit PNG, or TIFF in metres; or of the transport `compressedDepth`, where PNG or RVL
+        follow a header.
+    scale : float
+        Counts per metre of integer depth.
+    where : str
+        The topic, for messages.
+
+    Raises
+    ------
+    RecordingError
+        When the image is damaged or no depth.
+    """
+    data, where_format = np.asarray(message.data), f"{where} ({cut(message.format, 40)})"
+    if "compressedDepth" not in message.format or is_png(data):
+        pixels = decode_image(data, where_format)
+        if pixels.dtype == np.float32 and pixels.ndim == 2:
+            return depth_from_metres(pixels)
+        return depth_from_counts(pixels, scale, where_format)
+    n_header = _COMPRESSED_DEPTH_HEADER.size
+    decode = decode_rvl if message.format.endswith("rvl") else decode_image
+    counts = decode(data[n_header:], where_format)
+    if not message.format.startswith("32FC1"):
+        return depth_from_counts(counts, scale, where_format)
+    # The transport keeps floats as counts of inverse depth: depth = a / (counts - b).
+    _, a, b = _COMPRESSED_DEPTH_HEADER.unpack(data[:n_header].tobytes())
+    counts_of_one_per_metre = depth_from_counts(counts, 1.0, where_format)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return depth_from_metres(np.float32(a) / (counts_of_one_per_metre - np.float32(b)))
+
+
+def camera_fields(message: Any, where: str) -> CameraFields:  # noqa: ANN401 - ROS 1 or 2
+    """Return the fields of a `CameraInfo` message.
+
+    Parameters
+    ----------
+    message : sensor_msgs/CameraInfo
+        With D, K, R, P of ROS 1, or d, k, r, p of ROS 2.
+    where : str
+        Bag and topic, for messages.
+
+    Returns
+    -------
+    CameraFields
+        As they stand there, not checked.
+    """
+    return CameraFields(
+        where=where,
+        width=int(message.width),
+        height=int(message.height),
+        model=str(message.distortion_model),
+        K=_matrix(message, "K"),
+        D=_matrix(message, "D"),
+        R=_matrix(message, "R"),
+        P=_matrix(message, "P"),
+        binning=(int(message.binning_x), int(message.binning_y)),
+        roi=RegionOfInterest(
+            x_offset=int(message.roi.x_offset),
+            y_offset=int(message.roi.y_offset),
+            width=int(message.roi.width),
+            height=int(message.roi.height),
+        ),
+        frame_id=bare(str(message.header.frame_id)),
+    )
+
+
+def _matrix(message: Any, name: str) -> FloatArray:  # noqa: ANN401 - ROS 1 or 2
+    name_found = name if hasattr(message, name) else name.lower()
+    return np.asarray(getattr(message, name_found), dtype=np.float64)

@@ -1,0 +1,309 @@
+"""Bags of ROS 1 and 2 read by topic; folders."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from heapq import merge
+from pathlib import Path, PurePath
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from gvo.bounded_text import read_text
+from gvo.errors import RecordingError
+from gvo.io.bag.file import FAULTS, BagFile
+from gvo.io.bag.topics import Topic
+from gvo.sources.salvage.inflate import inflate_file
+from gvo.sources.salvage.scan import FoundMessage
+from gvo.yaml_text import YamlError, load_yaml
+
+STORAGE_SUFFIXES = (".mcap", ".db3")
+_COMPRESSED = ".zstd"
+_MAX_METADATA = 1 << 20  # bytes; thousands of files
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FolderFiles:
+    """What a folder holds.
+
+    Parameters
+    ----------
+    paths : tuple of Path
+        The files to read; those that end in `.zstd` are compressed.
+    notes : tuple of str
+        What was decided.
+    damage : tuple of str
+        What is missing.
+    """
+
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
+
+
+def find_files(folder: Path) -> FolderFiles:
+    """Find the files of a bag folder.
+
+    The metadata only name them. All else that they say is in the files too, and not always the
+    same: readers that compare the two find no messages then.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Raises
+    ------
+    RecordingError
+        When there is none.
+    """
+    held = sorted(path for path in folder.iterdir() if is_storage(path))
+    has_metadata = (folder / "metadata.yaml").is_file()
+    if not held and not has_metadata:
+        raise RecordingError(f"{folder}: holds neither metadata.yaml nor a .mcap or .db3")
+    counts = _listed_files(folder / "metadata.yaml") if has_metadata else {}
+    listed = {name: _find(name, held) for name in counts}
+    found = tuple(path for path in listed.values() if path is not None)
+    if not found:
+        if not held:
+            raise RecordingError(
+                f"{folder}: holds no .mcap or .db3, only metadata.yaml; copy it anew"
+            )
+        state = "names other files" if counts else "is malformed" if has_metadata else "is missing"
+        names = ", ".join(path.name for path in held)
+        return FolderFiles(
+            paths=tuple(held), notes=(f"bag: metadata.yaml {state}: read {names} without it",)
+        )
+    others = [path.name for path in held if path not in found]
+    return FolderFiles(
+        paths=found,
+        notes=tuple(f"bag: {name} is left out: metadata.yaml does not name it" for name in others),
+        damage=tuple(
+            f"{folder / name}: is missing{counts[name]}; copy it anew"
+            for name, path in listed.items()
+            if path is None
+        ),
+    )
+
+
+def unpack(path: Path, folder: Path) -> tuple[Path, str]:
+    """Decompress a file.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in `.zstd`.
+    folder : Path
+        Where to.
+
+    Returns
+    -------
+    path : Path
+        The decompressed file.
+    damage : str
+        What is missing of it; nothing where nothing is.
+
+    Raises
+    ------
+    RecordingError
+        When it cannot be read or the folder cannot be written.
+    """
+    target = folder / path.name.removesuffix(_COMPRESSED)
+    try:
+        reason = inflate_file(path, target)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be decompressed to {folder}: {error}") from error
+    return target, f"{path}: is cut or damaged ({reason}); copy it anew" if reason else ""
+
+
+def is_storage(path: Path) -> bool:
+    """Tell whether a path is a file of ROS 2, by its name, compressed or not."""
+    return path.is_file() and path.name.removesuffix(_COMPRESSED).endswith(STORAGE_SUFFIXES)
+
+
+def _find(name: str, held: list[Path]) -> Path | None:
+    """Return the file of a name, compressed or not."""
+    plain = name.removesuffix(_COMPRESSED)
+    names = (name, plain, f"{plain}{_COMPRESSED}")
+    return next((path for wanted in names for path in held if path.name == wanted), None)
+
+
+def _listed_files(metadata: Path) -> dict[str, str]:
+    """Return the names of the files, and for each what is known of its size, as text."""
+    try:
+        text = read_text(metadata, max_bytes=_MAX_METADATA)
+        content = load_yaml(text, max_characters=_MAX_METADATA)["rosbag2_bagfile_information"]
+        names = [PurePath(name).name for name in content["relative_file_paths"]]
+        files = {
+            PurePath(file["path"]).name: f" ({file['message_count']} messages)"
+            for file in content.get("files") or []
+        }
+    except (YamlError, OSError, ValueError, TypeError, LookupError, AttributeError):
+        return {}
+    return {name: files.get(name, "") for name in names}
+
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+OLD_TF_TYPE = "tf/msg/tfMessage"
+"""The type of `/tf` before tf2; it holds the same."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BagMessage:
+    """A message, not decoded yet.
+
+    Parameters
+    ----------
+    topic : Topic
+        As listed by the reader.
+    log_time_ns : int
+        When it was recorded, nanoseconds.
+    data : bytes
+        Serialised.
+    is_ros1 : bool
+        Serialised the way of ROS 1, not CDR.
+    """
+
+    topic: Topic
+    log_time_ns: int
+    data: bytes
+    is_ros1: bool
+
+    def decode(self) -> Any:  # noqa: ANN401 - classes made at run time
+        """Return the message.
+
+        Raises
+        ------
+        RecordingError
+            When the data are not of the type.
+        """
+        store = typestore(is_ros1=self.is_ros1)
+        decode = store.deserialize_ros1 if self.is_ros1 else store.deserialize_cdr
+        try:
+            return decode(memoryview(self.data), self.topic.type)
+        except FAULTS as error:
+            raise RecordingError(
+                f"{self.topic.name}: a message of {len(self.data)} bytes is no {self.topic.type}"
+            ) from error
+
+
+class BagReader:
+    """Bags that are one recording: split, or recorded side by side.
+
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        `.bag`, `.mcap` or `.db3` files, or ROS 2 bag folders.
+
+    Raises
+    ------
+    RecordingError
+        When one of them cannot be opened or yields nothing, with what to do.
+    """
+
+    def __init__(self, paths: Path | Sequence[Path]) -> None:
+        self.notes: list[str] = []
+        self._missing: list[str] = []
+        self._files: list[BagFile] = []
+        self._origins: dict[Path, Path] = {}
+        paths = [paths] if isinstance(paths, Path) else list(paths)
+        if not paths:
+            raise ValueError("expected at least one path of a bag")
+        for path in paths:
+            self._files += (
+                self._open_folder(path) if path.is_dir() else [BagFile(self._unpacked(path))]
+            )
+        self.notes += [file.note for file in self._files if file.note]
+        self.topics = _merge_topics(self._files)
+
+    @property
+    def damage(self) -> str:
+        """What cannot be read, in one line; complete when all messages were read."""
+        found = [*self._missing, *(file.damage for file in self._files)]
+        text = "; ".join(text for text in found if text)
+        for unpacked, path in self._origins.items():
+            text = text.replace(str(unpacked), str(path))
+        return text
+
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order of recording, over all files.
+
+        What is damaged is left out, see `damage`; in a file without an index the order is that
+        of its chunks. A file is opened when its first message is due.
+
+        Parameters
+        ----------
+        names : collection of str
+            Topics as listed.
+        """
+        topics = {(topic.name, topic.type): topic for topic in self.topics}
+        wanted = [file for file in self._files if any(c.name in names for c in file.counts)]
+        streams = [_begin(file, names) for file in wanted]
+        for _, message in merge(*streams, key=lambda item: item[0]):
+            if message is None:
+                continue
+            channel = message.channel
+            yield BagMessage(
+                topic=topics[channel.name, channel.type],
+                log_time_ns=message.log_time_ns,
+                data=message.data,
+                is_ros1=channel.is_ros1,
+            )
+
+    def _open_folder(self, folder: Path) -> list[BagFile]:
+        found = find_files(folder)
+        self.notes += found.notes
+        self._missing += found.damage
+        files: list[BagFile] = []
+        refusals: list[RecordingError] = []
+        for path in found.paths:
+            try:
+                files.append(BagFile(self._unpacked(path)))
+            except RecordingError as error:
+                refusals.append(error)
+        if not files:
+            raise refusals[0]
+        self._missing += [str(error) for error in refusals]
+        return files
+
+    def _unpacked(self, path: Path) -> Path:
+        if path.suffix != ".zstd":
+            return path
+        folder = Path(tempfile.mkdtemp(prefix="bag-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        unpacked, damage = unpack(path, folder)
+        self._origins[unpacked] = path
+        self._missing += [damage] if damage else []
+        return unpacked
+
+
+def _begin(file: BagFile, names: Collection[str]) -> Iterator[tuple[int, FoundMessage | None]]:
+    # The first item keeps the file closed until its time has come.
+    yield file.start_time_ns, None
+    for message in file.messages(names):
+        yield message.log_time_ns, message
+
+
+@cache
+def typestore(*, is_ros1: bool) -> Typestore:
+    """Return the standard message types that recordings are read and written with."""
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    definition = "geometry_msgs/TransformStamped[] transforms"
+    for name in (TF_TYPE, OLD_TF_TYPE):
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(definition, name))
+    return store
+
+
+def _merge_topics(files: Sequence[BagFile]) -> list[Topic]:
+    counts: dict[tuple[str, str], int] = {}
+    for file in files:
+        for channel, count in file.counts.items():
+            key = (channel.name, channel.type)
+            counts[key] = counts.get(key, 0) + count
+    return [Topic(name=name, type=type_, n_messages=n) for (name, type_), n in counts.items()]

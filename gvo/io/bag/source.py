@@ -1,0 +1,251 @@
+"""Bags as recordings: choose topics, find calibrations, stream images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.io.bag.calibration import calibrations_of_file, calibrations_of_messages
+from gvo.io.bag.cameras import camera_info_changes
+from gvo.io.bag.messages import (
+    decode_compressed,
+    decode_compressed_depth,
+    decode_depth,
+    decode_grey_or_color,
+    stamp_of,
+)
+from gvo.io.bag.reader import BagMessage, BagReader
+from gvo.io.bag.topics import (
+    COMPRESSED_TYPE,
+    CameraTopics,
+    Topic,
+    TopicChoice,
+    choose_topics,
+    find_camera_info,
+)
+from gvo.io.calibration.files import CalibrationPaths, paths_of
+from gvo.io.images import MILLIMETRES, GreyRange
+from gvo.io.poses.ground_truth import TRUTH_FRAMES, BagTruthSpec
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.poses.truth import FramedTruth, find_framed_truth
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, FloatArray
+
+
+class BagSource:
+    """A stereo or RGB-D camera in a bag, or in several that are one recording.
+
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        `.bag`, `.mcap` or `.db3` files, or ROS 2 bag folders.
+    topics : TopicChoice, optional
+        What the names of the topics do not decide.
+    calibration : Path or sequence of Path, optional
+        Files that replace the `CameraInfo` messages, see `read_cameras`.
+    config : Config, optional
+        Of which `depth.scale` (otherwise that of the calibration, or 1000), `images` and
+        `sync.stamps` matter.
+
+    Raises
+    ------
+    ValueError
+        Where there is no path.
+    RecordingError, CalibrationError
+        When the bag cannot be read, or holds no camera or no calibration.
+    """
+
+    def __init__(
+        self,
+        paths: Path | Sequence[Path],
+        *,
+        topics: TopicChoice | None = None,
+        calibration: CalibrationPaths = None,
+        config: Config | None = None,
+    ) -> None:
+        config = config or Config()
+        paths = [paths] if isinstance(paths, Path) else list(paths)
+        self._reader = BagReader(paths)
+        self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        self._tf: TfBuffer | None = None
+        self._takes_log_time = config.sync.stamps == "recording"
+        self._topics = self._choose_topics(topics or TopicChoice())
+        if paths_of(calibration):
+            found = calibrations_of_file(calibration, self._topics, self._reader)
+        else:
+            found = calibrations_of_messages(self._reader, self._topics, self._where)
+        self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
+        self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
+        decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
+        if self._topics.sensor == "rgbd":
+            decisions.append(
+                f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
+            )
+        self._info = RecordingInfo(
+            name=paths[0].resolve().stem if paths[0].is_file() else paths[0].resolve().name,
+            sensor=self._topics.sensor,
+            calibrations=found.calibrations,
+            n_images=self._topics.first.n_messages,
+            decisions=decisions,
+            depth_view=found.depth_view,
+            frame_id=found.frame_id,
+            T_body_cam=found.T_body_cam,
+        )
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What is known before the first image."""
+        return self._info
+
+    @property
+    def image_topics(self) -> tuple[str, str]:
+        """Names of the topics of stream 0 and 1."""
+        return self._topics.first.name, self._topics.second.name
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images of both topics in the order of recording.
+
+        Raises
+        ------
+        RecordingError
+            At the end, where a part of the bag could not be read, or a topic that announces
+            messages yields none.
+        """
+        counts = [0, 0]
+        for message in self._reader.messages(self.image_topics):
+            stream = self.image_topics.index(message.topic.name)
+            counts[stream] += 1
+            yield self._image(message, stream)
+        if self._reader.damage:
+            raise RecordingError(self._reader.damage)
+        for topic, count in zip((self._topics.first, self._topics.second), counts, strict=True):
+            if count == 0:
+                raise RecordingError(
+                    f"{self._where}: {topic.name} announces {topic.n_messages} messages but "
+                    "yields none; record or convert the bag anew"
+                )
+
+    def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
+        """Read `/tf` and `/tf_static`.
+
+        Parameters
+        ----------
+        frames : collection of str, optional
+            What will be looked up; of a long bag the rest is not kept.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read.
+        """
+        if self._tf is None:
+            self._tf = read_tf(self._reader, frames=frames)
+        return self._tf if self._tf.is_whole else read_tf(self._reader, frames=frames)
+
+    def camera_info_changes(self) -> dict[str, int]:
+        """Count, by topic, the `CameraInfo` that differ from the first one, which is used.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read.
+        """
+        topics = (self._topics.first, self._topics.second)
+        names = [find_camera_info(topic, self._reader.topics) for topic in topics]
+        return camera_info_changes(self._reader, [name for name in names if name])
+
+    def truth(
+        self,
+        spec: BagTruthSpec | None = None,
+        *,
+        frame: str = "",
+        T_frame_cam: FloatArray | None = None,
+    ) -> FramedTruth | Failure:
+        """Return true poses of a frame.
+
+        Parameters
+        ----------
+        spec : TfTruth or TopicTruth, optional
+            What to read; omitted: what names itself ground truth.
+        frame : str
+            In tf; empty: the rectified left or colour camera.
+        T_frame_cam : ndarray of float64, shape (4, 4), optional
+            How the camera sits in the frame, where tf does not say so.
+
+        Returns
+        -------
+        FramedTruth or Failure
+            The failure says why there is none, or why it cannot be compared.
+
+        Raises
+        ------
+        RecordingError
+            When the bag does not hold what was asked for.
+        """
+        whole = self.transforms((TRUTH_FRAMES.parent, TRUTH_FRAMES.child))
+        return find_framed_truth(
+            self._reader,
+            spec,
+            buffer=whole if whole.is_whole else None,
+            where=self._where,
+            frame=frame,
+            camera_frame=self._info.frame_id,
+            T_frame_cam=T_frame_cam,
+        )
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of the rectified camera, where the bag names it ground truth.
+
+        Raises
+        ------
+        RecordingError
+            When the bag cannot be read.
+        """
+        found = self.truth()
+        return found.trajectory if isinstance(found, FramedTruth) else None
+
+    def _choose_topics(self, choice: TopicChoice) -> CameraTopics:
+        try:
+            return choose_topics(self._reader.topics, choice, self._where)
+        except RecordingError as error:
+            if not self._reader.damage:
+                raise
+            raise RecordingError(f"{error}; {self._reader.damage}") from error
+
+    def _image(self, message: BagMessage, stream: int) -> StampedImage:
+        try:
+            content = message.decode()
+        except RecordingError as error:
+            # Without a header there is no other stamp than that of the recording.
+            stamp_ns, load = message.log_time_ns, partial(_fail, str(error))
+        else:
+            decode = self._decoder(message.topic, is_depth=self._is_depth(stream))
+            stamp_ns, load = stamp_of(content.header), partial(decode, content)
+        if self._takes_log_time:
+            stamp_ns = message.log_time_ns
+        return StampedImage(
+            stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=message.log_time_ns
+        )
+
+    def _is_depth(self, stream: int) -> bool:
+        return stream == 1 and self._topics.sensor == "rgbd"
+
+    def _decoder(self, topic: Topic, *, is_depth: bool) -> Callable[[Any], NDArray[Any]]:
+        is_compressed = topic.type == COMPRESSED_TYPE
+        if is_depth:
+            decode = decode_compressed_depth if is_compressed else decode_depth
+            return partial(decode, scale=self._scale, where=topic.name)
+        if is_compressed:
+            return partial(decode_compressed, where=topic.name, grey_range=self._grey_range)
+        return partial(decode_grey_or_color, where=topic.name, grey_range=self._grey_range)
+
+
+def _fail(reason: str) -> NDArray[Any]:
+    raise RecordingError(reason)

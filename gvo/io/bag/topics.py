@@ -1,0 +1,312 @@
+"""Which topics of a bag hold the camera: by message type and name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from gvo.errors import RecordingError
+from gvo.io.recording import Sensor
+
+IMAGE_TYPE = "sensor_msgs/msg/Image"
+COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+
+_COMPRESSED_SUFFIXES = ("/compressed", "/compressedDepth")
+_SIDES = (
+    ("left", "right"),
+    ("image_0", "image_1"),
+    ("image_00", "image_01"),
+    ("image0", "image1"),
+    ("cam0", "cam1"),
+    ("cam_0", "cam_1"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("infra1", "infra2"),
+    ("fisheye1", "fisheye2"),
+)
+_COLOR = re.compile(r"rgb|colou?r")
+_DEPTH = re.compile(r"depth")
+_REGISTERED = re.compile(r"aligned|registered")
+# at the start of a word: not in "unrectified" or "direct"
+_RECTIFIED = re.compile(r"(?<![a-z])rect")
+_N_LISTED = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topic:
+    """A topic of a bag.
+
+    Parameters
+    ----------
+    name : str
+        As recorded.
+    type : str
+        In the form `package/msg/Name`.
+    n_messages : int
+        As the bag announces.
+    """
+
+    name: str
+    type: str
+    n_messages: int
+
+    @property
+    def base(self) -> str:
+        """The name without the suffix of a transport and outer slashes."""
+        name = self.name
+        for suffix in _COMPRESSED_SUFFIXES:
+            name = name.removesuffix(suffix)
+        return name.strip("/")
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the name says that the images are rectified."""
+        return _RECTIFIED.search(self.base.lower()) is not None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicChoice:
+    """Topics that the user chose; None where the names decide."""
+
+    left: str | None = None
+    right: str | None = None
+    color: str | None = None
+    depth: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraTopics:
+    """The two image topics of a camera: left and right, or colour and depth."""
+
+    sensor: Sensor
+    first: Topic
+    second: Topic
+
+    def describe(self) -> str:
+        """Return one line for the list of decisions."""
+        return (
+            f"{self.sensor}: {self.first.name} + {self.second.name} "
+            f"({self.first.n_messages} + {self.second.n_messages} messages)"
+        )
+
+    @property
+    def flags(self) -> str:
+        """What to type to choose them."""
+        names = ("left", "right") if self.sensor == "stereo" else ("color", "depth")
+        return f"--{names[0]} {self.first.name} --{names[1]} {self.second.name}"
+
+
+_Names: TypeAlias = tuple[str | None, str | None]
+_Score: TypeAlias = tuple[int, ...]
+
+
+def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> CameraTopics:
+    """Choose the image topics of one camera.
+
+    A stereo pair is two topics that differ in left and right, image_0 and image_1, or the like;
+    an RGB-D camera is one with rgb or colour in its name and one with depth. Of the topics of
+    one camera, rectified ones are taken before raw ones, and these before compressed ones.
+
+    Parameters
+    ----------
+    topics : sequence of Topic
+        All topics of the bag.
+    choice : TopicChoice
+        What the user chose; of one topic the partner is found.
+    where : str
+        The bag, for messages.
+
+    Raises
+    ------
+    RecordingError
+        When there is no camera, or more than one; with the candidates and what to type.
+    """
+    images = [topic for topic in topics if topic.type in (IMAGE_TYPE, COMPRESSED_TYPE)]
+    if not images:
+        held = describe_topics(topics) or "no messages"
+        raise RecordingError(f"{where}: holds no image topics; it holds {held}")
+    sensor, names = _wanted(choice, where)
+    chosen = [None if name is None else _find(name, images, where) for name in names]
+    first, second = chosen
+    if sensor is not None and first is not None and second is not None:
+        return CameraTopics(sensor=sensor, first=first, second=second)
+    candidates = [
+        *_best(_fitting(_stereo_pairs(images), chosen) if sensor in (None, "stereo") else []),
+        *_best(_fitting(_rgbd_pairs(images), chosen) if sensor in (None, "rgbd") else []),
+    ]
+    if len(candidates) == 1:
+        return candidates[0]
+    for name, topic in zip(("right", "left", "depth", "color"), [*chosen, *chosen], strict=True):
+        # Of each sensor the two flags, the other's of the one that was given.
+        is_of = sensor == ("stereo" if name in ("left", "right") else "rgbd")
+        if topic is not None and not candidates and is_of:
+            raise RecordingError(
+                f"{where}: no partner of {topic.name} is known by its name; give --{name} TOPIC, "
+                f"one of {describe_topics(images)}"
+            )
+    raise RecordingError(_explain(where, images, candidates))
+
+
+def find_camera_info(image: Topic, topics: Iterable[Topic]) -> str | None:
+    """Return the name of the `CameraInfo` topic of an image topic.
+
+    It is `camera_info` beside the image topic, below it, or beside or below its namespace.
+
+    Parameters
+    ----------
+    image : Topic
+        Of images.
+    topics : iterable of Topic
+        All that the bag holds.
+
+    Returns
+    -------
+    str or None
+        None where the bag holds none, or only one without messages.
+    """
+    names = {
+        topic.name.strip("/"): topic.name
+        for topic in topics
+        if topic.type == CAMERA_INFO_TYPE and topic.n_messages > 0
+    }
+    for base in camera_info_names(image):
+        if base in names:
+            return names[base]
+    return None
+
+
+def camera_info_names(image: Topic) -> list[str]:
+    """Return where `CameraInfo` is looked for.
+
+    Parameters
+    ----------
+    image : Topic
+        Of images.
+
+    Returns
+    -------
+    list of str
+        Names without the leading slash, best first.
+    """
+    parent = image.base.rpartition("/")[0]
+    grandparent = parent.rpartition("/")[0]
+    places = [parent, image.base, grandparent, f"{grandparent}/info"]
+    return [f"{place}/camera_info".strip("/") for place in places]
+
+
+def _wanted(choice: TopicChoice, where: str) -> tuple[Sensor | None, _Names]:
+    stereo, rgbd = (choice.left, choice.right), (choice.color, choice.depth)
+    if any(stereo) and any(rgbd):
+        raise RecordingError(
+            f"{where}: give --left and --right, or --color and --depth, not some of both"
+        )
+    if any(stereo):
+        return "stereo", stereo
+    return ("rgbd", rgbd) if any(rgbd) else (None, (None, None))
+
+
+def _find(name: str, images: Sequence[Topic], where: str) -> Topic:
+    topic = find_topic(name, images)
+    if topic is None:
+        held = describe_topics(images)
+        raise RecordingError(f"{where}: has no image topic {name}; it has {held}")
+    return topic
+
+
+def _fitting(
+    pairs: Iterable[CameraTopics], chosen: Sequence[Topic | None]
+) -> Iterator[CameraTopics]:
+    for pair in pairs:
+        if chosen[0] in (None, pair.first) and chosen[1] in (None, pair.second):
+            yield pair
+
+
+def _stereo_pairs(images: Sequence[Topic]) -> Iterator[CameraTopics]:
+    by_name = {topic.name.lower(): topic for topic in images if topic.n_messages > 0}
+    for name, left in by_name.items():
+        partners = {other for side in _SIDES for other in _other_side(name, *side)}
+        for other in sorted(partners & by_name.keys()):
+            if by_name[other].type == left.type:
+                yield CameraTopics(sensor="stereo", first=left, second=by_name[other])
+
+
+def _other_side(name: str, side: str, other: str) -> Iterator[str]:
+    """Yield the name with one, or all, of the occurrences of a side replaced."""
+    if side in name:
+        yield name.replace(side, other)
+    for match in re.finditer(side, name):
+        yield name[: match.start()] + other + name[match.end() :]
+
+
+def _rgbd_pairs(images: Sequence[Topic]) -> Iterator[CameraTopics]:
+    usable = [topic for topic in images if topic.n_messages > 0]
+    depths = [topic for topic in usable if _DEPTH.search(topic.base.lower())]
+    for color in usable:
+        name = color.base.lower()
+        if color in depths or not _COLOR.search(name) or color.name.endswith("compressedDepth"):
+            continue
+        for depth in depths:
+            yield CameraTopics(sensor="rgbd", first=color, second=depth)
+
+
+def _best(pairs: Iterable[CameraTopics]) -> list[CameraTopics]:
+    """Return the best pair of topics of each camera."""
+    best: dict[str, CameraTopics] = {}
+    for pair in pairs:
+        camera = _camera_name(pair)
+        if camera not in best or _score(pair) > _score(best[camera]):
+            best[camera] = pair
+    return list(best.values())
+
+
+def _camera_name(pair: CameraTopics) -> str:
+    if pair.sensor == "stereo":
+        return pair.first.base.rpartition("/")[0]
+    parts = pair.first.base.lower().split("/")
+    index = next(i for i, part in enumerate(parts) if _COLOR.search(part))
+    return "/".join(parts[:index])
+
+
+def _score(pair: CameraTopics) -> _Score:
+    is_color = bool(_COLOR.search(pair.first.base.lower()))
+    score = (
+        pair.first.is_rectified + pair.second.is_rectified,
+        (pair.first.type == IMAGE_TYPE) + (pair.second.type == IMAGE_TYPE),
+        -is_color,
+    )
+    if pair.sensor == "stereo":
+        return score
+    is_registered = bool(_REGISTERED.search(pair.second.base.lower()))
+    is_consistent = pair.first.is_rectified == pair.second.is_rectified
+    return _n_common_parts(pair), is_registered, is_consistent, *score
+
+
+def _n_common_parts(pair: CameraTopics) -> int:
+    parts = zip(pair.first.base.split("/"), pair.second.base.split("/"), strict=False)
+    return next((n for n, (a, b) in enumerate(parts) if a != b), 0)
+
+
+def _explain(where: str, images: Sequence[Topic], candidates: Sequence[CameraTopics]) -> str:
+    if candidates:
+        choices = " or ".join(candidate.flags for candidate in candidates)
+        return f"{where}: holds more than one camera; choose {choices}"
+    return (
+        f"{where}: no stereo pair and no RGB-D camera among the image topics "
+        f"{describe_topics(images)}; choose --left TOPIC --right TOPIC or --color TOPIC --depth "
+        "TOPIC"
+    )
+
+
+def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
+    """Return the topic of a name, with or without the leading slash; None where there is none."""
+    return next((topic for topic in topics if topic.name.strip("/") == name.strip("/")), None)
+
+
+def describe_topics(topics: Sequence[Topic]) -> str:
+    """Return the first topics with types and numbers of messages in one line; empty for none."""
+    items = [f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics[:_N_LISTED]]
+    n_more = len(topics) - len(items)
+    return ", ".join(items) + (f" and {n_more} more" if n_more else "")

@@ -1,0 +1,1 @@
+"""Calibrations out of CameraInfo messages and calibration files."""

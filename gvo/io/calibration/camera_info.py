@@ -1,0 +1,331 @@
+"""Calibrations from CameraInfo fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gvo.bounded_text import MAX_SHOWN, cut, shortened
+from gvo.errors import CalibrationError
+from gvo.geometry.camera import Calibration
+from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
+from gvo.io.images import MAX_PIXELS
+from gvo.types import FloatArray
+
+_LARGEST_NUMBER = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionOfInterest:
+    """The part of the full image that was recorded; of width 0, all of it.
+
+    Parameters
+    ----------
+    x_offset, y_offset : int
+        Its first pixel, in pixels of the full image before binning.
+    width, height : int
+        Its size, in pixels of the full image before binning.
+    """
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraFields:
+    """What a `CameraInfo` says, as it stands there.
+
+    Parameters
+    ----------
+    where : str
+        File or topic, for messages.
+    width, height : int
+        Size of the full image, pixels.
+    model : str
+        Distortion model.
+    K, D, R, P : array_like of float
+        9, 0 to 14, 9 and 12 numbers; R and P of zeros mean "not set". K and P are of the full
+        image.
+    binning : tuple of two ints
+        How many columns and rows became one after the region was cut out; 0 means 1.
+    roi : RegionOfInterest
+        What was cut out.
+    frame_id : str
+        Of the camera in `/tf`, without a leading slash; empty where not known.
+    is_distorted_by_zeros : bool
+        D of zeros is meant: for `equidistant` no pinhole. Otherwise it says "no distortion".
+    """
+
+    where: str
+    width: int
+    height: int
+    model: str
+    K: ArrayLike
+    D: ArrayLike
+    R: ArrayLike
+    P: ArrayLike
+    binning: tuple[int, int] = (1, 1)
+    roi: RegionOfInterest = RegionOfInterest()
+    frame_id: str = ""
+    is_distorted_by_zeros: bool = False
+
+    @property
+    def binning_factors(self) -> tuple[int, int]:
+        """Columns and rows of the full image that became one."""
+        return max(self.binning[0], 1), max(self.binning[1], 1)
+
+    def recorded_size(self) -> tuple[int, int]:
+        """Return width and height of the image as recorded, after region and binning.
+
+        Raises
+        ------
+        CalibrationError
+            When the region lies outside the full image.
+        """
+        roi = self.roi
+        width = roi.width or self.width - roi.x_offset
+        height = roi.height or self.height - roi.y_offset
+        is_inside = roi.x_offset + width <= self.width and roi.y_offset + height <= self.height
+        if (self.width > 0 and self.height > 0 and not is_inside) or min(width, height) < 0:
+            raise CalibrationError(
+                f"{self.where}: the region of {width}x{height} px at ({roi.x_offset}, "
+                f"{roi.y_offset}) lies outside the full image of {self.width}x{self.height} px; "
+                "mend roi, or give --calibration FILE of the images as recorded"
+            )
+        binning_x, binning_y = self.binning_factors
+        return width // binning_x, height // binning_y
+
+
+def read_numbers(values: object, what: str) -> FloatArray:
+    """Return what a file or message holds as an array of one dimension.
+
+    Parameters
+    ----------
+    values : object
+        Numbers, nested or not; texts of numbers, as YAML reads `1e-5`.
+    what : str
+        File and key, for messages.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+
+    Raises
+    ------
+    CalibrationError
+        When they are none, not finite, or larger than any calibration holds.
+    """
+    try:
+        numbers = np.array(cast(ArrayLike, values), dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CalibrationError(f"{what} must hold numbers, got {shortened(values)}") from error
+    if not np.all(np.isfinite(numbers)):
+        raise CalibrationError(f"{what} holds a value that is not finite")
+    if np.any(np.abs(numbers) > _LARGEST_NUMBER):
+        raise CalibrationError(f"{what} holds {np.abs(numbers).max():g}, which no camera has")
+    return numbers
+
+
+MAX_SIDE_PX = 32767
+"""Largest width or height of an image, pixels: what OpenCV rectifies."""
+
+_ROTATION_TOLERANCE = 1e-3
+
+# As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
+_MODELS: dict[str, DistortionModel] = {
+    "plumb_bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "brown_conrady": "plumb_bob",
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant",
+}
+
+
+def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
+    """Check the fields of a `CameraInfo` and return the calibration of the recorded image.
+
+    Binning and region move K and P alike, by the raw region, as ROS's `PinholeCameraModel` does
+    it; `do_rectify` does not matter there either.
+
+    Parameters
+    ----------
+    fields : CameraFields
+        Raw numbers.
+    is_rectified : bool
+        The images are rectified already: only P counts.
+
+    Raises
+    ------
+    CalibrationError
+        When the camera is not calibrated, its distortion model is not known, a matrix is
+        malformed, or the region lies outside the image.
+    """
+    where = fields.where
+    K = _matrix(fields.K, (3, 3), f"{where}: K")
+    P = _matrix(fields.P, (3, 4), f"{where}: P")
+    R = _matrix(fields.R, (3, 3), f"{where}: R")
+    if not np.any(K):
+        K = P[:, :3].copy()
+    if not np.any(K):
+        raise CalibrationError(
+            f"{where}: the camera is not calibrated: K and P are zero; give --calibration FILE"
+        )
+    if not np.any(P):
+        P = np.hstack([K, np.zeros((3, 1))])
+    if not np.any(R):
+        R = np.eye(3)
+    _check_matrices(K, R, P, where)
+    model, D = _distortion(fields, is_rectified=is_rectified)
+    width, height = fields.recorded_size()
+    recorded = _from_full_image(fields)
+    calibration = Calibration(
+        width=width,
+        height=height,
+        K=K if recorded is None else recorded @ K,
+        D=D,
+        R=R,
+        P=P if recorded is None else recorded @ P,
+        is_rectified=is_rectified,
+        model=model,
+    )
+    check_camera(calibration, where)
+    return calibration
+
+
+def _from_full_image(fields: CameraFields) -> FloatArray | None:
+    """Return what maps pixels of the full image to the recorded one; None where it is whole."""
+    binning, roi = fields.binning_factors, fields.roi
+    if binning == (1, 1) and (roi.x_offset, roi.y_offset) == (0, 0):
+        return None
+    scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
+    shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
+    return np.asarray(scale @ shift)
+
+
+def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
+    """Check the fields of an RGB-D camera's `CameraInfo` and return the calibration.
+
+    Depth is measured along the axis of the raw camera: where rectification turns the camera,
+    the depth of a pixel would have to change with it.
+
+    Parameters
+    ----------
+    fields : CameraFields
+        Raw numbers of the colour camera.
+    is_rectified : bool
+        The images are rectified already: only P counts.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    CalibrationError
+        As `make_calibration`, and when R of raw images is not the identity.
+    """
+    calibration = make_calibration(fields, is_rectified=is_rectified)
+    if not is_rectified and not np.allclose(calibration.R, np.eye(3), atol=_ROTATION_TOLERANCE):
+        raise CalibrationError(
+            f"{fields.where}: R turns the camera, and depth cannot be turned with it: expected the "
+            "identity for an RGB-D camera; give rectified images or a calibration without R"
+        )
+    return calibration
+
+
+def is_rotation(matrix: FloatArray) -> bool:
+    """Tell whether a matrix of a file, shape (3, 3), is a rotation up to the file's rounding."""
+    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(3), atol=_ROTATION_TOLERANCE)
+    return bool(is_orthogonal and np.linalg.det(matrix) > 0)
+
+
+def check_camera(calibration: Calibration, where: str) -> None:
+    """Refuse a calibration whose rectified camera is none, naming where it comes from.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of one camera.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    CalibrationError
+        When a focal length or the image size is not positive, or the image is larger than
+        `MAX_SIDE_PX` a side, or `MAX_PIXELS`.
+    """
+    width, height = calibration.width, calibration.height
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
+        raise CalibrationError(
+            f"{where}: the image size must be at most {MAX_SIDE_PX} px a side and "
+            f"{MAX_PIXELS // 10**6} megapixels, got {width}x{height}; mend the calibration"
+        )
+    try:
+        calibration.pinhole()
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
+
+
+def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
+    numbers = read_numbers(values, what)
+    if numbers.size != shape[0] * shape[1]:
+        raise CalibrationError(
+            f"{what} must hold {shape[0] * shape[1]} numbers, got {numbers.size}"
+        )
+    return numbers.reshape(shape)
+
+
+def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> None:
+    if not is_rotation(R):
+        raise CalibrationError(f"{where}: R is no rotation")
+    for name, matrix in (("K", K), ("P", P)):
+        if not np.allclose(matrix[2, :3], [0.0, 0.0, 1.0], atol=1e-6):
+            raise CalibrationError(
+                f"{where}: the third row of {name} must begin with 0 0 1, got "
+                f"{' '.join(f'{value:g}' for value in matrix[2, :3])}"
+            )
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise CalibrationError(
+            f"{where}: focal lengths must be positive, got K with fx={K[0, 0]:g} fy={K[1, 1]:g}"
+        )
+
+
+def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[DistortionModel, FloatArray]:
+    D = read_numbers(fields.D, f"{fields.where}: D")
+    model = _MODELS.get("_".join(fields.model.lower().replace("-", " ").split()))
+    is_meant = fields.is_distorted_by_zeros and model == "equidistant"
+    if is_rectified or not (np.any(D) or is_meant):
+        return "plumb_bob", np.zeros(5)
+    if model is None:
+        raise CalibrationError(
+            f"{fields.where}: distortion model {shortened(fields.model)} is not supported, "
+            "expected plumb_bob, rational_polynomial or equidistant; rectify the images first"
+        )
+    if model == "plumb_bob" and D.size > 5:
+        model = "rational_polynomial"  # OpenCV goes by the count alone, and ROS with it
+    counts = {4, 5, *N_COEFFICIENTS[model]} if model != "equidistant" else {4}
+    if model == "equidistant" and not np.any(D[4:]):
+        D = D[:4]
+    if D.size not in counts:
+        raise CalibrationError(
+            f"{fields.where}: D of {cut(' '.join(fields.model.split()), MAX_SHOWN)} must "
+            f"hold "
+            f"{_alternatives(counts)} numbers, got {D.size}"
+        )
+    n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)
+    return model, np.concatenate([D, np.zeros(n_missing)])
+
+
+def _alternatives(counts: set[int]) -> str:
+    *most, last = (str(count) for count in sorted(counts))
+    return f"{', '.join(most)} or {last}" if most else last

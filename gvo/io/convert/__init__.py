@@ -1,0 +1,1 @@
+"""Recordings written as bags or as data-set folders."""

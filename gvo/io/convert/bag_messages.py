@@ -1,0 +1,386 @@
+"""Messages of images, calibrations, poses."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import RecordingError
+from gvo.geometry.camera import Calibration
+from gvo.io.bag.reader import TF_TYPE, typestore
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
+from gvo.io.images import MILLIMETRES, encode_jpeg, encode_png, encode_tiff, exact_counts
+from gvo.io.poses.ground_truth import TRUTH_FRAMES
+from gvo.types import DepthArray, FloatArray, ImageArray
+
+# Version 8 is read by more releases of ROS 2 than 9, and holds the same.
+_ROS2_VERSION: Final = 8
+_MAX_SECONDS_ROS1 = 2**32 - 1
+_MAX_SECONDS_ROS2 = 2**31 - 1
+# What tf2's static broadcaster offers: who comes late is given the last message all the same.
+_LATCHED_QOS: Final = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=QosTime(0, 0),
+    lifespan=QosTime(0, 0),
+    liveliness=QosLiveliness.SYSTEM_DEFAULT,
+    liveliness_lease_duration=QosTime(0, 0),
+    avoid_ros_namespace_conventions=False,
+)
+
+
+class Header(NamedTuple):
+    """Stamp in nanoseconds and frame of a message."""
+
+    stamp_ns: int
+    frame_id: str
+
+
+class FramePose(NamedTuple):
+    """A pose of a child frame in its parent: stamp in nanoseconds, T_parent_child (4, 4)."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    T_parent_child: FloatArray
+
+
+class BagWriter:
+    """A new bag, open inside a `with` block.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag`: ROS 1. `.mcap` or `.db3`: a file of ROS 2, made inside a folder of the same
+        name without the suffix. No suffix: a ROS 2 bag folder.
+    keeps_order : bool
+        Every reader is to give the messages in the order in which they were written: one whose
+        stamp goes back, or repeats within its topic, is logged a nanosecond after the last.
+
+    Attributes
+    ----------
+    result : Path
+        The finished file or folder.
+    """
+
+    def __init__(self, path: Path, *, keeps_order: bool = False) -> None:
+        self.is_ros1 = path.suffix == ".bag"
+        self.result = path
+        self._writer: Writer1 | Writer2
+        if self.is_ros1:
+            self._writer = Writer1(path)
+        else:
+            folder = path.with_suffix("")
+            is_mcap = path.suffix == ".mcap"
+            plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
+            self._writer = Writer2(folder, version=_ROS2_VERSION, storage_plugin=plugin)
+            if path.suffix:
+                self.result = folder / path.name
+        self._store = typestore(is_ros1=self.is_ros1)
+        self._connections: dict[str, Connection] = {}
+        self._log_time_ns = 0
+        self._keeps_order = keeps_order
+        self._newest_ns: dict[str, int] = {}  # log times by topic
+
+    def __enter__(self) -> BagWriter:
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self,
+        error_type: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(error_type, error, traceback)
+
+    def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
+        """Return a message.
+
+        Parameters
+        ----------
+        type_ : str
+            `package/msg/Name`.
+        **fields
+            All its fields, by name.
+        """
+        make_message: Callable[..., Any] = self._store.types[type_]
+        return make_message(**fields)
+
+    def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
+        """Return the message of a header.
+
+        Parameters
+        ----------
+        header : Header
+            Stamp in nanoseconds, and frame.
+
+        Raises
+        ------
+        RecordingError
+            When the stamp does not fit into the message.
+        """
+        sec, nanosec = divmod(header.stamp_ns, 10**9)
+        max_seconds = _MAX_SECONDS_ROS1 if self.is_ros1 else _MAX_SECONDS_ROS2
+        if not 0 <= sec <= max_seconds:
+            raise RecordingError(
+                f"{self.result.name}: the stamp {header.stamp_ns} ns cannot be written, expected "
+                f"0 to {max_seconds} s"
+            )
+        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        sequence = {"seq": 0} if self.is_ros1 else {}
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
+
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
+        """Write a message; its log time is the stamp, but never goes back, see `keeps_order`.
+
+        Parameters
+        ----------
+        topic, type_ : str
+            Name, and type as `package/msg/Name`.
+        message : object
+            Made by `make`.
+        stamp_ns : int
+            Not negative, nanoseconds.
+        is_latched : bool
+            Of the topic, told with its first message: the last message is kept for those who
+            subscribe later.
+        """
+        # Readers sort by log time: a frame whose stamp goes back must stay where it was. Those of
+        # one log time some readers sort by topic.
+        is_behind = stamp_ns < self._log_time_ns or stamp_ns == self._newest_ns.get(topic)
+        step_ns = 1 if self._keeps_order and is_behind else 0
+        self._log_time_ns = max(self._log_time_ns + step_ns, stamp_ns)
+        self._newest_ns[topic] = self._log_time_ns
+        if topic not in self._connections:
+            self._connections[topic] = self._connect(topic, type_, is_latched=is_latched)
+        serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
+        self._writer.write(self._connections[topic], self._log_time_ns, serialize(message, type_))
+
+    def _connect(self, topic: str, type_: str, *, is_latched: bool) -> Connection:
+        if isinstance(self._writer, Writer1):
+            return self._writer.add_connection(
+                topic, type_, typestore=self._store, latching=1 if is_latched else None
+            )
+        return self._writer.add_connection(
+            topic,
+            type_,
+            typestore=self._store,
+            offered_qos_profiles=[_LATCHED_QOS] if is_latched else [],
+        )
+
+
+def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
+    """Write an image.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    pixels : ndarray
+        uint8 (h, w): mono8; uint8 (h, w, 3): bgr8; float32 (h, w): 32FC1.
+    header : Header
+        Stamp and frame.
+    """
+    encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim]
+    if pixels.dtype == np.float32:
+        encoding = "32FC1"
+    height, width = pixels.shape[:2]
+    # Bags of both generations are little-endian, whatever the machine.
+    data = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
+    message = bag.make(
+        IMAGE_TYPE,
+        header=bag.header(header),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=data.nbytes // height,
+        data=data.view(np.uint8).ravel(),
+    )
+    bag.write(topic, IMAGE_TYPE, message, header.stamp_ns)
+
+
+def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
+    """Write a calibration as `CameraInfo`, all numbers without loss.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    calibration : Calibration
+        Of one camera.
+    header : Header
+        Stamp and frame.
+    """
+    matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
+    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    message = bag.make(
+        CAMERA_INFO_TYPE,
+        header=bag.header(header),
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model=calibration.model,
+        binning_x=0,
+        binning_y=0,
+        roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
+        **{name if bag.is_ros1 else name.lower(): M for name, M in matrices.items()},
+    )
+    bag.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
+
+
+def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
+    """Write a pose of the ground truth to `/tf`.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    stamp_ns : int
+        Nanoseconds.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Of the rectified camera, metres.
+    """
+    parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
+    write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])
+
+
+def write_transforms(
+    bag: BagWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
+) -> None:
+    """Write poses of frames as one `tf2_msgs/TFMessage`; of none: nothing.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        `/tf`, or `/tf_static` for what never moves, with `is_latched`.
+    poses : iterable of FramePose
+    is_latched : bool
+        As for `BagWriter.write`.
+    """
+    poses = tuple(poses)
+    if poses:
+        message = bag.make(TF_TYPE, transforms=[_transform(bag, pose) for pose in poses])
+        stamp_ns = max(pose.stamp_ns for pose in poses)
+        bag.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
+
+
+def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
+    """Return position and quaternion (x, y, z, qx, qy, qz, qw), shape (7,), of a pose (4, 4)."""
+    quaternion_xyzw = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat()
+    return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
+
+
+def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
+    x, y, z, *q = pose_numbers(pose.T_parent_child).tolist()
+    transform = bag.make(
+        "geometry_msgs/msg/Transform",
+        translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+    )
+    return bag.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=bag.header(Header(pose.stamp_ns, pose.parent)),
+        child_frame_id=pose.child,
+        transform=transform,
+    )
+
+
+# The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
+_DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
+
+
+def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
+    """Write an image as PNG, without loss.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to; ends in `/compressed`.
+    pixels : ndarray of uint8, shape (h, w) or (h, w, 3)
+        Grey, or colour in BGR order.
+    header : Header
+        Stamp and frame.
+    """
+    encoding = "mono8" if pixels.ndim == 2 else "bgr8"
+    kind = f"{encoding}; png compressed {'' if pixels.ndim == 2 else encoding}"
+    _write(bag, topic, kind, encode_png(pixels), header)
+
+
+def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header: Header) -> None:
+    """Write depth without loss: in whole millimetres as the transport `compressedDepth` does.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to; ends in `/compressedDepth`.
+    depth : ndarray of float32, shape (h, w)
+        Metres, NaN = unknown; as TIFF where it is not of whole millimetres, or beyond 65.5 m.
+    header : Header
+        Stamp and frame.
+    """
+    counts = exact_counts(depth, MILLIMETRES)
+    if counts is None:
+        _write(bag, topic, "32FC1; tiff compressed ", encode_tiff(depth), header)
+    else:
+        _write(bag, topic, "16UC1; compressedDepth", _DEPTH_HEADER + encode_png(counts), header)
+
+
+def write_picture(bag: BagWriter, topic: str, header: Header, image: ImageArray) -> None:
+    """Write a picture as JPEG.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to; by convention it ends in `/compressed`.
+    header : Header
+        Stamp and frame of the camera.
+    image : ndarray of uint8, shape (height, width, 3)
+        BGR.
+    """
+    _write(bag, topic, "jpeg", encode_jpeg(image), header)
+
+
+def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -> None:
+    message = bag.make(
+        COMPRESSED_TYPE,
+        header=bag.header(header),
+        format=kind,
+        data=np.frombuffer(data, dtype=np.uint8),
+    )
+    bag.write(topic, COMPRESSED_TYPE, message, header.stamp_ns)

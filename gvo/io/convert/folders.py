@@ -1,0 +1,405 @@
+"""The layouts of KITTI, EuRoC, TUM."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from gvo.config import SyncConfig
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.geometry.camera import Calibration
+from gvo.io.convert.common import LeftOut, choose_preparers, ideal_calibration, pose_on_body
+from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
+from gvo.io.frames import paired
+from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_png, is_in_counts, to_counts
+from gvo.io.recording import Source, StampedImage
+from gvo.trajectory.formats import write_euroc, write_kitti, write_tum
+from gvo.trajectory.trajectory import Trajectory, format_stamp
+from gvo.types import DepthArray, FaultyFrame, FloatArray
+
+
+class FolderStreams(ABC):
+    """Writes the two streams of a recording in one layout.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    left_out : LeftOut
+        Gets what cannot be written.
+    rectify : bool
+        Write raw images rectified and grey.
+    """
+
+    def __init__(self, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
+        self.info = source.info
+        self.left_out = left_out
+        self.is_rectifying = rectify and not self.info.calibrations[0].is_rectified
+        self._prepare = choose_preparers(self.info, is_rectifying=self.is_rectifying)
+
+    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        """Yield what the layout can hold: images with a stamp of their own."""
+        last_ns: list[int | None] = [None, None]
+        for image in images:
+            before_ns = last_ns[image.stream]
+            if before_ns is not None and image.stamp_ns <= before_ns:
+                self.leave_out(image, f"the stamp does not advance from {before_ns} ns")
+                continue
+            last_ns[image.stream] = image.stamp_ns
+            yield image
+
+    @abstractmethod
+    def add(self, image: StampedImage) -> bool:
+        """Write an image; False, with a note, where it cannot be read."""
+
+    @abstractmethod
+    def add_truth(self, truth: Trajectory) -> int:
+        """Write T_world_cam of the rectified camera, and return the number of poses."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what is known at the end."""
+
+    def load(self, image: StampedImage) -> NDArray[Any] | None:
+        """Return the pixels to write; None, with a note, where they cannot be read."""
+        prepare = self._prepare[image.stream]
+        try:
+            pixels = image.load()
+            return pixels if prepare is None else prepare(pixels)
+        except RecordingError as error:
+            self.leave_out(image, str(error))
+            return None
+
+    def leave_out(self, image: StampedImage, reason: str) -> None:
+        """Note an image that is not written."""
+        self.left_out.add_image(
+            f"{self.info.stream_names[image.stream]} image", image.stamp_ns, reason
+        )
+
+
+_EUROC_MODELS = {"plumb_bob": "radial-tangential"}
+
+
+def write_projections(
+    path: Path, names: tuple[str, str], calibrations: tuple[Calibration, ...]
+) -> None:
+    """Write the `calib.txt` of a KITTI folder.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    names : tuple of two str
+        `image_N` of left and right: the rows are `PN`.
+    calibrations : tuple of Calibration
+        Of left and right; their P is written.
+    """
+    lines = [
+        f"P{name[-1]}: {' '.join(repr(float(value)) for value in calibration.P.ravel())}\n"
+        for name, calibration in zip(names, calibrations, strict=True)
+    ]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def write_sensor_yaml(
+    path: Path, calibration: Calibration, *, T_body_sensor: FloatArray, is_rectified: bool
+) -> None:
+    """Write the `sensor.yaml` of one camera of an EuRoC folder.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    calibration : Calibration
+        Of the recording.
+    T_body_sensor : ndarray of float64, shape (4, 4)
+        Maps the camera, as its images are written, to the body, metres.
+    is_rectified : bool
+        The images that are written are rectified, whatever the recording's are.
+    """
+    written = ideal_calibration(calibration) if is_rectified else calibration
+    K = written.K
+    content: dict[str, Any] = {
+        "sensor_type": "camera",
+        "T_BS": {"cols": 4, "rows": 4, "data": _numbers(T_body_sensor)},
+        "resolution": [written.width, written.height],
+        "camera_model": "pinhole",
+        "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+        "distortion_model": _EUROC_MODELS.get(written.model, written.model),
+        "distortion_coefficients": _numbers(written.D),
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def write_camera_info_yaml(path: Path, calibration: Calibration, *, depth_scale: float) -> None:
+    """Write a calibration as ROS's camera_calibration does, with the scale of the depth.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    calibration : Calibration
+        Of the colour images that are written.
+    depth_scale : float
+        Counts per metre.
+    """
+    D = calibration.D
+    content = {
+        "image_width": calibration.width,
+        "image_height": calibration.height,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.K)},
+        "distortion_model": calibration.model,
+        "distortion_coefficients": {"rows": 1, "cols": len(D), "data": _numbers(D)},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.R)},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": _numbers(calibration.P)},
+        "depth_scale": depth_scale,
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _numbers(values: FloatArray) -> list[float]:
+    return [float(value) for value in np.ravel(values)]
+
+
+class KittiFolder(FolderStreams):
+    """Rectified pairs by number: `image_0` and `image_1`, in colour `image_2` and `image_3`.
+
+    Parameters
+    ----------
+    folder : Path
+        To be made.
+    source : Source
+        A stereo recording.
+    left_out : LeftOut
+        Gets what cannot be written.
+    sync : SyncConfig
+        Which images are a pair; its stamp is that of the left one.
+    """
+
+    def __init__(self, folder: Path, source: Source, left_out: LeftOut, sync: SyncConfig) -> None:
+        super().__init__(source, left_out, rectify=True)
+        self._folder = folder
+        self._sync = sync
+        self._stamps_ns: list[int] = []
+        self._folders: tuple[str, str] | None = None
+        folder.mkdir()
+
+    def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        """Yield the images of pairs, left before right."""
+        for pair in paired(images, self.info.sensor, self._sync):
+            if isinstance(pair, FaultyFrame):
+                self.left_out.add_image(
+                    f"{self.info.stream_names[0]} image", pair.stamp_ns, pair.reason
+                )
+            else:
+                yield from pair
+
+    def add(self, image: StampedImage) -> bool:
+        """Write an image; False, with a note, where it cannot be read: its number stays free."""
+        if image.stream == 0:
+            self._stamps_ns.append(image.stamp_ns)
+        pixels = self.load(image)
+        if pixels is None:
+            return False
+        if self._folders is None:
+            self._folders = ("image_2", "image_3") if pixels.ndim == 3 else ("image_0", "image_1")
+            for name in self._folders:
+                (self._folder / name).mkdir()
+        number = len(self._stamps_ns) - 1
+        path = self._folder / self._folders[image.stream] / f"{number:06d}.png"
+        path.write_bytes(encode_png(pixels))
+        return True
+
+    def add_truth(self, truth: Trajectory) -> int:
+        """Write a pose for each pair, where there is one for all of them."""
+        at_frames = truth.interpolate(np.array(self._stamps_ns, dtype=np.int64))
+        if len(at_frames) < len(self._stamps_ns):
+            self.left_out.add(
+                f"poses.txt: {len(at_frames)} of {len(self._stamps_ns)} pairs lie between true "
+                "poses, all are needed"
+            )
+            return 0
+        # The layout's poses are those of the camera that P is stated for: P = K [I | t_cam_cam0].
+        P = self.info.calibrations[0].P
+        t_cam_cam0 = np.linalg.solve(P[:, :3], P[:, 3])
+        T_cam_cam0 = se3.make_transform(np.eye(3), np.asarray(t_cam_cam0))
+        write_kitti(self._folder / "poses.txt", at_frames.transformed(T_cam_cam0))
+        return len(at_frames)
+
+    def close(self) -> None:
+        """Write stamps and calibration."""
+        lines = [f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns]
+        (self._folder / "times.txt").write_text("".join(lines), encoding="utf-8")
+        names = self._folders or ("image_0", "image_1")
+        write_projections(self._folder / "calib.txt", names, self.info.calibrations)
+
+
+class EurocFolder(FolderStreams):
+    """Pairs by stamp, raw or rectified, with the calibration of each camera.
+
+    Parameters
+    ----------
+    folder : Path
+        To be made.
+    source : Source
+        A stereo recording. Where it does not place its cameras on a body, the rectified left
+        camera is the body.
+    left_out : LeftOut
+        Gets what cannot be written.
+    rectify : bool
+        Write raw images rectified and grey.
+    """
+
+    def __init__(self, folder: Path, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
+        super().__init__(source, left_out, rectify=rectify)
+        self._root = folder / "mav0"
+        self._tables: tuple[list[str], list[str]] = ([], [])
+        T_body_cam = pose_on_body(source)
+        self._T_body_cam = np.eye(4) if T_body_cam is None else T_body_cam
+        for name in ("cam0", "cam1"):
+            (self._root / name / "data").mkdir(parents=True)
+
+    def add(self, image: StampedImage) -> bool:
+        """Write an image; False, with a note, where it cannot be read."""
+        pixels = self.load(image)
+        if pixels is None:
+            return False
+        name = f"{image.stamp_ns}.png"
+        (self._root / f"cam{image.stream}" / "data" / name).write_bytes(encode_png(pixels))
+        self._tables[image.stream].append(f"{image.stamp_ns},{name}\n")
+        return True
+
+    def add_truth(self, truth: Trajectory) -> int:
+        """Write the poses of the body."""
+        folder = self._root / "state_groundtruth_estimate0"
+        folder.mkdir()
+        write_euroc(folder / "data.csv", truth.transformed(se3.invert(self._T_body_cam)))
+        return len(truth)
+
+    def close(self) -> None:
+        """Write the tables of images and the calibrations."""
+        for stream, rows in enumerate(self._tables):
+            camera = self._root / f"cam{stream}"
+            text = "#timestamp [ns],filename\n" + "".join(rows)
+            (camera / "data.csv").write_text(text, encoding="utf-8")
+            calibration = self.info.calibrations[stream]
+            is_ideal = self.is_rectifying or calibration.is_rectified
+            R_rectified_raw = np.eye(3) if is_ideal else calibration.R
+            write_sensor_yaml(
+                camera / "sensor.yaml",
+                calibration,
+                T_body_sensor=self._T_body_rectified(stream)
+                @ se3.make_transform(R_rectified_raw, np.zeros(3)),
+                is_rectified=is_ideal,
+            )
+
+    def _T_body_rectified(self, stream: int) -> FloatArray:  # noqa: N802 - the field's name
+        """Return where the rectified left or right camera sits."""
+        left, right = self.info.calibrations
+        baseline = float(left.P[0, 3] - right.P[0, 3]) / float(left.P[0, 0])
+        t_left_camera = np.array([stream * baseline, 0.0, 0.0])
+        return np.asarray(self._T_body_cam @ se3.make_transform(np.eye(3), t_left_camera))
+
+
+_SCALES = (MILLIMETRES, DEFAULT_SCALE)
+# Half as far again as the first image shows must fit.
+_RESERVE = 1.5
+
+
+class TumFolder(FolderStreams):
+    """Colour and depth by stamp, with `calibration.yaml`.
+
+    Parameters
+    ----------
+    folder : Path
+        To be made.
+    source : Source
+        An RGB-D recording.
+    left_out : LeftOut
+        Gets what cannot be written.
+    rectify : bool
+        Write raw images rectified and grey, as it must be where depth is moved to colour.
+
+    Raises
+    ------
+    RecordingError
+        When the name of the folder stands for another camera.
+    """
+
+    def __init__(self, folder: Path, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
+        rectify = rectify or source.info.depth_view is not None
+        super().__init__(source, left_out, rectify=rectify)
+        self._folder = folder
+        self._tables: tuple[list[str], list[str]] = ([], [])
+        calibration = self.info.calibrations[0]
+        is_ideal = self.is_rectifying or calibration.is_rectified
+        self._calibration = ideal_calibration(calibration) if is_ideal else calibration
+        self._scale = self._scale_by_name()
+        self._n_cut = 0
+        for name in ("rgb", "depth"):
+            (folder / name).mkdir(parents=True)
+
+    def add(self, image: StampedImage) -> bool:
+        """Write an image; False, with a note, where it cannot be read."""
+        pixels = self.load(image)
+        if pixels is None:
+            return False
+        name = f"{('rgb', 'depth')[image.stream]}/{format_stamp(image.stamp_ns)}.png"
+        if image.stream == 1:
+            if self._scale is None:
+                self._scale = _choose_scale(pixels)
+            pixels, n_cut = to_counts(pixels, self._scale or DEFAULT_SCALE)
+            self._n_cut += n_cut
+        (self._folder / name).write_bytes(encode_png(pixels))
+        self._tables[image.stream].append(f"{format_stamp(image.stamp_ns)} {name}\n")
+        return True
+
+    def add_truth(self, truth: Trajectory) -> int:
+        """Write the poses as they are."""
+        write_tum(self._folder / "groundtruth.txt", truth)
+        return len(truth)
+
+    def close(self) -> None:
+        """Write the tables of images and the calibration."""
+        scale = self._scale or DEFAULT_SCALE
+        for name, rows in zip(("rgb", "depth"), self._tables, strict=True):
+            text = f"# {name} images\n# stamp filename\n" + "".join(rows)
+            (self._folder / f"{name}.txt").write_text(text, encoding="utf-8")
+        path = self._folder / "calibration.yaml"
+        write_camera_info_yaml(path, self._calibration, depth_scale=scale)
+        if self._n_cut:
+            self.left_out.add(
+                f"depth: {self._n_cut} pixels beyond {MAX_COUNT / scale:.1f} m became unknown"
+            )
+
+    def _scale_by_name(self) -> float | None:
+        """Return the scale that the folder's name stands for; None where it stands for none."""
+        published = published_calibration(self._folder.name)
+        if published is None:
+            return None
+        mine = self._calibration
+        if any(not np.array_equal(getattr(published, name), getattr(mine, name)) for name in "KDP"):
+            raise RecordingError(
+                f"{self._folder.name}: a TUM folder of this name is read with the published "
+                "calibration of freiburg1, 2 or 3, which is not that of the recording; give "
+                "another name"
+            )
+        return DEFAULT_SCALE
+
+
+def _choose_scale(depth: DepthArray) -> float | None:
+    """Return counts per metre: those that the depth was made of, where it shows them."""
+    if not np.any(np.isfinite(depth)):
+        return None
+    for scale in _SCALES:
+        if is_in_counts(depth, scale):
+            return scale
+    farthest = _RESERVE * float(np.nanmax(depth))
+    return DEFAULT_SCALE if DEFAULT_SCALE * farthest < MAX_COUNT else MILLIMETRES

@@ -1,0 +1,1 @@
+"""Data-set folders: KITTI odometry, EuRoC (ASL), TUM RGB-D."""

@@ -1,0 +1,191 @@
+"""Folders of the KITTI odometry benchmark: rectified stereo pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gvo.bounded_text import cut
+from gvo.errors import CalibrationError, RecordingError
+from gvo.geometry import se3
+from gvo.geometry.camera import Calibration
+from gvo.io.calibration.camera_info import check_camera
+from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
+from gvo.io.calibration.stereo_pair import stereo_baseline
+from gvo.io.datasets.files import FolderSource, StampedPath, first_image_size, read_rows, read_stamp
+from gvo.io.images import FULL_RANGE, GreyRange
+from gvo.io.recording import RecordingInfo
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FloatArray
+
+_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class KittiSource(FolderSource):
+    """A sequence folder: `calib.txt`, `times.txt`, `image_0` and `image_1`.
+
+    Where the grey cameras are missing, the colour cameras `image_2` and `image_3` are read. An
+    image's number is its row in `times.txt` and in `poses.txt`, so that missing images shift
+    nothing.
+
+    Parameters
+    ----------
+    folder : Path
+        Such a folder.
+    calibration : Path or sequence of Path, optional
+        Files of the pair that replace `calib.txt`, see `read_cameras`.
+    grey_range : GreyRange
+        Of images with 16 bits.
+
+    Raises
+    ------
+    RecordingError, CalibrationError
+        When files are missing or malformed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        calibration: CalibrationPaths = None,
+        grey_range: GreyRange = FULL_RANGE,
+    ) -> None:
+        self._folder = folder
+        rows = read_rows(folder / "times.txt", n_fields=1)
+        self._stamps_ns = [
+            read_stamp(fields[0], f"{folder / 'times.txt'}, line {number}", unit_ns=10**9)
+            for number, fields in rows
+        ]
+        names = _find_pair(folder)
+        left, right = (self._list_images(name) for name in names)
+        files = paths_of(calibration)
+        if files:
+            cameras = read_cameras(files, sensor="stereo", is_rectified=True)
+        else:
+            files = (folder / "calib.txt",)
+            paths = [path for _, path in left]
+            size = first_image_size(paths, folder / names[0], grey_range)
+            cameras = _read_cameras(files[0], names, size)
+        self._t_cam0_cam = _camera_offset(cameras.calibrations[0])
+        state = "rectified" if cameras.calibrations[0].is_rectified else "raw"
+        decisions = [
+            f"stereo: {names[0]} + {names[1]} ({len(left)} + {len(right)} images)",
+            f"calibration: {' + '.join(file.name for file in files)}, {state}",
+            f"baseline: {stereo_baseline(cameras.pair, cameras.origin):.4f} m",
+        ]
+        n_missing = len(self._stamps_ns) - len(left)
+        if n_missing:
+            decisions.append(f"missing: {n_missing} rows of times.txt have no image {names[0]}")
+        info = RecordingInfo(
+            name=folder.resolve().name,
+            sensor="stereo",
+            calibrations=cameras.calibrations,
+            n_images=len(left),
+            decisions=decisions,
+            T_body_cam=cameras.T_body_cam,
+        )
+        super().__init__(info, left, right, grey_range=grey_range)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of the left camera; the world is the first grey left camera.
+
+        Raises
+        ------
+        TrajectoryError
+            When the file is malformed.
+        RecordingError
+            When it does not have a row per row of `times.txt`.
+        """
+        official = self._folder.resolve().parents[1] / "poses" / f"{self._info.name}.txt"
+        for path in (self._folder / "poses.txt", official):
+            if path.is_file():
+                return self._read_truth(path)
+        return None
+
+    def _read_truth(self, path: Path) -> Trajectory:
+        T_world_cam0 = read_trajectory(path).T_world_cam
+        if len(T_world_cam0) != len(self._stamps_ns):
+            raise RecordingError(
+                f"{path}: expected {len(self._stamps_ns)} rows as in times.txt, got "
+                f"{len(T_world_cam0)}; cut both to the same rows"
+            )
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        T_cam0_cam = se3.make_transform(np.eye(3), self._t_cam0_cam)
+        is_later = np.concatenate([[True], stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1]])
+        return Trajectory(
+            stamps_ns=stamps_ns[is_later],
+            T_world_cam=(T_world_cam0 @ T_cam0_cam)[is_later],
+            stamps_from="times",
+        )
+
+    def _list_images(self, name: str) -> list[StampedPath]:
+        folder = self._folder / name
+        paths = sorted(path for path in folder.iterdir() if path.suffix in _IMAGE_SUFFIXES)
+        if not paths:
+            raise RecordingError(f"{folder}: holds no .png or .jpg images")
+        return [(self._stamp_of(path), path) for path in paths]
+
+    def _stamp_of(self, path: Path) -> int:
+        n_rows = len(self._stamps_ns)
+        if not path.stem.isascii() or not path.stem.isdigit() or int(path.stem) >= n_rows:
+            raise RecordingError(
+                f"{path}: expected an image number below {n_rows}, the rows of times.txt"
+            )
+        return self._stamps_ns[int(path.stem)]
+
+
+def _find_pair(folder: Path) -> tuple[str, str]:
+    for pair in _PAIRS:
+        if all((folder / name).is_dir() for name in pair):
+            return pair
+    raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
+
+
+def _read_cameras(path: Path, names: tuple[str, str], size: tuple[int, int]) -> CameraSet:
+    projections = _read_projections(path)
+    cameras = (_rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names)
+    return CameraSet(calibrations=tuple(cameras), origin=str(path))
+
+
+def _read_projections(path: Path) -> dict[str, FloatArray]:
+    projections = {}
+    for number, fields in read_rows(path, n_fields=1):
+        if not fields[0].startswith("P"):
+            continue
+        try:
+            projection = np.array([float(field) for field in fields[1:]])
+        except ValueError as error:
+            raise CalibrationError(f"{path}, line {number}: {cut(str(error), 300)}") from error
+        if projection.size != 12 or not np.all(np.isfinite(projection)):
+            raise CalibrationError(
+                f"{path}, line {number}: expected 12 finite numbers, got {projection.size}"
+            )
+        projections[fields[0].rstrip(":")] = projection.reshape(3, 4)
+    return projections
+
+
+def _rectified(
+    projections: dict[str, FloatArray], key: str, *, size: tuple[int, int], path: Path
+) -> Calibration:
+    if key not in projections:
+        raise CalibrationError(f"{path}: lacks {key}")
+    P = projections[key]
+    calibration = Calibration(
+        width=size[0],
+        height=size[1],
+        K=P[:, :3].copy(),
+        D=np.zeros(5),
+        R=np.eye(3),
+        P=P,
+        is_rectified=True,
+    )
+    check_camera(calibration, f"{path}: {key}")
+    return calibration
+
+
+def _camera_offset(calibration: Calibration) -> FloatArray:
+    """Return the centre of the camera in the frame of cam0: P = K [I | -centre]."""
+    return np.asarray(-np.linalg.solve(calibration.P[:, :3], calibration.P[:, 3]))

@@ -1,0 +1,218 @@
+"""Folders in the layout of the TUM RGB-D benchmark."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gvo.errors import CalibrationError, RecordingError
+from gvo.geometry.camera import Calibration
+from gvo.io.calibration.camera_info import CameraFields, make_calibration
+from gvo.io.calibration.files import (
+    CalibrationPaths,
+    CameraSet,
+    paths_of,
+    read_cameras,
+)
+from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamp
+from gvo.io.images import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
+from gvo.io.recording import RecordingInfo
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+
+DEFAULT_SCALE = 5000.0
+"""Counts per metre of the benchmark's depth images."""
+
+_PLAUSIBLE_MEDIAN_M = (0.5, 10.0)
+
+# fx, fy, cx, cy and distortion k1, k2, p1, p2, k3 of the benchmark's three colour cameras, as
+# published with it (J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems",
+# 2012, doi:10.1109/IROS.2012.6385773); the images of the third are undistorted.
+_CAMERAS = {
+    "1": (
+        (517.306408, 516.469215, 318.643040, 255.313989),
+        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    ),
+    "2": (
+        (520.908620, 521.007327, 325.141442, 249.701764),
+        (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    ),
+    "3": ((535.433105, 539.212524, 320.106653, 247.632132), (0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+_CAMERA_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?![a-z0-9])")
+
+
+class TumSource(FolderSource):
+    """A folder with `rgb.txt` and `depth.txt`.
+
+    The calibration is, first found: the file given, the published one of the camera that the
+    folder's name tells (freiburg1 or fr1, and so on), `calibration.yaml` in the folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Such a folder.
+    calibration : Path or sequence of Path, optional
+        File of the colour camera, see `read_cameras`.
+    depth_scale : float, optional
+        Counts per metre; otherwise that of the calibration file; otherwise 5000 as TUM has it,
+        or 1000 where the first depth image only makes sense in millimetres.
+    grey_range : GreyRange
+        Of images with 16 bits.
+
+    Raises
+    ------
+    RecordingError, CalibrationError
+        When files are missing or malformed, or no calibration is known.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        calibration: CalibrationPaths = None,
+        depth_scale: float | None = None,
+        grey_range: GreyRange = FULL_RANGE,
+    ) -> None:
+        self._folder = folder
+        color, depth = (_list_images(folder / name) for name in ("rgb.txt", "depth.txt"))
+        cameras = _find_calibration(folder, paths_of(calibration))
+        if depth_scale is not None:
+            scale, reason = depth_scale, "by depth.scale"
+        elif cameras.depth_scale is not None:
+            scale, reason = cameras.depth_scale, "by the calibration"
+        else:
+            scale, reason = _assume_scale([path for _, path in depth])
+        decisions = [
+            f"rgbd: rgb + depth ({len(color)} + {len(depth)} images)",
+            f"calibration: {cameras.origin}",
+            f"depth: {scale:g} counts per metre, {reason}",
+        ]
+        info = RecordingInfo(
+            name=folder.resolve().name,
+            sensor="rgbd",
+            calibrations=cameras.calibrations,
+            n_images=len(color),
+            decisions=decisions,
+            T_body_cam=cameras.T_body_cam,
+        )
+        load_second = partial(read_depth, scale=scale)
+        super().__init__(info, color, depth, load_second=load_second, grey_range=grey_range)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return T_world_cam of the colour camera.
+
+        Raises
+        ------
+        TrajectoryError
+            When the file is malformed.
+        """
+        path = self._folder / "groundtruth.txt"
+        return read_trajectory(path) if path.is_file() else None
+
+
+def published_calibration(name: str) -> Calibration | None:
+    """Return the published calibration of the camera that a folder's name tells.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder.
+
+    Returns
+    -------
+    Calibration or None
+        None where the name tells none of the three cameras.
+    """
+    named = _CAMERA_NAME.search(name.lower())
+    return None if named is None else _published_camera(*_CAMERAS[named[1]])
+
+
+def _list_images(table: Path) -> list[StampedPath]:
+    return [
+        (
+            read_stamp(fields[0], f"{table}, line {number}", unit_ns=10**9),
+            table.parent / fields[1],
+        )
+        for number, fields in read_rows(table, n_fields=2)
+    ]
+
+
+def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
+    beside = folder / "calibration.yaml"
+    named = _CAMERA_NAME.search(folder.resolve().name.lower())
+    if not explicit and named is not None:
+        origin = f"published for freiburg{named[1]}, by the name of the folder"
+        if beside.is_file():
+            origin += f"; {beside.name} there is not used, give it by --calibration to use it"
+        camera = _published_camera(*_CAMERAS[named[1]])
+        return CameraSet(calibrations=(camera,), origin=origin, depth_scale=DEFAULT_SCALE)
+    if not explicit and not beside.is_file():
+        raise CalibrationError(
+            f"{folder}: no calibration is known: the name holds none of freiburg1, freiburg2, "
+            "freiburg3; add calibration.yaml or give --calibration FILE"
+        )
+    paths = explicit or (beside,)
+    cameras = read_cameras(paths, sensor="rgbd", is_rectified=False)
+    return replace(cameras, origin=" + ".join(path.name for path in paths))
+
+
+def _published_camera(
+    intrinsics: tuple[float, float, float, float], distortion: Sequence[float]
+) -> Calibration:
+    fx, fy, cx, cy = intrinsics
+    fields = CameraFields(
+        where="published calibration",
+        width=640,
+        height=480,
+        model="plumb_bob",
+        K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        D=distortion,
+        R=np.zeros(9),
+        P=np.zeros(12),
+    )
+    return make_calibration(fields, is_rectified=False)
+
+
+def _assume_scale(paths: Sequence[Path]) -> tuple[float, str]:
+    """Choose between the two scales in use by the first depth image that can be read.
+
+    The scale of TUM's tools unless the scene would then be nearer than such a camera can see,
+    and millimetres put it where it can.
+    """
+    for path in paths:
+        median = _median_depth(path)
+        if median is None:
+            continue
+        if _is_plausible(median):
+            break
+        if _is_plausible(median * DEFAULT_SCALE / MILLIMETRES):
+            reason = (
+                f"because the median of {path.name} would be {median:.2f} m at TUM's "
+                f"{DEFAULT_SCALE:g} (--set depth.scale={DEFAULT_SCALE:g} if that is right)"
+            )
+            return MILLIMETRES, reason
+        reason = (
+            f"the default of TUM folders, at which the median of {path.name} is an implausible "
+            f"{median:.2f} m (--set depth.scale=... changes it)"
+        )
+        return DEFAULT_SCALE, reason
+    return DEFAULT_SCALE, "the default of TUM folders"
+
+
+def _median_depth(path: Path) -> float | None:
+    """Return the median of the known depth at the default scale; None where there is none."""
+    try:
+        depth = read_depth(path, DEFAULT_SCALE)
+    except RecordingError:
+        return None  # it becomes a faulty frame later
+    return float(np.nanmedian(depth)) if np.any(np.isfinite(depth)) else None
+
+
+def _is_plausible(median_m: float) -> bool:
+    return _PLAUSIBLE_MEDIAN_M[0] <= median_m <= _PLAUSIBLE_MEDIAN_M[1]

@@ -1,0 +1,1 @@
+"""What other front-ends give: pose graphs, pose streams, lines."""

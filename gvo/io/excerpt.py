@@ -1,0 +1,174 @@
+"""A part of a recording: from when, for how long, every how many frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from gvo.errors import ConfigurationError, RecordingError
+from gvo.io.sync import Pair
+from gvo.types import FaultyFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Excerpt:
+    """Which frames of a recording are wanted; all of them by default.
+
+    Stamps are those of the headers, relative to the first image of stream 0. When the messages
+    were recorded, and by which clock, plays no role.
+
+    Parameters
+    ----------
+    start_s : float
+        Leave out what comes before, seconds.
+    duration_s : float, optional
+        Leave out what comes so long after the start or later, seconds; so excerpts that follow
+        one another share no frame. None: to the end.
+    every : int
+        Keep the first and then each n-th of the frames. Frames are counted, that is pairs, not
+        images of one stream.
+
+    Raises
+    ------
+    ValueError
+        Where a number is out of its range.
+
+    Examples
+    --------
+    >>> Excerpt(start_s=10.0, duration_s=5.0, every=2).n_expected(3000, length_s=100.0)
+    75
+    """
+
+    start_s: float = 0.0
+    duration_s: float | None = None
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not (math.isfinite(self.start_s) and self.start_s >= 0):
+            raise ValueError(f"start_s must be 0 or more, got {self.start_s}")
+        if self.duration_s is not None and not (
+            math.isfinite(self.duration_s) and self.duration_s > 0
+        ):
+            raise ValueError(f"duration_s must be more than 0, got {self.duration_s}")
+        if self.every < 1:
+            raise ValueError(f"every must be 1 or more, got {self.every}")
+
+    @property
+    def is_everything(self) -> bool:
+        """Tell that nothing is left out."""
+        return self == Excerpt()
+
+    def n_expected(self, n_images: int, length_s: float | None = None) -> int:
+        """Estimate how many images of stream 0 are kept, with and without partners.
+
+        Parameters
+        ----------
+        n_images : int
+            Images of stream 0 in the whole recording.
+        length_s : float, optional
+            Of the recording, seconds. Where it is unknown, start and duration are not accounted
+            for.
+        """
+        share = 1.0
+        if length_s is not None and length_s > 0:
+            rest_s = max(length_s - self.start_s, 0.0)
+            kept_s = rest_s if self.duration_s is None else min(rest_s, self.duration_s)
+            share = kept_s / length_s
+        return math.ceil(n_images * share / self.every)
+
+
+def make_excerpt(start_s: float, duration_s: float | None, every: int) -> Excerpt:
+    """Return the excerpt that a user asked for.
+
+    Parameters
+    ----------
+    start_s, duration_s, every
+        As of `Excerpt`.
+
+    Raises
+    ------
+    ConfigurationError
+        Where a number is out of its range.
+    """
+    try:
+        return Excerpt(start_s=start_s, duration_s=duration_s, every=every)
+    except ValueError as error:
+        raise ConfigurationError(f"--start, --duration, --every: {error}") from error
+
+
+def take_excerpt(
+    items: Iterable[Pair | FaultyFrame], excerpt: Excerpt
+) -> Iterator[Pair | FaultyFrame]:
+    """Take a part of what `pair_images` gives.
+
+    The pairs are those of the whole recording; none of them is decoded here.
+
+    Parameters
+    ----------
+    items : iterable of pair of StampedImage, or FaultyFrame
+        What `pair_images` gives.
+    excerpt : Excerpt
+
+    Yields
+    ------
+    pair of StampedImage, or FaultyFrame
+        Unchanged. A faulty frame takes no place in the count of `every`: it is given where the
+        pair after it is due, and is left out with the pairs that are left out.
+
+    Raises
+    ------
+    RecordingError
+        Where the excerpt holds none of the items.
+
+    Notes
+    -----
+    It stops reading at the first pair after the end: then both streams are past it. An image
+    without partner ends nothing; its stamp may be a mistake, or the other stream may be late.
+    """
+    if excerpt.is_everything:
+        yield from items
+        return
+    stamps: list[int] = []  # of the first and the latest item
+    n_given = n_to_skip = 0
+    for item in items:
+        is_pair = not isinstance(item, FaultyFrame)
+        stamp_ns = item.stamp_ns if isinstance(item, FaultyFrame) else item[0].stamp_ns
+        stamps = [stamps[0], max(stamps[1], stamp_ns)] if stamps else [stamp_ns, stamp_ns]
+        place = _place(stamp_ns - stamps[0], excerpt)
+        if place == "after" and is_pair:
+            break
+        if place != "within":
+            continue
+        if n_to_skip:
+            n_to_skip -= is_pair
+            continue
+        n_given += 1
+        n_to_skip = excerpt.every - 1 if is_pair else 0
+        yield item
+    if stamps and not n_given:
+        raise RecordingError(_empty_text(excerpt, (stamps[1] - stamps[0]) / 1e9))
+
+
+def _place(since_first_ns: int, excerpt: Excerpt) -> Literal["before", "within", "after"]:
+    start_ns = round(excerpt.start_s * 1e9)
+    if excerpt.start_s > 0 and since_first_ns < start_ns:
+        return "before"
+    if excerpt.duration_s is None or since_first_ns < start_ns + round(excerpt.duration_s * 1e9):
+        return "within"
+    return "after"
+
+
+def _empty_text(excerpt: Excerpt, read_s: float) -> str:
+    if excerpt.duration_s is None or read_s < excerpt.start_s:
+        return (
+            f"no frame at {excerpt.start_s:g} s or later: the recording is {read_s:g} s long; "
+            "start earlier"
+        )
+    return (
+        f"no frame between {excerpt.start_s:g} and {excerpt.start_s + excerpt.duration_s:g} s: "
+        f"the recording has a gap there and goes on to {read_s:g} s or longer; start elsewhere "
+        "or take more"
+    )

@@ -1,0 +1,427 @@
+"""From a recording to frames: decode, check, rectify; repeated images refused."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.config import Config, SyncConfig
+from gvo.errors import GvoError, RecordingError
+from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.io.depth_registration import DepthRegistration
+from gvo.io.excerpt import Excerpt, take_excerpt
+from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
+from gvo.io.sync import Pair, StrayStamps, pair_images
+from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
+
+_ROW_STEP = 64
+
+
+def refuse_repeats(
+    items: Iterable[Frame | FaultyFrame], names: tuple[str, str]
+) -> Iterator[Frame | FaultyFrame]:
+    """Make frames faulty whose image is, pixel by pixel, that of the frame before.
+
+    No sensor gives the same noise twice: such an image is old. Taken for a new one, it says for
+    sure that the camera stood still. Two in a row make a camera that hangs; a single one, which
+    many drivers give now and then, is let through. Depth images are not compared: some sensors
+    give depth at a lower rate than colour. Nor are images of one value, in which nothing is seen
+    anyway.
+
+    Parameters
+    ----------
+    items : iterable of StereoFrame, RgbdFrame or FaultyFrame
+    names : tuple of two str
+        Of the streams.
+
+    Yields
+    ------
+    StereoFrame, RgbdFrame or FaultyFrame
+        All of them, in their order.
+
+    Raises
+    ------
+    GvoError
+        What reading the items raises, after those read before.
+    """
+    last: Frame | None = None
+    waiting: list[Frame | FaultyFrame] = []  # from the first repeat on
+    is_hanging = False
+    try:
+        for item in items:
+            if isinstance(item, FaultyFrame):
+                waiting.append(item)
+                if not _holds_frame(waiting):
+                    yield waiting.pop()
+                continue
+            repeated = _repeated(last, item, names)
+            waiting.append(item)
+            if repeated and not is_hanging and not _holds_frame(waiting[:-1]):
+                continue
+            is_hanging = bool(repeated)
+            for frame in waiting:
+                yield _refused(frame, repeated) if repeated else frame
+            waiting.clear()
+            last = last if repeated else item
+    except GvoError:
+        yield from waiting
+        raise
+    yield from waiting
+
+
+def _holds_frame(items: Iterable[Frame | FaultyFrame]) -> bool:
+    return any(not isinstance(item, FaultyFrame) for item in items)
+
+
+def _refused(item: Frame | FaultyFrame, name: str) -> FaultyFrame:
+    if isinstance(item, FaultyFrame):
+        return item
+    reason = (
+        f"the {name} image is that of the frame before, pixel by pixel: the camera hangs (one "
+        "without noise that stands still: --set sync.repeated_images=keep)"
+    )
+    return FaultyFrame(stamp_ns=item.stamp_ns, reason=reason)
+
+
+def _repeated(last: Frame | None, frame: Frame, names: tuple[str, str]) -> str:
+    """Name the first stream that shows the same as before; empty where none does."""
+    if last is None:
+        return ""
+    for name, before, now in zip(names, _images(last), _images(frame), strict=False):
+        if _is_same(before, now):
+            return name
+    return ""
+
+
+def _images(frame: Frame) -> tuple[ImageArray, ...]:
+    return (frame.left, frame.right) if isinstance(frame, StereoFrame) else (frame.image,)
+
+
+def _is_same(first: ImageArray, second: ImageArray) -> bool:
+    # a few rows mostly tell
+    if not np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP]):
+        return False
+    return np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
+
+
+# Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
+_N_AHEAD = 2
+# What reading or decoding one image may raise besides, in a source of one's own as well.
+_LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
+
+
+def frames(
+    source: Source,
+    config: Config,
+    excerpt: Excerpt | None = None,
+    *,
+    choose: Callable[[Iterator[Pair | FaultyFrame]], Iterator[Pair | FaultyFrame]] | None = None,
+) -> Iterator[Frame | FaultyFrame]:
+    """Read a recording as frames.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    config : Config
+        `sync` decides which images make one frame; with `runtime.threads` above one the images
+        of a frame are decoded side by side, two frames ahead. The result does not depend on the
+        number of threads.
+    excerpt : Excerpt, optional
+        The part that is wanted; the whole where omitted.
+    choose : callable, optional
+        Is given the pairs of that part, not decoded yet, and returns those that are wanted.
+
+    Yields
+    ------
+    StereoFrame, RgbdFrame or FaultyFrame
+        One for each image of stream 0 in the excerpt, in its order.
+
+    Raises
+    ------
+    RecordingError
+        When the recording cannot be read on; the frames before are yielded first.
+    """
+    pairs = paired(source.images(), source.info.sensor, config.sync)
+    if excerpt is not None:
+        pairs = take_excerpt(pairs, excerpt)
+    if choose is not None:
+        pairs = choose(pairs)
+    preparers = make_preparers(source.info)
+    make = _one_by_one if config.runtime.threads == 1 else _ahead
+    made = make(pairs, preparers, source.info)
+    if config.sync.repeated_images == "skip":
+        made = refuse_repeats(made, source.info.stream_names)
+    yield from made
+
+
+def paired(
+    images: Iterable[StampedImage],
+    sensor: Sensor,
+    sync: SyncConfig,
+    *,
+    limit_ms: float | None = None,
+) -> Iterator[Pair | FaultyFrame]:
+    """Decide which images make one frame, see `pair_images`.
+
+    Parameters
+    ----------
+    images : iterable of StampedImage
+        Both streams, interleaved in any way.
+    sensor : {"stereo", "rgbd"}
+        Says which limit counts.
+    sync : SyncConfig
+    limit_ms : float, optional
+        Largest difference of the stamps of a pair, in place of the configured one.
+
+    Yields
+    ------
+    pair of StampedImage, or FaultyFrame
+        Also for images of which the stamp alone is wrong, see `StrayStamps`.
+
+    Raises
+    ------
+    RecordingError
+        When the recording cannot be read on.
+    """
+    key = pair_limit_key(sensor)
+    limit = float(getattr(sync, key)) if limit_ms is None else limit_ms
+    stamps = StrayStamps(_readable(images))
+    pairs = pair_images(
+        stamps.sound(),
+        limit_ns=round(limit * 1e6),
+        partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
+        queue_size=sync.queue_size,
+        age_penalty=sync.age_penalty,
+    )
+    for item in pairs:
+        yield from stamps.take_faulty()
+        yield item
+    yield from stamps.take_faulty()
+
+
+def _readable(images: Iterable[StampedImage]) -> Iterator[StampedImage]:
+    """Yield the images; where a disk or a network fails, say so as all sources do."""
+    try:
+        yield from images
+    except (OSError, MemoryError) as error:
+        raise RecordingError(f"it cannot be read on: {_error_text(error)}") from error
+
+
+def pair_limit_key(sensor: Sensor) -> str:
+    """Return the parameter of `sync` that says how far the stamps of a pair may differ, ms."""
+    return "stereo_tolerance_ms" if sensor == "stereo" else "max_difference_ms"
+
+
+class ImagePreparer:
+    """Make raw pixels of one stream what a frame holds: checked, grey, rectified.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the stream; depth images take that of the colour camera.
+    is_depth : bool
+        The stream holds depth: rectified by the nearest pixel, so that no depth is made up.
+    depth_view : DepthView, optional
+        Of depth images that another camera sees than that of the calibration.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        *,
+        is_depth: bool = False,
+        depth_view: DepthView | None = None,
+    ) -> None:
+        recorded = calibration if depth_view is None else depth_view.calibration
+        self._size = (recorded.height, recorded.width)
+        self._is_depth = is_depth
+        self._register = None if depth_view is None else DepthRegistration(calibration, depth_view)
+        self._maps = None if depth_view is not None else rectification_maps(calibration)
+        self._fixed_maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+        if self._maps is not None and not is_depth:
+            # Linear interpolation is faster with fixed-point maps, the nearest pixel is not.
+            fixed = cv2.convertMaps(*self._maps, cv2.CV_16SC2)
+            self._fixed_maps = (np.asarray(fixed[0]), np.asarray(fixed[1]))
+
+    def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the image of the frame.
+
+        Parameters
+        ----------
+        pixels : ndarray
+            uint8 (h, w) or (h, w, 3) in BGR order; or depth as float32 (h, w), metres.
+
+        Returns
+        -------
+        ndarray of uint8 or float32, shape (h, w)
+
+        Raises
+        ------
+        RecordingError
+            When size or type are not what the calibration says.
+        """
+        _check_pixels(pixels, is_depth=self._is_depth)
+        if pixels.shape[:2] != self._size:
+            raise RecordingError(
+                f"expected {_size_text(self._size)} pixels by the calibration, got "
+                f"{_size_text(pixels.shape)}; give that of these images by --calibration FILE"
+            )
+        return self._depth(pixels) if self._is_depth else self._grey(pixels)
+
+    def _depth(self, depth: NDArray[Any]) -> DepthArray:
+        if self._register is not None:
+            depth = self._register(depth)
+        if self._maps is not None:
+            depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=np.nan))
+        # a few rows mostly tell, at a sixteenth of the cost
+        if not (_is_known(depth[::16]) or _is_known(depth)):
+            raise RecordingError("no pixel of the depth image is known")
+        return np.asarray(depth, dtype=np.float32)
+
+    def _grey(self, pixels: NDArray[Any]) -> ImageArray:
+        if pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        if self._fixed_maps is not None:
+            pixels = cv2.remap(pixels, *self._fixed_maps, cv2.INTER_LINEAR)
+        return np.asarray(pixels, dtype=np.uint8)
+
+
+_Preparers = tuple[ImagePreparer, ImagePreparer]
+_Item = Pair | FaultyFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Started:
+    item: _Item
+    results: tuple[Future[NDArray[Any] | str], ...]
+
+
+def make_preparers(info: RecordingInfo) -> _Preparers:
+    """Return what makes the raw images of both streams those of frames.
+
+    Parameters
+    ----------
+    info : RecordingInfo
+        Of the recording. Depth of a camera of its own is registered to the colour camera.
+    """
+    first = ImagePreparer(info.calibrations[0])
+    if info.sensor == "stereo":
+        return first, ImagePreparer(info.calibrations[1])
+    return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
+
+
+def _one_by_one(
+    items: Iterable[_Item], preparers: _Preparers, info: RecordingInfo
+) -> Iterator[Frame | FaultyFrame]:
+    for item in items:
+        if isinstance(item, FaultyFrame):
+            yield item
+        else:
+            results = [_prepare(*job, info) for job in zip(item, preparers, strict=True)]
+            yield _make_frame(item, results, info.sensor)
+
+
+def _ahead(
+    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo
+) -> Iterator[Frame | FaultyFrame]:
+    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
+        started: deque[_Started] = deque()
+        fault: GvoError | None = None
+        while fault is None:
+            try:
+                item = next(items)
+            except StopIteration:
+                break
+            except GvoError as error:
+                fault = error  # what was read before it counts
+            else:
+                started.append(_start(pool.submit, item, preparers, info))
+                if len(started) > _N_AHEAD:
+                    yield _finish(started.popleft(), info.sensor)
+        while started:
+            yield _finish(started.popleft(), info.sensor)
+        if fault is not None:
+            raise fault
+
+
+def _start(
+    submit: Callable[..., Future[NDArray[Any] | str]],
+    item: _Item,
+    preparers: _Preparers,
+    info: RecordingInfo,
+) -> _Started:
+    if isinstance(item, FaultyFrame):
+        return _Started(item=item, results=())
+    jobs = zip(item, preparers, strict=True)
+    return _Started(item=item, results=tuple(submit(_prepare, *job, info) for job in jobs))
+
+
+def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
+    if isinstance(started.item, FaultyFrame):
+        return started.item
+    return _make_frame(started.item, [result.result() for result in started.results], sensor)
+
+
+def _prepare(
+    image: StampedImage, preparer: ImagePreparer, info: RecordingInfo
+) -> NDArray[Any] | str:
+    """Return the prepared image, or one line on what is wrong with it."""
+    try:
+        return preparer(image.load())
+    except (RecordingError, *_LOAD_ERRORS) as error:
+        return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
+
+
+def _make_frame(
+    pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
+) -> Frame | FaultyFrame:
+    stamp_ns = pair[0].stamp_ns
+    first, second = results
+    if isinstance(first, str) or isinstance(second, str):
+        reasons = [result for result in results if isinstance(result, str)]
+        return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
+    if sensor == "stereo":
+        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
+    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
+
+
+def _check_pixels(pixels: object, *, is_depth: bool) -> None:
+    """Refuse what would be taken for something else, such as 16 bits cut to 8.
+
+    Raises
+    ------
+    RecordingError
+    """
+    if not isinstance(pixels, np.ndarray):
+        raise RecordingError(f"expected an array of pixels, got {type(pixels).__name__}")
+    if is_depth:
+        expected, is_right = "float (h, w) in metres", pixels.dtype.kind == "f"
+        is_right &= pixels.ndim == 2
+    else:
+        expected, is_right = "uint8 (h, w) or (h, w, 3)", pixels.dtype == np.uint8
+        is_right &= pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if not is_right:
+        raise RecordingError(f"expected pixels of {expected}, got {pixels.dtype} {pixels.shape}")
+
+
+def _is_known(depth: NDArray[Any]) -> bool:
+    """Tell whether any depth is finite and positive."""
+    return bool(np.any((depth > 0) & (depth < np.inf)))
+
+
+def _error_text(error: Exception) -> str:
+    """Return what an error says on one line, with its kind where that is none of ours."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, GvoError) else f"{type(error).__name__}: {text}"
+
+
+def _size_text(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"

@@ -1,0 +1,545 @@
+"""Image files and depth counts, both ways."""
+
+from __future__ import annotations
+
+import re
+import stat
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.errors import RecordingError
+from gvo.types import DepthArray, ImageArray
+
+MAX_PIXELS = 100_000_000
+"""More than any camera has: a damaged header must not make a decoder allocate gigabytes."""
+
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"IEND"
+_JPEG_MAGIC = b"\xff\xd8\xff"
+_TIFF_MAGICS = {b"II*\0": "<", b"MM\0*": ">"}
+_BMP_MAGIC = b"BM"
+# Without going back: comments can be split up in more ways than could ever be tried.
+_PNM_GAP = rb"(?>(?:\s+#[^\n]*+)*+\s+)"
+_PNM = re.compile(rb"P[1-6]" + _PNM_GAP + rb"(\d{1,10}+)" + _PNM_GAP + rb"(\d{1,10}+)\s")
+_JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD8)})  # no length follows
+_TIFF_SIZE_TAGS = (256, 257)
+_TIFF_FORMS = {3: "H", 4: "I"}
+_N_HEAD = 512
+_MAX_PIXELS_PER_BYTE = 2048  # twice what deflate makes of black, four times what JPEG does
+
+
+class ImageHeader(NamedTuple):
+    """Format by name, width and height in pixels; 0 where the header does not tell."""
+
+    format: str
+    width: int
+    height: int
+
+
+def read_header(data: NDArray[np.uint8]) -> ImageHeader | None:
+    """Read the header of an encoded image.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n,)
+        The whole file.
+
+    Returns
+    -------
+    ImageHeader or None
+        Of PNG, JPEG, TIFF, BMP, PBM, PGM or PPM; None for anything else.
+    """
+    head = data[:_N_HEAD].tobytes()
+    if head.startswith(_PNG_MAGIC):
+        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+        return ImageHeader("PNG", *size)
+    if head.startswith(_JPEG_MAGIC):
+        return ImageHeader("JPEG", *_jpeg_size(data))
+    if head[:4] in _TIFF_MAGICS:
+        return ImageHeader("TIFF", *_tiff_size(data, _TIFF_MAGICS[head[:4]]))
+    if head.startswith(_BMP_MAGIC) and len(head) >= 26:
+        width, height = struct.unpack("<ii", head[18:26])
+        return ImageHeader("BMP", abs(width), abs(height))
+    if match := _PNM.match(head):
+        return ImageHeader("PNM", int(match[1]), int(match[2]))
+    return None
+
+
+def check_size(width: int, height: int, where: str, *, max_pixels: int = MAX_PIXELS) -> None:
+    """Refuse sizes that no image has.
+
+    Parameters
+    ----------
+    width, height : int
+        As announced, pixels.
+    where : str
+        File or topic, for the message.
+    max_pixels : int
+        Of an image.
+
+    Raises
+    ------
+    RecordingError
+        When there are no pixels, or more than `max_pixels`.
+    """
+    if not (width > 0 and height > 0 and width * height <= max_pixels):
+        raise RecordingError(f"{where}: the image claims {width}x{height} pixels, it is damaged")
+
+
+def check_density(header: ImageHeader, n_bytes: int, where: str) -> None:
+    """Refuse an image that claims more pixels than its bytes can hold.
+
+    Parameters
+    ----------
+    header : ImageHeader
+    n_bytes : int
+        Of the whole file.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    RecordingError
+        Before memory for these pixels is asked for.
+    """
+    if header.width * header.height > n_bytes * _MAX_PIXELS_PER_BYTE:
+        raise RecordingError(
+            f"{where}: the image claims {header.width}x{header.height} pixels in {n_bytes} bytes, "
+            "it is damaged"
+        )
+
+
+def is_png(data: NDArray[np.uint8]) -> bool:
+    """Tell whether data begin as a PNG does."""
+    return data[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
+
+
+def is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
+    """Tell whether a JPEG has its end; cameras fill their buffers up behind it."""
+    end = b"\xff\xd9"
+    return end in data[-1024:].tobytes() or end in data.tobytes().rstrip(b"\0")[-1024:]
+
+
+def is_png_complete(data: NDArray[np.uint8]) -> bool:
+    """Tell whether the chunks of a PNG end before it does.
+
+    OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
+    """
+    position = len(_PNG_MAGIC)
+    while position < len(data):
+        head = data[position : position + 8].tobytes()
+        position += 12 + int.from_bytes(head[:4], "big")
+        if head[4:] == _PNG_END:
+            break
+    return position <= len(data)
+
+
+def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        segment = data[position : position + 9].tobytes()
+        if segment[1] in _JPEG_FRAME_MARKERS:
+            return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
+        position += _jpeg_step(segment)
+    return 0, 0
+
+
+def _jpeg_step(segment: bytes) -> int:
+    """Return how far it is to what follows, as a decoder goes on."""
+    if segment[1] == 0xFF:
+        return 1  # a marker may be preceded by any number of fill bytes
+    if segment[1] in _JPEG_BARE_MARKERS:
+        return 2
+    return 2 + int.from_bytes(segment[2:4], "big")
+
+
+def _tiff_size(data: NDArray[np.uint8], order: str) -> tuple[int, int]:
+    """Read width and height from the first directory of a TIFF."""
+    sizes = dict.fromkeys(_TIFF_SIZE_TAGS, 0)
+    (offset,) = struct.unpack(f"{order}I", data[4:8].tobytes().ljust(4, b"\0"))
+    (n_entries,) = struct.unpack(f"{order}H", data[offset : offset + 2].tobytes().ljust(2, b"\0"))
+    entries = data[offset + 2 : offset + 2 + 12 * n_entries].tobytes()
+    for start in range(0, len(entries) - 11, 12):
+        tag, type_, _ = struct.unpack_from(f"{order}HHI", entries, start)
+        # of several of one tag the first counts
+        if sizes.get(tag) == 0 and type_ in _TIFF_FORMS:
+            (sizes[tag],) = struct.unpack_from(f"{order}{_TIFF_FORMS[type_]}", entries, start + 8)
+    return sizes[256], sizes[257]
+
+
+_TOO_DARK = 1 << 12
+_COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}
+_MAX_FILE_BYTES = 1 << 30  # more than all pixels that are allowed need
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GreyRange:
+    """Which values of 16-bit images become black and white.
+
+    Cameras of 10, 12 or 14 bits fill the lower bits of 16, thermal ones a part in the middle, and
+    no encoding tells. The range is one for the whole recording: a gain chosen for each frame
+    would change the brightness of what is tracked.
+
+    Parameters
+    ----------
+    black : int
+        This value and all below become 0.
+    white : int
+        This value and all above become 255.
+
+    Examples
+    --------
+    >>> GreyRange(white=4095).narrow(np.array([0, 15, 16, 4095, 9000], np.uint16)).tolist()
+    [0, 0, 1, 255, 255]
+    """
+
+    black: int = 0
+    white: int = 65535
+
+    def __post_init__(self) -> None:
+        """Refuse what is no range."""
+        if not 0 <= self.black < self.white <= 65535:
+            raise ValueError(
+                f"expected 0 <= black < white <= 65535, got black={self.black} white={self.white}"
+            )
+
+    def narrow(self, values: NDArray[np.uint16]) -> ImageArray:
+        """Return values of 8 bits: for the full range the upper eight."""
+        if self == FULL_RANGE:
+            return (values >> 8).astype(np.uint8)
+        above = np.clip(values, self.black, self.white).astype(np.uint32) - np.uint32(self.black)
+        return (above * 256 // (self.white + 1 - self.black)).astype(np.uint8)
+
+
+MILLIMETRES = 1000.0
+"""Counts per metre of depth in millimetres: integer depth in messages is so by REP 118."""
+
+# All positive finite numbers: neither zero nor infinity, and no comparison holds for NaN.
+_KNOWN_DEPTH_M = (
+    float(np.nextafter(np.float32(0), np.float32(1))),
+    float(np.finfo(np.float32).max),
+)
+
+FULL_RANGE = GreyRange()
+
+
+def read_image(path: Path, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
+    """Read an image file.
+
+    Parameters
+    ----------
+    path : Path
+        PNG, JPEG, TIFF, BMP or PNM.
+    grey_range : GreyRange
+        Of 16-bit images.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width) or (height, width, 3)
+        Grey, or colour in BGR order.
+
+    Raises
+    ------
+    RecordingError
+        When the file is missing, empty, truncated or no image, or nearly black.
+    """
+    return to_8_bit(decode_image(_read_bytes(path), str(path)), str(path), grey_range)
+
+
+def read_depth(path: Path, scale: float) -> DepthArray:
+    """Read a depth image file.
+
+    Parameters
+    ----------
+    path : Path
+        16-bit grey image.
+    scale : float
+        Counts per metre.
+
+    Returns
+    -------
+    ndarray of float32, shape (height, width)
+        Metres, NaN = unknown.
+
+    Raises
+    ------
+    RecordingError
+        When the file is missing, empty, truncated or no 16-bit grey image.
+    """
+    return depth_from_counts(decode_image(_read_bytes(path), str(path)), scale, str(path))
+
+
+def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
+    """Decode an image file held in memory, unchanged in depth and channels.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n,)
+        The whole file.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    RecordingError
+        When it is empty, truncated, of an absurd size or no image.
+    """
+    if len(data) == 0:
+        raise RecordingError(f"{where}: the image is empty")
+    header = read_header(data)
+    if header is None:
+        raise RecordingError(
+            f"{where}: the image cannot be decoded: expected PNG, JPEG, TIFF, BMP or PNM, but it "
+            f"begins with {data[:8].tobytes()!r}"
+        )
+    check_size(header.width, header.height, where)
+    check_density(header, len(data), where)
+    is_complete = _COMPLETE.get(header.format)
+    if is_complete is not None and not is_complete(data):
+        raise RecordingError(f"{where}: the {header.format} image is truncated")
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise RecordingError(f"{where}: the image cannot be decoded") from error
+    if pixels is None or pixels.size == 0:
+        raise RecordingError(f"{where}: the image cannot be decoded")
+    return np.asarray(pixels)
+
+
+def to_8_bit(pixels: NDArray[Any], where: str, grey_range: GreyRange = FULL_RANGE) -> ImageArray:
+    """Return grey (h, w) or BGR (h, w, 3) pixels of 8 bits; alpha is dropped.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8 or uint16, shape (h, w), (h, w, 3) or (h, w, 4)
+        Colour in BGR order.
+    where : str
+        File or topic, for the message.
+    grey_range : GreyRange
+        Of 16-bit images.
+
+    Raises
+    ------
+    RecordingError
+        When the values are of another type, or those of 16 bits would become nearly black.
+    """
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    if pixels.dtype not in (np.uint8, np.uint16) or channels not in (1, 3, 4):
+        raise RecordingError(
+            f"{where}: expected grey or colour of 8 or 16 bits, got {pixels.dtype} of shape "
+            f"{pixels.shape}"
+        )
+    if pixels.dtype == np.uint16:
+        _check_brightness(int(pixels.max(initial=0)), grey_range, where)
+        pixels = grey_range.narrow(pixels)
+    if pixels.ndim == 3 and channels == 1:
+        pixels = pixels[:, :, 0]
+    if channels == 4:
+        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2BGR))
+    return np.ascontiguousarray(pixels)
+
+
+def _check_brightness(largest: int, grey_range: GreyRange, where: str) -> None:
+    if grey_range == FULL_RANGE and largest < _TOO_DARK:
+        n_bits = max(8, largest.bit_length())
+        raise RecordingError(
+            f"{where}: the 16-bit image is nearly black, its largest value is {largest} of 65535; "
+            f"where the camera has {n_bits} bits, set images.white={(1 << n_bits) - 1}"
+        )
+
+
+def depth_from_counts(counts: NDArray[Any], scale: float, where: str) -> DepthArray:
+    """Return metres (h, w), NaN = unknown, of depth counts.
+
+    Parameters
+    ----------
+    counts : ndarray of uint16, shape (h, w)
+        Depth; 0 and 65535 mean unknown.
+    scale : float
+        Counts per metre.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    RecordingError
+        When the counts are no 16-bit grey image.
+    """
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        raise RecordingError(
+            f"{where}: expected depth as 16-bit grey, got {counts.dtype} of shape {counts.shape}"
+        )
+    depth: DepthArray = counts.astype(np.float32)
+    depth /= np.float32(scale)
+    # One look at each pixel for both: with one added, 65535 becomes 0 and 0 becomes 1.
+    np.copyto(depth, np.nan, where=counts + np.uint16(1) <= 1)
+    return depth
+
+
+def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
+    """Return depth where all that is unknown is NaN.
+
+    Parameters
+    ----------
+    metres : ndarray of float, shape (h, w)
+        Zero, negative or not finite: unknown.
+
+    Returns
+    -------
+    ndarray of float32, shape (h, w)
+        Metres, NaN = unknown; the same array where nothing has to be marked.
+    """
+    metres = np.asarray(metres, dtype=np.float32)
+    # Both leave NaN out. Most drivers mark all that is unknown so: a look is a tenth of a copy.
+    lowest, highest = np.fmin.reduce(metres, axis=None), np.fmax.reduce(metres, axis=None)
+    if lowest > 0 and highest < np.inf:
+        return metres
+    depth: DepthArray = np.full(metres.shape, np.nan, dtype=np.float32)
+    # OpenCV compares and copies in a third of NumPy's time.
+    cv2.copyTo(metres, cv2.inRange(metres, *_KNOWN_DEPTH_M), depth)
+    return depth
+
+
+def _read_bytes(path: Path) -> NDArray[np.uint8]:
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise RecordingError(f"{path}: is no file")  # a device may never end
+        if status.st_size > _MAX_FILE_BYTES:
+            raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
+        return np.fromfile(path, dtype=np.uint8)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: the file is missing") from error
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a zero in a name
+        raise RecordingError(f"{str(path)!r}: is no name of a file") from error
+
+
+def encode_png(pixels: NDArray[Any]) -> bytes:
+    """Return an image as a PNG file.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8 or uint16, shape (h, w) or (h, w, 3)
+        Grey, or colour in BGR order.
+
+    Raises
+    ------
+    RecordingError
+        When it cannot be one.
+    """
+    return _encode(".png", pixels)
+
+
+def encode_tiff(pixels: NDArray[Any]) -> bytes:
+    """Return an image as a TIFF file.
+
+    Parameters
+    ----------
+    pixels : ndarray of float32, shape (h, w)
+
+    Raises
+    ------
+    RecordingError
+        When it cannot be one.
+    """
+    return _encode(".tiff", pixels)
+
+
+def encode_jpeg(image: ImageArray, *, quality: int = 80) -> bytes:
+    """Return a picture as a JPEG file.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width, 3)
+        BGR.
+    quality : int
+        0 to 100.
+
+    Raises
+    ------
+    RecordingError
+        When it cannot be one.
+    """
+    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def _encode(suffix: str, pixels: NDArray[Any], parameters: Sequence[int] = ()) -> bytes:
+    is_encoded, data = cv2.imencode(suffix, pixels, parameters)
+    if not is_encoded:
+        raise RecordingError(
+            f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
+        )
+    return data.tobytes()
+
+
+MAX_COUNT = 65534
+"""Largest count: 0 and 65535 are unknown."""
+
+# Counts read as float32 metres and multiplied again miss an integer by its rounding only.
+_TOLERANCE = 5e-3
+
+
+def is_in_counts(depth: DepthArray, scale: float) -> bool:
+    """Tell whether depth was made of counts of this scale.
+
+    Parameters
+    ----------
+    depth : ndarray of float32, shape (h, w)
+        Metres, NaN = unknown.
+    scale : float
+        Counts per metre.
+
+    Returns
+    -------
+    bool
+        False where nothing is known, too.
+    """
+    counts = scale * depth[np.isfinite(depth)].astype(np.float64)
+    return len(counts) > 0 and bool(np.all(np.abs(counts - np.round(counts)) < _TOLERANCE))
+
+
+def to_counts(depth: DepthArray, scale: float) -> tuple[NDArray[np.uint16], int]:
+    """Return counts, and the number of pixels that are too far for them.
+
+    Parameters
+    ----------
+    depth : ndarray of float32, shape (h, w)
+        Metres, NaN = unknown.
+    scale : float
+        Counts per metre.
+
+    Returns
+    -------
+    counts : ndarray of uint16, shape (h, w)
+        Rounded, 0 = unknown or too far.
+    n_too_far : int
+    """
+    counts = np.round(scale * np.nan_to_num(depth, nan=0.0).astype(np.float64))
+    is_far = counts > MAX_COUNT
+    counts[is_far] = 0
+    return counts.astype(np.uint16), int(np.count_nonzero(is_far))
+
+
+def exact_counts(depth: DepthArray, scale: float) -> NDArray[np.uint16] | None:
+    """Return counts from which the depth comes back bit by bit; None where there are none.
+
+    Parameters
+    ----------
+    depth : ndarray of float32, shape (h, w)
+        Metres, NaN = unknown.
+    scale : float
+        Counts per metre.
+    """
+    counts, _ = to_counts(depth, scale)
+    is_exact = np.array_equal(depth_from_counts(counts, scale, "depth"), depth, equal_nan=True)
+    return counts if is_exact else None

@@ -1,0 +1,123 @@
+"""Recognise what kind of recording a path holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gvo.bounded_text import exists
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.io.bag.reader import STORAGE_SUFFIXES, is_storage
+from gvo.io.bag.source import BagSource
+from gvo.io.bag.topics import TopicChoice
+from gvo.io.calibration.files import CalibrationPaths
+from gvo.io.datasets.euroc import EurocSource
+from gvo.io.datasets.kitti import KittiSource
+from gvo.io.datasets.tum import TumSource
+from gvo.io.images import GreyRange
+from gvo.io.recording import Source
+
+BAG_SUFFIXES = (".bag", *STORAGE_SUFFIXES)
+_KINDS = (
+    "a recording is a .bag, .mcap or .db3 file, a ROS 2 bag folder (metadata.yaml), or a folder "
+    "of KITTI odometry (calib.txt), EuRoC (mav0 or cam0) or TUM RGB-D (rgb.txt)"
+)
+# By such a name in it a folder is known to be one recording.
+FOLDER_MARKERS = ("metadata.yaml", "calib.txt", "times.txt", "mav0", "cam0", "rgb.txt")
+_TOPICS = ("left", "right", "color", "depth")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingOptions:
+    """What the user says about a recording.
+
+    Parameters
+    ----------
+    calibration : Path or sequence of Path
+        Files that replace the recording's own calibration: one or two, or a folder.
+    left, right : str, optional
+        Topics of a stereo pair in a bag.
+    color, depth : str, optional
+        Topics of an RGB-D camera in a bag.
+    """
+
+    calibration: CalibrationPaths = None
+    left: str | None = None
+    right: str | None = None
+    color: str | None = None
+    depth: str | None = None
+
+
+def open_recording(
+    path: str | Path | Sequence[str | Path],
+    *,
+    config: Config | None = None,
+    options: RecordingOptions | None = None,
+) -> Source:
+    """Open a recording of any kind.
+
+    Parameters
+    ----------
+    path : str or Path, or a sequence of them
+        File or folder; several bags are one recording.
+    config : Config, optional
+        Of which `depth.scale` and `images` matter here.
+    options : RecordingOptions, optional
+        What to choose, and the calibration.
+
+    Raises
+    ------
+    ValueError
+        Where there is no path.
+    RecordingError
+        When a path is missing or holds no recording, or does not hold what is needed.
+    CalibrationError
+        When the camera is not calibrated.
+    """
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(one) for one in path]
+    if not paths:
+        raise ValueError("expected at least one path of a recording")
+    config = config or Config()
+    options = options or RecordingOptions()
+    for one in paths:
+        if not exists(one):
+            raise RecordingError(f"{one}: does not exist; {_KINDS}")
+    if all(is_bag(one) for one in paths):
+        topics = TopicChoice(
+            left=options.left, right=options.right, color=options.color, depth=options.depth
+        )
+        return BagSource(paths, topics=topics, calibration=options.calibration, config=config)
+    if len(paths) > 1:
+        other = next(one for one in paths if not is_bag(one))
+        raise RecordingError(f"{other}: is no bag; only several bags can be one recording")
+    return _open_folder(paths[0], config, options)
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a path that exists is a bag of ROS, by its name or by what it holds."""
+    if path.is_file():
+        return path.suffix == ".bag" or is_storage(path)
+    return (path / "metadata.yaml").is_file() or any(map(is_storage, path.iterdir()))
+
+
+def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Source:
+    for name in _TOPICS:
+        if getattr(options, name) is not None:
+            raise RecordingError(f"{path}: --{name} names a topic of a bag, this is no bag")
+    calibration = options.calibration
+    grey_range = GreyRange(black=config.images.black, white=config.images.white)
+    if _is_kitti(path):
+        return KittiSource(path, calibration=calibration, grey_range=grey_range)
+    if (path / "mav0").is_dir() or (path / "cam0").is_dir():
+        return EurocSource(path, calibration=calibration, grey_range=grey_range)
+    if (path / "rgb.txt").is_file():
+        scale = config.depth.scale
+        return TumSource(path, calibration=calibration, depth_scale=scale, grey_range=grey_range)
+    raise RecordingError(f"{path}: is no recording; {_KINDS}")
+
+
+def _is_kitti(path: Path) -> bool:
+    has_images = any((path / name).is_dir() for name in ("image_0", "image_2"))
+    return (path / "calib.txt").is_file() or (has_images and (path / "times.txt").is_file())

@@ -1,0 +1,1 @@
+"""Recorded poses: tf, ground truth, and the frame whose poses are written."""

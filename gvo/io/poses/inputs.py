@@ -1,0 +1,387 @@
+"""Poses and truth as the command line names them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gvo.bounded_text import exists
+from gvo.errors import RecordingError, TrajectoryError
+from gvo.io.bag.reader import BagReader
+from gvo.io.bag.source import BagSource
+from gvo.io.opening import is_bag, open_recording
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.ground_truth import (
+    TRUTH_TYPES,
+    BagTruth,
+    FileTruth,
+    find_obvious_truth,
+    parse_bag_truth,
+    parse_truth,
+    read_bag_truth,
+)
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.poses.truth import FramedTruth, in_frame
+from gvo.io.recording import Source
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, FloatArray
+
+_MARK = "#"
+# The frames of a run's bag are those of the robot under names of their own.
+_OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed)/")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseInput:
+    """Poses that were named on the command line.
+
+    Parameters
+    ----------
+    name : str
+        Of the topic, the chain or the file.
+    trajectory : Trajectory
+    child_frame : str
+        Whose poses they are; empty where that is not known.
+    decision : str
+        What was read, in one line; empty for a file.
+    warning : str
+        What of the bag could not be read, or why they are compared though of another frame than
+        the reference; empty where there is nothing.
+    """
+
+    name: str
+    trajectory: Trajectory
+    child_frame: str = ""
+    decision: str = ""
+    warning: str = ""
+
+
+def is_in_bag(text: str) -> bool:
+    """Tell whether the text is `BAG#WHAT`, or a bag. A file or folder of that name wins."""
+    if exists(Path(text)):
+        return is_bag(Path(text))
+    path, mark, _ = text.partition(_MARK)
+    return bool(mark) and exists(Path(path))
+
+
+def read_poses(text: str) -> Trajectory:
+    """Read poses from a file, or out of a bag.
+
+    Parameters
+    ----------
+    text : str
+        A file of poses, `BAG#tf:PARENT:CHILD`, `BAG#TOPIC`, or a bag that names its ground truth.
+
+    Raises
+    ------
+    TrajectoryError, RecordingError
+        When they cannot be read.
+    """
+    return read_pose_input(text).trajectory
+
+
+def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
+    """Read poses from a file, or out of a bag, with what is known about them.
+
+    Parameters
+    ----------
+    text : str
+        As of `read_poses`.
+    frame : str
+        The frame that the poses are to be of, by its name in the bag's tf; empty: as they are.
+
+    Returns
+    -------
+    PoseInput
+
+    Raises
+    ------
+    TrajectoryError, RecordingError
+        When they cannot be read.
+    """
+    if not is_in_bag(text):
+        return PoseInput(name=Path(text).stem, trajectory=read_trajectory(text))
+    path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
+    reader = BagReader(Path(path))
+    truth = _read(reader, what, path)
+    found = PoseInput(
+        name=what or Path(path).stem,
+        trajectory=truth.trajectory,
+        # what is named ground truth is of the camera, whatever frame it has
+        child_frame="" if truth.is_of_camera else _OWN_FRAME.sub("", truth.child_frame),
+        decision=truth.decision,
+        warning=reader.damage,
+    )
+    if not frame or found.child_frame in ("", frame):
+        return found
+    return _brought(found, truth, reader, frame)
+
+
+def _read(reader: BagReader, what: str, path: str) -> BagTruth:
+    if what:
+        return read_bag_truth(reader, parse_bag_truth(what), where=path)
+    truth = find_obvious_truth(reader, where=path)
+    if not isinstance(truth, Failure):
+        return truth
+    held = [f"{path}{_MARK}{topic.name}" for topic in reader.topics if topic.type in TRUTH_TYPES]
+    raise RecordingError(
+        f"{path}: name the poses: {', '.join([f'{path}{_MARK}tf:PARENT:CHILD', *held])}"
+    )
+
+
+def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -> PoseInput:
+    """Return poses of another frame of the same body; as they are where that cannot be done."""
+    reason = "positions without rotations cannot be moved"
+    if truth.trajectory.has_rotations:
+        tree = read_tf(reader, frames=(truth.child_frame, frame))
+        framed = in_frame(truth, tree, frame=frame)
+        if not isinstance(framed, Failure):
+            return replace(
+                found,
+                trajectory=framed.trajectory,
+                child_frame=frame,
+                decision=framed.decision,
+            )
+        reason = framed.reason
+    apart = f"{found.name} is of {truth.child_frame}, the reference of {frame}: {reason}"
+    return replace(found, warning="; ".join(filter(None, [found.warning, apart])))
+
+
+def choose_frame(
+    source: Source, name: str | None = None, *, T_initial: FloatArray | None = None
+) -> OutputFrame:
+    """Find how the camera sits in the frame whose poses are asked for.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    name : str, optional
+        As `/tf` of a bag names it; where that does not connect it with the camera, it is the
+        body that the calibration places the camera on. Omitted: the camera itself.
+    T_initial : ndarray of float64, shape (4, 4), optional
+        T_world_frame of the first frame, metres; the identity where omitted.
+
+    Raises
+    ------
+    RecordingError
+        When neither says where the camera is.
+    """
+    info = source.info
+    if name is None:
+        return OutputFrame(info.frame_id, T_initial=T_initial)
+    name = name.strip("/")
+    if isinstance(source, BagSource):
+        buffer = source.transforms((name, info.frame_id))
+        if info.T_body_cam is None or name in buffer.frames:
+            return OutputFrame.from_tf(
+                buffer, name, info.frame_id, T_initial=T_initial, where=info.name
+            )
+    if info.T_body_cam is None:
+        raise RecordingError(
+            f"{info.name}: --frame {name}: the recording does not say where the camera is on it; "
+            "give a calibration with the camera's pose on the body by --calibration FILE"
+        )
+    placed = OutputFrame(name, info.T_body_cam, T_initial=T_initial)
+    placed.origin = "the body on which the calibration places the camera"
+    return placed
+
+
+def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) -> FramedTruth:
+    """Read the true poses that were asked for.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    text : str
+        `tf:PARENT:CHILD` or a topic of the recording, which must be a bag; or a file of poses,
+        or another recording, of the frame that is asked for.
+    frame : OutputFrame, optional
+        Whose poses are asked for; the camera's where omitted.
+
+    Raises
+    ------
+    RecordingError, TrajectoryError
+        When it cannot be read, or tf does not bring it to the frame.
+    """
+    frame = frame or OutputFrame()
+    spec = parse_truth(text)
+    if isinstance(spec, FileTruth):
+        return FramedTruth(trajectory=read_ground_truth(spec.path), decision=str(spec.path))
+    if not isinstance(source, BagSource):
+        raise TrajectoryError(
+            f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
+        )
+    truth = source.truth(spec, frame=_name_in_tf(frame), T_frame_cam=frame.fixed_mount)
+    if isinstance(truth, Failure):
+        raise TrajectoryError(f"--ground-truth {text}: {truth.reason}")
+    return truth
+
+
+def own_truth(source: Source, *, frame: OutputFrame | None = None) -> FramedTruth | Failure:
+    """Read what a recording itself names its ground truth.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    frame : OutputFrame, optional
+        Whose poses are asked for; the camera's where omitted.
+
+    Returns
+    -------
+    FramedTruth or Failure
+        The failure says why there is none, or why it cannot be compared.
+
+    Raises
+    ------
+    RecordingError, TrajectoryError
+        When it cannot be read.
+    """
+    frame = frame or OutputFrame()
+    if isinstance(source, BagSource):
+        return source.truth(frame=_name_in_tf(frame), T_frame_cam=frame.fixed_mount)
+    truth = source.ground_truth()
+    if truth is None:
+        return Failure(reason="the recording holds none")
+    return FramedTruth(trajectory=frame.convert(truth), decision="of the recording")
+
+
+def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
+    """Return what a bag knows of frames; None where the recording is no bag."""
+    if not isinstance(source, BagSource):
+        return None
+    return source.transforms([name for name in frames if name])
+
+
+def count_calibration_changes(source: Source) -> dict[str, int] | None:
+    """Count the `CameraInfo` of a bag that differ from the first, by topic; None for no bag."""
+    return source.camera_info_changes() if isinstance(source, BagSource) else None
+
+
+def read_compared(
+    reference: str, estimates: Sequence[str]
+) -> tuple[Trajectory, dict[str, Trajectory], list[str]]:
+    """Read what `gvo compare` compares.
+
+    Parameters
+    ----------
+    reference : str
+        See `read_ground_truth`.
+    estimates : sequence of str
+        Files of poses, or what lies inside of bags; brought to the frame of the reference where
+        tf can.
+
+    Returns
+    -------
+    reference : Trajectory
+    estimates : dict of str to Trajectory
+        By their shortest names that differ.
+    warnings : list of str
+        What they are to be taken with, a line each.
+
+    Raises
+    ------
+    TrajectoryError, RecordingError
+        When something cannot be read.
+    """
+    if is_in_bag(reference):
+        first = read_pose_input(reference)
+        truth, frame, warnings = first.trajectory, first.child_frame, [first.warning]
+    else:
+        truth, frame, warnings = read_ground_truth(reference), "", []
+    found = [read_pose_input(text, frame=frame) for text in estimates]
+    warnings += [one.warning for one in found]
+    names = _short_names(estimates, [one.name for one in found])
+    trajectories = {name: one.trajectory for name, one in zip(names, found, strict=True)}
+    return truth, trajectories, [warning for warning in warnings if warning]
+
+
+def read_ground_truth(path: str | Path) -> Trajectory:
+    """Read true poses.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file of poses (TUM, KITTI, EuRoC), a recording's folder, or a bag that names its ground
+        truth; what lies inside of a bag as `BAG#tf:PARENT:CHILD` or `BAG#TOPIC`.
+
+    Returns
+    -------
+    Trajectory
+        Of a recording that of the camera.
+
+    Raises
+    ------
+    TrajectoryError, RecordingError
+        When the file holds no poses, or the recording no ground truth.
+    """
+    if is_in_bag(str(path)) or (Path(path).is_dir() and is_bag(Path(path))):
+        return read_poses(str(path))
+    path = Path(path)
+    if (path / "groundtruth.txt").is_file():
+        return read_trajectory(path / "groundtruth.txt")
+    if path.is_file() or not exists(path):
+        return read_trajectory(path)
+    truth = open_recording(path).ground_truth()
+    if truth is None:
+        raise TrajectoryError(f"{path}: this recording holds no ground truth")
+    return truth
+
+
+def initial_pose(truth: FramedTruth | Failure, stamp_ns: int) -> FloatArray:
+    """Return the true pose of the first frame.
+
+    Parameters
+    ----------
+    truth : FramedTruth or Failure
+        In the frame that is asked for.
+    stamp_ns : int
+        Of the first frame, nanoseconds.
+
+    Returns
+    -------
+    ndarray of float64, shape (4, 4)
+        T_world_frame: between the true poses before and after, or the first one where the truth
+        begins later.
+
+    Raises
+    ------
+    TrajectoryError
+        When there is no truth, it has no rotations, or ends before the first frame.
+    """
+    if isinstance(truth, Failure):
+        raise TrajectoryError(f"--initial-pose truth: there is no ground truth: {truth.reason}")
+    if not truth.trajectory.has_rotations:
+        raise TrajectoryError("--initial-pose truth: the ground truth has no rotations")
+    if len(truth.trajectory) == 0 or truth.trajectory.stamps_ns[-1] < stamp_ns:
+        raise TrajectoryError("--initial-pose truth: the ground truth ends before the first frame")
+    at_first = truth.trajectory.interpolate(np.array([stamp_ns], dtype=np.int64))
+    poses = at_first if len(at_first) else truth.trajectory
+    first: FloatArray = poses.T_world_cam[0]
+    return first
+
+
+def _name_in_tf(frame: OutputFrame) -> str:
+    return "" if frame.is_camera else frame.name
+
+
+def _short_names(texts: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Name estimates by their files or topics, with folders where that is ambiguous."""
+    longer = [
+        name if names.count(name) == 1 else f"{Path(text).parent.name}/{name}"
+        for text, name in zip(texts, names, strict=True)
+    ]
+    if len(set(longer)) == len(longer):
+        return longer
+    return (
+        list(texts)
+        if len(set(texts)) == len(texts)
+        else [f"{number}: {text}" for number, text in enumerate(texts, 1)]
+    )

@@ -1,0 +1,268 @@
+"""True poses in the frame that is estimated; estimates compared with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gvo.geometry import se3
+from gvo.io.bag.reader import BagReader
+from gvo.io.poses.ground_truth import BagTruth, BagTruthSpec, find_obvious_truth, read_bag_truth
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.poses.tf_paths import bare
+from gvo.trajectory.evaluation import Evaluation, evaluate
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import BoolArray, Failure, FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FramedTruth:
+    """True poses to be compared with the estimates of one frame.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        T_parent_frame; of positions without rotations those of the point that was measured.
+    decision : str
+        What was read and how it was brought into the frame, in one line.
+    T_frame_point : ndarray of float64, shape (4, 4)
+        Where that point lies in the frame, metres; the identity for poses.
+    warning : str
+        What the errors are to be taken with, in one line; empty where there is nothing.
+    """
+
+    trajectory: Trajectory
+    decision: str
+    T_frame_point: FloatArray = field(default_factory=lambda: np.eye(4))
+    warning: str = ""
+
+    def comparable(self, estimate: Trajectory) -> Trajectory:
+        """Return the estimate of the frame as that of what the truth is of."""
+        if np.array_equal(self.T_frame_point, np.eye(4)):
+            return estimate
+        return estimate.transformed(self.T_frame_point)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Place:
+    """A frame fixed to one of tf, whose name is empty where it is not known."""
+
+    name: str
+    T_name_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+
+    def describe(self) -> str:
+        return self.name or "the camera, whose frame the recording does not name"
+
+
+def find_framed_truth(
+    reader: BagReader,
+    spec: BagTruthSpec | None = None,
+    *,
+    where: str,
+    frame: str = "",
+    camera_frame: str = "",
+    T_frame_cam: FloatArray | None = None,
+    buffer: TfBuffer | None = None,
+) -> FramedTruth | Failure:
+    """Read the truth that was asked for, or the obvious one, in the frame that is estimated.
+
+    Parameters
+    ----------
+    reader : BagReader
+    spec : TfTruth or TopicTruth, optional
+        What to read; omitted: what names itself ground truth, see `find_obvious_truth`.
+    where : str
+        The bag, for messages.
+    frame, camera_frame, T_frame_cam
+        As of `in_frame`.
+    buffer : TfBuffer, optional
+        Of the bag, with all its frames; read where omitted and needed.
+
+    Returns
+    -------
+    FramedTruth or Failure
+        The failure says why there is none, or why it cannot be compared.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read, or does not hold what was asked for.
+    """
+    truth: BagTruth | Failure
+    if spec is None:
+        truth = find_obvious_truth(reader, buffer, where=where)
+        if isinstance(truth, Failure):
+            return truth
+    else:
+        truth = read_bag_truth(reader, spec, where=where, buffer=buffer)
+    if buffer is None:
+        frames = [name for name in (truth.child_frame, frame, camera_frame) if name]
+        buffer = read_tf(reader, frames=frames) if len({*frames}) > 1 else TfBuffer()
+    return in_frame(truth, buffer, frame=frame, camera_frame=camera_frame, T_frame_cam=T_frame_cam)
+
+
+def in_frame(
+    truth: BagTruth,
+    buffer: TfBuffer,
+    *,
+    frame: str = "",
+    camera_frame: str = "",
+    T_frame_cam: FloatArray | None = None,
+) -> FramedTruth | Failure:
+    """Bring true poses into the frame that is estimated: T_parent_child @ T_child_frame.
+
+    Where the messages name no child frame, they are taken for poses of the frame itself.
+    Positions without rotations stay: estimates are moved to the point instead, by
+    `FramedTruth.comparable`; where the place of the point in the frame is not known it is taken
+    for the frame's origin, with a warning.
+
+    Parameters
+    ----------
+    truth : BagTruth
+    buffer : TfBuffer
+        Of the bag.
+    frame : str
+        That is estimated, by its name in tf; empty: the rectified camera.
+    camera_frame : str
+        Of the rectified camera in tf; empty where the recording names none.
+    T_frame_cam : ndarray of float64, shape (4, 4), optional
+        Where the camera sits in the frame, metres, if that does not come from tf.
+
+    Returns
+    -------
+    FramedTruth or Failure
+        The failure says why tf does not bring the child frame of poses to the frame.
+    """
+    camera = _Place(name=bare(camera_frame))
+    asked = camera
+    if T_frame_cam is not None:
+        asked = _Place(name=camera.name, T_name_frame=se3.invert(T_frame_cam))
+    elif frame:
+        asked = _Place(name=bare(frame))
+    if not truth.is_of_camera and not truth.child_frame:
+        return _framed(truth, f"; it names no frame, taken for {frame or 'the camera'}")
+    child = camera if truth.is_of_camera else _Place(name=bare(truth.child_frame))
+    if child is asked or (not truth.is_of_camera and child.name == bare(frame)):
+        return _framed(truth, "")
+    if not truth.trajectory.has_rotations:
+        return _at_point(truth, buffer, child, asked)
+    return _moved(truth, buffer, child, asked)
+
+
+def _moved(
+    truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place
+) -> FramedTruth | Failure:
+    trajectory = truth.trajectory
+    T_child_asked, is_known, reason = _between(buffer, child, asked, trajectory)
+    if not np.any(is_known):
+        return Failure(
+            reason=f"it is of {child.describe()}, the estimate of {asked.describe()}: {reason}; "
+            f"give --frame {child.name or 'FRAME'} and its T_body_cam by --calibration FILE"
+        )
+    poses = trajectory.T_world_cam[is_known] @ T_child_asked[is_known]
+    n_unknown = int(np.count_nonzero(~is_known))
+    left_out = f"; {n_unknown} left out where tf does not know it" if n_unknown else ""
+    how = "" if child.name == asked.name else f"; brought from {child.name} to {asked.name} by tf"
+    framed = _framed(truth, how + left_out)
+    return replace(framed, trajectory=replace(trajectory.select(is_known), T_world_cam=poses))
+
+
+def _at_point(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> FramedTruth:
+    T_asked_child, is_known, reason = _between(buffer, asked, child, truth.trajectory)
+    framed = _framed(truth, "")
+    points = T_asked_child[is_known, :3, 3]
+    if len(points) == 0 or not np.allclose(points, points[0], atol=1e-6):
+        reason = reason or f"tf moves {child.name} against {asked.name}"
+        warning = (
+            f"where {child.describe()} lies from {asked.describe()} is not known ({reason}): the "
+            "errors hold its lever arm"
+        )
+        return replace(framed, warning=warning)
+    # a point has no directions of its own: only its place counts
+    T_asked_point = se3.make_transform(np.eye(3), points[0])
+    place = ", ".join(f"{value:.3f}" for value in points[0])
+    how = f"; {child.name} lies at ({place}) m from {asked.name} by tf"
+    return replace(framed, T_frame_point=T_asked_point, decision=f"{framed.decision}{how}")
+
+
+def _between(
+    buffer: TfBuffer, target: _Place, source: _Place, trajectory: Trajectory
+) -> tuple[FloatArray, BoolArray, str]:
+    """Return T_target_source at each stamp, where it is known, and why where it nowhere is."""
+    stamps_ns, reason = trajectory.stamps_ns, ""
+    if target.name == source.name:
+        T, is_known = np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.ones(len(stamps_ns), bool)
+    elif not target.name or not source.name:
+        return np.empty((len(stamps_ns), 4, 4)), np.zeros(len(stamps_ns), bool), "tf cannot tell"
+    else:
+        T, is_known = buffer.lookup_many(target.name, source.name, stamps_ns)
+        if not np.any(is_known):
+            found = buffer.lookup(target.name, source.name, int(stamps_ns[0]))
+            reason = found.reason if isinstance(found, Failure) else ""
+    return se3.invert(target.T_name_frame) @ T @ source.T_name_frame, is_known, reason
+
+
+def _framed(truth: BagTruth, how: str) -> FramedTruth:
+    return FramedTruth(trajectory=truth.trajectory, decision=f"{truth.decision}{how}")
+
+
+# A truth that stands while the estimate moves is none of it.
+_MIN_EXTENT_M = 0.1
+_MIN_SHARE = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TruthComparison:
+    """Estimates as those of what the truth is of, and their errors.
+
+    Parameters
+    ----------
+    truth : FramedTruth
+    estimates : dict of str to Trajectory
+        By name; of the point that the truth measured, where that holds positions only.
+    evaluations : tuple of Evaluation
+        In the same order.
+    """
+
+    truth: FramedTruth
+    estimates: dict[str, Trajectory]
+    evaluations: tuple[Evaluation, ...]
+
+    @classmethod
+    def of(cls, truth: FramedTruth, estimates: Mapping[str, Trajectory]) -> TruthComparison:
+        """Compare estimates of the frame that was asked for.
+
+        Parameters
+        ----------
+        truth : FramedTruth
+        estimates : mapping of str to Trajectory
+
+        Raises
+        ------
+        TrajectoryError
+            Where nothing can be associated.
+        """
+        comparable = {name: truth.comparable(estimate) for name, estimate in estimates.items()}
+        evaluations = tuple(
+            evaluate(truth.trajectory, estimate, name=name) for name, estimate in comparable.items()
+        )
+        return cls(truth=truth, estimates=comparable, evaluations=evaluations)
+
+    def warnings(self) -> list[str]:
+        """Return what the errors are to be taken with, a line each."""
+        warnings = [self.truth.warning] if self.truth.warning else []
+        true_m = _extent(self.truth.trajectory)
+        estimated_m = max(map(_extent, self.estimates.values()))
+        if estimated_m > _MIN_EXTENT_M and true_m < _MIN_SHARE * estimated_m:
+            warnings.append(
+                f"it moves by {true_m:.2g} m where the estimate moves by {estimated_m:.2g} m: is "
+                "it of another frame, are PARENT and CHILD exchanged?"
+            )
+        return warnings
+
+
+def _extent(trajectory: Trajectory) -> float:
+    """Return the diagonal of the box around the positions, metres."""
+    return float(np.linalg.norm(np.ptp(trajectory.positions, axis=0)))

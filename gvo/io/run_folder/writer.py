@@ -1,0 +1,261 @@
+"""The files of a run, written as the run goes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gvo.closable import Closable
+from gvo.errors import OutputError
+from gvo.io.run_folder.line_file import LineFile, RewrittenFile, replace_text
+from gvo.trajectory.formats import (
+    COVARIANCE_HEADER,
+    format_covariance_line,
+    format_tum_line,
+    write_tum,
+)
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Status
+
+SUMMARY = "summary.json"
+JOURNAL = "journal.bin"
+PICTURE = "trajectories.png"
+REPORT = "report.html"
+SHUTTLE_PICTURE = "shuttle.png"
+TRUTH = "ground_truth.txt"
+TRUE_POSITIONS = "ground_truth_positions.csv"
+POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
+TRAJECTORIES = ("raw", "causal", "smoothed")
+FRAMES_HEADER = (
+    "stamp_ns",
+    "status",
+    "segment",
+    "n_keypoints",
+    "n_points",
+    "n_matches",
+    "n_inliers",
+    "n_links",
+    "reason",
+)
+EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
+TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
+
+# The journal first: what is left of the others without it is no run that could go on.
+_OF_EARLIER_RUNS = (
+    JOURNAL,
+    SUMMARY,
+    "edges.csv",
+    "timings.csv",
+    PICTURE,
+    REPORT,
+    SHUTTLE_PICTURE,
+    TRUTH,
+    TRUE_POSITIONS,
+)
+
+
+class RunFolder(Closable):
+    """Trajectories, covariances and the tables of frames, edges and times, line by line.
+
+    Smoothed poses come in the order in which they leave the window; `close` puts them in the
+    order of their stamps. At any moment the files hold whole lines, whatever happens to the
+    process; a line that was cut off by the end of the power is cut out where the run goes on.
+
+    Parameters
+    ----------
+    path : Path
+        Folder to write into; made where it is missing. Files of an earlier run are replaced, its
+        summary and picture removed.
+    columns : sequence of str
+        Of the table of frames; the first is `stamp_ns`.
+    goes_on : bool
+        The run in the folder was interrupted and goes on: what it wrote is given once more from
+        its start, and the lines that are there stand. `settle` is to be called after that.
+
+    Attributes
+    ----------
+    is_settled : bool
+        All was given once more that had been written before an interruption.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be written.
+    ResumeError
+        When its tables are not those of the run that goes on.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        columns: Sequence[str] = FRAMES_HEADER,
+        goes_on: bool = False,
+    ) -> None:
+        self.path = path
+        self._goes_on = goes_on
+        self.is_settled = not goes_on
+        self._is_writable = True
+        self._files: dict[str, LineFile] = {}
+        with ExitStack() as stack, self._refused_on_error(path):
+            path.mkdir(parents=True, exist_ok=True)
+            for name in () if goes_on else _OF_EARLIER_RUNS:
+                (path / name).unlink(missing_ok=True)
+            stack.callback(self._close_files)
+            self._open_all(columns)
+            stack.pop_all()
+
+    def _open_all(self, columns: Sequence[str]) -> None:
+        for name in TRAJECTORIES:
+            self._open(f"{name}.txt", "")
+            self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
+        self._open("frames.csv", _csv_line(columns))
+        if columns is FRAMES_HEADER:
+            self._open("edges.csv", _csv_line(EDGES_HEADER))
+            self._open("timings.csv", _csv_line(TIMINGS_HEADER))
+
+    @contextmanager
+    def _refused_on_error(self, path: Path) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._is_writable = False
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+    def _open(self, name: str, header: str) -> None:
+        path = self.path / name
+        if self._goes_on and name.startswith("smoothed"):
+            # An interruption wrote preliminary poses too, and all in the order of their stamps.
+            self._files[name] = RewrittenFile(path, header)
+        else:
+            self._files[name] = LineFile(path, header, goes_on=self._goes_on)
+
+    def _write(self, name: str, lines: str) -> None:
+        file = self._files[name]
+        with self._refused_on_error(file.path):
+            file.write(lines)
+
+    def settle(self) -> None:
+        """Take that all was given once more that had been written before the interruption."""
+        for file in self._files.values() if self._goes_on else ():
+            with self._refused_on_error(file.path):
+                file.settle()
+        self.is_settled = True
+
+    def add_frame(self, frame: object, result: FrameResult) -> None:
+        """Write what one frame gave; its images are not needed."""
+        row = (
+            result.stamp_ns,
+            result.status,
+            result.segment,
+            result.n_keypoints,
+            result.n_points,
+            result.n_matches,
+            result.n_inliers,
+            result.n_links,
+            result.reason,
+        )
+        self.add_poses(result.raw, result.causal, row)
+        self._write("edges.csv", "".join(map(_csv_line, _link_rows(result))))
+        self._write("timings.csv", _csv_line((result.stamp_ns, *_times(result))))
+        self.add_smoothed(result.finished)
+
+    def add_poses(self, raw: Estimate, causal: Estimate, row: Sequence[object]) -> None:
+        """Write both poses of a frame as it arrives, and its row of the table."""
+        self._add_pose("raw", raw)
+        self._add_pose("causal", causal)
+        self._write("frames.csv", _csv_line(row))
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write a row for a frame without a pose."""
+        row = (frame.stamp_ns, Status.SKIPPED, "", 0, 0, 0, 0, 0, frame.reason)
+        self._write("frames.csv", _csv_line(row))
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses that are final."""
+        for estimate in estimates:
+            self._add_pose("smoothed", estimate)
+
+    def _add_pose(self, name: str, estimate: Estimate) -> None:
+        pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)
+        self._write(f"{name}.txt", f"{pose}\n")
+        covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
+        self._write(f"{name}_covariance.csv", f"{covariance}\n")
+
+    def frame_stamps_ns(self) -> IntArray:
+        """Return the stamps of all frames of the table, shape (n,), also of faulty ones."""
+        with (self.path / "frames.csv").open(encoding="utf-8", newline="") as file:
+            return np.array([int(row["stamp_ns"]) for row in csv.DictReader(file)], dtype=np.int64)
+
+    def write_truth(self, truth: Trajectory) -> None:
+        """Write the true poses that the estimates were compared with.
+
+        Positions without rotations become a table of their own: as poses they would claim more
+        than is known.
+        """
+        if truth.has_rotations:
+            write_tum(self.path / TRUTH, truth)
+            return
+        rows = zip(truth.stamps_ns.tolist(), *truth.positions.T.tolist(), strict=True)
+        lines = [_csv_line(POSITIONS_HEADER), *map(_csv_line, rows)]
+        path = self.path / TRUE_POSITIONS
+        with self._refused_on_error(path):
+            path.write_text("".join(lines), encoding="utf-8")
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write `summary.json`; at any moment the one before or this one is there, whole."""
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        path = self.path / SUMMARY
+        with self._refused_on_error(path):
+            replace_text(path, text)
+
+    def close(self) -> None:
+        """Close all files and sort the smoothed poses by stamp."""
+        self._close_files()
+        if not (self.is_settled and self._is_writable):
+            return
+        for name, n_header in (("smoothed.txt", 0), ("smoothed_covariance.csv", 1)):
+            with self._refused_on_error(self.path / name):
+                _sort_lines(self.path / name, n_header=n_header)
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+
+def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
+    for link in result.links:
+        chi2 = "" if link.chi2 is None else f"{link.chi2:.6g}"
+        yield result.stamp_ns, link.reference_ns, link.kind, int(link.is_accepted), chi2
+
+
+def _times(result: FrameResult) -> Iterator[str]:
+    for name in TIMINGS_HEADER[1:]:
+        elapsed_ms = result.stage_ms.get(name.removesuffix("_ms"))
+        yield "" if elapsed_ms is None else f"{elapsed_ms:.3f}"
+
+
+def _sort_lines(path: Path, *, n_header: int) -> None:
+    """Sort the lines of a file by their stamp, the number at their start."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    header, body = lines[:n_header], lines[n_header:]
+    body.sort(key=_stamp_digits)
+    replace_text(path, "".join(header + body))
+
+
+def _stamp_digits(line: str) -> int:
+    # Seconds with nine decimals, or nanoseconds: without the point both are nanoseconds.
+    return int(line.replace(",", " ").split(" ", 1)[0].replace(".", ""))
+
+
+def _csv_line(row: Iterable[object]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(row)
+    return buffer.getvalue()

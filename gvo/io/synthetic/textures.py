@@ -1,0 +1,306 @@
+"""Textures and their atlas."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
+
+_MAX_ROWS = 32_000  # cv2.remap addresses images with 16 bits
+_SMALLEST_LEVEL = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Texture:
+    """A periodic grey image and the area of a surface that it covers.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8, shape (n, n)
+        Grey values, n a power of two, the same for all textures of a scene.
+    size_m : (float, float)
+        Width and height of one period, metres.
+    mask : ndarray of bool, shape (n, n), optional
+        True where the texture is opaque.
+    """
+
+    pixels: ImageArray
+    size_m: tuple[float, float]
+    mask: BoolArray | None = None
+
+    def __post_init__(self) -> None:
+        """Check the shape once."""
+        n = len(self.pixels)
+        if self.pixels.shape != (n, n) or n < _SMALLEST_LEVEL or n & (n - 1):
+            raise ValueError(
+                f"pixels must be square, their size a power of two, got {self.pixels.shape}"
+            )
+        if self.mask is not None and self.mask.shape != self.pixels.shape:
+            raise ValueError(f"mask must be {self.pixels.shape}, got {self.mask.shape}")
+
+
+class TextureAtlas:
+    """All textures in one image, shrunk independently along rows and columns.
+
+    Level (i, j) of a texture is 2^i times narrower and 2^j times lower, so that surfaces seen
+    at a grazing angle are blurred along one direction only.
+
+    Parameters
+    ----------
+    textures : sequence of Texture
+        All of one size.
+    """
+
+    def __init__(self, textures: Sequence[Texture]) -> None:
+        self.size = len(textures[0].pixels)
+        if any(len(texture.pixels) != self.size for texture in textures):
+            raise ValueError("the textures of a scene must be of one size")
+        n_levels = int(np.log2(self.size // _SMALLEST_LEVEL)) + 1
+        sizes = self.size >> np.arange(n_levels)
+        starts = np.concatenate([[0], np.cumsum(sizes + 2)])
+        span = int(starts[-1])
+        n_columns = -(-len(textures) // (_MAX_ROWS // span))
+        per_column = -(-len(textures) // n_columns)
+        self._image = np.zeros((per_column * span, n_columns * span), dtype=np.uint8)
+        corners = []
+        for k, texture in enumerate(textures):
+            x, y = (k // per_column) * span, (k % per_column) * span
+            corners.append((x, y))
+            _write_levels(self._image[y : y + span, x : x + span], texture.pixels, starts)
+        self.corners: FloatArray = np.array(corners, dtype=np.float64)
+        # Texel t of level i is at starts[i] + 1 + (t / 2^i - 0.5): one texel of gutter.
+        self._scales = (0.5 ** np.arange(n_levels)).astype(np.float32)
+        self._starts = (starts[:-1] + 0.5).astype(np.float32)
+        self._masks = [_mask_levels(texture.mask, n_levels) for texture in textures]
+
+    def locate(
+        self, texels: NDArray[np.float32], footprints: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return where in the atlas texture coordinates lie, relative to the texture's corner.
+
+        Parameters
+        ----------
+        texels : ndarray of float32
+            Coordinates along one axis, the first texel's centre at 0.5, any period.
+        footprints : ndarray of float32, the same shape
+            Texels per pixel; the level whose texel is nearest to one pixel is taken.
+        """
+        exponents = (footprints * np.float32(np.sqrt(2.0))).view(np.int32) >> 23
+        levels = np.clip(exponents - 127, 0, len(self._scales) - 1)
+        wrapped = texels - np.floor(texels * np.float32(1.0 / self.size)) * np.float32(self.size)
+        return np.asarray(wrapped * self._scales.take(levels) + self._starts.take(levels))
+
+    def sample(self, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the grey values at positions in the atlas, bilinear.
+
+        Parameters
+        ----------
+        map_x, map_y : ndarray of float32, shape (n,) or (h, w)
+            Column and row in the atlas, texels.
+
+        Returns
+        -------
+        ndarray of float32, of the same shape
+            0 to 255.
+        """
+        shape = map_x.shape
+        if map_x.ndim == 1:  # cv2.remap writes images of fewer than 2^15 rows
+            pad = -len(map_x) % 256
+            map_x = np.pad(map_x, (0, pad)).reshape(-1, 256)
+            map_y = np.pad(map_y, (0, pad)).reshape(-1, 256)
+        if map_x.size == 0:
+            return np.zeros(shape, dtype=np.float32)
+        grey = np.asarray(cv2.remap(self._image, map_x, map_y, cv2.INTER_LINEAR))
+        return grey.ravel()[: np.prod(shape)].reshape(shape).astype(np.float32)
+
+    def is_opaque(
+        self, texture: int, level: int, s: NDArray[np.float32], t: NDArray[np.float32]
+    ) -> BoolArray:
+        """Tell where a texture is opaque.
+
+        Parameters
+        ----------
+        texture : int
+            Index of a texture that has a mask.
+        level : int
+            Of the mask's pyramid: 0 is the finest.
+        s, t : ndarray of float32, shape (n,) or (h, w)
+            Texture coordinates, texels of the finest level.
+
+        Returns
+        -------
+        ndarray of bool, of the same shape
+        """
+        masks = self._masks[texture]
+        mask = masks[min(level, len(masks) - 1)]
+        n = len(mask)
+        scale = np.float32(n / self.size)
+        columns = np.floor(s * scale).astype(np.int32) & (n - 1)
+        rows = np.floor(t * scale).astype(np.int32) & (n - 1)
+        return np.asarray(mask.ravel().take(rows * n + columns))
+
+
+def _write_levels(block: ImageArray, pixels: ImageArray, starts: IntArray) -> None:
+    narrow = pixels.astype(np.float32)
+    for x, x_end in pairwise(starts):
+        level = narrow
+        for y, y_end in pairwise(starts):
+            padded = np.pad(np.rint(level), 1, mode="wrap")
+            block[y:y_end, x:x_end] = padded.astype(np.uint8)
+            level = 0.5 * (level[0::2] + level[1::2])
+        narrow = 0.5 * (narrow[:, 0::2] + narrow[:, 1::2])
+
+
+def _mask_levels(mask: BoolArray | None, n_levels: int) -> list[BoolArray]:
+    if mask is None:
+        return []
+    shares = mask.astype(np.float32)
+    levels = [mask]
+    for _ in range(n_levels - 1):
+        shares = 0.5 * (shares[0::2] + shares[1::2])
+        shares = 0.5 * (shares[:, 0::2] + shares[:, 1::2])
+        levels.append(shares >= 0.5)
+    return levels
+
+
+N_TEXELS = 1024
+Canvas: TypeAlias = NDArray[np.float32]
+Box: TypeAlias = tuple[float, float, float, float]
+Point: TypeAlias = tuple[float, float]
+
+
+def blank(grey: float) -> Canvas:
+    """Return a canvas of one grey value."""
+    return np.full((N_TEXELS, N_TEXELS), grey, dtype=np.float32)
+
+
+def gradient(top: float, bottom: float) -> Canvas:
+    """Return a canvas that changes from the first to the last row."""
+    column = np.linspace(top, bottom, N_TEXELS, dtype=np.float32)[:, np.newaxis]
+    return np.repeat(column, N_TEXELS, axis=1)
+
+
+def noise(rng: np.random.Generator, *, exponent: float = 1.0, largest: float = 0.5) -> Canvas:
+    """Return periodic noise of unit variance whose amplitudes fall as 1/f^exponent.
+
+    Parameters
+    ----------
+    rng : Generator
+    exponent : float
+        0 is white, 1 is like natural images, 2 is cloudy.
+    largest : float
+        Largest wavelength as a share of the canvas.
+    """
+    f_x = fft.rfftfreq(N_TEXELS) * N_TEXELS
+    f_y = fft.fftfreq(N_TEXELS)[:, np.newaxis] * N_TEXELS
+    f = np.hypot(f_x, f_y).astype(np.float32)
+    amplitudes = np.where(f < 1.0 / largest, 0.0, np.maximum(f, 1.0) ** np.float32(-exponent))
+    white = fft.rfft2(rng.standard_normal((N_TEXELS, N_TEXELS), dtype=np.float32))
+    field = fft.irfft2(white * amplitudes.astype(np.float32), s=(N_TEXELS, N_TEXELS))
+    return np.asarray(field / field.std(), dtype=np.float32)
+
+
+def bricks(
+    rng: np.random.Generator, n_columns: int, n_rows: int, *, joint: int = 2, shift: float = 0.5
+) -> Canvas:
+    """Return a bond of bricks: the tone of each normally distributed, joints at -3.
+
+    Parameters
+    ----------
+    rng : Generator
+    n_columns, n_rows : int
+        Bricks in a period, the rows an even number.
+    joint : int
+        Width of the joints, texels.
+    shift : float
+        Of every second row, in bricks.
+    """
+    y = np.arange(N_TEXELS)[:, np.newaxis] * (n_rows / N_TEXELS)
+    row = y.astype(np.int64)
+    x = np.arange(N_TEXELS) * (n_columns / N_TEXELS) + shift * (row % 2)
+    tones = rng.standard_normal((n_rows, n_columns))
+    wide, high = N_TEXELS / n_columns, N_TEXELS / n_rows
+    is_joint = ((x % 1.0) * wide < joint) | ((y % 1.0) * high < joint)
+    return np.where(is_joint, -3.0, tones[row, x.astype(np.int64) % n_columns]).astype(np.float32)
+
+
+def fill(canvas: Canvas, box: Box, grey: float | Canvas) -> None:
+    """Fill a box (x, y, width, height) with a grey value, or the same part of a canvas."""
+    part = _part(box)
+    canvas[part] = grey[part] if isinstance(grey, np.ndarray) else grey
+
+
+def frame(canvas: Canvas, box: Box, grey: float, thickness: float) -> None:
+    """Draw the outline of a box, inwards."""
+    x, y, w, h = box
+    fill(canvas, (x, y, w, thickness), grey)
+    fill(canvas, (x, y + h - thickness, w, thickness), grey)
+    fill(canvas, (x, y, thickness, h), grey)
+    fill(canvas, (x + w - thickness, y, thickness, h), grey)
+
+
+def _part(box: Box) -> tuple[slice, slice]:
+    x, y, w, h = (round(value * N_TEXELS) for value in box)
+    return slice(max(y, 0), max(y + max(h, 1), 0)), slice(max(x, 0), max(x + max(w, 1), 0))
+
+
+def polyline(canvas: Canvas, points: NDArray[np.float64], grey: float, thickness: int) -> None:
+    """Draw connected lines through points, shape (n, 2); what leaves comes back opposite."""
+    path = np.rint(points * N_TEXELS).astype(np.int32)
+    for dx in (-N_TEXELS, 0, N_TEXELS):
+        for dy in (-N_TEXELS, 0, N_TEXELS):
+            shifted = path + np.array([dx, dy], dtype=np.int32)
+            cv2.polylines(canvas, [shifted], False, float(grey), thickness)
+
+
+def polygon(canvas: Canvas, points: Sequence[Point], grey: float) -> None:
+    """Fill a polygon."""
+    corners = np.rint(np.array(points) * N_TEXELS).astype(np.int32)
+    cv2.fillPoly(canvas, [corners], float(grey))
+
+
+def disc(canvas: Canvas, center: Point, radii: Point, grey: float) -> None:
+    """Fill an ellipse."""
+    x, y, a, b = (round(value * N_TEXELS) for value in (*center, *radii))
+    cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, float(grey), cv2.FILLED)
+
+
+def write(canvas: Canvas, text: str, box: Box, grey: float) -> None:
+    """Write a line of text into a box."""
+    x, y, w, h = (round(value * N_TEXELS) for value in box)
+    font = cv2.FONT_HERSHEY_DUPLEX
+    (wide, high), _ = cv2.getTextSize(text, font, 1.0, 2)
+    scale = min(w / wide, h / high)
+    ink = np.zeros(canvas[y : y + h, x : x + w].shape, dtype=np.uint8)
+    bold = max(1, round(2 * scale))
+    cv2.putText(ink, text, (0, len(ink) - 1), font, scale, 255, bold, cv2.LINE_AA)
+    share = ink.astype(np.float32) / 255
+    canvas[y : y + h, x : x + w] += share * (np.float32(grey) - canvas[y : y + h, x : x + w])
+
+
+def crack(canvas: Canvas, rng: np.random.Generator, *, n_steps: int, grey: float) -> None:
+    """Draw a random walk that keeps its direction for a while."""
+    headings = rng.uniform(0, 2 * np.pi) + 0.35 * np.cumsum(rng.standard_normal(n_steps))
+    steps = 0.008 * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    polyline(canvas, rng.uniform(0, 1, 2) + np.cumsum(steps, axis=0), grey, 2)
+
+
+def opaque(canvas: Canvas) -> BoolArray:
+    """Return the mask of a canvas: opaque where its value is positive."""
+    return np.asarray(canvas > 0)
+
+
+def finish(canvas: Canvas, size_m: tuple[float, float], mask: BoolArray | None = None) -> Texture:
+    """Return the texture of a canvas, blurred by half a texel: no lens is sharper."""
+    padded = np.pad(canvas, 4, mode="wrap")
+    smooth = np.asarray(cv2.GaussianBlur(padded, (0, 0), 0.6))[4:-4, 4:-4]
+    pixels = np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
+    return Texture(pixels=pixels, size_m=size_m, mask=mask)

@@ -1,0 +1,273 @@
+"""Worlds that deceive: traffic, facade, mirror, blank wall."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from gvo.geometry.se3 import exp, make_transform
+from gvo.io.synthetic import textures as paint
+from gvo.io.synthetic.moving_scene import Stage
+from gvo.io.synthetic.scene import Rectangle, Scene, make_scene
+from gvo.io.synthetic.textures import Texture
+from gvo.io.synthetic.worlds.building import box, plain, slab, stretched, wall
+from gvo.io.synthetic.worlds.motion import CAMERA_HEIGHT_M, R_MAP_LEVEL, drive_along, look_around
+from gvo.io.synthetic.worlds.room import LAMP, room_rectangles, room_textures
+from gvo.io.synthetic.worlds.street import DAYLIGHT, street_rectangles
+from gvo.io.synthetic.worlds.street_textures import street_textures
+from gvo.types import FloatArray
+
+_BUS_M = (18.0, 2.55, 3.0)  # length, width, height
+_BOTTOM_M = 0.3
+# Where the car halts and where the bus crosses its road, along it; metres.
+_HALT_M = 36.0
+_CROSSING_M = _HALT_M + 10.3
+_SPEED_M_S = 8.0
+_BRAKE_M_S2 = 3.2
+_HALT_S = 2.5
+_START_S = 9.5
+_START_M_S2 = 1.8
+
+
+def traffic_drive(stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a car that brakes, stands for 7 s and drives on.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    t = stamps_s
+    left_s = np.maximum(_HALT_S - t, 0.0)
+    gone_s = np.maximum(t - _START_S, 0.0)
+    s = _HALT_M - 0.5 * _BRAKE_M_S2 * left_s**2
+    # Up to its speed, then on with it.
+    rising_s = np.minimum(gone_s, _SPEED_M_S / _START_M_S2)
+    s = s + 0.5 * _START_M_S2 * rising_s**2 + _SPEED_M_S * (gone_s - rising_s)
+    speeds = _BRAKE_M_S2 * left_s + _START_M_S2 * rising_s
+    return drive_along(t, s, shake=np.minimum(speeds / _SPEED_M_S, 1.0))
+
+
+def bus_path(elapsed_s: float) -> FloatArray:
+    """Return T_map_body of the bus: it comes from the left, halts at 5.5 s, pulls off at 6.5 s."""
+    coming_s = max(5.5 - elapsed_s, 0.0)
+    gone_s = max(elapsed_s - 6.5, 0.0)
+    x = -0.5 * 2.6 * coming_s**2 + 0.5 * 1.2 * gone_s**2
+    return np.asarray(make_transform(np.eye(3), np.array([x, _CROSSING_M, 0.0])))
+
+
+@lru_cache(maxsize=2)
+def traffic(seed: int) -> Stage:
+    """Build the street with a gap for the crossing, and the bus."""
+    still = [*filter(_leaves_way, street_rectangles(seed))]
+    textures = street_textures(seed) | {"bus": _bus_side(np.random.default_rng([seed, 4]))}
+    return Stage(
+        scene=make_scene([*still, *_bus()], textures, DAYLIGHT),
+        n_still=len(still),
+        path=bus_path,
+    )
+
+
+def _leaves_way(rectangle: Rectangle) -> bool:
+    """Tell whether the bus does not run into a rectangle, or it is ground or sky."""
+    corner, s, t = (
+        np.asarray(v, dtype=np.float64)
+        for v in (rectangle.corner, rectangle.edge_s, rectangle.edge_t)
+    )
+    corners = np.array([corner, corner + s, corner + t, corner + s + t])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    is_beside = high[1] < _CROSSING_M - 2.5 or low[1] > _CROSSING_M + 2.5
+    return bool(is_beside or high[2] < _BOTTOM_M or (high - low).max() > 200.0)
+
+
+def _bus() -> Sequence[Rectangle]:
+    """Return a bus that stands along x, its middle at the origin."""
+    length, width, height = _BUS_M
+    size = (width, length, height)
+    return box(np.zeros(2), 0.0, size, stretched("bus"), bottom=_BOTTOM_M, top=plain("body")) + box(
+        np.zeros(2), 0.0, (width - 0.3, length - 1.0, _BOTTOM_M), replace(plain("metal"), gain=0.3)
+    )
+
+
+def _bus_side(rng: np.random.Generator) -> Texture:
+    """Paint a row of windows with passengers, advertisements, doors and wheels."""
+    canvas = paint.gradient(196, 150) + 4 * paint.noise(rng, exponent=1.0)
+    for k in range(14):
+        x = 0.02 + k * 0.069
+        paint.fill(canvas, (x, 0.12, 0.062, 0.36), float(rng.uniform(35, 70)))
+        for _ in range(5):
+            u, v = x + rng.uniform(0.006, 0.05), rng.uniform(0.2, 0.42)
+            paint.disc(canvas, (u, v), (0.006, 0.035), float(rng.uniform(60, 200)))
+        if k % 4 == 1:
+            paint.fill(canvas, (x, 0.12, 0.062, 0.78), 45)
+            paint.frame(canvas, (x, 0.12, 0.031, 0.78), 170, 0.004)
+    for k, words in enumerate(("CITY LINES", "SEE THE SEA", "FRESH BREAD", "NIGHT MAPS")):
+        x = 0.095 + 0.245 * k
+        paint.fill(canvas, (x + 0.06, 0.55, 0.13, 0.2), float(rng.uniform(60, 120)))
+        paint.write(canvas, words, (x + 0.065, 0.59, 0.12, 0.12), 235)
+    for _ in range(160):  # dirt and dents
+        x, y = rng.uniform(0.0, 0.99), rng.uniform(0.5, 0.95)
+        paint.fill(canvas, (x, y, *rng.uniform(0.002, 0.008, 2)), float(rng.uniform(60, 230)))
+    for x in (0.12, 0.55, 0.86):
+        paint.disc(canvas, (x, 0.95), (0.028, 0.15), 30)
+        paint.disc(canvas, (x, 0.95), (0.014, 0.08), 150)
+    return paint.finish(canvas, (_BUS_M[0], _BUS_M[2]))
+
+
+PERIOD_M = 2.0
+_FRONT_M = 8.0
+_ENDS_M = (-60.0, 460.0)
+_FACADE_SPEED_M_S = 11.0
+_ACCELERATION_M_S2 = 3.0
+
+
+def ride(stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a tram that starts and rides at about 11 m/s.
+
+    At 10 Hz it moves by more than half a window from frame to frame: whoever looks for the
+    nearest equal window sees it ride backwards.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    t = stamps_s
+    rising_s = np.minimum(t, _FACADE_SPEED_M_S / _ACCELERATION_M_S2)
+    x = 0.5 * _ACCELERATION_M_S2 * rising_s**2 + _FACADE_SPEED_M_S * (t - rising_s)
+    pace = rising_s * _ACCELERATION_M_S2 / _FACADE_SPEED_M_S
+    sway = pace * np.stack([0.03 * np.sin(2.1 * t), 0.01 * np.sin(5.3 * t + 1)])
+    position = np.column_stack([x, sway[0], CAMERA_HEIGHT_M + sway[1]])
+    zeros = np.zeros_like(t)
+    tilts = [0.004 * np.sin(3.7 * t), 0.006 * np.sin(1.9 * t), 0.004 * np.sin(4.3 * t)]
+    tilt = exp(np.stack([*(pace * each for each in tilts), zeros, zeros, zeros], axis=-1))
+    level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(t), 3, 3)), position)
+    return np.asarray(level @ tilt)
+
+
+@lru_cache(maxsize=2)
+def facade(seed: int) -> Scene:
+    """Build the house front, the street before it, and what stands there."""
+    first, last = _ENDS_M
+    front = wall(
+        np.array([first, _FRONT_M]), np.array([last, _FRONT_M]), (0.0, 16.0), plain("windows")
+    )
+    ends = np.array([first, 0.0]), np.array([last, 0.0])
+    aside = np.array([0.0, 1.0])
+    rectangles = [
+        front,
+        slab(ends[0], ends[1], 12.0, 0.0, plain("asphalt")),
+        slab(ends[0] + 7.0 * aside, ends[1] + 7.0 * aside, 2.0, 0.1, plain("pavement")),
+        wall(ends[0] + 6.0 * aside, ends[1] + 6.0 * aside, (0.0, 0.1), plain("kerb")),
+        *_things(np.random.default_rng([seed, 5])),
+    ]
+    windows = _window(np.random.default_rng([seed, 6]))
+    return make_scene(rectangles, street_textures(seed) | {"windows": windows}, DAYLIGHT)
+
+
+def _things(rng: np.random.Generator) -> Iterator[Rectangle]:
+    """Yield trunks and posts along the kerb, at no regular distance."""
+    x = _ENDS_M[0]
+    while x < _ENDS_M[1]:
+        foot = np.array([x, float(rng.uniform(6.3, 6.7))])
+        is_tree = rng.random() < 0.6
+        width = float(rng.uniform(0.25, 0.5)) if is_tree else 0.14
+        bark = replace(
+            plain("bark" if is_tree else "metal"),
+            offset_m=(float(rng.uniform(0.0, 2.0)), float(rng.uniform(0.0, 2.0))),
+        )
+        yield from box(foot, float(rng.uniform(-0.3, 0.3)), (width, width, 6.0), bark)[:4]
+        x += float(rng.uniform(4.0, 9.0))
+
+
+def _window(rng: np.random.Generator) -> Texture:
+    """Paint one window in its part of the front; every other one is the same."""
+    canvas = 150 + 9 * paint.bricks(rng, 10, 32) + 5 * paint.noise(rng, exponent=0.9)
+    paint.fill(canvas, (0.24, 0.2, 0.52, 0.5), 228)
+    paint.fill(canvas, (0.27, 0.22, 0.46, 0.46), paint.gradient(90, 35))
+    for _ in range(9):
+        u, v = rng.uniform(0.3, 0.66), rng.uniform(0.3, 0.62)
+        paint.fill(canvas, (u, v, *rng.uniform(0.01, 0.05, 2)), float(rng.uniform(60, 220)))
+    for x in (0.27, 0.49, 0.715):
+        paint.fill(canvas, (x, 0.22, 0.015, 0.46), 235)
+    paint.fill(canvas, (0.27, 0.38, 0.46, 0.012), 235)
+    paint.fill(canvas, (0.2, 0.7, 0.6, 0.03), 205)
+    paint.fill(canvas, (0.2, 0.73, 0.6, 0.012), 60)
+    return paint.finish(canvas, (PERIOD_M, 3.2))
+
+
+# The mirror: width and height, and where its middle is; metres.
+_MIRROR_M = (1.9, 1.5)
+_MIDDLE_M = np.array([0.0, 1.25, 1.3])
+_SWING_RAD = np.radians(5.0)
+_SWING_S = 4.0
+# The time from turning away to being turned to the blank wall, and how long it is looked at.
+_AWAY_S = (2.0, 2.0)
+_BLANK_S = 2.5
+
+
+@lru_cache(maxsize=2)
+def mirror_room(seed: int) -> Stage:
+    """Build the room with a standing mirror that swings about its upright axis."""
+    still = room_rectangles()
+    width, height = _MIRROR_M
+    half = 0.5 * width
+    glass = wall(np.array([-half, 0.0]), np.array([half, 0.0]), (0.0, height), stretched("black"))
+    frame = [
+        *box(np.array([0.0, 0.03]), 0.0, (0.04, width + 0.1, 0.06), plain("wood"), bottom=-0.06),
+        *box(np.array([0.0, 0.03]), 0.0, (0.04, width + 0.1, 0.06), plain("wood"), bottom=height),
+        *box(np.array([-half - 0.03, 0.03]), 0.0, (0.04, 0.06, height), plain("wood")),
+        *box(np.array([half + 0.03, 0.03]), 0.0, (0.04, 0.06, height), plain("wood")),
+    ]
+    textures = room_textures(seed) | {"black": paint.finish(paint.blank(0), (1.0, 1.0))}
+    return Stage(
+        scene=make_scene([*still, glass, *frame], textures, LAMP),
+        n_still=len(still),
+        path=_swing,
+        mirror=len(still),
+    )
+
+
+def _swing(elapsed_s: float) -> FloatArray:
+    """Return T_map_body of the mirror; it begins to swing gently after a second."""
+    t = max(elapsed_s - 1.0, 0.0)
+    angle = _SWING_RAD * min(0.5 * t, 1.0) * np.sin(2.0 * np.pi * t / _SWING_S)
+    R = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
+    return make_transform(R, _MIDDLE_M - [0.0, 0.0, 0.5 * _MIRROR_M[1]])
+
+
+@lru_cache(maxsize=2)
+def blank_room(seed: int) -> Stage:
+    """Build the room with a wall of one grey behind the camera, from floor to ceiling."""
+    blank: Texture = paint.finish(paint.blank(190), (1.0, 1.0))
+    board = wall(np.array([2.0, -1.97]), np.array([-2.0, -1.97]), (0.0, 2.5), stretched("blank"))
+    return Stage(
+        scene=make_scene([*room_rectangles(), board], room_textures(seed) | {"blank": blank}, LAMP)
+    )
+
+
+def turn_away(stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a hand that turns to the wall behind it, and back.
+
+    Parameters
+    ----------
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start; the wall fills the view from 3.8 s to 7.0 s.
+    """
+    start, duration = _AWAY_S
+    away = _smooth((stamps_s - start) / duration)
+    back = _smooth((stamps_s - start - duration - _BLANK_S) / duration)
+    zeros = np.zeros_like(stamps_s)
+    angles = -np.pi * (away - back)
+    yaw = exp(np.stack([zeros, zeros, angles, zeros, zeros, zeros], axis=-1))
+    T_map_cam = look_around(stamps_s)
+    T_map_cam[:, :3, :3] = yaw[:, :3, :3] @ T_map_cam[:, :3, :3]
+    return T_map_cam
+
+
+def _smooth(share: FloatArray) -> FloatArray:
+    x = np.clip(share, 0.0, 1.0)
+    return np.asarray(x * x * (3.0 - 2.0 * x))

@@ -1,0 +1,381 @@
+"""Matches drawn over the image."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.types import (
+    BoolArray,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    FrameResult,
+    ImageArray,
+    RelativePose,
+    RgbdFrame,
+    Status,
+    StereoFrame,
+)
+from gvo.viz.canvas import (
+    BLACK,
+    WHITE,
+    DepthScale,
+    bgr,
+    colour_bar,
+    draw_crosses,
+    draw_dots,
+    draw_segments,
+    in_groups,
+    paint_depth,
+    shortened,
+    table,
+    text_width,
+    write,
+    write_lines,
+)
+from gvo.viz.canvas import HEIGHT_PX as FOOTER_PX
+from gvo.viz.palette import INLIERS, OUTLIERS, STATUSES
+
+HEADER_PX: Final = 44
+MIN_WIDTH_PX: Final = 640
+"""The text needs it."""
+
+_WIDE = 2.0  # an image so much wider than high has its depth below
+_MARGIN_PX = 8
+_GAP_PX = 18
+_ROWS_PX = (17, 37)
+_DARK_TEXT = frozenset({Status.OK, Status.COASTING})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Two panels of one size, one above the other or side by side, a header and a footer.
+
+    Parameters
+    ----------
+    panel : tuple of two int
+        Width and height of a panel, pixels; both even, as encoders want them.
+    scale : float
+        Pixels of a panel per pixel of the image.
+    is_stacked : bool
+        One panel above the other.
+    """
+
+    panel: tuple[int, int]
+    scale: float
+    is_stacked: bool
+
+    @classmethod
+    def of(cls, camera: PinholeCamera, max_width: int) -> Layout:
+        """Return the layout for the images of a camera.
+
+        Raises
+        ------
+        ValueError
+            When the picture would be too narrow for its text.
+        """
+        if max_width < MIN_WIDTH_PX:
+            raise ValueError(f"max_width must be at least {MIN_WIDTH_PX}, got {max_width}")
+        is_stacked = camera.width >= _WIDE * camera.height
+        n_columns = 1 if is_stacked else 2
+        widest, narrowest = max_width // n_columns, MIN_WIDTH_PX // n_columns
+        width = max(narrowest, min(widest, camera.width)) & ~1
+        scale = width / camera.width
+        height = max(2, round(camera.height * scale) & ~1)
+        return cls(panel=(width, height), scale=scale, is_stacked=is_stacked)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the whole, pixels."""
+        width, height = self.panel
+        across, down = (1, 2) if self.is_stacked else (2, 1)
+        return across * width, HEADER_PX + down * height + FOOTER_PX
+
+    def empty(self) -> ImageArray:
+        """Return a black picture, shape (height, width, 3)."""
+        width, height = self.size
+        return np.zeros((height, width, 3), dtype=np.uint8)
+
+    def panels(self, canvas: ImageArray) -> tuple[ImageArray, ImageArray]:
+        """Return the parts of a picture that are the panels, to be written to."""
+        width, height = self.panel
+        body = canvas[HEADER_PX : canvas.shape[0] - FOOTER_PX]
+        if self.is_stacked:
+            return body[:height], body[height:]
+        return body[:, :width], body[:, width:]
+
+    def scaled(self, pixels: FloatArray) -> FloatArray:
+        """Return where pixels of the image, shape (n, 2), are in a panel."""
+        return np.asarray((pixels + 0.5) * self.scale - 0.5)
+
+
+def write_header(
+    canvas: ImageArray,
+    layout: Layout,
+    result: FrameResult | FaultyFrame,
+    *,
+    index: int | None,
+    rate_hz: float | None = None,
+) -> None:
+    """Write status, number, stamp, counts and rate above the panels."""
+    status = result.status if isinstance(result, FrameResult) else Status.SKIPPED
+    upper, lower = _ROWS_PX
+    u = _write_badge(canvas, status) + _GAP_PX
+    if index is not None:
+        u = write(canvas, f"frame {index}", (u, upper))[0] + _GAP_PX
+    seconds, nanoseconds = divmod(result.stamp_ns, 10**9)
+    write(canvas, f"stamp {seconds}.{nanoseconds // 1000:06d} s", (u, upper))
+    if not isinstance(result, FrameResult):
+        return
+    n_outliers = max(0, result.n_matches - result.n_inliers)
+    u = write(canvas, f"{result.n_matches} matches", (_MARGIN_PX, lower))[0] + _GAP_PX
+    for text, colour in (
+        (f"{result.n_inliers} inliers", bgr(INLIERS)),
+        (f"{n_outliers} outliers", bgr(OUTLIERS)),
+        (f"{result.n_links} links", WHITE),
+    ):
+        u = write(canvas, text, (u, lower), colour)[0] + _GAP_PX
+    rate = _rate_text(result, rate_hz)
+    write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
+
+
+def write_footer(canvas: ImageArray, layout: Layout, camera: PinholeCamera, reason: str) -> None:
+    """Write a reason, and the scale of depth, below the panels."""
+    width, height = layout.size
+    middle = width // 2
+    canvas[height - FOOTER_PX :, middle:] = colour_bar(DepthScale.of(camera), width - middle)
+    text = shortened(reason, middle - 2 * _MARGIN_PX)
+    write(canvas, text, (_MARGIN_PX, height - 10))
+
+
+def _write_badge(canvas: ImageArray, status: Status) -> int:
+    """Write the status in a field of its colour; return where that ends."""
+    text = status.value
+    right = _MARGIN_PX + text_width(text) + 2 * _MARGIN_PX
+    field = canvas[2 : _ROWS_PX[0] + 6, _MARGIN_PX:right]
+    field[:] = bgr(STATUSES[status.value])
+    if status is Status.SKIPPED:  # black on black
+        field[[0, -1]] = WHITE
+        field[:, [0, -1]] = WHITE
+    write(canvas, text, (2 * _MARGIN_PX, _ROWS_PX[0]), BLACK if status in _DARK_TEXT else WHITE)
+    return right
+
+
+def _rate_text(result: FrameResult, rate_hz: float | None) -> str:
+    elapsed_ms = sum(result.stage_ms.values())
+    if rate_hz is None and elapsed_ms > 0.0:
+        rate_hz = 1e3 / elapsed_ms
+    parts = [f"{elapsed_ms:.1f} ms"] if elapsed_ms > 0.0 else []
+    parts += [] if rate_hz is None else [f"{rate_hz:.1f} Hz"]
+    return "   ".join(parts)
+
+
+INLIER_COLOUR: Final = bgr(INLIERS)
+OUTLIER_COLOUR: Final = bgr(OUTLIERS)
+MAX_WIDTH_PX: Final = 1280
+"""Of a composed picture, where nothing else is asked for."""
+
+_CHARACTER_PX = 10  # wider than the mean
+_DIMMED = 0.4  # of the grey image below coloured lines
+_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
+
+
+def draw_matches(
+    image: ImageArray,
+    pixels_reference: FloatArray,
+    pixels_current: FloatArray,
+    inliers: BoolArray,
+    *,
+    lines: Sequence[str] = (),
+) -> ImageArray:
+    """Draw the matches between two images over the later one.
+
+    A line runs from where a point was to where it is now. Inliers end in a blue dot, outliers
+    in an orange cross, drawn above them.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width)
+        The current image, grey.
+    pixels_reference, pixels_current : ndarray of float64, shape (n, 2)
+        (u, v) of the matches in the earlier and in the current image; pixel (0, 0) is the centre
+        of the first. Matches that are not finite are left out.
+    inliers : ndarray of bool, shape (n,)
+    lines : sequence of str
+        Text for the upper left corner; characters that are not ASCII become question marks.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR.
+
+    Raises
+    ------
+    ValueError
+        When the shapes do not fit.
+    """
+    n = len(inliers)
+    if image.ndim != 2 or pixels_reference.shape != (n, 2) or pixels_current.shape != (n, 2):
+        raise ValueError(
+            f"expected a grey image and {n} matches, got images of {image.shape}, pixels of "
+            f"{pixels_reference.shape} and {pixels_current.shape}"
+        )
+    canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    flow = np.stack([pixels_reference, pixels_current], axis=1)
+    is_finite = np.isfinite(flow).all(axis=(1, 2))
+    kept, refused = flow[is_finite & inliers], flow[is_finite & ~inliers]
+    draw_segments(canvas, kept, INLIER_COLOUR)
+    draw_dots(canvas, kept[:, 1], INLIER_COLOUR)
+    draw_segments(canvas, refused, OUTLIER_COLOUR)
+    draw_crosses(canvas, refused[:, 1], OUTLIER_COLOUR)
+    write_lines(canvas, lines)
+    return canvas
+
+
+def compose_overlay(
+    frame: Frame,
+    result: FrameResult,
+    camera: PinholeCamera,
+    *,
+    index: int | None = None,
+    rate_hz: float | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw what one frame gave: status, flow and depth.
+
+    The flow since the frame that the raw chain goes on from is drawn by `draw_matches`. The
+    second part, below for wide images and at the right for others, shows the depth of the same
+    points: for a stereo camera a line from where a point is in the left image to where it is in
+    the right one, in the colour of its depth; for an RGB-D camera the depth image in colours,
+    unknown depth dark, and the points.
+
+    Parameters
+    ----------
+    frame : StereoFrame or RgbdFrame
+    result : FrameResult
+        What it gave.
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    index : int, optional
+        Number of the frame, to be told.
+    rate_hz : float, optional
+        Frames per second, to be told; from the milliseconds of the frame where omitted.
+    max_width : int
+        Most pixels in a row; at least 640.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR, of one even size for all frames of a camera.
+
+    Raises
+    ------
+    ValueError
+        When a stereo frame comes with a camera without a baseline, or images of another size.
+    """
+    image = frame.left if isinstance(frame, StereoFrame) else frame.image
+    if image.shape != (camera.height, camera.width):
+        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
+    layout = Layout.of(camera, max_width)
+    found = result.registration or _NOTHING
+    n_told = min(len(found.pixels_current), len(found.points_current))
+    pixels = layout.scaled(found.pixels_current[:n_told])
+    canvas = layout.empty()
+    small = _resized(image, layout.panel)
+    first, second = layout.panels(canvas)
+    first[:] = draw_matches(
+        small,
+        layout.scaled(found.pixels_reference[:n_told]),
+        pixels,
+        found.inliers[:n_told],
+        lines=["flow"],
+    )
+    depths = found.points_current[:n_told, 2]
+    if isinstance(frame, StereoFrame):
+        second[:] = _disparity_picture(small, pixels, depths, camera, layout)
+    else:
+        second[:] = _depth_picture(frame, pixels, camera, layout)
+    write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
+    write_footer(canvas, layout, camera, result.reason)
+    return canvas
+
+
+def compose_faulty(
+    frame: FaultyFrame,
+    camera: PinholeCamera,
+    *,
+    index: int | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw a frame that cannot be used: dark, with the reason.
+
+    Parameters
+    ----------
+    frame : FaultyFrame
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    index : int, optional
+        Number of the frame, to be told.
+    max_width : int
+        Most pixels in a row; at least 640.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR, of the size of the other frames of the camera.
+    """
+    layout = Layout.of(camera, max_width)
+    canvas = layout.empty()
+    write_header(canvas, layout, frame, index=index)
+    write_footer(canvas, layout, camera, "")
+    texts = textwrap.wrap(frame.reason, layout.panel[0] // _CHARACTER_PX)
+    write_lines(layout.panels(canvas)[0], [f"{Status.SKIPPED}: no pose", *texts])
+    return canvas
+
+
+def _resized(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    is_smaller = size[0] < image.shape[1]
+    mode = cv2.INTER_AREA if is_smaller else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size, interpolation=mode), dtype=np.uint8)
+
+
+def _disparity_picture(
+    image: ImageArray,
+    pixels: FloatArray,
+    depths: FloatArray,
+    camera: PinholeCamera,
+    layout: Layout,
+) -> ImageArray:
+    if not isinstance(camera, StereoCamera):
+        raise ValueError("a stereo frame needs a camera with a baseline")
+    dimmed = cv2.convertScaleAbs(image, alpha=_DIMMED)
+    canvas = np.asarray(cv2.cvtColor(dimmed, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    is_known = np.isfinite(pixels).all(axis=1) & (depths > 0.0)
+    left, depths = pixels[is_known], depths[is_known]
+    right = left.copy()
+    right[:, 0] -= layout.scale * camera.depth_to_disparity(depths)
+    segments = np.stack([left, right], axis=1)
+    levels = DepthScale.of(camera).levels(depths)
+    for indices, colour in in_groups(levels):
+        draw_segments(canvas, segments[indices], colour)
+    draw_dots(canvas, left, table()[levels])
+    write_lines(canvas, ["disparity: from left to right"])
+    return canvas
+
+
+def _depth_picture(
+    frame: RgbdFrame, pixels: FloatArray, camera: PinholeCamera, layout: Layout
+) -> ImageArray:
+    canvas = paint_depth(frame.depth, DepthScale.of(camera), layout.panel)
+    known = pixels[np.isfinite(pixels).all(axis=1)]
+    draw_dots(canvas, known, BLACK, radius=2.3)
+    draw_dots(canvas, known, WHITE, radius=1.0)
+    write_lines(canvas, ["depth, and the matched points"])
+    return canvas

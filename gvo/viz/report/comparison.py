@@ -1,0 +1,113 @@
+"""The report of any number of estimates beside a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from gvo.trajectory.alignment import AlignMode
+from gvo.trajectory.evaluation import Evaluation
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.report.errors import drift_plot, error_plots
+from gvo.viz.report.measures import compare
+from gvo.viz.report.page import facts_html, plots_html, table_html, write_page
+from gvo.viz.report.paths import World, lines_of, path_plots
+from gvo.viz.report.sheets import settings, write_plots
+
+_HEADER = (
+    "estimate",
+    "poses",
+    "coverage [%]",
+    "ATE RMSE [m]",
+    "ATE max [m]",
+    "RPE [m]",
+    "RPE [deg]",
+    "t_err [%]",
+    "r_err [deg/100 m]",
+    "path ratio",
+)
+
+
+def write_comparison_report(
+    path: str | Path | None,
+    truth: Trajectory,
+    trajectories: Mapping[str, Trajectory],
+    evaluations: Sequence[Evaluation],
+    *,
+    align: AlignMode,
+    plots: str | Path | None = None,
+) -> None:
+    """Write a page about estimates beside a reference; equal input gives equal files.
+
+    Parameters
+    ----------
+    path : str or Path, optional
+        The page; where omitted only the plots are written.
+    truth : Trajectory
+        The reference.
+    trajectories : mapping of str to Trajectory
+        By name, at least one.
+    evaluations : sequence of Evaluation
+        Of the same estimates.
+    align : {"none", "origin", "se3", "sim3"}
+        What moves each estimate onto the reference.
+    plots : str or Path, optional
+        Folder for each plot as PNG and PDF.
+
+    Raises
+    ------
+    ConfigurationError
+        When a file or the folder cannot be written.
+    TrajectoryError
+        Where nothing can be associated, or a plot cannot be written.
+    ValueError
+        Where there is no estimate.
+    """
+    if not trajectories:
+        raise ValueError("expected at least one estimate")
+    compared = [compare(truth, t, name=name, align=align) for name, t in trajectories.items()]
+    asked_m = evaluations[0].segments_m if evaluations else None
+    world = World.of(truth)
+    shown = truth_around(truth, [c.reference for c in compared])
+    with settings():
+        lines = lines_of(shown, {c.name: c.trajectory for c in compared})
+        sheets = [
+            *path_plots(lines, world),
+            *error_plots(compared, align),
+            drift_plot(compared, asked_m=asked_m),
+        ]
+        if path is not None:
+            names = ", ".join(trajectories)
+            facts = {"Estimates": names, "Poses of the reference": str(len(truth))}
+            facts["Alignment"] = align
+            body = [
+                "<h1>Comparison of trajectories</h1>",
+                facts_html(facts),
+                table_html(_HEADER, map(_row, evaluations)),
+                *plots_html(sheets, lines, world),
+            ]
+            write_page(Path(path), f"Comparison: {names}", body)
+        if plots is not None:
+            write_plots(sheets, Path(plots))
+
+
+def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
+    """Return the part of the truth that the associated poses span."""
+    first_ns = min(int(part.stamps_ns[0]) for part in parts)
+    last_ns = max(int(part.stamps_ns[-1]) for part in parts)
+    return truth.select((truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns))
+
+
+def _row(evaluation: Evaluation) -> list[str]:
+    numbers = (
+        100.0 * evaluation.coverage,
+        evaluation.ate_m,
+        evaluation.ate_max_m,
+        evaluation.rpe_m,
+        evaluation.rpe_deg,
+        evaluation.t_pct,
+        evaluation.r_deg_per_100m,
+        evaluation.path_ratio,
+    )
+    texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
+    return [evaluation.name, str(evaluation.n), *texts]

@@ -1,0 +1,297 @@
+"""Errors over time and path; covariances beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M
+from gvo.types import FloatArray
+from gvo.viz.palette import ESTIMATES, Style, styles_of
+from gvo.viz.report.measures import (
+    N_DOF,
+    Comparison,
+    Consistency,
+    Drift,
+    drift,
+    drift_lengths,
+    nees_band,
+)
+from gvo.viz.report.sheets import (
+    WIDE,
+    Plot,
+    arrange,
+    draw_curve,
+    elapsed,
+    kept_of_curve,
+    new_figure,
+    plain_decades,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_ROW_HEIGHT = 2.1
+_MANY = 8
+
+
+def error_plots(comparisons: Sequence[Comparison], align: str) -> list[Plot]:
+    """Return the errors over time and over the distance travelled."""
+    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
+    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
+    moved = "as they are" if align == "none" else f"aligned by {align.upper()}"
+    rotations = (
+        " Rotation errors are of the rotation since the first pose."
+        if any(c.errors_rad is not None for c in comparisons)
+        else " The truth holds no rotations: there are no rotation errors."
+    )
+    return [
+        Plot(
+            slug="errors_over_time",
+            title="Errors over time",
+            text=f"Position errors of the trajectories, {moved}."
+            f"{rotations} Good curves are low and smooth; a step is a single bad frame.",
+            figure=_curves(
+                comparisons,
+                lambda c: elapsed(c.reference.stamps_ns, first_ns),
+                "row" if is_by_row else "elapsed [s]",
+            ),
+        ),
+        Plot(
+            slug="errors_over_distance",
+            title="Errors over distance travelled",
+            text="The same errors along the true path: a steady slope is drift, in metres per "
+            "metre; where the camera stands, the curve must stand too.",
+            figure=_curves(
+                comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
+            ),
+        ),
+    ]
+
+
+def _curves(
+    comparisons: Sequence[Comparison], abscissa: Callable[[Comparison], FloatArray], label: str
+) -> Figure:
+    has_rotations = any(c.errors_rad is not None for c in comparisons)
+    n_rows = 2 if has_rotations else 1
+    figure = new_figure(WIDE, 0.9 + n_rows * _ROW_HEIGHT)
+    rows = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
+    for c, style in zip(comparisons, styles_of(c.name for c in comparisons), strict=True):
+        x, seconds = abscissa(c), c.reference.stamps_ns / 1e9
+        text = f"{c.name} (RMSE {c.ate_m:.3g} m)"
+        draw_curve(rows[0], x, c.errors_m, style, seconds=seconds, label=text)
+        if c.errors_rad is not None:
+            draw_curve(rows[1], x, np.rad2deg(c.errors_rad), style, seconds=seconds)
+    rows[0].set_ylabel("position error [m]")
+    if has_rotations:
+        rows[1].set_ylabel("rotation error [deg]")
+    for axes in rows:
+        axes.set_ylim(bottom=0.0)
+        axes.margins(x=0.01)
+    rows[-1].set_xlabel(label)
+    arrange(figure, rows[0])
+    figure.align_ylabels(list(rows))
+    return figure
+
+
+def drift_plot(
+    comparisons: Sequence[Comparison], *, asked_m: Sequence[float] | None = None
+) -> Plot:
+    """Return the drift by the length of segments.
+
+    Parameters
+    ----------
+    comparisons : sequence of Comparison
+    asked_m : sequence of float, optional
+        Lengths that were asked for, metres; those that suit the path where omitted.
+    """
+    title = "Drift by length of segment"
+    path_m = max(float(c.reference.distances()[-1]) for c in comparisons)
+    usual = (KITTI_SEGMENTS_M, SHORT_SEGMENTS_M)
+    is_asked = asked_m is not None and tuple(asked_m) not in usual
+    lengths = tuple(asked_m) if asked_m is not None and is_asked else drift_lengths(path_m)
+    found = [(c.name, drift(c, lengths)) for c in comparisons]
+    drifts = [(name, item) for name, item in found if item is not None]
+    if not drifts:
+        reason = (
+            "the truth holds positions without rotations, segments cannot be compared"
+            if any(c.errors_rad is None for c in comparisons)
+            else f"the path of {path_m:.2g} m is too short for segments"
+        )
+        return Plot(slug="drift", title=title, text=f"Not drawn: {reason}.")
+    origin = (
+        "the standard lengths of the KITTI benchmark"
+        if lengths == KITTI_SEGMENTS_M
+        else "the lengths asked for"
+        if is_asked
+        else f"round lengths that suit a path of {path_m:.3g} m"
+    )
+    n_least = int(drifts[0][1].n_segments[-1])
+    text = (
+        f"Mean error over all segments of a length, as KITTI's devkit takes it; {origin}. "
+        "Translation drift falls with the length where noise is random, and is level where a "
+        "scale or a direction is wrong; rotation drift should fall as well. The longest point "
+        f"is the mean of {n_least} overlapping segments."
+    )
+    return Plot(slug="drift", title=title, text=text, figure=_drift_figure(found))
+
+
+def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
+    figure = new_figure(WIDE, 3.5)
+    panels: Any = figure.subplots(1, 2)
+    styles = styles_of(name for name, _ in found)
+    for index, ((name, item), style) in enumerate(zip(found, styles, strict=True)):
+        if item is None:
+            continue
+        _draw_drift(panels, name, item, style, marker="osD^vP*X"[index % _MANY])
+    panels[0].set(xlabel="length of segment [m]", ylabel="translation error [%]")
+    panels[1].set(xlabel="length of segment [m]", ylabel="rotation error [deg/m]")
+    for axes in panels:
+        axes.set_ylim(0.0, 1.1 * axes.dataLim.y1 or 1.0)
+        axes.set_xlim(left=0.0)
+    arrange(figure, panels[0])
+    figure.subplots_adjust(wspace=0.2)
+    return figure
+
+
+def _draw_drift(panels: Any, name: str, item: Drift, style: Style, *, marker: str) -> None:  # noqa: ANN401
+    from gvo.viz.plots import plain
+
+    looks = {"color": style.color, "linestyle": style.linestyle, "marker": marker, "ms": 4.5}
+    panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
+    panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
+
+
+_N_COLUMNS = 350
+_SIGMAS = 3.0
+# below it a value is drawn on the floor of the logarithmic axis
+_FLOOR = 0.01
+# rows of the figure: translations, then rotations
+_PANELS = ((3, "x", "m"), (4, "y", "m"), (5, "z", "m"), (0, "x", "deg"), (1, "y", "deg"))
+_ALL_PANELS = (*_PANELS, (2, "z", "deg"))
+
+
+def covariance_plots(found: Sequence[Consistency], first_ns: int) -> list[Plot]:
+    """Return errors with their 3-sigma bands, and the NEES.
+
+    Parameters
+    ----------
+    found : sequence of Consistency
+        Of causal and smoothed poses, at least one.
+    first_ns : int
+        Where the elapsed time is zero.
+    """
+    late_s = (min(int(item.stamps_ns[0]) for item in found) - first_ns) / 1e9
+    step_s = float(np.median(np.diff(found[0].stamps_ns))) / 1e9 if len(found[0].nees) > 1 else 0.0
+    late = (
+        f" The truth begins {late_s:.2g} s after the first pose: the bands hold that time as well, "
+        "the errors do not."
+        if late_s > 3.0 * step_s > 0.0
+        else ""
+    )
+    low, high = nees_band()
+    return [
+        Plot(
+            slug="covariance",
+            title="Errors within their covariances",
+            text="Errors of the poses along their own axes, since the first pose, with the band "
+            "of three stated sigmas (filled: smoothed; dashed: causal). Nothing is fitted: the "
+            "first poses are laid onto each other, so noise of the first true pose counts as "
+            f"error, the more the longer the path. {_inside(found)} In a good run 99.7 % are "
+            f"inside, and the errors use more than a tenth of the band. Errors that leave it in "
+            f"the first second and then stay level are those of the first true poses.{late}",
+            figure=_bands(found, first_ns),
+        ),
+        Plot(
+            slug="nees",
+            title="Normalised squared error (NEES)",
+            text="Error squared over stated covariance, of six degrees of freedom: "
+            f"{N_DOF} on average, and 95 % between {low:.2f} and {high:.1f} (shaded), where the "
+            "covariances are right. Errors of one run are tied to each other over time, so a "
+            "single run may lie off for long. Above the band the run is too sure of itself, "
+            f"below it too modest. {_nees_words(found)}",
+            figure=_nees(found, first_ns),
+        ),
+    ]
+
+
+def _inside(found: Sequence[Consistency]) -> str:
+    parts = []
+    for item in found:
+        shares = 100.0 * item.share_inside(_SIGMAS)
+        parts.append(
+            f"{item.name}: {shares[3:].mean():.1f} % of the position and {shares[:3].mean():.1f} % "
+            "of the rotation errors"
+        )
+    return f"Inside are, {'; '.join(parts)}."
+
+
+def _nees_words(found: Sequence[Consistency]) -> str:
+    parts = []
+    for item in found:
+        below, within, above = (100.0 * share for share in item.share_of_nees())
+        parts.append(
+            f"{item.name}: {within:.1f} % within, {below:.1f} % below, {above:.1f} % above, "
+            f"mean {item.nees.mean():.3g}"
+        )
+    return f"Here, {'; '.join(parts)}."
+
+
+def _bands(found: Sequence[Consistency], first_ns: int) -> Figure:
+    figure = new_figure(WIDE, 5.2)
+    panels: Any = figure.subplots(2, 3, sharex=True)
+    for panel, (index, letter, unit) in zip(panels.flat, _ALL_PANELS, strict=True):
+        factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
+        for item in found:
+            x = elapsed(item.stamps_ns, first_ns)
+            _draw_band(panel, item.name, x, _SIGMAS * factor * item.sigmas[:, index])
+        for item in found:
+            x, style = elapsed(item.stamps_ns, first_ns), _style(item.name)
+            y = factor * item.errors[:, index]
+            draw_curve(panel, x, y, style, label=item.name, n_columns=_N_COLUMNS)
+        kind = "position" if unit == "m" else "rotation"
+        panel.set_ylabel(f"{kind} {letter} [{unit}]")
+    for panel in panels[-1]:
+        panel.set_xlabel("elapsed [s]")
+    arrange(figure, panels[0, 0])
+    figure.subplots_adjust(wspace=0.4, hspace=0.1)
+    figure.align_ylabels()
+    return figure
+
+
+def _style(name: str) -> Style:
+    return Style(color=ESTIMATES[name], linewidth=1.1, zorder=3.0)
+
+
+def _draw_band(axes: Any, name: str, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
+    kept = kept_of_curve(x, reach, n_columns=_N_COLUMNS)
+    x, reach = x[kept], reach[kept]
+    colour, label = ESTIMATES[name], f"\u00b13 sigma {name}"
+    if len(x) == 1:  # a band of one pose has no area
+        axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=colour, marker="_", label=label)
+        return
+    if name == "smoothed":
+        axes.fill_between(x, -reach, reach, color=colour, alpha=0.2, lw=0, label=label)
+        return
+    axes.plot(x, reach, color=colour, ls="--", lw=1.0, label=label)
+    axes.plot(x, -reach, color=colour, ls="--", lw=1.0)
+
+
+def _nees(found: Sequence[Consistency], first_ns: int) -> Figure:
+    figure = new_figure(WIDE, 3.0)
+    axes = figure.subplots()
+    axes.axhspan(*nees_band(), color="0.9", lw=0, zorder=0.5, label="95 % band")
+    axes.axhline(N_DOF, color="black", ls=":", lw=1.0, label="expected: 6")
+    for item in found:
+        x = elapsed(item.stamps_ns, first_ns)
+        draw_curve(axes, x, np.maximum(item.nees, _FLOOR), _style(item.name), label=item.name)
+    axes.set_yscale("log")
+    plain_decades(axes.yaxis)
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(min(low, 0.5), 0.7 * _FLOOR), max(high, 120.0))
+    axes.margins(x=0.01)
+    axes.set(xlabel="elapsed [s]", ylabel="NEES [-]")
+    arrange(figure, axes)
+    return figure

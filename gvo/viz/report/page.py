@@ -1,0 +1,191 @@
+"""The page: head, tables, plots, all in one file without outside links."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from gvo.errors import ConfigurationError
+from gvo.viz.report.paths import Line, World, scene_json
+from gvo.viz.report.sheets import Plot
+
+_SUFFIXES = (".html", ".htm")
+_DASHES = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
+
+
+def write_page(path: Path, title: str, body: Iterable[str]) -> None:
+    """Write a page.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced where it exists.
+    title : str
+    body : iterable of str
+        HTML, with all texts escaped.
+
+    Raises
+    ------
+    ConfigurationError
+        When the name is not that of a page, or the file cannot be written.
+    """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ConfigurationError(
+            f"{path}: expected a name ending in .html, got {path.suffix or 'no ending'}"
+        )
+    page = "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            # no request for an icon either
+            '<link rel="icon" href="data:,">',
+            f"<title>{escape(title)}</title>\n<style>\n{_resource('page.css')}</style>",
+            "</head>\n<body>",
+            *body,
+            "</body>\n</html>\n",
+        ]
+    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(page, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def plots_html(
+    plots: Sequence[Plot], lines: Sequence[Line] = (), world: World | None = None
+) -> list[str]:
+    """Return the sections of the plots; that in space can be turned where there are lines."""
+    parts = []
+    is_open = False
+    for plot in plots:
+        if plot.is_half != is_open:
+            parts.append('<div class="pair">' if plot.is_half else "</div>")
+            is_open = plot.is_half
+        if plot.slug == "space" and world is not None:
+            parts.append(_turning(plot, lines, world))
+        else:
+            parts.append(_section(plot))
+    return parts
+
+
+def _section(plot: Plot) -> str:
+    text = escape(plot.text)
+    if plot.figure is None:
+        body = f'<p class="absent">{text}</p>'
+    else:
+        body = f'<p class="note">{text}</p>\n<div class="panel">{plot.svg()}</div>'
+    return f'<section id="{plot.slug}">\n<h2>{escape(plot.title)}</h2>\n{body}\n</section>'
+
+
+def _turning(plot: Plot, lines: Sequence[Line], world: World) -> str:
+    """Return the view in space: a canvas where scripts run, the standing one elsewhere."""
+    legend = "".join(_legend_entry(line) for line in lines)
+    return f"""<section id="{plot.slug}">
+<h2>{escape(plot.title)}</h2>
+<p class="note">{escape(plot.text)}</p>
+<div id="turning">
+<p class="note">Drag to turn; arrow keys turn as well, + and - or the wheel (after a click) come
+nearer and go farther, a double click or Home starts anew.</p>
+<div class="panel"><canvas id="scene" tabindex="0" role="img"
+aria-label="{escape(plot.title)}"></canvas>
+<ul class="legend">{legend}</ul></div>
+</div>
+<div id="standing"><div class="panel">{plot.svg()}</div></div>
+<script type="application/json" id="scene-data">{scene_json(lines, world)}</script>
+<script>
+{_resource("scene.js")}</script>
+</section>"""
+
+
+def _legend_entry(line: Line) -> str:
+    dash = _DASHES[line.style.linestyle]
+    return (
+        '<li><svg viewBox="0 0 34 10" aria-hidden="true"><path d="M1 5H33" fill="none" '
+        f'stroke="{line.style.color}" stroke-width="2.5" stroke-dasharray="{dash}"/></svg>'
+        f"{escape(line.name)}</li>"
+    )
+
+
+def table_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table whose first column holds names, all others numbers."""
+    head = "".join(_cell("th", text, is_name=n == 0) for n, text in enumerate(header))
+    body = "".join(
+        "<tr>" + "".join(_cell("td", text, is_name=n == 0) for n, text in enumerate(row)) + "</tr>"
+        for row in rows
+    )
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="scroll">{table}</div>'
+
+
+def _cell(tag: str, text: str, *, is_name: bool) -> str:
+    return (
+        f"<{tag}>{escape(text)}</{tag}>"
+        if is_name
+        else f'<{tag} class="number">{escape(text)}</{tag}>'
+    )
+
+
+def facts_html(facts: Mapping[str, str]) -> str:
+    """Return a table of facts by name; those without a text are left out."""
+    rows = "".join(
+        f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
+        for name, text in facts.items()
+        if text
+    )
+    return f'<table class="facts"><tbody>{rows}</tbody></table>'
+
+
+def list_html(title: str, items: Iterable[str], *, kind: str = "") -> str:
+    """Return a titled list; nothing where there are no items."""
+    entries = "".join(f"<li>{escape(item)}</li>" for item in items)
+    if not entries:
+        return ""
+    return f'<section class="{kind}">\n<h2>{escape(title)}</h2>\n<ul>{entries}</ul>\n</section>'
+
+
+def configuration_html(
+    configuration: Mapping[str, Any], defaults: Mapping[str, Mapping[str, Any]]
+) -> str:
+    """Return all sections; what differs from its default is marked, the default beside it."""
+    sections = [
+        _configuration_section(name, section, defaults.get(name, {}))
+        for name, section in configuration.items()
+        if isinstance(section, Mapping)
+    ]
+    if not sections:
+        return ""
+    intro = "Marked are the parameters that differ from their defaults."
+    return (
+        f'<h2>Configuration</h2>\n<p class="note">{intro}</p>\n'
+        f'<div class="configuration">{"".join(sections)}</div>'
+    )
+
+
+def _configuration_section(
+    name: str, section: Mapping[str, Any], defaults: Mapping[str, Any]
+) -> str:
+    rows = []
+    for key, value in section.items():
+        is_changed = key in defaults and defaults[key] != value
+        mark = ' class="changed"' if is_changed else ""
+        note = f"default {_yaml(defaults[key])}" if is_changed else ""
+        cells = f"<td><code>{escape(key)}</code></td><td>{escape(_yaml(value))}</td>"
+        rows.append(f"<tr{mark}>{cells}<td>{escape(note)}</td></tr>")
+    body = "".join(rows)
+    return f"<section><h3>{escape(name)}</h3><table><tbody>{body}</tbody></table></section>"
+
+
+def _yaml(value: Any) -> str:  # noqa: ANN401
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
+
+
+def _resource(name: str) -> str:
+    return (files("gvo.viz.report") / name).read_text(encoding="utf-8")

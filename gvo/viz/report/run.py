@@ -1,0 +1,265 @@
+"""The report of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.errors import TrajectoryError
+from gvo.io.run_folder.reader import RunRecord
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.report.comparison import truth_around
+from gvo.viz.report.errors import covariance_plots, drift_plot, error_plots
+from gvo.viz.report.frames import count_plot, edge_plots, status_plot, timing_plot
+from gvo.viz.report.measures import Comparison, compare, consistency
+from gvo.viz.report.page import (
+    configuration_html,
+    facts_html,
+    list_html,
+    plots_html,
+    table_html,
+    write_page,
+)
+from gvo.viz.report.paths import Line, World, lines_of, path_plots
+from gvo.viz.report.sheets import Plot, settings, write_plots
+
+_TRUTH_SECTIONS = {
+    "errors_over_time": "Errors over time",
+    "errors_over_distance": "Errors over distance travelled",
+    "drift": "Drift by length of segment",
+    "covariance": "Errors within their covariances",
+    "nees": "Normalised squared error (NEES)",
+}
+_PATH_SECTIONS = {"above": "From above", "side": "From the side", "space": "In space"}
+_ERROR_HEADER = (
+    "estimate",
+    "poses",
+    "ATE RMSE [m]",
+    "RPE [m]",
+    "RPE [deg]",
+    "t_err [%]",
+    "r_err [deg/100 m]",
+)
+_ERROR_KEYS = ("ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
+
+
+def write_run_report(
+    path: str | Path, record: RunRecord, *, plots: str | Path | None = None
+) -> None:
+    """Write a page about a run; equal input gives equal files.
+
+    Parameters
+    ----------
+    path : str or Path
+        The page, replaced where it exists.
+    record : RunRecord
+        From `read_run`; also of a run that has not ended.
+    plots : str or Path, optional
+        Folder for each plot as PNG and PDF.
+
+    Raises
+    ------
+    ConfigurationError
+        When the page or the folder cannot be written.
+    TrajectoryError
+        When a plot cannot be written.
+    """
+    estimates = record.comparable()
+    compared, reason = _compare(record, estimates)
+    with settings():
+        lines, world = _lines(record, estimates, compared)
+        sheets = [
+            *_path_plots(lines, world),
+            *_truth_plots(record, estimates, compared, reason),
+            status_plot(record.frames),
+            count_plot(record.frames),
+            timing_plot(record.timings),
+            *edge_plots(record.edges, _first_ns(record), _link_factor(record.summary)),
+        ]
+        # The page first: it shall be there where the folder cannot be written.
+        body = [*_head(record), *plots_html(sheets, lines, world), *_tail(record)]
+        write_page(Path(path), f"gvo: {record.name}", body)
+        if plots is not None:
+            write_plots(sheets, Path(plots))
+
+
+def _compare(
+    record: RunRecord, estimates: Mapping[str, Trajectory]
+) -> tuple[list[Comparison], str]:
+    """Return the comparisons; where there are none, why."""
+    if record.truth is None or not estimates:
+        found = str(record.summary.get("ground_truth") or "")
+        return [], found.removeprefix("none: ") or "the run has no ground truth"
+    try:
+        return [
+            compare(record.truth, estimate, name=name, align="se3")
+            for name, estimate in estimates.items()
+        ], ""
+    except TrajectoryError as error:
+        return [], str(error)
+
+
+def _lines(
+    record: RunRecord, estimates: Mapping[str, Trajectory], compared: list[Comparison]
+) -> tuple[list[Line], World | None]:
+    if compared and record.truth is not None:
+        shown = truth_around(record.truth, [c.reference for c in compared])
+        return lines_of(shown, {c.name: c.trajectory for c in compared}), World.of(record.truth)
+    if not estimates:
+        return [], None
+    return lines_of(None, estimates), World.of(next(iter(estimates.values())))
+
+
+def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
+    if world is not None:
+        return path_plots(lines, world)
+    text = "Not drawn: the run holds no pose."
+    return [Plot(slug=slug, title=title, text=text) for slug, title in _PATH_SECTIONS.items()]
+
+
+def _truth_plots(
+    record: RunRecord,
+    estimates: Mapping[str, Trajectory],
+    compared: list[Comparison],
+    reason: str,
+) -> list[Plot]:
+    if not compared or record.truth is None:
+        text = f"Not drawn: errors need true poses, and {_sentence(reason)}"
+        return [Plot(slug=slug, title=title, text=text) for slug, title in _TRUTH_SECTIONS.items()]
+    return [
+        *error_plots(compared, "se3"),
+        drift_plot(compared),
+        *_covariance_plots(record.truth, estimates, _first_ns(record)),
+    ]
+
+
+def _sentence(reason: str) -> str:
+    return reason if reason.endswith(".") else f"{reason}."
+
+
+def _covariance_plots(
+    truth: Trajectory, estimates: Mapping[str, Trajectory], first_ns: int
+) -> list[Plot]:
+    wanted = [estimates[name] for name in ("causal", "smoothed") if name in estimates]
+    names = [name for name in ("causal", "smoothed") if name in estimates]
+    results = [consistency(truth, t, name=name) for name, t in zip(names, wanted, strict=True)]
+    found = [result for result in results if result is not None]
+    if found:
+        return covariance_plots(found, first_ns)
+    text = (
+        "Not drawn: the truth holds positions without rotations, covariances are of poses."
+        if not truth.has_rotations
+        else "Not drawn: no two poses have a true pose and a covariance beside them."
+    )
+    slugs = ("covariance", "nees")
+    return [Plot(slug=slug, title=_TRUTH_SECTIONS[slug], text=text) for slug in slugs]
+
+
+def _first_ns(record: RunRecord) -> int:
+    stamps_ns = record.frames.stamps_ns
+    return int(stamps_ns[0]) if len(stamps_ns) > 0 else 0
+
+
+def _link_factor(summary: Mapping[str, Any]) -> float | None:
+    factor = summary.get("configuration", {}).get("window", {}).get("link_sigma_factor")
+    return None if factor is None else float(factor)
+
+
+def _head(record: RunRecord) -> list[str]:
+    summary = record.summary
+    parts = [f"<h1>{escape(record.name)}</h1>"]
+    if not record.is_finished:
+        parts.append(
+            '<p class="absent">This run has not ended: it goes on, or it was interrupted. '
+            "Shown is what was written so far.</p>"
+        )
+    parts.append(list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
+    parts.append(facts_html(_facts(record)))
+    if summary.get("errors"):
+        rows = [_error_row(row) for row in summary["errors"]]
+        parts.append(table_html(_ERROR_HEADER, rows))
+    return [part for part in parts if part]
+
+
+def _error_row(row: Mapping[str, Any]) -> list[str]:
+    numbers = [row.get(key) for key in _ERROR_KEYS]
+    texts = ["-" if number is None else f"{float(number):.4g}" for number in numbers]
+    return [str(row.get("name", "")), str(row.get("n", "")), *texts]
+
+
+def _facts(record: RunRecord) -> dict[str, str]:
+    summary, frames = record.summary, record.frames
+    statuses = {status: frames.statuses.count(status) for status in dict.fromkeys(frames.statuses)}
+    coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
+    return {
+        "Sensor": str(summary.get("sensor", "")),
+        "Poses of": str(summary.get("frame", "")),
+        "Frames": str(len(frames.stamps_ns)),
+        "Duration": _duration(record),
+        "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames are tied",
+        "Segments": _segment_words(summary.get("segments", ())),
+        "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
+        "Ground truth": str(summary.get("ground_truth", "")),
+        "Learnt of the rig": _rig_words(summary.get("rig_offsets")),
+        "Median per frame": _median_words(summary.get("median_ms")),
+        "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
+        "Version": _version(summary),
+    }
+
+
+def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
+    if len(segments) < 2:
+        return ""
+    joined = [
+        f"{segment['id']} joined to {segment['joined_to']}"
+        for segment in segments
+        if segment.get("joined_to") is not None
+    ]
+    return ", ".join([str(len(segments)), *joined])
+
+
+def _duration(record: RunRecord) -> str:
+    stamps_ns = record.frames.stamps_ns
+    if len(stamps_ns) < 2:
+        return ""
+    rate = 1e9 / float(np.median(np.diff(stamps_ns)))
+    return f"{float(stamps_ns[-1] - stamps_ns[0]) / 1e9:.1f} s, {rate:.3g} frames per second"
+
+
+def _rig_words(offsets: Mapping[str, Any] | None) -> str:
+    if not offsets:
+        return ""
+    known = {key: value for key, value in offsets.items() if value is not None}
+    words = []
+    if "disparity_px" in known:
+        sigma = (
+            f" (sigma {known['disparity_sigma_px']:.3f})" if "disparity_sigma_px" in known else ""
+        )
+        words.append(f"disparities too large by {known['disparity_px']:.3f} px{sigma}")
+    if "row_px" in known:
+        words.append(f"rows of the right image too large by {known['row_px']:.3f} px")
+    return ", ".join(words)
+
+
+def _median_words(medians: Mapping[str, Any] | None) -> str:
+    known = {stage: ms for stage, ms in (medians or {}).items() if ms is not None}
+    return ", ".join(f"{stage} {float(ms):.1f} ms" for stage, ms in known.items())
+
+
+def _tail(record: RunRecord) -> list[str]:
+    summary = record.summary
+    defaults = Config().model_dump()
+    return [
+        list_html("Decisions", map(str, summary.get("decisions", ()))),
+        configuration_html(summary.get("configuration", {}), defaults),
+    ]
+
+
+def _version(summary: Mapping[str, Any]) -> str:
+    version = summary.get("gvo_version")
+    return "" if version is None else f"gvo {version}"

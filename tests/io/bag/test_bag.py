@@ -1,0 +1,416 @@
+"""Bags as recordings."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.rosbag1 import Writer
+
+from gvo.config import Config
+from gvo.errors import CalibrationError, GvoError, RecordingError
+from gvo.io.bag.reader import TF_TYPE, typestore
+from gvo.io.bag.source import BagSource
+from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE, TopicChoice
+from gvo.io.frames import frames
+from gvo.io.opening import open_recording
+from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
+
+_K = [50.0, 0, 23.5, 0, 50.0, 15.5, 0, 0, 1]
+_P_LEFT = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+_P_RIGHT = [50.0, 0, 23.5, -25.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+
+Message = tuple[str, str, int, object]
+
+
+def _make(type_: str, **fields: Any) -> Any:
+    make_message: Any = typestore(is_ros1=True).types[type_]
+    return make_message(**fields)
+
+
+def _header(stamp_ns: int, frame_id: str = "camera") -> Any:
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    stamp = _make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return _make("std_msgs/msg/Header", seq=0, stamp=stamp, frame_id=frame_id)
+
+
+def _image(topic: str, stamp_ns: int, pixels: Any, encoding: str, **changes: Any) -> Message:
+    fields = {
+        "header": _header(stamp_ns),
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": pixels[0].nbytes,
+        "data": np.frombuffer(pixels.tobytes(), np.uint8),
+    }
+    return topic, IMAGE_TYPE, stamp_ns, _make(IMAGE_TYPE, **(fields | changes))
+
+
+def _info(topic: str, projection: list[float], **changes: Any) -> Message:
+    region = _make(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=0,
+        y_offset=0,
+        height=0,
+        width=0,
+        do_rectify=False,
+    )
+    fields: dict[str, Any] = {
+        "header": _header(0),
+        "height": 32,
+        "width": 48,
+        "distortion_model": "plumb_bob",
+        "D": np.zeros(5),
+        "K": np.array(_K),
+        "R": np.eye(3).ravel(),
+        "P": np.array(projection),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": region,
+    }
+    return topic, CAMERA_INFO_TYPE, 0, _make(CAMERA_INFO_TYPE, **(fields | changes))
+
+
+def _write(path: Path, messages: list[Message]) -> Path:
+    store = typestore(is_ros1=True)
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_, log_time_ns, message in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_, typestore=store)
+            data = message if isinstance(message, bytes) else store.serialize_ros1(message, type_)
+            writer.write(connections[topic], log_time_ns, data)
+    return path
+
+
+def _stereo(tiny: Any, name: str = "image_rect", **info: Any) -> list[Message]:
+    messages = [
+        _info("/s/left/camera_info", _P_LEFT, **info),
+        _info("/s/right/camera_info", _P_RIGHT, **info),
+    ]
+    for n in range(3):
+        for k, side in enumerate(("left", "right")):
+            messages.append(_image(f"/s/{side}/{name}", n, tiny.texture(2 * n + k), "mono8"))
+    return messages
+
+
+def _rgbd(tiny: Any, depth: Any, encoding: str) -> list[Message]:
+    return [
+        _info("/c/rgb/camera_info", _P_LEFT),
+        _image("/c/rgb/image_color", 0, tiny.texture(1, is_color=True)[:, :, ::-1], "rgb8"),
+        _image("/c/depth/image", 0, depth, encoding),
+    ]
+
+
+def test_a_stereo_pair_is_read_with_its_calibration(tmp_path: Path, tiny: Any) -> None:
+    source = BagSource(_write(tmp_path / "drive.bag", _stereo(tiny)))
+    assert source.info.name == "drive"
+    assert source.info.n_images == 3
+    assert source.info.decisions == [
+        "stereo: /s/left/image_rect + /s/right/image_rect (3 + 3 messages)",
+        "calibration: /s/left/camera_info + /s/right/camera_info; the images are rectified",
+        "baseline: 0.5000 m from P of /s/right/camera_info",
+    ]
+    read = list(frames(source, Config()))
+    assert [frame.stamp_ns for frame in read] == [0, 1, 2]
+    assert isinstance(read[1], StereoFrame)
+    np.testing.assert_array_equal(read[1].right, tiny.texture(3))
+
+
+def test_raw_images_are_undistorted_rectified_ones_are_not(tmp_path: Path, tiny: Any) -> None:
+    D = np.array([-0.2, 0.1, 0.0, 0.0, 0.0])
+    raw = BagSource(_write(tmp_path / "raw.bag", _stereo(tiny, "image_raw", D=D)))
+    assert not raw.info.calibrations[0].is_rectified
+    np.testing.assert_array_equal(raw.info.calibrations[1].D, D)
+    rectified = BagSource(_write(tmp_path / "rect.bag", _stereo(tiny, D=D)))
+    assert rectified.info.calibrations[0].is_rectified
+    (frame, *_) = frames(rectified, Config())
+    assert isinstance(frame, StereoFrame)
+    np.testing.assert_array_equal(frame.left, tiny.texture(0))
+
+
+def _scaled(scale: float | None) -> Config:
+    return Config.model_validate({"depth": {"scale": scale}})
+
+
+@pytest.mark.parametrize(
+    ("encoding", "scale", "factor"),
+    [("16UC1", None, 5.0), ("mono16", 5000.0, 1.0), ("32FC1", 5000.0, 1.0)],
+)
+def test_depth_is_in_metres(
+    tmp_path: Path, tiny: Any, encoding: str, scale: float | None, factor: float
+) -> None:
+    depth = tiny.depth(1) if encoding == "32FC1" else tiny.counts(1)
+    path = _write(tmp_path / "a.bag", _rgbd(tiny, depth, encoding))
+    (frame,) = frames(BagSource(path, config=_scaled(scale)), Config())
+    assert isinstance(frame, RgbdFrame)
+    np.testing.assert_allclose(frame.depth, factor * tiny.depth(1), rtol=1e-6)
+
+
+def test_depth_of_another_camera_is_registered(tmp_path: Path, tiny: Any) -> None:
+    messages = _rgbd(tiny, tiny.counts(1), "16UC1")
+    other = _info("/c/depth/camera_info", _P_LEFT, K=np.array([40.0, *_K[1:]]))
+    view = BagSource(_write(tmp_path / "a.bag", [*messages, other])).info.depth_view
+    assert view is not None
+    np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
+    assert view.calibration.K[0, 0] == 40.0
+    same = _info("/c/depth/camera_info", _P_LEFT)
+    assert BagSource(_write(tmp_path / "b.bag", [*messages, same])).info.depth_view is None
+
+
+def test_each_faulty_image_is_one_faulty_frame(tmp_path: Path, tiny: Any) -> None:
+    messages = _stereo(tiny)
+    left = "/s/left/image_rect"
+    messages += [
+        _image(left, 10, tiny.texture(1), "mono8", data=np.zeros(3, np.uint8)),
+        _image(left, 11, tiny.texture(1), "mono8", height=2**31, step=2**30),
+        _image(left, 12, tiny.texture(1), "unknown"),
+        _image(left, 13, tiny.texture(1)[:9], "mono8"),
+        (left, IMAGE_TYPE, 14, b"short"),
+    ]
+    messages += [_image("/s/right/image_rect", n, tiny.texture(1), "mono8") for n in range(10, 15)]
+    read = list(frames(BagSource(_write(tmp_path / "a.bag", messages)), Config()))
+    assert [type(item) for item in read] == [StereoFrame] * 3 + [FaultyFrame] * 5
+    reasons = [item.reason for item in read if isinstance(item, FaultyFrame)]
+    for reason, word in zip(
+        reasons, ["got 3", "needs", "'unknown'", "48x9", "5 bytes"], strict=True
+    ):
+        assert word in reason
+        assert reason.startswith("left image: ")
+
+
+def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> None:
+    messages = [m for m in _rgbd(tiny, tiny.counts(1), "16UC1") if m[1] == IMAGE_TYPE]
+    bag = _write(tmp_path / "a.bag", messages)
+    with pytest.raises(CalibrationError, match=r"no CameraInfo for /c/rgb/image_color: .*--calib"):
+        BagSource(bag)
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
+    (frame,) = frames(BagSource(bag, calibration=path), Config())
+    assert isinstance(frame, RgbdFrame)
+    np.testing.assert_allclose(frame.depth, 2 * tiny.depth(1), rtol=1e-6)
+    (frame,) = frames(BagSource(bag, calibration=path, config=_scaled(5000.0)), Config())
+    assert isinstance(frame, RgbdFrame)
+    np.testing.assert_allclose(frame.depth, tiny.depth(1), rtol=1e-6)
+
+
+def test_a_stereo_calibration_file_holds_both_cameras(tmp_path: Path, tiny: Any) -> None:
+    bag = _write(tmp_path / "a.bag", _stereo(tiny))
+    right = tiny.ros_camera(projection_matrix={"data": [50.0, 0, 23.5, -50.0, *_P_RIGHT[4:]]})
+    path = tmp_path / "pair.yaml"
+    path.write_text(yaml.safe_dump({"left": tiny.ros_camera(), "right": right}))
+    assert getattr(BagSource(bag, calibration=path).info.camera, "baseline", None) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("info", "text"),
+    [
+        ({"distortion_model": "fov", "D": np.full(4, 0.1)}, "'fov'"),
+        ({"K": np.zeros(9), "P": np.zeros(12)}, "not calibrated"),
+        ({"P": np.zeros(12)}, "baseline must be positive"),
+        ({"R": np.full(9, 7.0)}, "R is no rotation"),
+        ({"K": np.full(9, np.nan)}, "not finite"),
+        ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
+    ],
+)
+def test_an_unusable_camera_info_is_refused(
+    tmp_path: Path, tiny: Any, info: dict[str, Any], text: str
+) -> None:
+    bag = _write(tmp_path / "a.bag", _stereo(tiny, "image_raw", **info))
+    with pytest.raises(CalibrationError, match=text) as caught:
+        BagSource(bag)
+    assert str(caught.value).startswith(str(bag))
+
+
+def test_depth_of_a_camera_that_rectification_turns_is_refused(tmp_path: Path, tiny: Any) -> None:
+    R = np.array([0.8, 0, 0.6, 0, 1, 0, -0.6, 0, 0.8])
+    messages = _rgbd(tiny, tiny.depth(0), "32FC1")
+    messages[0] = _info("/c/rgb/camera_info", _P_LEFT, R=R)
+    with pytest.raises(CalibrationError, match=r"/c/rgb/camera_info: R turns the camera"):
+        BagSource(_write(tmp_path / "a.bag", messages))
+    content = tiny.ros_camera(rectification_matrix={"data": R.tolist()})
+    file = tmp_path / "turned.yaml"
+    file.write_text(yaml.safe_dump(content))
+    bag = _write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
+    with pytest.raises(CalibrationError, match=r"turned\.yaml: R turns the camera"):
+        BagSource(bag, calibration=file)
+
+
+def test_topics_can_be_chosen(tmp_path: Path, tiny: Any) -> None:
+    bag = _write(tmp_path / "a.bag", _stereo(tiny))
+    choice = TopicChoice(left="/s/right/image_rect", right="/s/left/image_rect")
+    with pytest.raises(CalibrationError, match="exchanged"):
+        BagSource(bag, topics=choice)
+
+
+def _transform(parent: str, child: str, stamp_ns: int, t: float, w: float = 1.0) -> Any:
+    return _make(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=_make(
+            "geometry_msgs/msg/Transform",
+            translation=_make("geometry_msgs/msg/Vector3", x=t, y=0.0, z=0.0),
+            rotation=_make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=w),
+        ),
+    )
+
+
+def test_the_truth_is_world_to_ground_truth_and_nothing_else(tmp_path: Path, tiny: Any) -> None:
+    transforms = [
+        _transform("world", "ground_truth", 7, 2.0),
+        _transform("world", "base_link", 6, 3.0),
+        _transform("/world", "/ground_truth", 5, 1.0),
+        _transform("map", "ground_truth", 8, 4.0),
+    ]
+    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms))
+    truth = BagSource(_write(tmp_path / "a.bag", [*_stereo(tiny), message])).ground_truth()
+    assert truth is not None
+    assert truth.stamps_ns.tolist() == [5, 7]
+    np.testing.assert_array_equal(truth.positions[:, 0], [1.0, 2.0])
+    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms[1:2]))
+    assert BagSource(_write(tmp_path / "b.bag", [*_stereo(tiny), message])).ground_truth() is None
+    assert BagSource(_write(tmp_path / "c.bag", _stereo(tiny))).ground_truth() is None
+
+
+def test_a_truth_that_is_no_transform_is_none(tmp_path: Path, tiny: Any) -> None:
+    transforms = [_transform("world", "ground_truth", 7, 2.0, w=0.0)]
+    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms))
+    source = BagSource(_write(tmp_path / "a.bag", [*_stereo(tiny), message]))
+    assert source.ground_truth() is None
+    assert source.transforms().notes
+
+
+def test_several_bags_are_one_recording(tmp_path: Path, tiny: Any) -> None:
+    messages = _stereo(tiny)
+    whole = BagSource(_write(tmp_path / "whole.bag", messages))
+    names = sorted({topic for topic, *_ in messages})
+    parts = [
+        _write(tmp_path / f"{number}.bag", [m for m in messages if m[0] == name])
+        for number, name in enumerate(names)
+    ]
+    found = [tiny.fingerprint(frame) for frame in frames(BagSource(parts), Config())]
+    assert found == [tiny.fingerprint(frame) for frame in frames(whole, Config())]
+    assert len(found) == whole.info.n_images > 1
+
+
+def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny: Any) -> None:
+    plain: list[tuple[str, str, int, Any]] = list(_stereo(tiny))
+    for _, _, _, message in plain:
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+    path = _write(tmp_path / "a.bag", plain)
+    read = list(frames(BagSource(path), Config()))
+    faulty = [item for item in read if isinstance(item, FaultyFrame)]
+    assert all("--set sync.stamps=recording" in item.reason for item in faulty)
+    assert len(faulty) == len(read) - 1 > 0
+    settings = {"sync": {"stamps": "recording", "stereo_tolerance_ms": 1.0}}
+    config = Config.model_validate(settings)
+    stamped = list(frames(BagSource(path, config=config), config))
+    assert [type(item) for item in stamped] == [StereoFrame] * len(read)
+    left = [stamp for name, _, stamp, _ in plain if name == "/s/left/image_rect"]
+    assert [item.stamp_ns for item in stamped] == left
+
+
+def test_of_a_cut_bag_the_start_is_read_and_the_loss_told(tmp_path: Path, tiny: Any) -> None:
+    path = _write(tmp_path / "a.bag", _stereo(tiny))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(0.7 * len(data))])
+    read = frames(BagSource(path), Config())
+    first = next(read)
+    assert isinstance(first, StereoFrame)
+    with pytest.raises(RecordingError, match=r"cannot be read|missing|cut"):
+        list(read)
+
+
+_RECORDED = (
+    "bad/assertion_in_reader.bag",
+    "bad/damaged.bag",
+    "bad/empty-file.bag",
+    "bad/empty_message_definition.bag",
+    "bad/no-messages.bag",
+    "bad/not_a_bag.mcap",
+    "bad/old_type_names.db3",
+    "bad/silent_zero_messages_mcap",
+    "bad/silent_zero_messages_mcap/talker.mcap",
+    "bad/silent_zero_messages_sqlite3",
+    "bad/silent_zero_messages_sqlite3/talker.db3",
+    "bad/truncated.bag",
+    "bad/truncated.mcap",
+    "bad/unindexed.bag",
+    "bad/version1.bag",
+    "good/compressed_image.bag",
+    "good/nav2_turtlebot.mcap",
+    "good/pose_streams.bag",
+    "good/realsense_rgbd.bag",
+    "good/ros2_all_types_mcap",
+    "good/ros2_all_types_mcap/test_bag_mcap.mcap",
+    "good/ros2_all_types_sqlite3",
+    "good/ros2_all_types_sqlite3/test_bag_sqlite3.db3",
+    "good/tf_bz2.bag",
+    "good/tf_example.bag",
+    "good/tf_example_ros2",
+    "good/tf_example_ros2/tf_example.db3",
+    "good/tf_lz4.bag",
+    "good/tf_uncompressed.bag",
+)
+_OPENING = ("good/realsense_rgbd.bag",)
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize("name", _RECORDED)
+def test_every_recorded_bag_opens_or_is_refused_in_one_line(gvo_data: Path, name: str) -> None:
+    path = gvo_data / "bags" / name
+    assert path.exists()
+    if name in _OPENING:
+        assert len(list(frames(open_recording(path), Config()))) == 1
+        return
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.recorded
+def test_no_recorded_bag_is_left_out(gvo_data: Path) -> None:
+    found = {f"{path.parent.name}/{path.name}" for path in (gvo_data / "bags").glob("*/*")}
+    assert found == {name for name in _RECORDED if name.count("/") == 1}
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("bad/version1.bag", "older format"),
+        ("bad/empty-file.bag", "empty"),
+        ("good/nav2_turtlebot.mcap", "no image topics; it holds /odom"),
+        ("good/compressed_image.bag", "--left TOPIC --right TOPIC"),
+    ],
+)
+def test_the_message_says_what_to_do(gvo_data: Path, name: str, words: str) -> None:
+    with pytest.raises(GvoError, match=words):
+        open_recording(gvo_data / "bags" / name)
+
+
+@pytest.mark.recorded
+@pytest.mark.parametrize(
+    ("name", "topic", "shape"),
+    [
+        ("good/realsense_rgbd.bag", "/device_0/sensor_1/Color_0/image/data", (480, 640, 3)),
+        ("good/compressed_image.bag", "/raspicam_node/image/compressed", (960, 1280, 3)),
+        ("bad/old_type_names.db3", "/image", (480, 640, 3)),
+        ("bad/old_type_names.db3", "/image/compressed", (480, 640, 3)),
+    ],
+)
+def test_recorded_images_are_decoded(
+    gvo_data: Path, tmp_path: Path, tiny: Any, name: str, topic: str, shape: tuple[int, ...]
+) -> None:
+    path = tmp_path / "pair.yaml"
+    right = tiny.ros_camera(projection_matrix={"data": _P_RIGHT})
+    path.write_text(yaml.safe_dump({"left": tiny.ros_camera(), "right": right}))
+    topics = TopicChoice(left=topic, right=topic)
+    source = BagSource(gvo_data / "bags" / name, topics=topics, calibration=path)
+    pixels = next(source.images()).load()
+    assert pixels.shape == shape
+    assert pixels.std() > 10

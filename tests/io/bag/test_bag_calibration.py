@@ -1,0 +1,386 @@
+"""Calibrations of bags: from `CameraInfo`, from transforms, and of depth seen from elsewhere."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rosbags.rosbag1 import Writer
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import CalibrationError
+from gvo.geometry import se3
+from gvo.geometry.camera import rectification_maps
+from gvo.io.bag.calibration import (
+    BagCalibration,
+    calibrations_of_file,
+    calibrations_of_messages,
+)
+from gvo.io.bag.cameras import camera_info_changes
+from gvo.io.bag.reader import TF_TYPE, BagReader, typestore
+from gvo.io.bag.topics import (
+    CAMERA_INFO_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    TopicChoice,
+    choose_topics,
+)
+from gvo.io.calibration.stereo_pair import stereo_baseline
+from gvo.types import FloatArray
+
+_K = [50.0, 0, 23.5, 0, 50.0, 15.5, 0, 0, 1]
+_P = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+_D = [-0.2, 0.05, 0.001, -0.002, 0.0]
+
+Message = tuple[str, str, int, object]
+
+
+def _make(type_: str, **fields: Any) -> Any:
+    make_message: Any = typestore(is_ros1=True).types[type_]
+    return make_message(**fields)
+
+
+def _header(frame_id: str, stamp_ns: int = 0) -> Any:
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    stamp = _make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return _make("std_msgs/msg/Header", seq=0, stamp=stamp, frame_id=frame_id)
+
+
+def _info(topic: str, frame_id: str = "camera", stamp_ns: int = 0, **changes: Any) -> Message:
+    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    fields: dict[str, Any] = {
+        "height": 32,
+        "width": 48,
+        "distortion_model": "plumb_bob",
+        "D": [0.0] * 5,
+        "K": _K,
+        "R": np.zeros(9),
+        "P": np.zeros(12),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {},
+    } | changes
+    for name in "DKRP":
+        fields[name] = np.array(fields[name], dtype=np.float64)
+    roi = region | {"do_rectify": False} | fields["roi"]
+    fields["roi"] = _make("sensor_msgs/msg/RegionOfInterest", **roi)
+    header = _header(frame_id, stamp_ns)
+    return topic, CAMERA_INFO_TYPE, stamp_ns, _make(CAMERA_INFO_TYPE, header=header, **fields)
+
+
+def _image(topic: str, size: tuple[int, int] = (48, 32), frame_id: str = "camera") -> Message:
+    message = _make(
+        IMAGE_TYPE,
+        header=_header(frame_id),
+        height=size[1],
+        width=size[0],
+        encoding="mono8",
+        is_bigendian=0,
+        step=size[0],
+        data=np.zeros(size[0] * size[1], np.uint8),
+    )
+    return topic, IMAGE_TYPE, 0, message
+
+
+def _transform(T: FloatArray) -> Any:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return _make(
+        "geometry_msgs/msg/Transform",
+        translation=_make("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))),
+        rotation=_make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )
+
+
+def _tf(topic: str, parent: str, child: str, T: FloatArray, stamp_ns: int = 0) -> Message:
+    transform = _make(
+        "geometry_msgs/msg/TransformStamped",
+        header=_header(parent, stamp_ns),
+        child_frame_id=child,
+        transform=_transform(T),
+    )
+    return topic, TF_TYPE, stamp_ns, _make(TF_TYPE, transforms=[transform])
+
+
+def _bag(path: Path, messages: Sequence[Message]) -> BagReader:
+    store = typestore(is_ros1=True)
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_, log_time_ns, message in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_, typestore=store)
+            data = store.serialize_ros1(message, type_)
+            writer.write(connections[topic], log_time_ns, data)
+    return BagReader(path)
+
+
+def _found(path: Path, messages: Sequence[Message], **choice: str) -> BagCalibration:
+    reader = _bag(path, messages)
+    topics = choose_topics(reader.topics, TopicChoice(**choice), "the bag")
+    return calibrations_of_messages(reader, topics, "the bag")
+
+
+def _pose(rotation: Sequence[float], t: Sequence[float]) -> FloatArray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    T[:3, 3] = t
+    return T
+
+
+_T_BODY_LEFT = _pose([0.2, -1.1, 0.7], [0.3, 0.1, 0.9])
+_T_LEFT_RIGHT = _pose([0.01, -0.02, 0.015], [0.12, 0.001, -0.002])
+
+
+def _pair(name: str = "image_raw", **changes: Any) -> list[Message]:
+    return [
+        *(_image(f"/s/{side}/{name}") for side in ("left", "right")),
+        *(
+            _info(f"/s/{side}/camera_info", f"{side}_optical", **changes)
+            for side in ("left", "right")
+        ),
+    ]
+
+
+def _mounts(topic: str = "/tf_static", stamp_ns: int = 0) -> list[Message]:
+    return [
+        _tf(topic, "body", "left_optical", _T_BODY_LEFT, stamp_ns),
+        _tf(topic, "body", "right_optical", _T_BODY_LEFT @ _T_LEFT_RIGHT, stamp_ns),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("model", "D"),
+    [("plumb_bob", _D), ("equidistant", [0.01, -0.002, 0.001, 0.0])],
+)
+@pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf_static", 0), ("/tf", 7_000_000_000)])
+def test_raw_cameras_without_baseline_are_rectified_by_tf(
+    tmp_path: Path, model: str, D: list[float], topic: str, stamp_ns: int
+) -> None:
+    messages = [*_pair(distortion_model=model, D=D), *_mounts(topic, stamp_ns)]
+    found = _found(tmp_path / "a.bag", messages)
+    assert found.frame_id == "left_optical"
+    assert "baseline: 0.1200 m from tf left_optical -> right_optical" in found.decisions
+    left, right = found.calibrations
+    assert left.model == model
+    # a point seen by the raw cameras, through OpenCV's projection of each
+    point_left = np.array([0.3, -0.1, 3.0])
+    uv = {}
+    for camera, T in ((left, np.eye(4)), (right, np.linalg.inv(_T_LEFT_RIGHT))):
+        point = T[:3, :3] @ point_left + T[:3, 3]
+        u, v, w = camera.P[:, :3] @ camera.R @ point
+        maps = rectification_maps(camera)
+        assert maps is not None
+        column, row = round(u / w), round(v / w)
+        ray = camera.R.T @ np.linalg.solve(camera.P[:, :3], [column, row, 1.0])
+        project: Any = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
+        pixel, _ = project(ray[None, None], np.zeros(3), np.zeros(3), camera.K, camera.D)
+        np.testing.assert_allclose(
+            [m[row, column] for m in maps], np.asarray(pixel).ravel(), atol=1e-3
+        )
+        uv[camera is left] = np.array([u / w, v / w])
+    assert uv[True][1] == pytest.approx(uv[False][1], abs=1e-9)
+    depth = (left.R @ point_left)[2]
+    baseline = stereo_baseline((left, right), "")
+    assert uv[True][0] - uv[False][0] == pytest.approx(left.P[0, 0] * baseline / depth)
+
+
+def test_rectified_images_without_baseline_take_it_from_tf(tmp_path: Path) -> None:
+    T = _pose([0, 0, 0], [0.25, 0, 0])
+    messages = [*_pair("image_rect", P=_P), _tf("/tf_static", "left_optical", "right_optical", T)]
+    left, right = _found(tmp_path / "a.bag", messages).calibrations
+    assert left.is_rectified
+    assert right.P[0, 3] == pytest.approx(-50 * 0.25)
+    T = _pose([0, 0.05, 0], [0.25, 0, 0])
+    messages[-1] = _tf("/tf_static", "left_optical", "right_optical", T)
+    with pytest.raises(CalibrationError, match=r"turned by 2\.86 deg .* --calibration FILE"):
+        _found(tmp_path / "b.bag", messages)
+
+
+def test_a_baseline_of_p_wins_over_tf(tmp_path: Path) -> None:
+    messages = [*_pair(P=_P), *_mounts()]
+    info = _info("/s/right/camera_info", "right_optical", P=[*_P[:3], -25.0, *_P[4:]])
+    messages[3] = info
+    found = _found(tmp_path / "a.bag", messages)
+    assert "baseline: 0.5000 m from P of /s/right/camera_info" in found.decisions
+    np.testing.assert_array_equal(found.calibrations[1].P, np.reshape(info[3].P, (3, 4)))  # type: ignore[attr-defined]
+
+
+def test_without_any_baseline_the_message_says_what_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"nor from tf: .*right_optical.*--calibration FILE"):
+        _found(tmp_path / "a.bag", [*_pair(), _mounts()[0]])
+    messages = [m if m[1] == IMAGE_TYPE else _info(m[0], "same") for m in _pair()]
+    with pytest.raises(CalibrationError, match="both CameraInfo name the frame same"):
+        _found(tmp_path / "b.bag", messages)
+    messages = [m if m[1] == IMAGE_TYPE else _info(m[0], "") for m in _pair()]
+    with pytest.raises(CalibrationError, match="name no frame") as caught:
+        _found(tmp_path / "c.bag", messages)
+    assert str(caught.value).startswith("the bag: the baseline must be positive")
+
+
+def test_binning_and_region_of_the_message_describe_the_recorded_image(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {
+        "width": 200,
+        "height": 100,
+        "K": [180.0, 0, 99, 0, 180, 49, 0, 0, 1],
+        "binning_x": 2,
+        "binning_y": 2,
+        "roi": {"x_offset": 20, "y_offset": 10, "width": 96, "height": 64, "do_rectify": True},
+        "P": [180.0, 0, 99, 0, 0, 180, 49, 0, 0, 0, 1, 0],
+    }
+    messages = _pair(**changes)
+    changes["P"][3] = -36.0
+    messages[3] = _info("/s/right/camera_info", **changes)
+    left, right = _found(tmp_path / "a.bag", messages).calibrations
+    assert (left.width, left.height) == (48, 32)
+    np.testing.assert_allclose(left.K.ravel(), [90, 0, 39.5, 0, 90, 19.5, 0, 0, 1])
+    assert stereo_baseline((left, right), "") == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool) -> None:
+    messages = _pair(width=0, height=0)
+    messages[:2] = [_image(f"/s/{side}/image_raw", (64, 40)) for side in ("left", "right")]
+    if is_compressed:
+        data = np.asarray(cv2.imencode(".png", np.zeros((40, 64), np.uint8))[1]).ravel()
+        fields = {"header": _header("camera"), "format": "png", "data": data}
+        messages[:2] = [
+            (f"{m[0]}/compressed", COMPRESSED_TYPE, 0, _make(COMPRESSED_TYPE, **fields))
+            for m in messages[:2]
+        ]
+    found = _found(tmp_path / "a.bag", [*messages, *_mounts()])
+    assert (found.calibrations[0].width, found.calibrations[0].height) == (64, 40)
+    assert any("left/camera_info leaves the size 0: 64x40 px" in line for line in found.decisions)
+
+
+def test_camera_info_that_changes_is_counted_and_the_first_one_used(tmp_path: Path) -> None:
+    zoomed = [90.0, 0, 23.5, 0, 90.0, 15.5, 0, 0, 1]
+    name = "/c/rgb/camera_info"
+    messages = [
+        _image("/c/rgb/image_raw"),
+        _image("/c/depth/image_raw"),
+        *(_info(name, stamp_ns=n, K=_K if n < 3 else zoomed) for n in range(5)),
+        *(_info("/c/depth/camera_info", stamp_ns=n) for n in range(5)),
+    ]
+    assert _found(tmp_path / "a.bag", messages).calibrations[0].K[0, 0] == 50.0
+    reader = BagReader(tmp_path / "a.bag")
+    assert camera_info_changes(reader, [name, "/c/depth/camera_info"]) == {name: 2}
+
+
+def _rgbd(depth_name: str = "/c/depth/image_raw", **depth: Any) -> list[Message]:
+    frame_id = depth.pop("frame_id", "depth_optical")
+    return [
+        _image("/c/rgb/image_raw"),
+        _image(depth_name),
+        _info("/c/rgb/camera_info", "color_optical"),
+        _info(f"{depth_name.rpartition('/')[0]}/camera_info", frame_id, **depth),
+    ]
+
+
+_DEPTH_K = [40.0, 0, 25.0, 0, 40.0, 14.0, 0, 0, 1]
+_T_COLOR_DEPTH = _pose([0.01, 0.02, -0.01], [0.015, 0.001, -0.002])
+
+
+def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: Path) -> None:
+    # The tf tree is up to the other side: the depth camera is the parent of the colour camera.
+    tf = _tf("/tf_static", "depth_optical", "color_optical", se3.invert(_T_COLOR_DEPTH))
+    messages = [*_rgbd(K=_DEPTH_K, width=64, D=_D), tf]
+    found = _found(tmp_path / "a.bag", messages)
+    view = found.depth_view
+    assert view is not None
+    np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)
+    assert (view.calibration.width, view.calibration.K[0, 0]) == (64, 40.0)
+    np.testing.assert_array_equal(view.calibration.D, _D)
+    assert found.frame_id == "color_optical"
+    (line,) = [line for line in found.decisions if line.startswith("depth: ")]
+    assert "0.0152 m from colour by tf color_optical -> depth_optical" in line
+
+
+def test_the_place_alone_makes_a_camera_of_its_own(tmp_path: Path) -> None:
+    tf = _tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH)
+    view = _found(tmp_path / "a.bag", [*_rgbd(), tf]).depth_view
+    assert view is not None
+    np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)
+
+
+def test_depth_of_one_frame_and_other_intrinsics_needs_no_tf(tmp_path: Path) -> None:
+    depths: list[dict[str, Any]] = [{"K": _DEPTH_K}, {"width": 64}]
+    for n, changes in enumerate(depths):
+        view = _found(tmp_path / f"{n}.bag", _rgbd(frame_id="color_optical", **changes)).depth_view
+        assert view is not None
+        np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "depth"),
+    [
+        ("/c/depth/image_raw", {"frame_id": "color_optical"}),
+        ("/c/depth/image_raw", {"frame_id": "/color_optical"}),
+        ("/c/depth/image_raw", {"frame_id": "coincident"}),
+        ("/c/aligned_depth_to_color/image_raw", {"K": _DEPTH_K}),
+        ("/c/depth_registered/image_raw", {"K": _DEPTH_K}),
+    ],
+)
+def test_registered_depth_is_left_alone(tmp_path: Path, name: str, depth: dict[str, Any]) -> None:
+    tf = [
+        _tf("/tf_static", "color_optical", "depth_optical", _T_COLOR_DEPTH),
+        _tf("/tf_static", "color_optical", "coincident", np.eye(4)),
+    ]
+    found = _found(tmp_path / "a.bag", [*_rgbd(name, **depth), *tf])
+    assert found.depth_view is None
+    assert not any(line.startswith("depth: ") for line in found.decisions)
+
+
+def test_without_tf_the_advice_is_one_line(tmp_path: Path) -> None:
+    found = _found(tmp_path / "a.bag", _rgbd(K=_DEPTH_K))
+    assert found.depth_view is None
+    (line,) = [line for line in found.decisions if line.startswith("depth: ")]
+    assert "not registered to colour (fx 40.0 against 50.0 px; " in line
+    assert line.endswith("give a topic of depth registered to colour by --depth")
+    (line,) = _found(tmp_path / "b.bag", _rgbd()).decisions[1:]
+    assert "taken as registered" in line
+    found = _found(tmp_path / "c.bag", _rgbd("/c/unregistered_depth/image_raw", K=_DEPTH_K))
+    assert "not registered to colour" in found.decisions[-1]
+
+
+def test_a_depth_camera_without_calibration_is_taken_as_registered(tmp_path: Path) -> None:
+    found = _found(tmp_path / "a.bag", _rgbd(K=np.zeros(9)))
+    assert found.depth_view is None
+    assert "/c/depth/camera_info: the camera is not calibrated" in found.decisions[-1]
+
+
+def test_a_file_wins_and_names_body_and_frame(tmp_path: Path, tiny: Any) -> None:
+    reader = _bag(tmp_path / "a.bag", [m for m in _pair() if m[1] == IMAGE_TYPE])
+    topics = choose_topics(reader.topics, TopicChoice(), "")
+    camera = {
+        "intrinsics": [50.0, 50.0, 23.5, 15.5],
+        "resolution": [48, 32],
+        "distortion_coefficients": _D[:4],
+    }
+    for n, T in enumerate([_T_BODY_LEFT, _T_BODY_LEFT @ _T_LEFT_RIGHT]):
+        content = camera | {"T_BS": {"data": T.ravel().tolist()}}
+        (tmp_path / f"{n}.yaml").write_text(yaml.safe_dump(content))
+    found = calibrations_of_file([tmp_path / "0.yaml", tmp_path / "1.yaml"], topics, reader)
+    assert found.frame_id == "camera"
+    assert found.T_body_cam is not None
+    R = found.calibrations[0].R
+    np.testing.assert_allclose(found.T_body_cam[:3, :3], _T_BODY_LEFT[:3, :3] @ R.T, atol=1e-12)
+    assert any(line.startswith("baseline: 0.1200 m from the poses") for line in found.decisions)
+    ros = tmp_path / "c.yaml"
+    ros.write_text(yaml.safe_dump(tiny.ros_camera()))
+    with pytest.raises(CalibrationError, match="left and right"):
+        calibrations_of_file(ros, topics)
+
+
+@pytest.mark.recorded
+def test_the_recorded_depth_is_placed_by_what_librealsense_wrote(gvo_data: Path) -> None:
+    reader = BagReader(gvo_data / "bags" / "good" / "realsense_rgbd.bag")
+    topics = choose_topics(reader.topics, TopicChoice(), "")
+    found = calibrations_of_messages(reader, topics, "")
+    assert found.depth_scale == 1000.0
+    assert found.depth_view is not None
+    assert found.depth_view.calibration.K[0, 0] == pytest.approx(390.43, abs=0.01)
+    # A D435: the colour camera stands 15 mm left of the depth camera.
+    T_color_depth = found.depth_view.T_color_depth
+    np.testing.assert_allclose(T_color_depth[:3, 3], [0.0143, 0.0006, 0.0006], atol=1e-4)

@@ -1,0 +1,380 @@
+"""ROS messages of images and calibrations."""
+
+import struct
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gvo.errors import RecordingError
+from gvo.io.bag.messages import (
+    camera_fields,
+    decode_compressed,
+    decode_compressed_depth,
+    decode_depth,
+    decode_grey_or_color,
+    stamp_of,
+)
+from gvo.io.images import GreyRange
+from tests.io.rvl_coder import encode_rvl
+
+
+def _message(
+    pixels: NDArray[Any], encoding: str, *, padding: int = 0, is_bigendian: bool = False
+) -> Any:
+    """Serialise pixels row by row, each followed by padding."""
+    height, width = pixels.shape[:2]
+    dtype = pixels.dtype.newbyteorder(">" if is_bigendian else "<")
+    rows = [row.astype(dtype).tobytes() + b"\xaa" * padding for row in pixels]
+    return SimpleNamespace(
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=int(is_bigendian),
+        step=len(rows[0]),
+        data=np.frombuffer(b"".join(rows), np.uint8),
+    )
+
+
+@pytest.mark.parametrize("padding", [0, 1, 7])
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+def test_padding_after_the_rows_is_left_out(tiny: Any, encoding: str, padding: int) -> None:
+    pixels = tiny.texture(1)
+    message = _message(pixels, encoding, padding=padding)
+    np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), pixels)
+
+
+_CHANNELS = {
+    "bgr": [0, 1, 2],
+    "rgb": [2, 1, 0],
+    "bgra": [0, 1, 2, 0],
+    "rgba": [2, 1, 0, 1],
+}
+_COLOURS = [
+    *[(f"{name}{bits}", channels) for name, channels in _CHANNELS.items() for bits in (8, 16)],
+    *[(f"{bits}UC3", _CHANNELS["bgr"]) for bits in (8, 16)],
+    *[(f"{bits}UC4", _CHANNELS["bgra"]) for bits in (8, 16)],
+]
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+@pytest.mark.parametrize("padding", [0, 3])
+@pytest.mark.parametrize(("encoding", "channels"), _COLOURS)
+def test_colours_come_in_the_order_blue_green_red(
+    tiny: Any, encoding: str, channels: list[int], padding: int, is_bigendian: bool
+) -> None:
+    bgr = tiny.texture(1, is_color=True)
+    stored = bgr[:, :, channels]
+    if "16" in encoding:
+        stored = stored * np.uint16(256) + 7  # the lower byte is lost
+    message = _message(stored, encoding, padding=padding, is_bigendian=is_bigendian)
+    np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), bgr)
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+@pytest.mark.parametrize("encoding", ["mono16", "16UC1"])
+def test_sixteen_bit_grey_is_shifted_to_eight(tiny: Any, encoding: str, is_bigendian: bool) -> None:
+    grey = tiny.texture(1)
+    message = _message(grey * np.uint16(256) + 3, encoding, is_bigendian=is_bigendian)
+    np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), grey)
+
+
+_PATTERNS = ["rggb", "bggr", "gbrg", "grbg"]
+
+
+def _patches() -> NDArray[np.uint8]:
+    """Return four flat colours, each 16 pixels wide and high, in BGR order."""
+    colours = np.array([[(30, 100, 200), (250, 5, 60)], [(0, 255, 10), (90, 80, 70)]], np.uint8)
+    return colours.repeat(16, axis=0).repeat(16, axis=1)
+
+
+def _mosaic(bgr: NDArray[Any], pattern: str) -> NDArray[Any]:
+    """Keep of each pixel the colour of its filter; the pattern names two rows of two."""
+    mosaic = np.empty_like(bgr[:, :, 0])
+    for place, name in enumerate(pattern):
+        cells = (slice(place // 2, None, 2), slice(place % 2, None, 2))
+        mosaic[cells] = bgr[:, :, "bgr".index(name)][cells]
+    return mosaic
+
+
+def _assert_patches(pixels: NDArray[np.uint8]) -> None:
+    assert pixels.shape == (32, 32, 3)
+    for top in (0, 16):
+        for left in (0, 16):
+            inside = (slice(top + 2, top + 14), slice(left + 2, left + 14))
+            np.testing.assert_array_equal(pixels[inside], _patches()[inside])
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("pattern", _PATTERNS)
+def test_bayer_patterns_give_back_flat_colours(pattern: str, bits: int, is_bigendian: bool) -> None:
+    mosaic = _mosaic(_patches(), pattern)
+    if bits == 16:
+        mosaic = mosaic * np.uint16(256)
+    message = _message(mosaic, f"bayer_{pattern}{bits}", padding=4, is_bigendian=is_bigendian)
+    _assert_patches(decode_grey_or_color(message, "/image"))
+
+
+def _bgr_of_yuv(yuv: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Convert by the formula of ITU-R BT.601 for values of 16 to 235."""
+    y, u, v = (yuv[..., k].astype(float) - offset for k, offset in enumerate((16, 128, 128)))
+    b, g, r = 2.018 * u, -0.391 * u - 0.813 * v, 1.596 * v
+    return np.clip(np.stack([b, g, r], axis=-1) + 1.164 * y[..., np.newaxis], 0, 255)
+
+
+@pytest.mark.parametrize("padding", [0, 6])
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
+def test_pixels_that_share_their_colour_by_twos_follow_the_formula(
+    encoding: str, padding: int
+) -> None:
+    yuv = np.random.default_rng(0).integers(16, 236, (6, 8, 3), dtype=np.uint8)
+    yuv[:, 1::2, 1:] = yuv[:, ::2, 1:]
+    luma = 1 if encoding in ("yuv422", "uyvy") else 0
+    stored = np.empty((6, 8, 2), np.uint8)
+    stored[:, :, luma] = yuv[:, :, 0]
+    stored[:, ::2, 1 - luma], stored[:, 1::2, 1 - luma] = yuv[:, ::2, 1], yuv[:, ::2, 2]
+    decoded = decode_grey_or_color(_message(stored, encoding, padding=padding), "/image")
+    assert np.abs(decoded - _bgr_of_yuv(yuv)).max() <= 1.5
+
+
+@pytest.mark.parametrize("padding", [0, 6])
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_planes_of_colour_below_the_grey_one_follow_the_formula(
+    encoding: str, padding: int
+) -> None:
+    rng = np.random.default_rng(0)
+    grey = rng.integers(16, 236, (6, 8), dtype=np.uint8)
+    chroma = rng.integers(0, 256, (3, 4, 2), dtype=np.uint8)
+    order = [0, 1] if encoding == "nv12" else [1, 0]
+    message = _message(
+        np.vstack([grey, chroma[:, :, order].reshape(3, 8)]), encoding, padding=padding
+    )
+    message.height = 6
+    yuv = np.dstack([grey, chroma.repeat(2, axis=0).repeat(2, axis=1)])
+    decoded = decode_grey_or_color(message, "/image")
+    assert np.abs(decoded - _bgr_of_yuv(yuv)).max() <= 1.5
+
+
+def test_an_odd_size_has_no_colour_by_twos() -> None:
+    with pytest.raises(RecordingError, match="/image"):
+        decode_grey_or_color(_message(np.zeros((4, 5, 2), np.uint8), "yuv422"), "/image")
+    message = _message(np.zeros((7, 4), np.uint8), "nv12")
+    message.height = 5
+    with pytest.raises(RecordingError, match="/image"):
+        decode_grey_or_color(message, "/image")
+
+
+def test_a_camera_of_twelve_bits_is_refused_until_its_range_is_told(tiny: Any) -> None:
+    grey = tiny.texture(1)
+    message = _message(grey * np.uint16(16) + 5, "mono16")
+    with pytest.raises(RecordingError, match=r"/image: .*of 65535.*12 bits.*images.white=4095"):
+        decode_grey_or_color(message, "/image")
+    pixels = decode_grey_or_color(message, "/image", GreyRange(white=4095))
+    np.testing.assert_array_equal(pixels, grey)
+
+
+@pytest.mark.parametrize("is_bigendian", [False, True])
+def test_depth_is_counts_or_metres(tiny: Any, is_bigendian: bool) -> None:
+    for encoding in ("16UC1", "mono16"):
+        message = _message(tiny.counts(1), encoding, is_bigendian=is_bigendian, padding=2)
+        np.testing.assert_array_equal(decode_depth(message, 5000.0, "/depth"), tiny.depth(1))
+    message = _message(tiny.depth(1), "32FC1", is_bigendian=is_bigendian)
+    np.testing.assert_array_equal(decode_depth(message, 5000.0, "/depth"), tiny.depth(1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"encoding": "jpeg2000"}, "encoding 'jpeg2000' is not supported"),
+        ({"width": 0}, "no pixels"),
+        ({"height": 0}, "no pixels"),
+        ({"width": 2**31}, "needs"),
+        ({"height": 2**31}, "needs"),
+        ({"step": 1}, "needs"),
+        ({"step": 2**31}, "needs"),
+        ({"data": np.zeros(5, np.uint8)}, "got 5"),
+        ({"data": np.zeros(0, np.uint8)}, "got 0"),
+    ],
+)
+def test_an_image_whose_header_does_not_fit_its_data_is_refused(
+    tiny: Any, changes: dict[str, Any], text: str
+) -> None:
+    message = _message(tiny.texture(1), "mono8")
+    for name, value in changes.items():
+        setattr(message, name, value)
+    with pytest.raises(RecordingError, match=f"/image: .*{text}"):
+        decode_grey_or_color(message, "/image")
+
+
+def test_colour_and_doubles_are_no_depth_and_floats_are_no_grey(tiny: Any) -> None:
+    with pytest.raises(
+        RecordingError, match=r"encoding '64FC1' is not supported, expected .*32FC1"
+    ):
+        decode_depth(_message(tiny.depth(1).astype(np.float64), "64FC1"), 1000.0, "/depth")
+    with pytest.raises(RecordingError, match="encoding 'bgr8'"):
+        decode_depth(_message(tiny.texture(1, is_color=True), "bgr8"), 1000.0, "/depth")
+    with pytest.raises(RecordingError, match="encoding '32FC1'"):
+        decode_grey_or_color(_message(tiny.depth(1), "32FC1"), "/image")
+
+
+def _compressed(pixels: NDArray[Any], format_: str, suffix: str = ".png") -> Any:
+    """Encode pixels in BGR order as a file does."""
+    _, data = cv2.imencode(suffix, pixels)
+    return SimpleNamespace(format=format_, data=data.ravel())
+
+
+@pytest.mark.parametrize(
+    ("encoding", "formats"),
+    [
+        ("mono8", ["png", "mono8; png compressed ", "mono8;png"]),
+        ("mono16", ["png", "mono16; png compressed "]),
+        ("bgr8", ["png", "bgr8; png compressed bgr8", "rgb8; png compressed bgr8", "bgr8; png"]),
+        ("bgr16", ["bgr16; png compressed bgr16"]),
+        ("bgra8", ["bgra8; png compressed bgr8"]),
+        *[(f"bayer_{p}8", [f"bayer_{p}8; png compressed "]) for p in _PATTERNS],
+        *[(f"bayer_{p}16", [f"bayer_{p}16; png compressed "]) for p in _PATTERNS],
+    ],
+)
+def test_png_changes_no_bit_of_a_raw_image(tiny: Any, encoding: str, formats: list[str]) -> None:
+    stored = tiny.texture(1, is_color="bgr" in encoding)
+    if encoding == "bgra8":
+        stored = np.dstack([stored, tiny.texture(2)])
+    if "16" in encoding:
+        stored = stored * np.uint16(257)
+    raw = decode_grey_or_color(_message(stored, encoding), "/image")
+    for format_ in formats:
+        pixels = decode_compressed(_compressed(stored, format_), "/image")
+        np.testing.assert_array_equal(pixels, raw)
+
+
+@pytest.mark.parametrize(
+    ("stored", "format_"),
+    [
+        ("bgr", "jpeg"),
+        ("bgr", "jpg"),
+        ("bgr", "rgb8; jpeg compressed bgr8"),
+        ("bgr", "bgr8; jpeg compressed bgr8"),
+        ("bgr", "bayer_rggb8; jpeg compressed bgr8"),
+        ("bgr", "yuv422; jpeg compressed bgr8"),
+        ("rgb", "rgb8; jpeg compressed rgb8"),
+        ("rgb", "bgr8; jpeg compressed rgb8"),
+    ],
+)
+def test_jpeg_colours_are_right_in_every_form_of_the_transport(stored: str, format_: str) -> None:
+    pixels = _patches() if stored == "bgr" else _patches()[:, :, ::-1]
+    decoded = decode_compressed(_compressed(pixels, format_, ".jpg"), "/image")
+    inside = (slice(4, 12), slice(4, 12))  # one of the four colours is enough
+    assert np.abs(decoded[inside].astype(int) - _patches()[inside]).max() <= 8
+
+
+@pytest.mark.parametrize("pattern", _PATTERNS)
+def test_a_mosaic_in_a_png_gets_its_colours(pattern: str) -> None:
+    mosaic = _mosaic(_patches(), pattern)
+    message = _compressed(mosaic, f"bayer_{pattern}8; png compressed ")
+    _assert_patches(decode_compressed(message, "/image"))
+
+
+def test_damaged_and_foreign_compressed_images_are_refused_with_their_format(tiny: Any) -> None:
+    message = _compressed(tiny.texture(1), "mono8; png compressed ")
+    message.data = message.data[:50]
+    with pytest.raises(RecordingError, match="/image"):
+        decode_compressed(message, "/image")
+    message = SimpleNamespace(format="h264", data=np.arange(100, dtype=np.uint8))
+    with pytest.raises(RecordingError, match=r"/image \(h264\): .*expected PNG, JPEG"):
+        decode_compressed(message, "/image")
+
+
+@pytest.mark.parametrize(
+    ("format_", "n_header"),
+    [
+        ("16UC1; compressedDepth png", 12),
+        ("16UC1; compressedDepth", 12),
+        ("mono16; compressedDepth", 12),
+        ("16UC1; compressedDepth png", 0),  # from writers that forget the header
+        ("16UC1; png compressed ", 0),
+        ("png", 0),
+    ],
+)
+def test_compressed_depth_of_integers_is_exact(tiny: Any, format_: str, n_header: int) -> None:
+    message = _compressed(tiny.counts(1), format_)
+    message.data = np.concatenate([np.zeros(n_header, np.uint8), message.data])
+    depth = decode_compressed_depth(message, 5000.0, "/depth")
+    np.testing.assert_array_equal(depth, tiny.depth(1))
+
+
+def test_depth_in_metres_may_come_as_tiff(tiny: Any) -> None:
+    message = _compressed(tiny.depth(1), "32FC1; tiff compressed ", ".tiff")
+    np.testing.assert_array_equal(decode_compressed_depth(message, 5000.0, "/depth"), tiny.depth(1))
+
+
+def test_depth_as_jpeg_is_refused(tiny: Any) -> None:
+    message = _compressed(tiny.texture(1), "16UC1; jpeg compressed ", ".jpg")
+    with pytest.raises(RecordingError, match=r"/depth \(16UC1; jpeg .*16-bit grey"):
+        decode_compressed_depth(message, 5000.0, "/depth")
+
+
+@pytest.mark.parametrize("data", [b"", b"x", bytes(12), bytes(40)])
+@pytest.mark.parametrize("coder", ["png", "rvl"])
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_compressed_depth_without_an_image_is_refused(
+    encoding: str, coder: str, data: bytes
+) -> None:
+    message: Any = SimpleNamespace(
+        format=f"{encoding}; compressedDepth {coder}", data=np.frombuffer(data, np.uint8)
+    )
+    with pytest.raises(RecordingError, match="/depth"):
+        decode_compressed_depth(message, 5000.0, "/depth")
+
+
+@pytest.mark.parametrize("coder", ["png", "rvl"])
+def test_compressed_depth_of_floats_is_inverse_depth(tiny: Any, coder: str) -> None:
+    # as the transport writes it: counts = a / depth + b, 0 = unknown
+    quantization, largest = 100.0, 10.0
+    a = quantization * (quantization + 1.0)
+    b = 1.0 - a / largest
+    depth = tiny.depth(1)
+    counts = np.nan_to_num(a / depth + b, nan=0.0).astype(np.uint16)
+    code = cv2.imencode(".png", counts)[1].tobytes() if coder == "png" else encode_rvl(counts)
+    data = np.frombuffer(struct.pack("<iff", 0, a, b) + code, np.uint8)
+    message: Any = SimpleNamespace(format=f"32FC1; compressedDepth {coder}", data=data)
+    decoded = decode_compressed_depth(message, 5000.0, "/depth")
+    np.testing.assert_array_equal(np.isnan(decoded), np.isnan(depth))
+    # rounding down by one count: depth^2 / a
+    is_known = np.isfinite(depth)
+    errors = (decoded - depth)[is_known]
+    assert errors.min() > -1e-5
+    assert np.all(errors < 1.01 * depth[is_known] ** 2 / a + 1e-5)
+
+
+@pytest.mark.parametrize("spell", [str.upper, str.lower])
+def test_camera_info_of_either_generation_is_read(spell: Any) -> None:
+    matrices = {"D": np.arange(5.0), "K": np.arange(9.0), "R": np.eye(3), "P": np.arange(12.0)}
+    spelt = {spell(name): values for name, values in matrices.items()}
+    roi = SimpleNamespace(x_offset=1, y_offset=2, width=40, height=30)
+    message = SimpleNamespace(
+        header=SimpleNamespace(frame_id="/left_optical"),
+        width=48,
+        height=32,
+        distortion_model="plumb_bob",
+        binning_x=2,
+        binning_y=3,
+        roi=roi,
+        **spelt,
+    )
+    fields = camera_fields(message, "/info")
+    for name, values in matrices.items():
+        np.testing.assert_array_equal(np.asarray(getattr(fields, name)), values)
+    assert (fields.width, fields.height, fields.where) == (48, 32, "/info")
+    assert (fields.binning, fields.frame_id) == ((2, 3), "left_optical")
+    assert (fields.roi.x_offset, fields.roi.y_offset) == (1, 2)
+    assert (fields.roi.width, fields.roi.height) == (40, 30)
+
+
+def test_stamps_are_exact() -> None:
+    stamp = SimpleNamespace(sec=1403636584, nanosec=763555584)
+    header: Any = SimpleNamespace(stamp=stamp, frame_id="")
+    assert stamp_of(header) == 1403636584763555584

@@ -1,0 +1,211 @@
+"""Calibrations from fields."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import CalibrationError
+from gvo.io.calibration.camera_info import (
+    CameraFields,
+    RegionOfInterest,
+    make_calibration,
+    make_rgbd_calibration,
+)
+
+_K = [50.0, 0, 23.5, 0, 51.0, 15.5, 0, 0, 1]
+_P = [40.0, 0, 20.5, -20.0, 0, 41.0, 10.5, 0, 0, 0, 1, 0]
+
+
+def _fields(**changes: Any) -> CameraFields:
+    values: dict[str, Any] = {
+        "where": "/info",
+        "width": 48,
+        "height": 32,
+        "model": "plumb_bob",
+        "K": _K,
+        "D": [0.1, -0.2, 0.001, 0.002, 0.05],
+        "R": np.eye(3),
+        "P": _P,
+    }
+    return CameraFields(**(values | changes))
+
+
+def test_all_numbers_are_taken_over_bit_by_bit() -> None:
+    calibration = make_calibration(_fields(), is_rectified=False)
+    np.testing.assert_array_equal(calibration.K.ravel(), _K)
+    np.testing.assert_array_equal(calibration.D, [0.1, -0.2, 0.001, 0.002, 0.05])
+    np.testing.assert_array_equal(calibration.P.ravel(), _P)
+
+
+def test_what_is_not_set_is_made_up_from_the_other_matrix() -> None:
+    calibration = make_calibration(_fields(R=np.zeros(9), P=np.zeros(12)), is_rectified=False)
+    np.testing.assert_array_equal(calibration.R, np.eye(3))
+    np.testing.assert_array_equal(calibration.P[:, :3], calibration.K)
+    rectified = make_calibration(_fields(K=np.zeros(9)), is_rectified=True)
+    np.testing.assert_array_equal(rectified.K, rectified.P[:, :3])
+
+
+@pytest.mark.parametrize("D", [[], [0.1, 0.2, 0.3, 0.4]])
+def test_missing_distortion_coefficients_are_zero(D: list[float]) -> None:
+    calibration = make_calibration(_fields(D=D), is_rectified=False)
+    np.testing.assert_array_equal(calibration.D, [*D, 0, 0, 0, 0, 0][:5])
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"K": np.zeros(9), "P": np.zeros(12)}, "not calibrated"),
+        ({"K": _K[:8]}, "K must hold 9 numbers, got 8"),
+        ({"K": [np.nan, *_K[1:]]}, "not finite"),
+        ({"K": ["a"] * 9}, "K must hold numbers"),
+        ({"P": [-40.0, *_P[1:]]}, "focal lengths must be positive"),
+        ({"R": 2 * np.eye(3)}, "R is no rotation"),
+        ({"K": [1e300, *_K[1:]]}, "K holds 1e.300"),
+        ({"K": [10**400, *_K[1:]]}, "K must hold numbers"),
+        ({"K": [0.0, *_K[1:]]}, "focal lengths must be positive, got K with fx=0 fy=51"),
+        ({"K": [*_K[:8], 0.0]}, "third row of K must begin with 0 0 1, got 0 0 0"),
+        ({"P": [*_P[:8], 1, 0, 1, 0]}, "third row of P must begin with 0 0 1, got 1 0 1"),
+        ({"D": [0.1, 0.2]}, "D of plumb_bob must hold 4 or 5 numbers, got 2"),
+        ({"D": [0.1] * 7}, "D of plumb_bob must hold 4, 5, 8, 12 or 14 numbers, got 7"),
+        ({"model": "equidistant"}, "D of equidistant must hold 4 numbers, got 5"),
+        ({"model": "rational_polynomial", "D": [0.1] * 15}, "4, 5, 8, 12 or 14 numbers, got 15"),
+        ({"model": "thin_prism"}, "distortion model 'thin_prism' .* expected plumb_bob"),
+        ({"model": "Inverse Brown Conrady"}, "distortion model 'Inverse Brown Conrady'"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "R is no rotation"),
+        ({"width": 0}, "image size must be positive"),
+        ({"width": 2**31}, "at most 32767 px a side .* got 2147483648x32"),
+        ({"height": 32768}, "at most 32767 px a side .* got 48x32768"),
+        ({"width": 30000, "height": 30000}, "100 megapixels, got 30000x30000"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_refused(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(CalibrationError, match=f"/info.*{text}"):
+        make_calibration(_fields(**changes), is_rectified=False)
+
+
+def test_depth_is_not_rectified_by_a_camera_that_turns() -> None:
+    R = np.asarray(Rotation.from_rotvec([0.0, 0.01, 0.0]).as_matrix())
+    with pytest.raises(CalibrationError, match=r"/info.*R turns the camera.*identity"):
+        make_rgbd_calibration(_fields(R=R), is_rectified=False)
+    # rectified images and their depth are turned already
+    assert make_rgbd_calibration(_fields(R=R), is_rectified=True).is_rectified
+    for unturned in (np.eye(3), np.zeros(9)):
+        calibration = make_rgbd_calibration(_fields(R=unturned), is_rectified=False)
+        np.testing.assert_array_equal(calibration.R, np.eye(3))
+
+
+def test_the_distortion_model_of_rectified_images_does_not_matter() -> None:
+    fields = _fields(model="rational_polynomial", D=[0.1] * 8)
+    assert not np.any(make_calibration(fields, is_rectified=True).D)
+
+
+def test_a_model_without_distortion_does_not_matter_either() -> None:
+    fields = _fields(model="Brown Conrady", D=np.zeros(5))
+    assert not np.any(make_calibration(fields, is_rectified=False).D)
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "model", "n_kept"),
+    [
+        ("plumb_bob", 4, "plumb_bob", 5),
+        ("radtan", 4, "plumb_bob", 5),
+        ("radial-tangential", 4, "plumb_bob", 5),
+        ("Brown Conrady", 5, "plumb_bob", 5),
+        ("plumb_bob", 8, "rational_polynomial", 8),
+        ("rational_polynomial", 5, "rational_polynomial", 8),
+        ("rational_polynomial", 8, "rational_polynomial", 8),
+        ("rational_polynomial", 12, "rational_polynomial", 12),
+        ("rational_polynomial", 14, "rational_polynomial", 14),
+        ("equidistant", 4, "equidistant", 4),
+        ("fisheye", 4, "equidistant", 4),
+        ("kannala_brandt", 4, "equidistant", 4),
+    ],
+)
+def test_the_model_goes_by_name_and_count(name: str, n: int, model: str, n_kept: int) -> None:
+    D = np.linspace(0.01, 0.02, n)
+    calibration = make_calibration(_fields(model=name, D=D), is_rectified=False)
+    assert calibration.model == model
+    np.testing.assert_array_equal(calibration.D, [*D, *[0.0] * (n_kept - n)])
+
+
+def test_zeros_after_the_coefficients_of_a_fisheye_are_filling() -> None:
+    fields = _fields(model="Kannala Brandt4", D=[0.1, 0.2, 0.3, 0.4, 0.0])
+    np.testing.assert_array_equal(
+        make_calibration(fields, is_rectified=False).D, [0.1, 0.2, 0.3, 0.4]
+    )
+
+
+def test_zeros_of_a_fisheye_mean_no_distortion_unless_they_are_meant() -> None:
+    unset = make_calibration(_fields(model="equidistant", D=[0.0] * 4), is_rectified=False)
+    assert unset.model == "plumb_bob"
+    fields = _fields(model="equidistant", D=[0.0] * 4, is_distorted_by_zeros=True)
+    assert make_calibration(fields, is_rectified=False).model == "equidistant"
+
+
+def test_binning_and_region_give_the_camera_of_the_recorded_image() -> None:
+    # by hand, as image_geometry has it: the region first, then both axes by their binning
+    fields = _fields(
+        width=1280,
+        height=960,
+        K=[800.0, 0, 640, 0, 810, 480, 0, 0, 1],
+        P=[700.0, 0, 630, -70, 0, 700, 470, 0, 0, 0, 1, 0],
+        binning=(2, 4),
+        roi=RegionOfInterest(x_offset=100, y_offset=60, width=800, height=600),
+    )
+    calibration = make_calibration(fields, is_rectified=False)
+    assert (calibration.width, calibration.height) == (400, 150)
+    np.testing.assert_allclose(calibration.K.ravel(), [400, 0, 270, 0, 202.5, 105, 0, 0, 1])
+    expected = [350, 0, 265, -35, 0, 175, 102.5, 0, 0, 0, 1, 0]
+    np.testing.assert_allclose(calibration.P.ravel(), expected)
+    np.testing.assert_array_equal(calibration.D, fields.D)
+
+
+@given(
+    binning=st.sampled_from([0, 1, 2, 4]),
+    offset=st.integers(0, 200),
+    point=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+)
+def test_a_binned_region_sees_a_point_where_the_full_image_has_it(
+    binning: int, offset: int, point: tuple[float, float]
+) -> None:
+    wide: dict[str, Any] = {
+        "width": 1280,
+        "height": 960,
+        "K": [800.0, 0, 640, 0, 800, 480, 0, 0, 1],
+    }
+    roi = RegionOfInterest(x_offset=offset, y_offset=offset // 2, width=1000, height=800)
+    fields = _fields(**wide, P=np.zeros(12), binning=(binning, binning), roi=roi)
+    full = make_calibration(_fields(**wide, P=np.zeros(12)), is_rectified=False)
+    part = make_calibration(fields, is_rectified=False)
+    scale = max(binning, 1)
+    points = np.array([[*point, 1.0]])
+    np.testing.assert_allclose(
+        part.lens.project(points) * scale + [offset, offset // 2],
+        full.lens.project(points),
+        atol=1e-9,
+    )
+    assert (part.width, part.height) == (1000 // scale, 800 // scale)
+
+
+def test_a_region_of_size_zero_is_the_rest_of_the_image() -> None:
+    assert make_calibration(_fields(), is_rectified=False).width == 48
+    rest = _fields(roi=RegionOfInterest(x_offset=8, y_offset=2))
+    calibration = make_calibration(rest, is_rectified=False)
+    assert (calibration.width, calibration.height) == (40, 30)
+
+
+@pytest.mark.parametrize(
+    "roi",
+    [
+        RegionOfInterest(x_offset=1, width=48, height=32),
+        RegionOfInterest(y_offset=33),
+        RegionOfInterest(width=48, height=33),
+    ],
+)
+def test_a_region_outside_the_image_is_refused(roi: RegionOfInterest) -> None:
+    with pytest.raises(CalibrationError, match=r"/info: the region .* full image of 48x32 px"):
+        make_calibration(_fields(roi=roi), is_rectified=False)

@@ -1,0 +1,154 @@
+"""Tiny recordings, made by hand."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FaultyFrame, Frame, StereoFrame
+
+_WIDTH, _HEIGHT = 48, 32
+
+Item = tuple[int, int, NDArray[Any] | Exception]
+
+
+class ListSource:
+    """A recording in memory: stream, stamp, and pixels or what loading raises."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        items: Sequence[Item],
+        *,
+        calibrations: tuple[Calibration, ...],
+        truth: Trajectory | None = None,
+    ) -> None:
+        self._items = items
+        self._truth = truth
+        self.info = RecordingInfo(
+            name="list",
+            sensor=sensor,
+            calibrations=calibrations,
+            n_images=sum(item[0] == 0 for item in items),
+        )
+
+    def images(self) -> Iterator[StampedImage]:
+        for stream, stamp_ns, pixels in self._items:
+            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(_give, pixels))
+
+    def ground_truth(self) -> Trajectory | None:
+        return self._truth
+
+
+class Tiny:
+    """Makers of small images, folders and sources."""
+
+    size = (_WIDTH, _HEIGHT)
+    camera = PinholeCamera(fx=50.0, fy=50.0, cx=23.5, cy=15.5, width=_WIDTH, height=_HEIGHT)
+
+    def texture(self, seed: int, *, is_color: bool = False) -> NDArray[np.uint8]:
+        """Return noise: no two images are alike."""
+        shape = (_HEIGHT, _WIDTH, 3) if is_color else (_HEIGHT, _WIDTH)
+        return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+    def counts(self, seed: int) -> NDArray[np.uint16]:
+        """Return depth of 1 to 3 m at 5000 counts per metre, with two holes."""
+        rng = np.random.default_rng(seed)
+        values = rng.integers(5000, 15000, (_HEIGHT, _WIDTH), dtype=np.uint16)
+        values[0, :2] = 0, 65535
+        return values
+
+    def depth(self, seed: int) -> NDArray[np.float32]:
+        """Return the same depth in metres."""
+        depth = self.counts(seed).astype(np.float32) / np.float32(5000)
+        depth[0, :2] = np.nan
+        return depth
+
+    def stereo(self, items: Sequence[Item], **options: Any) -> ListSource:
+        """Return a rectified stereo recording."""
+        left = Calibration.from_camera(self.camera)
+        right = Calibration.from_camera(self.camera, baseline=0.5)
+        return ListSource("stereo", items, **({"calibrations": (left, right)} | options))
+
+    def rgbd(self, items: Sequence[Item], **options: Any) -> ListSource:
+        """Return an undistorted RGB-D recording."""
+        calibration = Calibration.from_camera(self.camera)
+        return ListSource("rgbd", items, **({"calibrations": (calibration,)} | options))
+
+    def ros_camera(self, **changes: object) -> dict[str, object]:
+        """Return a calibration in the form of ROS; keys of value None are left out."""
+        content: dict[str, object] = {
+            "image_width": _WIDTH,
+            "image_height": _HEIGHT,
+            "camera_matrix": {"rows": 3, "cols": 3, "data": self.camera.K.ravel().tolist()},
+            "distortion_model": "plumb_bob",
+            "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        }
+        return {key: value for key, value in (content | changes).items() if value is not None}
+
+    def write_image(self, path: Path, pixels: NDArray[Any]) -> None:
+        """Write an image file, and the folders above it."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), pixels)
+
+    def write_kitti(
+        self, folder: Path, n_frames: int = 3, *, cameras: Sequence[int] = (0, 1)
+    ) -> Path:
+        """Write a KITTI folder; cameras 2 and 3 are in colour and set off from camera 0."""
+        offsets = {0: (0, 0, 0), 1: (-25, 0, 0), 2: (3, 0.1, 0.002), 3: (-22, 0.1, 0.002)}
+        rows = {
+            camera: np.hstack([self.camera.K, np.reshape(offset, (3, 1))]).ravel()
+            for camera, offset in offsets.items()
+        }
+        lines = [f"P{camera}: {' '.join(map(repr, row.tolist()))}" for camera, row in rows.items()]
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "calib.txt").write_text("\n".join(lines) + "\n")
+        (folder / "times.txt").write_text("".join(f"{0.1 * n:.6e}\n" for n in range(n_frames)))
+        poses = [f"1 0 0 0 0 1 0 0 0 0 1 {n}\n" for n in range(n_frames)]
+        (folder / "poses.txt").write_text("".join(poses))
+        for camera in cameras:
+            for n in range(n_frames):
+                pixels = self.texture(10 * n + camera, is_color=camera > 1)
+                self.write_image(folder / f"image_{camera}" / f"{n:06d}.png", pixels)
+        return folder
+
+    def write_tum(self, folder: Path, color: Sequence[str], depth: Sequence[str]) -> Path:
+        """Write a TUM folder with images of these stamps and a `calibration.yaml`."""
+        for stream, stamps in (("rgb", color), ("depth", depth)):
+            rows = [f"# {stream} images"]
+            for n, stamp in enumerate(stamps):
+                pixels = self.texture(n, is_color=True) if stream == "rgb" else self.counts(n)
+                self.write_image(folder / stream / f"{stamp}.png", pixels)
+                rows.append(f"{stamp} {stream}/{stamp}.png")
+            (folder / f"{stream}.txt").write_text("\n".join(rows) + "\n")
+        (folder / "calibration.yaml").write_text(yaml.safe_dump(self.ros_camera()))
+        return folder
+
+    def fingerprint(self, frame: Frame | FaultyFrame) -> tuple[object, ...]:
+        """Return all that a frame holds, comparable bit by bit."""
+        if isinstance(frame, FaultyFrame):
+            return ("faulty", frame.stamp_ns, frame.reason)
+        if isinstance(frame, StereoFrame):
+            return ("stereo", frame.stamp_ns, frame.left.tobytes(), frame.right.tobytes())
+        return ("rgbd", frame.stamp_ns, frame.image.tobytes(), frame.depth.tobytes())
+
+
+def _give(pixels: NDArray[Any] | Exception) -> NDArray[Any]:
+    if isinstance(pixels, Exception):
+        raise pixels
+    return pixels
+
+
+@pytest.fixture(scope="session")
+def tiny() -> Tiny:
+    """Return the makers of tiny recordings."""
+    return Tiny()

@@ -1,0 +1,202 @@
+"""EuRoC folders."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from gvo.config import Config
+from gvo.errors import CalibrationError, RecordingError
+from gvo.io.datasets.euroc import EurocSource
+from gvo.io.frames import frames
+from gvo.types import StereoFrame
+
+_STAMPS = (1403636584763555584, 1403636584813555456)
+
+
+def _sensor(tiny: Any, T_body_cam: Any, **changes: Any) -> str:
+    camera = tiny.camera
+    content = {
+        "sensor_type": "camera",
+        "T_BS": {"cols": 4, "rows": 4, "data": np.ravel(T_body_cam).tolist()},
+        "resolution": list(tiny.size),
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": "radial-tangential",
+        "distortion_coefficients": [0.0, 0.0, 0.0, 0.0],
+    }
+    return yaml.safe_dump({k: v for k, v in (content | changes).items() if v is not None})
+
+
+def _poses() -> tuple[Any, Any]:
+    """Return T_body_left and T_body_right: turned, the right one 0.5 m along the left x axis."""
+    T_body_left = np.eye(4)
+    T_body_left[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.2, 0.9]).as_matrix()
+    T_body_left[:3, 3] = 0.1, 0.2, -0.3
+    T_left_right = np.eye(4)
+    T_left_right[:3, :3] = Rotation.from_euler("xyz", [0.01, -0.02, 0.015]).as_matrix()
+    T_left_right[0, 3] = 0.5
+    return T_body_left, T_body_left @ T_left_right
+
+
+def _write(folder: Path, tiny: Any, **changes: Any) -> Path:
+    for n, T_body_cam in enumerate(_poses()):
+        camera = folder / "mav0" / f"cam{n}"
+        rows = ["#timestamp [ns],filename"]
+        for k, stamp_ns in enumerate(_STAMPS):
+            tiny.write_image(camera / "data" / f"{stamp_ns}.png", tiny.texture(10 * k + n))
+            rows.append(f"{stamp_ns},{stamp_ns}.png")
+        (camera / "data.csv").write_text("\r\n".join(rows) + "\r\n")
+        (camera / "sensor.yaml").write_text(_sensor(tiny, T_body_cam, **changes))
+    return folder
+
+
+def test_the_folder_and_its_mav0_are_the_same_recording(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "MH_01", tiny)
+    for source in (EurocSource(folder), EurocSource(folder / "mav0")):
+        assert source.info.name == "MH_01"
+        images = list(source.images())
+        assert [image.stamp_ns for image in images] == [s for s in _STAMPS for _ in range(2)]
+        np.testing.assert_array_equal(images[3].load(), tiny.texture(11))
+
+
+def test_points_lie_on_one_row_of_the_rectified_pair(tmp_path: Path, tiny: Any) -> None:
+    left, right = EurocSource(_write(tmp_path / "m", tiny)).info.calibrations
+    T_body_left, T_body_right = _poses()
+    points_body = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + T_body_left[:3, 2] * 5
+    rows = []
+    for calibration, T_body_cam in ((left, T_body_left), (right, T_body_right)):
+        T_cam_body = np.linalg.inv(T_body_cam)
+        points_raw = points_body @ T_cam_body[:3, :3].T + T_cam_body[:3, 3]
+        homogeneous = points_raw @ calibration.R.T @ calibration.P[:, :3].T
+        rows.append(homogeneous[:, 1] / homogeneous[:, 2])
+    np.testing.assert_allclose(rows[0], rows[1], atol=1e-6)
+    assert getattr(EurocSource(tmp_path / "m").info.camera, "baseline", 0) == pytest.approx(0.5)
+
+
+def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    assert EurocSource(folder).ground_truth() is None
+    states = folder / "mav0" / "state_groundtruth_estimate0"
+    states.mkdir()
+    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y []"
+    row = f"{_STAMPS[0]},1,2,3,0.8,0,0.6,0"
+    (states / "data.csv").write_text(f"{header}, q_RS_z []\n{row}\n")
+    source = EurocSource(folder)
+    truth = source.ground_truth()
+    assert truth is not None
+    # a point of the rectified camera, by hand through raw camera and body to the world
+    point_rectified = np.array([0.3, -0.2, 2.0])
+    point_raw = source.info.calibrations[0].R.T @ point_rectified
+    T_body_left, _ = _poses()
+    point_body = T_body_left[:3, :3] @ point_raw + T_body_left[:3, 3]
+    expected = Rotation.from_quat([0, 0.6, 0, 0.8]).apply(point_body) + np.array([1, 2, 3])
+    found = truth.T_world_cam[0] @ np.append(point_rectified, 1.0)
+    np.testing.assert_allclose(found[:3], expected, atol=1e-12)
+    assert truth.stamps_ns.tolist() == [_STAMPS[0]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"camera_model": "omni"}, "camera model 'omni'"),
+        ({"distortion_model": "fov", "distortion_coefficients": [0.1]}, "distortion model 'fov'"),
+        ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4"),
+        ({"resolution": None}, "resolution must hold"),
+        ({"T_BS": {"data": [1.0] * 16}}, "T_BS is no rigid transform"),
+        ({"T_BS": "none"}, "T_BS must hold numbers"),
+    ],
+)
+def test_a_malformed_sensor_is_refused(
+    tmp_path: Path, tiny: Any, changes: dict[str, Any], text: str
+) -> None:
+    folder = _write(tmp_path / "m", tiny, **changes)
+    with pytest.raises(CalibrationError, match=rf"sensor\.yaml.*{text}"):
+        EurocSource(folder)
+
+
+def test_a_date_that_is_none_is_refused_in_the_sensor_too(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    with (folder / "mav0/cam1/sensor.yaml").open("a") as file:
+        file.write("calibrated: 2024-99-99\n")
+    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml: the calibration is no YAML"):
+        EurocSource(folder)
+
+
+def test_a_missing_table_is_refused_and_a_missing_image_is_not(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    (folder / "mav0/cam1/data" / f"{_STAMPS[1]}.png").unlink()
+    image = list(EurocSource(folder).images())[3]
+    with pytest.raises(RecordingError, match="missing"):
+        image.load()
+    (folder / "mav0/cam1/data.csv").unlink()
+    with pytest.raises(RecordingError, match=r"data\.csv: the file is missing"):
+        EurocSource(folder)
+
+
+def test_a_calibration_file_replaces_the_rectification(tmp_path: Path, tiny: Any) -> None:
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
+    path = tmp_path / "pair.yaml"
+    path.write_text(yaml.safe_dump(pair))
+    info = EurocSource(_write(tmp_path / "m", tiny), calibration=path).info
+    assert getattr(info.camera, "baseline", None) == 1.0
+    assert not info.calibrations[0].is_rectified
+
+
+def test_a_fisheye_pair_is_rectified(tmp_path: Path, tiny: Any) -> None:
+    changes = {"distortion_model": "equidistant", "distortion_coefficients": [0.01, 0.0, 0.0, 0.0]}
+    source = EurocSource(_write(tmp_path / "m", tiny, **changes))
+    assert [c.model for c in source.info.calibrations] == ["equidistant"] * 2
+    assert getattr(source.info.camera, "baseline", 0) == pytest.approx(0.5)
+    assert all(isinstance(frame, StereoFrame) for frame in frames(source, Config()))
+
+
+def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = _write(tmp_path / "m", tiny)
+    T_body_left, _ = _poses()
+    sensors = [folder / "mav0" / f"cam{n}" / "sensor.yaml" for n in range(2)]
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
+    (tmp_path / "pair.yaml").write_text(yaml.safe_dump(pair))
+    for calibration in (None, sensors, folder, folder / "mav0", tmp_path / "pair.yaml"):
+        info = EurocSource(folder, calibration=calibration).info
+        assert info.T_body_cam is not None
+        R = info.calibrations[0].R
+        np.testing.assert_allclose(info.T_body_cam[:3, :3], T_body_left[:3, :3] @ R.T, atol=1e-12)
+        np.testing.assert_allclose(info.T_body_cam[:3, 3], T_body_left[:3, 3], atol=1e-12)
+    # the file's own pose on its body counts
+    moved = yaml.safe_load(sensors[0].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "0.yaml").write_text(yaml.safe_dump(moved))
+    moved = yaml.safe_load(sensors[1].read_text())
+    moved["T_BS"]["data"][3] += 1.0
+    (tmp_path / "1.yaml").write_text(yaml.safe_dump(moved))
+    info = EurocSource(folder, calibration=[tmp_path / "0.yaml", tmp_path / "1.yaml"]).info
+    assert info.T_body_cam is not None
+    assert info.T_body_cam[0, 3] == pytest.approx(T_body_left[0, 3] + 1.0)
+    assert "rectification: the poses of both on the body of 0.yaml + 1.yaml" in info.decisions
+
+
+def test_a_folder_without_poses_on_the_body_needs_none_of_the_pair(
+    tmp_path: Path, tiny: Any
+) -> None:
+    folder = _write(tmp_path / "m", tiny, T_BS=None)
+    with pytest.raises(CalibrationError, match=r"sensor\.yaml: the baseline must be positive"):
+        EurocSource(folder)
+
+
+@pytest.mark.recorded
+def test_the_recorded_flight_is_rectified(gvo_data: Path) -> None:
+    source = EurocSource(gvo_data / "euroc_mh01_start")
+    camera: Any = source.info.camera
+    assert camera.baseline == pytest.approx(0.11007, abs=1e-4)
+    items = list(frames(source, Config()))
+    assert len(items) == 50
+    assert all(isinstance(item, StereoFrame) for item in items)
+    truth = source.ground_truth()
+    assert truth is not None
+    assert truth.stamps_ns[0] < items[0].stamp_ns

@@ -1,0 +1,170 @@
+"""KITTI odometry folders."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from gvo.errors import CalibrationError, GvoError, RecordingError, TrajectoryError
+from gvo.io.datasets.kitti import KittiSource
+
+
+def test_images_come_by_stamp_and_unchanged(tmp_path: Path, tiny: Any) -> None:
+    source = KittiSource(tiny.write_kitti(tmp_path / "00", 12))
+    images = list(source.images())
+    assert [(image.stream, image.stamp_ns) for image in images] == [
+        (stream, n * 100_000_000) for n in range(12) for stream in (0, 1)
+    ]
+    np.testing.assert_array_equal(images[5].load(), tiny.texture(21))
+    assert source.info.sensor == "stereo"
+    assert source.info.n_images == 12
+    assert source.info.name == "00"
+
+
+def test_the_camera_is_that_of_the_projections(tmp_path: Path, tiny: Any) -> None:
+    info = KittiSource(tiny.write_kitti(tmp_path / "00")).info
+    camera = info.camera
+    assert getattr(camera, "baseline", None) == 0.5
+    assert (camera.width, camera.height, camera.fx) == (*tiny.size, 50.0)
+    assert all(calibration.is_rectified for calibration in info.calibrations)
+
+
+def test_the_colour_cameras_are_read_where_the_grey_ones_are_missing(
+    tmp_path: Path, tiny: Any
+) -> None:
+    source = KittiSource(tiny.write_kitti(tmp_path / "00", cameras=(2, 3)))
+    np.testing.assert_array_equal(next(source.images()).load(), tiny.texture(2, is_color=True))
+    assert getattr(source.info.camera, "baseline", None) == 0.5
+    # the truth is that of camera 0: P2 maps the centre of camera 2 to (0, 0, 0)
+    truth = source.ground_truth()
+    assert truth is not None
+    centre = np.append(truth.positions[0], 1.0)
+    np.testing.assert_allclose(source.info.calibrations[0].P @ centre, 0.0, atol=1e-12)
+    np.testing.assert_allclose(truth.positions[2] - truth.positions[0], [0, 0, 2], atol=1e-12)
+
+
+def test_a_missing_image_shifts_no_stamps(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00", 4)
+    (folder / "image_0" / "000001.png").unlink()
+    stamps = [image.stamp_ns for image in KittiSource(folder).images() if image.stream == 0]
+    assert stamps == [0, 200_000_000, 300_000_000]
+
+
+def test_poses_are_found_beside_and_in_the_official_layout(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "sequences" / "07")
+    beside = KittiSource(folder).ground_truth()
+    (tmp_path / "poses").mkdir()
+    shutil.move(folder / "poses.txt", tmp_path / "poses" / "07.txt")
+    official = KittiSource(folder).ground_truth()
+    assert beside is not None
+    assert official is not None
+    np.testing.assert_array_equal(official.T_world_cam, beside.T_world_cam)
+    np.testing.assert_array_equal(official.stamps_ns, [0, 100_000_000, 200_000_000])
+    (tmp_path / "poses" / "07.txt").unlink()
+    assert KittiSource(folder).ground_truth() is None
+
+
+def test_poses_of_another_length_are_refused(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00", 3)
+    (folder / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    with pytest.raises(RecordingError, match=r"poses\.txt: expected 3 rows .* got 2"):
+        KittiSource(folder).ground_truth()
+    (folder / "poses.txt").write_text("1 0 0\n")
+    with pytest.raises(TrajectoryError, match=r"poses\.txt"):
+        KittiSource(folder).ground_truth()
+
+
+def test_a_calibration_file_wins(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    pair = {"left": tiny.ros_camera(), "right": tiny.ros_camera(projection_matrix={"data": P})}
+    path = tmp_path / "pair.yaml"
+    path.write_text(yaml.safe_dump(pair))
+    info = KittiSource(folder, calibration=path).info
+    assert getattr(info.camera, "baseline", None) == 1.0
+    assert any("pair.yaml" in decision for decision in info.decisions)
+
+
+def test_two_files_may_replace_the_calibration(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    (folder / "calib.txt").unlink()
+    P = [50.0, 0, 23.5, -50.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
+    (tmp_path / "l.yaml").write_text(yaml.safe_dump(tiny.ros_camera()))
+    right = tiny.ros_camera(projection_matrix={"data": P})
+    (tmp_path / "r.yaml").write_text(yaml.safe_dump(right))
+    info = KittiSource(folder, calibration=[tmp_path / "l.yaml", tmp_path / "r.yaml"]).info
+    assert getattr(info.camera, "baseline", None) == 1.0
+    assert "calibration: l.yaml + r.yaml, rectified" in info.decisions
+    assert info.T_body_cam is None
+
+
+def test_an_empty_list_of_files_is_none(tmp_path: Path, tiny: Any) -> None:
+    info = KittiSource(tiny.write_kitti(tmp_path / "00"), calibration=()).info
+    assert "calibration: calib.txt, rectified" in info.decisions
+
+
+def _without(name: str) -> Any:
+    return lambda folder: (folder / name).unlink()
+
+
+def _with(name: str, text: str) -> Any:
+    return lambda folder: (folder / name).write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kind", "text"),
+    [
+        (_without("times.txt"), RecordingError, r"times\.txt: the file is missing"),
+        (_without("calib.txt"), RecordingError, r"calib\.txt: the file is missing"),
+        (_with("times.txt", "0\nx\n0.2\n"), RecordingError, r"times\.txt, line 2: the stamp 'x'"),
+        (_with("times.txt", "0\n0.1\n"), RecordingError, r"000002\.png: .* number below 2"),
+        (_with("image_0/left.png", ""), RecordingError, r"left\.png: expected an image number"),
+        (_with("calib.txt", "P0: 1 2 3\n"), CalibrationError, "line 1: expected 12"),
+        (_with("calib.txt", "P0: a b c\n"), CalibrationError, "line 1"),
+        (_with("calib.txt", f"P0: {'0 ' * 12}\n"), CalibrationError, "P0: focal lengths"),
+        (_with("calib.txt", "Tr: 1\n"), CalibrationError, "lacks P0"),
+        (lambda folder: shutil.rmtree(folder / "image_1"), RecordingError, "expected image_0"),
+    ],
+)
+def test_a_malformed_folder_is_refused(
+    tmp_path: Path, tiny: Any, spoil: Any, kind: type[GvoError], text: str
+) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    spoil(folder)
+    with pytest.raises(kind, match=text) as caught:
+        KittiSource(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_exchanged_cameras_are_refused(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    text = (folder / "calib.txt").read_text()
+    text = text.replace("P0", "PX").replace("P1", "P0").replace("PX", "P1")
+    (folder / "calib.txt").write_text(text)
+    with pytest.raises(CalibrationError, match=r"calib\.txt: the baseline must be positive"):
+        KittiSource(folder)
+
+
+def test_the_first_image_that_can_be_read_says_the_size(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_kitti(tmp_path / "00")
+    (folder / "image_0" / "000000.png").write_bytes(b"damaged")
+    assert KittiSource(folder).info.camera.width == tiny.size[0]
+    for path in (folder / "image_0").iterdir():
+        path.write_bytes(b"damaged")
+    with pytest.raises(RecordingError, match="none of its 3 images can be read"):
+        KittiSource(folder)
+
+
+@pytest.mark.recorded
+def test_the_recorded_drive_is_read(gvo_data: Path) -> None:
+    source = KittiSource(gvo_data / "kitti_06_start")
+    assert source.info.n_images == 51
+    assert getattr(source.info.camera, "baseline", 0.0) == pytest.approx(0.53715, abs=1e-5)
+    truth = source.ground_truth()
+    assert truth is not None
+    assert len(truth) == 51
+    assert truth.stamps_ns[1] == 104_498_900
+    assert np.linalg.norm(truth.positions[-1]) == pytest.approx(60, abs=3)

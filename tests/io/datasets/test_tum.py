@@ -1,0 +1,207 @@
+"""TUM RGB-D folders."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from gvo.config import Config
+from gvo.errors import CalibrationError, RecordingError
+from gvo.io.datasets.tum import TumSource
+from gvo.io.frames import frames
+from gvo.types import RgbdFrame
+
+_COLOR = ("1305031102.175304", "1305031102.211214")
+_DEPTH = ("1305031102.160407", "1305031102.194330")
+
+
+def test_images_come_by_stamp_in_metres_and_exact_nanoseconds(tmp_path: Path, tiny: Any) -> None:
+    source = TumSource(tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH))
+    images = list(source.images())
+    assert [(image.stream, image.stamp_ns) for image in images] == [
+        (1, 1305031102160407000),
+        (0, 1305031102175304000),
+        (1, 1305031102194330000),
+        (0, 1305031102211214000),
+    ]
+    np.testing.assert_array_equal(images[0].load(), tiny.depth(0))
+    np.testing.assert_array_equal(images[1].load(), tiny.texture(0, is_color=True))
+    assert source.info.n_images == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "fx", "k1"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", 517.306408, 0.262383),
+        ("fr2_desk", 520.908620, 0.231222),
+        ("Freiburg3_office", 535.433105, 0.0),
+    ],
+)
+def test_the_name_of_the_folder_tells_the_camera(
+    tmp_path: Path, tiny: Any, name: str, fx: float, k1: float
+) -> None:
+    folder = tiny.write_tum(tmp_path / name, _COLOR, _DEPTH)
+    (folder / "calibration.yaml").unlink()
+    (calibration,) = TumSource(folder).info.calibrations
+    assert (calibration.K[0, 0], calibration.D[0]) == (fx, k1)
+    np.testing.assert_array_equal(calibration.P[:, :3], calibration.K)
+    np.testing.assert_array_equal(calibration.R, np.eye(3))
+    assert (calibration.width, calibration.height) == (640, 480)
+
+
+def test_the_file_given_wins_then_the_name_then_the_file_beside(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "freiburg1", _COLOR, _DEPTH)
+    info = TumSource(folder).info
+    assert info.camera.fx == 517.306408
+    (line,) = [line for line in info.decisions if line.startswith("calibration:")]
+    assert "freiburg1, by the name of the folder" in line
+    assert "calibration.yaml there is not used" in line
+    (folder / "calibration.yaml").unlink()
+    assert not any("not used" in line for line in TumSource(folder).info.decisions)
+    other = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
+    assert TumSource(other).info.camera.fx == tiny.camera.fx
+    K = [99.0, 0, 23.5, 0, 99.0, 15.5, 0, 0, 1]
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(tiny.ros_camera(camera_matrix={"data": K})))
+    info = TumSource(folder, calibration=path).info
+    assert info.camera.fx == 99.0
+    assert "calibration: mine.yaml" in info.decisions
+
+
+@pytest.mark.parametrize("name", ["afr1ca", "fr10", "fr1day", "freiburg4_desk", "fr"])
+def test_a_name_that_only_looks_alike_tells_no_camera(tmp_path: Path, tiny: Any, name: str) -> None:
+    folder = tiny.write_tum(tmp_path / name, _COLOR, _DEPTH)
+    assert TumSource(folder).info.camera.fx == tiny.camera.fx
+
+
+def test_without_any_calibration_the_message_says_what_to_give(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "office", _COLOR, _DEPTH)
+    (folder / "calibration.yaml").unlink()
+    with pytest.raises(CalibrationError, match="--calibration FILE"):
+        TumSource(folder)
+
+
+def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+
+    def largest(**options: Any) -> float:
+        return float(np.nanmax(next(TumSource(folder, **options).images()).load()))
+
+    at_5000 = largest()
+    (folder / "calibration.yaml").write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
+    assert largest() == pytest.approx(2 * at_5000)
+    assert largest(depth_scale=10000.0) == pytest.approx(0.5 * at_5000)
+
+
+def test_a_camera_on_a_body_says_where(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    T_cam_imu = np.eye(4)
+    T_cam_imu[:3, 3] = 0.1, 0.2, 0.3
+    camera = {
+        "camera_model": "pinhole",
+        "intrinsics": [50.0, 50.0, 23.5, 15.5],
+        "resolution": [48, 32],
+        "distortion_model": "equidistant",
+        "distortion_coeffs": [0.1, 0.0, 0.0, 0.0],
+        "T_cam_imu": T_cam_imu.tolist(),
+    }
+    path = tmp_path / "camchain-imucam.yaml"
+    path.write_text(yaml.safe_dump({"cam0": camera}))
+    info = TumSource(folder, calibration=path).info
+    assert info.calibrations[0].model == "equidistant"
+    assert info.T_body_cam is not None
+    np.testing.assert_allclose(info.T_body_cam[:3, 3], [-0.1, -0.2, -0.3])
+    assert "calibration: camchain-imucam.yaml" in info.decisions
+
+
+def _depth_decision(source: TumSource) -> str:
+    (line,) = [line for line in source.info.decisions if line.startswith("depth: ")]
+    return line
+
+
+def test_depth_that_only_makes_sense_in_millimetres_is_read_so(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    assert _depth_decision(TumSource(folder)).startswith(
+        "depth: 5000 counts per metre, the default"
+    )
+    expected = next(TumSource(folder).images()).load()
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
+    assert _depth_decision(TumSource(folder)).startswith("depth: 1000 counts per metre, because")
+    found = next(TumSource(folder).images()).load()
+    is_known = np.isfinite(expected)
+    np.testing.assert_allclose(found[is_known], expected[is_known], atol=2e-3)
+    insisted = TumSource(folder, depth_scale=5000.0)
+    assert _depth_decision(insisted) == "depth: 5000 counts per metre, by depth.scale"
+
+
+def test_a_published_camera_keeps_its_scale_however_near_the_scene(
+    tmp_path: Path, tiny: Any
+) -> None:
+    folder = tiny.write_tum(tmp_path / "fr2_near", _COLOR, _DEPTH)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)
+    assert _depth_decision(TumSource(folder)).startswith("depth: 5000 counts per metre")
+
+
+def test_depth_that_makes_no_sense_at_all_is_doubted(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    for stamp in _DEPTH:
+        tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 1000 + 1)
+    assert "implausible" in _depth_decision(TumSource(folder))
+
+
+def test_depth_and_colour_are_undistorted_with_the_same_camera(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", ["1.0"], ["1.0"])
+    D = [0.3, -0.1, 0.001, -0.002, 0.0]
+    (folder / "calibration.yaml").write_text(
+        yaml.safe_dump(tiny.ros_camera(distortion_coefficients={"data": D}))
+    )
+    (frame,) = frames(TumSource(folder), Config())
+    assert isinstance(frame, RgbdFrame)
+    K = tiny.camera.K
+    grey = cv2.cvtColor(tiny.texture(0, is_color=True), cv2.COLOR_BGR2GRAY)
+    expected = np.asarray(cv2.undistort(grey, K, np.array(D)), dtype=np.int64)
+    assert np.abs(frame.image.astype(np.int64) - expected).max() <= 1
+    # each depth is one of the raw depths, at the pixel that the distortion model says
+    u, v = 30, 8
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    raw, _ = cv2.projectPoints(np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), K, np.array(D))
+    column, row = np.rint(np.ravel(raw)).astype(int)
+    assert frame.depth[v, u] == tiny.depth(0)[row, column]
+
+
+def test_the_truth_is_read_where_there_is_one(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    assert TumSource(folder).ground_truth() is None
+    (folder / "groundtruth.txt").write_text("# truth\n1305031102.1753 1 2 3 0 0 0 1\n")
+    truth = TumSource(folder).ground_truth()
+    assert truth is not None
+    np.testing.assert_array_equal(truth.positions, [[1, 2, 3]])
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+def test_a_missing_list_is_refused(tmp_path: Path, tiny: Any, name: str) -> None:
+    folder = tiny.write_tum(tmp_path / "f", _COLOR, _DEPTH)
+    (folder / name).unlink()
+    with pytest.raises(RecordingError, match=name):
+        TumSource(folder)
+
+
+@pytest.mark.recorded
+def test_nearly_all_recorded_images_find_their_depth(gvo_data: Path) -> None:
+    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    items = list(frames(source, Config()))
+    assert len(items) == 80
+    assert sum(isinstance(item, RgbdFrame) for item in items) >= 78
+
+
+@pytest.mark.recorded
+def test_the_recorded_depth_in_millimetres_is_noticed(gvo_data: Path) -> None:
+    room = TumSource(gvo_data / "sevenscenes_start")
+    assert _depth_decision(room).startswith("depth: 1000 counts per metre, because")
+    desk = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    assert _depth_decision(desk).startswith("depth: 5000 counts per metre")

@@ -1,0 +1,215 @@
+"""Pose graphs as events: every measurement once, each pose with its first connection."""
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.io.edges.events import EdgeEvent, Event, PoseEvent
+from gvo.io.edges.pose_graph import PoseGraphSource
+from gvo.trajectory.g2o import format_edge, format_vertex
+from gvo.types import FloatArray, PosePrior
+
+
+def translation(x: float) -> FloatArray:
+    return se3.make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def edge_line(a: int, b: int) -> str:
+    """Return an exact edge of poses that lie on a line, number n at n metres."""
+    return format_edge(a, b, translation(b - a), 1e-2 * np.eye(6))
+
+
+def write(folder: Path, *lines: str) -> Path:
+    path = folder / "graph.g2o"
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return path
+
+
+def events_of(path: Path) -> list[Event]:
+    return list(PoseGraphSource(path).events())
+
+
+def describe(event: Event) -> tuple[object, ...]:
+    if isinstance(event, PoseEvent):
+        return ("pose", event.frame_id, *(edge.reference_id for edge in event.edges))
+    return ("edge", event.edge.reference_id, event.frame_id)
+
+
+def test_poses_come_with_the_edges_of_the_lines_that_follow_at_once(tmp_path: Path) -> None:
+    lines = [edge_line(*ends) for ends in [(0, 1), (1, 2), (0, 2), (2, 3), (0, 1), (3, 4)]]
+    assert [describe(event) for event in events_of(write(tmp_path, *lines))] == [
+        ("pose", 0),
+        ("pose", 1, 0),
+        ("pose", 2, 1, 0),
+        ("pose", 3, 2),
+        ("edge", 0, 1),
+        ("pose", 4, 3),
+    ]
+
+
+def test_stamps_are_the_order_a_second_each(tmp_path: Path) -> None:
+    poses = events_of(write(tmp_path, edge_line(7, 4), edge_line(4, 9)))
+    stamps = [event.stamp_ns for event in poses if isinstance(event, PoseEvent)]
+    assert stamps == [0, 1_000_000_000, 2_000_000_000]
+
+
+def test_an_edge_from_a_new_pose_is_turned_round(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    T = se3.exp(rng.normal(size=6))
+    A = rng.normal(size=(6, 6))
+    covariance = A @ A.T + np.eye(6)
+    lines = [edge_line(0, 1), format_edge(2, 1, T, covariance)]
+    (event,) = [e for e in events_of(write(tmp_path, *lines)) if describe(e)[:2] == ("pose", 2)]
+    assert isinstance(event, PoseEvent)
+    (edge,) = event.edges
+    assert edge.reference_id == 1
+    np.testing.assert_allclose(edge.T_reference_frame @ T, np.eye(4), atol=1e-12)
+    # any poses: the chi-square of both readings agrees
+    T_1, T_2 = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6))
+    before = se3.log(se3.invert(T) @ se3.invert(T_2) @ T_1)
+    after = se3.log(se3.invert(edge.T_reference_frame) @ se3.invert(T_1) @ T_2)
+    assert after @ np.linalg.solve(edge.covariance, after) == pytest.approx(
+        before @ np.linalg.solve(covariance, before)
+    )
+
+
+def test_edges_between_unknown_poses_wait_until_they_are_connected(tmp_path: Path) -> None:
+    ends = [(0, 1), (5, 6), (6, 7), (5, 7), (1, 5), (7, 8)]
+    events = events_of(write(tmp_path, *(edge_line(*pair) for pair in ends)))
+    assert [describe(event) for event in events] == [
+        ("pose", 0),
+        ("pose", 1, 0),
+        ("pose", 5, 1),
+        ("pose", 6, 5),
+        ("pose", 7, 5),
+        ("edge", 6, 7),
+        ("pose", 8, 7),
+    ]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@given(st.lists(st.tuples(st.integers(-3, 12), st.integers(-3, 12)), min_size=1, max_size=40))
+def test_every_connected_edge_comes_once_and_refers_to_poses_that_came_before(
+    tmp_path: Path, ends: list[tuple[int, int]]
+) -> None:
+    source = PoseGraphSource(write(tmp_path, *(edge_line(*pair) for pair in ends)))
+    known: set[object] = set()
+    n_edges = 0
+    T_world: dict[object, FloatArray] = {}
+    for event in source.events():
+        if isinstance(event, PoseEvent):
+            assert event.frame_id not in known
+            assert bool(event.edges) == bool(known)
+            edges = event.edges
+            known.add(event.frame_id)
+            T_world[event.frame_id] = translation(float(event.frame_id))  # type: ignore[arg-type]
+        else:
+            assert event.frame_id in known
+            edges = (event.edge,)
+        for edge in edges:
+            n_edges += 1
+            step = se3.invert(T_world[edge.reference_id]) @ T_world[event.frame_id]
+            np.testing.assert_allclose(edge.T_reference_frame, step, atol=1e-12)
+    reached = {ends[0][0]}
+    for _ in ends:
+        reached |= {end for pair in ends if reached & set(pair) for end in pair}
+    connected = [pair for pair in ends if set(pair) <= reached]
+    assert known == reached
+    assert n_edges == len(connected)
+    assert bool(source.faults) == (len(connected) < len(ends))
+
+
+def test_what_is_not_connected_is_told(tmp_path: Path) -> None:
+    lines = [format_vertex(n, translation(n)) for n in (0, 1, 4)]
+    source = PoseGraphSource(write(tmp_path, *lines, edge_line(0, 1), edge_line(5, 6)))
+    assert len(list(source.events())) == 2
+    warnings = "\n".join(source.faults.warnings())
+    assert "1 edges are not connected with the first pose" in warnings
+    assert "the first: 5 6" in warnings
+    assert "1 vertices have no edge" in warnings
+
+
+@pytest.mark.parametrize("position", [0, 3, 5])
+def test_a_fixed_pose_holds_the_world_wherever_it_stands(tmp_path: Path, position: int) -> None:
+    lines = [format_vertex(n, translation(10.0 + n)) for n in (0, 1, 2)]
+    lines += [edge_line(0, 1), edge_line(1, 2)]
+    lines.insert(position, "FIX 1")
+    first, *others = events_of(write(tmp_path, *lines))
+    assert describe(first) == ("pose", 1)
+    assert isinstance(first, PoseEvent)
+    assert isinstance(first.prior, PosePrior)
+    np.testing.assert_allclose(first.prior.T_world_frame, translation(11.0))
+    assert all(event.prior is None for event in others if isinstance(event, PoseEvent))
+
+
+def test_several_fixed_poses_get_their_vertices_as_priors(tmp_path: Path) -> None:
+    lines = [format_vertex(n, translation(10.0 + n)) for n in (0, 1, 2)]
+    events = events_of(write(tmp_path, *lines, "FIX 0 2", edge_line(0, 1), edge_line(1, 2)))
+    priors = [e.prior for e in events if isinstance(e, PoseEvent)]
+    assert [prior is not None for prior in priors] == [True, False, True]
+
+
+def test_the_first_vertex_holds_the_world_where_nothing_is_fixed(tmp_path: Path) -> None:
+    lines = [format_vertex(n, translation(10.0 + n)) for n in (2, 0)]
+    first = events_of(write(tmp_path, *lines, edge_line(0, 2)))[0]
+    assert isinstance(first, PoseEvent)
+    assert first.frame_id == 2
+    assert isinstance(first.prior, PosePrior)
+    np.testing.assert_allclose(first.prior.T_world_frame, translation(12.0))
+
+
+def test_foreign_tags_are_counted(tmp_path: Path) -> None:
+    lines = ["PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1", "VERTEX_TRACKXYZ 9 0 0 3", edge_line(0, 1)]
+    source = PoseGraphSource(write(tmp_path, *lines))
+    assert len(list(source.events())) == 2
+    (warning,) = source.faults.warnings()
+    assert "VERTEX_TRACKXYZ in line 2" in warning
+
+
+def test_measurements_are_given_as_they_were_read(tmp_path: Path) -> None:
+    path = write(tmp_path, edge_line(0, 1), "FIX 0", "EDGE3 1 2 1 0 0 0 0 0", edge_line(2, 1))
+    first, fix, old, last = PoseGraphSource(path).measurement_lines()
+    assert (first, fix, last) == (edge_line(0, 1), "FIX 0", edge_line(2, 1))
+    assert old.startswith("EDGE_SE3:QUAT 1 2 1.0 0.0 0.0 0.0 0.0 0.0 1.0 1.0 0.0")
+
+
+@pytest.mark.parametrize("name", ["sphere2500.txt", "pose3example-grid.txt", "pose3example.txt"])
+def test_gtsams_examples_are_connected(name: str) -> None:
+    path = Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]
+    source = PoseGraphSource(path)
+    events = list(source.events())
+    graph, _ = gtsam.readG2o(str(path), True)
+    n_edges = sum(1 if isinstance(e, EdgeEvent) else len(e.edges) for e in events)
+    assert n_edges == graph.size()
+    assert not source.faults
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([], "holds no edge"),
+        (["EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"], "EDGE_SE2"),
+        (["EDGE_SE3:QUAT 0 1 1 2"], "graph.g2o:1: EDGE_SE3:QUAT needs 30 numbers"),
+        (["<xml>"], "graph.g2o:1"),
+    ],
+)
+def test_what_is_no_graph_is_refused_in_one_line(
+    tmp_path: Path, lines: list[str], words: str
+) -> None:
+    with pytest.raises(TrajectoryError, match=words) as caught:
+        PoseGraphSource(write(tmp_path, *lines))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: Path) -> None:
+    source = PoseGraphSource(write(tmp_path, edge_line(0, 1), edge_line(1, 2), "EDGE3 1 2"))
+    events = source.events()
+    assert describe(next(events)) == ("pose", 0)
+    with pytest.raises(TrajectoryError, match=r"graph\.g2o:3"):
+        list(events)

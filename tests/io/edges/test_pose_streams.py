@@ -1,0 +1,208 @@
+"""Streams of poses as edges: what is fused, what is left out, how sure the steps are."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.io.edges.events import InputFaults, PoseEvent
+from gvo.io.edges.pose_streams import (
+    FusedChains,
+    PoseSample,
+    StepSigma,
+    TrajectoryStream,
+    step_covariance,
+)
+from gvo.trajectory.formats import write_covariances, write_kitti, write_tum
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
+from gvo.types import FloatArray, PosePrior
+
+SECOND = 1_000_000_000
+seeds = st.integers(0, 2**32 - 1)
+
+
+class ListStream:
+    """A stream in memory."""
+
+    def __init__(
+        self, samples: list[PoseSample], name: str = "list", stamps_from: StampsFrom = "file"
+    ) -> None:
+        self._samples = samples
+        self.name = name
+        self.decisions: list[str] = []
+        self.n_poses = len(samples)
+        self.stamps_from: StampsFrom = stamps_from
+
+    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
+        return iter(self._samples)
+
+
+def motion(seconds: float) -> FloatArray:
+    """Return a pose that turns at a constant rate about y, moving along a circle."""
+    return se3.exp(seconds * np.array([0.0, 0.3, 0.0, 0.0, 0.0, 1.0]))
+
+
+def sampled(seconds: list[float], T_world: FloatArray | None = None) -> ListStream:
+    T = np.eye(4) if T_world is None else T_world
+    return ListStream(
+        [PoseSample(stamp_ns=round(s * SECOND), T_world_frame=T @ motion(s)) for s in seconds]
+    )
+
+
+def fuse(*streams: ListStream) -> tuple[list[PoseEvent], FusedChains]:
+    source = FusedChains(streams, [StepSigma()] * len(streams))
+    events = [event for event in source.events() if isinstance(event, PoseEvent)]
+    return events, source
+
+
+def test_one_stream_is_a_chain_in_its_own_world() -> None:
+    stream = sampled([0.0, 0.1, 0.2, 0.5], se3.exp(np.arange(6.0)))
+    events, source = fuse(stream)
+    assert [len(event.edges) for event in events] == [0, 1, 1, 1]
+    assert isinstance(events[0].prior, PosePrior)
+    T = events[0].prior.T_world_frame
+    for event, sample in zip(events, stream.samples(source.faults), strict=True):
+        for edge in event.edges:
+            T = T @ edge.T_reference_frame
+        np.testing.assert_allclose(T, sample.T_world_frame, atol=1e-12)
+    assert not source.faults
+
+
+def test_another_stream_gives_edges_at_the_stamps_of_the_first_in_any_world() -> None:
+    first = sampled([0.0, 0.1, 0.2, 0.3, 0.4])
+    dense = sampled([0.005 * n for n in range(40, 200)], se3.exp(np.ones(6)))
+    events, _ = fuse(first, dense)
+    assert [len(event.edges) for event in events] == [0, 1, 1, 2, 2]
+    for event in events[3:]:
+        own, other = event.edges
+        assert other.reference_id == own.reference_id
+        # a circle between poses 5 ms apart is nearly straight
+        np.testing.assert_allclose(other.T_reference_frame, own.T_reference_frame, atol=1e-5)
+
+
+def test_nothing_is_interpolated_over_a_gap() -> None:
+    first = sampled([0.1 * n for n in range(13)])
+    gappy = sampled([0.1 * n + 0.01 for n in range(-1, 13) if not 4 <= n <= 9])
+    events, _ = fuse(first, gappy)
+    assert [len(event.edges) for event in events] == [0, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1, 2]
+
+
+def test_a_step_from_pose_to_pose_over_a_gap_needs_no_interpolation() -> None:
+    first = sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
+    other = sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
+    events, _ = fuse(first, other)
+    assert [len(event.edges) for event in events] == [0, 2, 2, 2, 2, 2]
+
+
+def test_stamps_that_go_back_are_skipped_and_counted() -> None:
+    events, source = fuse(sampled([0.0, 0.1, 0.1, 0.05, 0.2]))
+    assert [event.stamp_ns for event in events] == [0, SECOND // 10, SECOND // 5]
+    (warning,) = source.faults.warnings()
+    assert warning.startswith("2 poses have a stamp that does not advance")
+
+
+def test_an_input_without_a_common_stamp_is_told() -> None:
+    _, source = fuse(sampled([0.0, 0.1]), sampled([5.0, 5.1]))
+    (warning,) = source.faults.warnings()
+    assert "give no edge" in warning
+
+
+def test_stamped_and_bare_rows_do_not_mix() -> None:
+    bare = ListStream([PoseSample(stamp_ns=0, T_world_frame=np.eye(4))], "bare", "rows")
+    with pytest.raises(TrajectoryError, match=r"bare holds rows .* times\.txt"):
+        FusedChains([sampled([0.0]), bare], [StepSigma()] * 2)
+
+
+def test_bare_rows_of_different_length_are_the_same_frames(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.txt", tmp_path / "b.txt"]
+    for path, n in zip(paths, (5, 3), strict=True):
+        poses = np.stack([motion(0.1 * i) for i in range(n)])
+        write_kitti(path, Trajectory(stamps_ns=np.arange(n), T_world_cam=poses))
+    source = FusedChains([TrajectoryStream(path=path) for path in paths], [StepSigma()] * 2)
+    assert source.has_made_up_stamps
+    assert [len(event.edges) for event in source.events() if isinstance(event, PoseEvent)] == [
+        0,
+        2,
+        2,
+        1,
+        1,
+    ]
+
+
+def random_covariance(rng: np.random.Generator) -> FloatArray:
+    A = rng.normal(size=(6, 6))
+    return np.asarray(A @ A.T + 0.1 * np.eye(6)) * 1e-3
+
+
+@given(seeds)
+def test_the_covariance_of_odometrys_step_is_the_growth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_step = se3.exp(rng.normal(size=6))
+    of_step = random_covariance(rng)
+    T_a, C_a = se3.exp(rng.normal(size=6)), random_covariance(rng)
+    before = PoseSample(stamp_ns=0, T_world_frame=T_a, covariance=C_a)
+    C_b = se3.compose_covariance(C_a, T_step, of_step)
+    after = PoseSample(stamp_ns=1, T_world_frame=T_a @ T_step, covariance=C_b)
+    np.testing.assert_allclose(step_covariance(before, after, StepSigma()), of_step, atol=1e-12)
+
+
+@given(seeds)
+def test_the_covariance_between_independent_fixes_is_that_of_samples(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_a, T_b = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6))
+    C_a = random_covariance(rng)
+    # smaller than before in every direction: no growth
+    C_b = 1e-4 * C_a
+    before = PoseSample(stamp_ns=0, T_world_frame=T_a, covariance=C_a)
+    after = PoseSample(stamp_ns=1, T_world_frame=T_b, covariance=C_b)
+    n = 4000
+    d_a, d_b = (rng.multivariate_normal(np.zeros(6), 1e-6 * C, n) for C in (C_a, C_b))
+    T_ab = se3.invert(T_a) @ T_b
+    errors = se3.log(se3.invert(T_ab) @ se3.invert(T_a @ se3.exp(d_a)) @ (T_b @ se3.exp(d_b)))
+    expected = 1e6 * np.cov(errors.T)
+    C = step_covariance(before, after, StepSigma())
+    scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
+    assert np.abs((C - expected) / scale).max() < 0.15
+
+
+@pytest.mark.parametrize("covariance", [None, np.zeros((6, 6)), np.full((6, 6), np.nan)])
+def test_a_pose_without_covariance_gives_a_step_of_the_stated_sigma(
+    covariance: FloatArray | None,
+) -> None:
+    before, after = (
+        PoseSample(stamp_ns=n, T_world_frame=motion(n), covariance=covariance) for n in (0, 1)
+    )
+    C = step_covariance(before, after, StepSigma.fixed(0.1, 0.5))
+    np.testing.assert_allclose(np.sqrt(np.diag(C)), [0.1] * 3 + [0.5] * 3)
+
+
+def test_default_sigmas_grow_with_the_motion() -> None:
+    near, far = (StepSigma().covariance(motion(s)) for s in (0.0, 2.0))
+    assert np.all(np.diag(near) > 0)
+    assert np.all(np.diag(far) > np.diag(near))
+
+
+def test_covariances_beside_a_file_are_taken(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    poses, covariances = [np.eye(4)], [1e-10 * np.eye(6)]
+    steps = [random_covariance(rng) for _ in range(4)]
+    for n, C in enumerate(steps):
+        T_step = se3.invert(motion(n)) @ motion(n + 1)
+        poses.append(poses[-1] @ T_step)
+        covariances.append(se3.compose_covariance(covariances[-1], T_step, C))
+    trajectory = Trajectory(
+        stamps_ns=np.arange(5) * SECOND,
+        T_world_cam=np.stack(poses),
+        covariances=np.stack(covariances),
+    )
+    write_tum(tmp_path / "raw.txt", trajectory)
+    write_covariances(tmp_path / "raw_covariance.csv", trajectory)
+    source = FusedChains([TrajectoryStream(path=tmp_path / "raw.txt")], [StepSigma()])
+    events = [event for event in source.events() if isinstance(event, PoseEvent)]
+    for event, C in zip(events[1:], steps, strict=True):
+        np.testing.assert_allclose(event.edges[0].covariance, C, atol=1e-8)

@@ -1,0 +1,194 @@
+"""Ground truth of tf and of topics, in bags written here and recorded."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.io.bag.reader import BagReader
+from gvo.io.poses.ground_truth import (
+    TRUTH_FRAMES,
+    BagTruth,
+    BagTruthSpec,
+    TfTruth,
+    TopicTruth,
+    read_bag_truth,
+)
+from gvo.types import FloatArray
+from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+
+SECOND = 10**9
+
+
+def pose(n: float) -> FloatArray:
+    return se3.exp(n * np.array([0.05, 0.1, -0.2, 1.0, 0.5, 0.0]))
+
+
+def read(path: Path, spec: BagTruthSpec) -> BagTruth:
+    return read_bag_truth(BagReader(path), spec, where=path.name)
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+@pytest.mark.parametrize(
+    ("type_", "child"),
+    [(ODOMETRY, "base"), (TRANSFORM, "base"), (STAMPED, ""), (WITH_COVARIANCE, "")],
+)
+def test_a_topic_gives_poses_at_the_stamps_of_its_headers(
+    tmp_path: Path, name: str, type_: str, child: str
+) -> None:
+    bag = PoseBag(tmp_path / name)
+    for n in (3, 1, 2):  # recorded out of order, at other times than their stamps
+        bag.pose("/truth", type_, n * SECOND + 5, pose(n), parent="/map", child="/base")
+    truth = read(bag.write(), TopicTruth(name="truth"))
+    assert truth.trajectory.stamps_ns.tolist() == [n * SECOND + 5 for n in (1, 2, 3)]
+    expected = np.stack([pose(n) for n in (1, 2, 3)])
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, expected, atol=1e-12)
+    assert truth.trajectory.stamps_from == "topic"
+    assert (truth.parent_frame, truth.child_frame) == ("map", child)
+    assert truth.decision == f"/truth ({type_}), 3 poses{' of base' if child else ''}"
+
+
+def test_of_two_poses_of_one_stamp_the_later_counts_and_bad_ones_are_told(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    bag.pose("/truth", STAMPED, 1, pose(1))
+    bag.pose("/truth", STAMPED, 1, pose(2))
+    bag.pose("/truth", STAMPED, 2, pose(3), norm=0.0)
+    truth = read(bag.write(), TopicTruth(name="/truth"))
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, [pose(2)], atol=1e-12)
+    assert "1 poses; 1 messages hold no pose and were skipped; the first: /truth" in truth.decision
+
+
+def test_fixes_are_positions_without_rotations(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.mcap")
+    for n in range(3):
+        bag.fix(n * SECOND, [48.0, 11.0, 500.0 + n])
+    bag.fix(9 * SECOND, [48.0, 11.0, 500.0], status=-1)
+    truth = read(bag.write(), TopicTruth(name="/fix"))
+    assert not truth.trajectory.has_rotations
+    np.testing.assert_allclose(truth.trajectory.positions[:, 2], [0.0, 1.0, 2.0], atol=1e-6)
+    assert truth.child_frame == "gps"
+    assert truth.decision.startswith(
+        "/fix (sensor_msgs/msg/NavSatFix), 3 positions without rotations of gps; east, north, up "
+        "of 48.0000000 deg, 11.0000000 deg, 500.00 m; 1 messages hold no position"
+    )
+
+
+def chain_bag(path: Path) -> PoseBag:
+    """Write map -> odom each second, odom -> base each 0.4 s, base -> camera once."""
+    bag = PoseBag(path)
+    bag.tf(0, "base", "camera", pose(-2), is_static=True)
+    for n in range(5):
+        bag.tf(n * SECOND, "/map", "/odom", pose(0.1 * n))
+    for n in range(12):
+        bag.tf(n * SECOND * 2 // 5, "odom", "base", pose(n))
+    return bag
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_a_chain_gives_a_pose_at_each_stamp_of_its_moving_edges(tmp_path: Path, name: str) -> None:
+    """The edges are put together here, by scipy's interpolation."""
+    truth = read(chain_bag(tmp_path / name).write(), TfTruth(parent="map", child="camera"))
+    tenths = sorted({10 * n for n in range(5)} | {4 * n for n in range(11)})
+    assert truth.trajectory.stamps_ns.tolist() == [n * SECOND // 10 for n in tenths]
+    T_map_odom = between([10 * n for n in range(5)], [pose(0.1 * n) for n in range(5)], tenths)
+    T_odom_base = between([4 * n for n in range(12)], [pose(n) for n in range(12)], tenths)
+    expected = T_map_odom @ T_odom_base @ pose(-2)
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, expected, atol=1e-9)
+    assert truth.decision == (
+        "tf map -> camera, 13 poses; 1 stamps where not all of the chain is known"
+    )
+    assert not truth.is_of_camera
+
+
+def between(stamps: list[int], poses: list[FloatArray], wanted: list[int]) -> FloatArray:
+    T = np.stack(poses)
+    R = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))(wanted).as_matrix()
+    t = np.stack([np.interp(wanted, stamps, T[:, axis, 3]) for axis in range(3)], axis=1)
+    return se3.make_transform(R, t)
+
+
+def test_a_chain_may_be_followed_from_the_child_to_the_parent(tmp_path: Path) -> None:
+    path = chain_bag(tmp_path / "a.bag").write()
+    up = read(path, TfTruth(parent="base", child="map")).trajectory
+    down = read(path, TfTruth(parent="map", child="base")).trajectory
+    np.testing.assert_allclose(up.T_world_cam @ down.T_world_cam, [np.eye(4)] * 13, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "reason"),
+    [
+        ("base", "camera", "they do not move in tf"),
+        ("map", "basis", "tf holds no frame basis"),
+        ("nowhere", "base", "tf holds no frame nowhere"),
+    ],
+)
+def test_a_chain_that_holds_no_poses_is_refused(
+    tmp_path: Path, parent: str, child: str, reason: str
+) -> None:
+    path = chain_bag(tmp_path / "a.bag").write()
+    with pytest.raises(RecordingError, match=f"holds no poses of {child} in {parent}: {reason}"):
+        read(path, TfTruth(parent=parent, child=child))
+
+
+def test_a_topic_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
+    bag = chain_bag(tmp_path / "a.bag")
+    bag.fix(0, [0, 0, 0])
+    with pytest.raises(RecordingError, match=r"a.bag: has no poses on topic /odom.*/fix \("):
+        read(bag.write(), TopicTruth(name="/odom"))
+
+
+def test_the_truth_of_converted_data_sets_is_of_the_camera_at_the_stamps_of_its_file(
+    tmp_path: Path,
+) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    bag.tf(5, "/world", "/ground_truth", pose(1))
+    bag.tf(7, "world", "ground_truth", pose(2))
+    bag.tf(6, "world", "base_link", pose(3))
+    bag.tf(8, "map", "ground_truth", pose(4))
+    truth = read(bag.write(), TRUTH_FRAMES)
+    assert truth.is_of_camera
+    assert truth.trajectory.stamps_from == "file"
+    assert truth.trajectory.stamps_ns.tolist() == [5, 7]
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, [pose(1), pose(2)], atol=1e-12)
+
+
+@pytest.mark.recorded
+def test_the_recorded_chain_of_odometry_is_the_recorded_topic(gvo_data: Path) -> None:
+    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
+    chain = read(path, TfTruth(parent="odom", child="base_link"))
+    topic = read(path, TopicTruth(name="/odom"))
+    assert (topic.parent_frame, topic.child_frame) == ("odom", "base_link")
+    np.testing.assert_array_equal(chain.trajectory.stamps_ns, topic.trajectory.stamps_ns)
+    assert len(chain.trajectory) == 2639
+    difference = np.abs(chain.trajectory.T_world_cam - topic.trajectory.T_world_cam).max()
+    assert difference < 1e-9
+
+
+@pytest.mark.recorded
+def test_a_recorded_chain_of_two_moving_edges_is_read(gvo_data: Path) -> None:
+    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
+    truth = read(path, TfTruth(parent="map", child="base_link"))
+    lower, upper = (np.array(recorded_stamps(path, child)) for child in ("base_link", "odom"))
+    stamps = np.union1d(lower, upper)
+    first, last = max(lower[0], upper[0]), min(lower[-1], upper[-1])
+    expected = stamps[(stamps >= first) & (stamps <= last)]
+    np.testing.assert_array_equal(truth.trajectory.stamps_ns, expected)
+    # the filter's own poses, which it turns into the upper edge
+    amcl = read(path, TopicTruth(name="/amcl_pose"))
+    inner = truth.trajectory.interpolate(amcl.trajectory.stamps_ns)
+    known = np.isin(amcl.trajectory.stamps_ns, inner.stamps_ns)
+    apart = np.linalg.norm(inner.positions - amcl.trajectory.positions[known], axis=1)
+    assert np.median(apart) < 0.1
+
+
+def recorded_stamps(path: Path, child: str) -> list[int]:
+    transforms = [
+        transform
+        for message in BagReader(path).messages(["/tf"])
+        for transform in message.decode().transforms
+        if transform.child_frame_id == child
+    ]
+    return [t.header.stamp.sec * SECOND + t.header.stamp.nanosec for t in transforms]

@@ -1,0 +1,297 @@
+"""Poses in the frame asked for, against composition by hand and sampled covariances."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
+from gvo.geometry import se3
+from gvo.io.poses.base_frame import OutputFrame, parse_initial_pose
+from gvo.io.poses.tf import TfBuffer
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Estimate, FloatArray, Status
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+STAMPS_NS = [1_700_000_000_000_000_000 + n * 100_000_000 for n in range(6)]
+# x forward, y left, z up, of a camera that looks forward
+R_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def random_transform(rng: np.random.Generator) -> FloatArray:
+    return se3.exp(np.concatenate([rng.uniform(-1.5, 1.5, size=3), rng.normal(size=3)]))
+
+
+def random_covariance(rng: np.random.Generator, scale: float = 1.0) -> FloatArray:
+    A = rng.normal(size=(6, 6))
+    return np.asarray(scale**2 * (A @ A.T + 0.1 * np.eye(6)))
+
+
+def camera_drive(rng: np.random.Generator) -> list[Estimate]:
+    """Return estimates of a camera, the first at the origin of the world."""
+    poses = [np.eye(4)]
+    for _ in STAMPS_NS[1:]:
+        poses.append(poses[-1] @ random_transform(rng))
+    return [
+        Estimate(
+            stamp_ns=stamp_ns, T_world_cam=T, covariance=random_covariance(rng), status=Status.OK
+        )
+        for stamp_ns, T in zip(STAMPS_NS, poses, strict=True)
+    ]
+
+
+def apply_all(frame: OutputFrame, estimates: Sequence[Estimate]) -> list[Estimate]:
+    return [frame.apply(estimate) for estimate in estimates]
+
+
+def mounted(rng: np.random.Generator, stamps_ns: Sequence[int]) -> tuple[TfBuffer, FloatArray]:
+    """Return base -> pan (moving) -> mast -> cam (static), and T_base_cam (n, 4, 4) by hand."""
+    buffer = TfBuffer()
+    T_pan_mast, T_mast_cam = random_transform(rng), random_transform(rng)
+    buffer.add("pan", "mast", 0, T_pan_mast, is_static=True)
+    buffer.add("mast", "cam", 0, T_mast_cam, is_static=True)
+    T_base_pan = [random_transform(rng) for _ in stamps_ns]
+    for stamp_ns, T in zip(stamps_ns, T_base_pan, strict=True):
+        buffer.add("base", "pan", stamp_ns, T)
+    return buffer, np.array([T @ T_pan_mast @ T_mast_cam for T in T_base_pan])
+
+
+def test_the_camera_itself_comes_back_untouched() -> None:
+    drive = camera_drive(np.random.default_rng(0))
+    for frame in (OutputFrame(), OutputFrame.from_tf(TfBuffer(), "/cam", "cam")):
+        assert all(out is given for out, given in zip(apply_all(frame, drive), drive, strict=True))
+        assert frame.first_stamp_ns == STAMPS_NS[0]
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_static_mount_is_composed_as_by_hand(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drive, T_body_cam, T_initial = camera_drive(rng), random_transform(rng), random_transform(rng)
+    frame = OutputFrame("body", T_body_cam, T_initial=T_initial)
+    outs = apply_all(frame, drive)
+    np.testing.assert_allclose(outs[0].T_world_cam, T_initial, rtol=0, atol=1e-12)
+    for out, given_ in zip(outs, drive, strict=True):
+        # a body's motion since the start is the camera's, seen from the body
+        T_first_now = T_body_cam @ given_.T_world_cam @ np.linalg.inv(T_body_cam)
+        np.testing.assert_allclose(out.T_world_cam, T_initial @ T_first_now, rtol=0, atol=1e-9)
+        assert (out.stamp_ns, out.status) == (given_.stamp_ns, given_.status)
+    assert frame.n_guessed == 0
+
+
+def test_a_camera_that_looks_forward_moves_the_base_along_its_x_axis() -> None:
+    rng = np.random.default_rng(0)
+    T_base_cam = se3.make_transform(R_BODY_OPTICAL, np.array([0.3, 0.0, 1.2]))
+    frame = OutputFrame("base_link", T_base_cam)
+    first, second = camera_drive(rng)[:2]
+    forward = se3.make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    frame.apply(first)
+    moved = frame.apply(
+        Estimate(
+            stamp_ns=second.stamp_ns, T_world_cam=forward, covariance=np.eye(6), status=Status.OK
+        )
+    )
+    np.testing.assert_allclose(moved.T_world_cam[:3, 3], [2.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(moved.T_world_cam[:3, :3], np.eye(3), atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drive = camera_drive(rng)
+    buffer, T_base_cam = mounted(rng, STAMPS_NS)
+    frame = OutputFrame.from_tf(buffer, "base", "/cam")
+    frame.start(STAMPS_NS[0])
+    for n in rng.permutation(len(drive)):
+        expected = T_base_cam[0] @ drive[n].T_world_cam @ np.linalg.inv(T_base_cam[n])
+        out = frame.apply(drive[n]).T_world_cam
+        np.testing.assert_allclose(out, expected, rtol=0, atol=1e-9)
+    assert frame.n_guessed == 0
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    buffer, T_base_cam = mounted(rng, STAMPS_NS)
+    frame = OutputFrame.from_tf(buffer, "base", "cam", T_initial=random_transform(rng))
+    outs = [
+        frame.apply(
+            Estimate(
+                stamp_ns=stamp_ns,
+                T_world_cam=np.linalg.inv(T_base_cam[0]) @ T_base_cam[n],
+                covariance=np.eye(6),
+                status=Status.OK,
+            )
+        )
+        for n, stamp_ns in enumerate(STAMPS_NS)
+    ]
+    for out in outs[1:]:
+        np.testing.assert_allclose(out.T_world_cam, outs[0].T_world_cam, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
+    rng = np.random.default_rng(3)
+    buffer, T_base_cam = mounted(rng, STAMPS_NS)
+    mount = OutputFrame.from_tf(buffer, "base", "cam")
+    frame = mount if is_moving else OutputFrame("base", T_base_cam[0])
+    frame.start(STAMPS_NS[0])
+    T, covariance = random_transform(rng), random_covariance(rng, scale=1e-4)
+
+    def of(T_world_cam: FloatArray) -> Estimate:
+        return frame.apply(
+            Estimate(
+                stamp_ns=STAMPS_NS[3],
+                T_world_cam=T_world_cam,
+                covariance=covariance,
+                status=Status.OK,
+            )
+        )
+
+    out = of(T)
+    twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
+    poses = np.array([of(T @ se3.exp(xi)).T_world_cam for xi in twists])
+    moved = se3.log(np.linalg.inv(out.T_world_cam) @ poses)
+    sampled = moved.T @ moved / len(moved)
+    # whitened by the stated covariance it is the identity; its entries scatter by 0.016 to 0.022
+    L_inverse = np.linalg.inv(np.linalg.cholesky(out.covariance))
+    np.testing.assert_allclose(L_inverse @ sampled @ L_inverse.T, np.eye(6), atol=0.1)
+    assert np.array_equal(out.covariance, out.covariance.T)
+
+
+def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_counted() -> None:
+    rng = np.random.default_rng(1)
+    drive = camera_drive(rng)
+    buffer, T_base_cam = mounted(rng, STAMPS_NS[2:5])
+    frame = OutputFrame.from_tf(buffer, "base", "cam")
+    for _ in range(2):  # raw and causal, say
+        outs = apply_all(frame, drive)
+    rows = [0, 0, 0, 1, 2, 2]
+    for out, given_, row in zip(outs, drive, rows, strict=True):
+        expected = T_base_cam[0] @ given_.T_world_cam @ np.linalg.inv(T_base_cam[row])
+        np.testing.assert_allclose(out.T_world_cam, expected, rtol=0, atol=1e-9)
+    assert frame.n_guessed == 3
+
+
+def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_taken() -> None:
+    buffer = TfBuffer()
+    for stamp_ns in (10, 20, 60, 70):
+        at = np.array([float(stamp_ns), 0.0, 0.0])
+        buffer.add("base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
+    buffer.add("shelf", "cam", 30, np.eye(4))
+    frame = OutputFrame.from_tf(buffer, "base", "cam")
+    xs = [float(frame.T_frame_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
+    np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
+    assert frame.n_guessed == 2
+
+
+def test_the_first_frame_may_be_named_and_its_pose_given_late() -> None:
+    rng = np.random.default_rng(2)
+    drive, T_truth = camera_drive(rng), random_transform(rng)
+    frame = OutputFrame()
+    frame.start(STAMPS_NS[0], T_truth)
+    np.testing.assert_allclose(
+        frame.apply(drive[3]).T_world_cam, T_truth @ drive[3].T_world_cam, atol=1e-12
+    )
+    with pytest.raises(ValueError, match="already"):
+        frame.start(STAMPS_NS[1])
+
+
+@pytest.mark.parametrize(
+    ("frame", "camera", "words"),
+    [
+        ("base_lnk", "cam", ("no frame base_lnk", "nearest: base_link", "mast")),
+        ("base_link", "kamera_optical", ("no frame kamera_optical", "it holds base_link")),
+        ("base_link", "", ("frame_id is empty",)),
+        ("base_link", "lidar", ("does not connect", "lidar at car", "tf holds base_link")),
+        ("base_link", "late", ("late is known from", "rider")),
+    ],
+)
+def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
+    frame: str, camera: str, words: Sequence[str]
+) -> None:
+    buffer = TfBuffer()
+    buffer.add("base_link", "mast", 0, np.eye(4), is_static=True)
+    buffer.add("mast", "cam", 0, np.eye(4), is_static=True)
+    buffer.add("car", "lidar", 0, np.eye(4), is_static=True)
+    buffer.add("base_link", "rider", 1, np.eye(4))
+    buffer.add("rider", "late", 2, np.eye(4))
+    with pytest.raises(RecordingError) as caught:
+        OutputFrame.from_tf(buffer, frame, camera, where="drive.bag")
+    text = str(caught.value)
+    assert "\n" not in text
+    for word in ("drive.bag", f"--frame {frame}", "--calibration", camera, *words):
+        assert word in text
+
+
+def test_without_any_tf_the_line_says_so() -> None:
+    with pytest.raises(RecordingError, match="tf holds no frame base: it is empty"):
+        OutputFrame.from_tf(TfBuffer(), "base", "cam")
+
+
+def test_what_is_no_rigid_transform_is_refused() -> None:
+    for T in (np.eye(3), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan), 2 * np.eye(4)):
+        with pytest.raises(ValueError, match="T_frame_cam"):
+            OutputFrame("body", T)
+        with pytest.raises(ValueError, match="T_initial"):
+            OutputFrame(T_initial=T)
+
+
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_true_poses_of_the_camera_become_those_of_the_frame_in_their_own_world(
+    is_moving: bool,
+) -> None:
+    rng = np.random.default_rng(4)
+    drive = camera_drive(rng)
+    buffer, T_base_cam = mounted(rng, STAMPS_NS[1:])
+    static = OutputFrame("base", T_base_cam[0], T_initial=random_transform(rng))
+    frame = OutputFrame.from_tf(buffer, "base", "cam") if is_moving else static
+    truth = frame.convert(Trajectory.of(drive))
+    first = 1 if is_moving else 0  # tf says nothing of the first stamp
+    assert truth.stamps_ns.tolist() == STAMPS_NS[first:]
+    for n, T_world_base in enumerate(truth.T_world_cam):
+        T = T_base_cam[n] if is_moving else T_base_cam[0]
+        np.testing.assert_allclose(T_world_base @ T, drive[n + first].T_world_cam, atol=1e-9)
+
+
+def test_positions_alone_are_not_moved_to_another_frame() -> None:
+    positions = Trajectory.of_positions(np.arange(3), np.zeros((3, 3)))
+    assert OutputFrame().convert(positions) is positions
+    with pytest.raises(TrajectoryError, match="positions of base_link"):
+        OutputFrame("base_link", np.eye(4)).convert(positions)
+
+
+def test_the_initial_pose_is_read_with_and_without_a_rotation() -> None:
+    assert parse_initial_pose("truth") == "truth"
+    np.testing.assert_array_equal(
+        parse_initial_pose("1, -2,3e1"), se3.make_transform(np.eye(3), np.array([1.0, -2.0, 30.0]))
+    )
+    half = np.sqrt(0.5)
+    T = parse_initial_pose(f"0,0,0,0,0,{half:.4f},{half:.4f}")
+    expected = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    np.testing.assert_allclose(np.asarray(T)[:3, :3], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1,2",
+        "1,2,x",
+        "1,2,nan",
+        "1,2,3,0,0,90",
+        "Truth",
+        "1,2,3,0,0,0,0",
+        "1;2;3",
+        "1,2,3,-1e308,2,0,0",
+    ],
+)
+def test_an_initial_pose_that_is_none_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"--initial-pose .*expected") as caught:
+        parse_initial_pose(text)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,129 @@
+"""What `gvo compare` is given: files, and chains and topics of bags."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.geometry import se3
+from gvo.io.poses.inputs import is_in_bag, read_pose_input, read_poses
+from gvo.trajectory.evaluation import Evaluation, evaluate
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory
+from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
+
+T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))
+MOTION = se3.exp(np.outer(np.arange(8), [0.1, 0.0, -0.2, 1.0, 0.5, 0.1]))
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    bag = PoseBag(tmp_path / "a.bag")
+    bag.tf(0, "base", "cam", T_BASE_CAM, is_static=True)
+    for n, T in enumerate(MOTION):
+        bag.tf(n * 10**8, "map", "base", T)
+        bag.pose("/odom", ODOMETRY, n * 10**8, T, child="base")
+        bag.pose("/slam", ODOMETRY, n * 10**8, T @ T_BASE_CAM, child="cam")
+        bag.pose("/gt", STAMPED, n * 10**8, T)
+        bag.fix(n * 10**8, [48.0, 11.0, float(n)], frame="gps")
+    return bag.write()
+
+
+def measures(found: Evaluation) -> list[float]:
+    values = [found.ate_m, found.ate_max_m, found.rpe_m, found.rpe_deg]
+    return [np.inf if value is None else value for value in values]
+
+
+def test_a_chain_has_no_error_against_itself_nor_against_its_topic(bag: Path) -> None:
+    chain = read_poses(f"{bag}#tf:map:base")
+    for text in (f"{bag}#tf:map:base", f"{bag}#/odom", f"{bag}#odom", f"{bag}#topic:/odom"):
+        found = evaluate(chain, read_poses(text), name="same")
+        assert found.n == 8
+        assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
+
+
+def test_poses_are_brought_to_the_frame_of_the_reference(bag: Path) -> None:
+    reference = read_pose_input(f"{bag}#/odom")
+    for text in (f"{bag}#tf:map:cam", f"{bag}#/slam"):
+        apart = evaluate(reference.trajectory, read_poses(text), name="apart")
+        assert measures(apart)[2] > 0.05
+        brought = read_pose_input(text, frame=reference.child_frame)
+        assert brought.child_frame == "base"
+        assert not brought.warning
+        found = evaluate(reference.trajectory, brought.trajectory, name="brought")
+        assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
+
+
+def test_what_cannot_be_brought_to_the_frame_is_compared_with_a_warning(bag: Path) -> None:
+    found = read_pose_input(f"{bag}#/slam", frame="vicon/drone")
+    assert found.child_frame == "cam"
+    assert found.warning.startswith("/slam is of cam, the reference of vicon/drone: ")
+    fixes = read_pose_input(f"{bag}#/fix", frame="base")
+    assert fixes.warning == (
+        "/fix is of gps, the reference of base: positions without rotations cannot be moved"
+    )
+
+
+def test_a_bag_by_itself_gives_the_truth_that_it_names(bag: Path) -> None:
+    found = read_pose_input(str(bag))
+    assert found.name == "a"
+    assert found.decision.startswith("/gt (")
+    np.testing.assert_allclose(found.trajectory.T_world_cam, MOTION, atol=1e-12)
+
+
+def test_a_bag_that_names_no_truth_lists_what_can_be_asked_for(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "b.bag")
+    bag.pose("/odom", ODOMETRY, 0, np.eye(4))
+    path = bag.write()
+    with pytest.raises(RecordingError, match=r"name the poses: .*b.bag#tf:PARENT.*b.bag#/odom$"):
+        read_poses(str(path))
+
+
+def test_files_are_read_and_win_over_bags(bag: Path, tmp_path: Path) -> None:
+    trajectory = Trajectory(stamps_ns=np.arange(8), T_world_cam=MOTION)
+    for name in ("poses.txt", f"{bag.name}#odd"):
+        write_tum(tmp_path / name, trajectory)
+        assert not is_in_bag(str(tmp_path / name))
+        assert read_poses(str(tmp_path / name)).stamps_ns.tolist() == list(range(8))
+    assert read_pose_input(str(tmp_path / "poses.txt")).name == "poses"
+
+
+def test_a_folder_of_ros2_is_a_bag(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "c.mcap")
+    bag.pose("/odom", ODOMETRY, 3, np.eye(4))
+    folder = bag.write().parent
+    assert read_poses(f"{folder}#/odom").stamps_ns.tolist() == [3]
+    with pytest.raises(RecordingError, match="name the poses"):
+        read_poses(str(folder))
+    bag = PoseBag(tmp_path / "d.mcap")
+    bag.pose("/gt_pose", ODOMETRY, 4, np.eye(4))
+    assert read_poses(str(bag.write().parent)).stamps_ns.tolist() == [4]
+
+
+def test_what_is_neither_is_refused_in_one_line(bag: Path, tmp_path: Path) -> None:
+    for text in (str(tmp_path / "none.txt"), f"{tmp_path}/none.bag#/odom", f"{bag}#tf:map"):
+        with pytest.raises(GvoError) as caught:
+            read_poses(text)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(TrajectoryError, match="expected two frames"):
+        read_poses(f"{bag}#tf:map")
+
+
+@pytest.mark.recorded
+def test_a_recorded_chain_has_no_error_against_itself(gvo_data: Path) -> None:
+    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
+    for text in (f"{path}#tf:odom:base_link", f"{path}#tf:map:base_link"):
+        found = evaluate(read_poses(text), read_poses(text), name="same")
+        assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
+        assert (found.coverage, found.path_ratio) == (1.0, 1.0)
+
+
+@pytest.mark.recorded
+def test_recorded_streams_of_other_rates_than_the_truth_are_compared(gvo_data: Path) -> None:
+    """The truth comes each 60 ms, the estimate each 67 ms: hardly any stamps are equal."""
+    path = gvo_data / "bags/good/pose_streams.bag"
+    truth, estimate = read_poses(f"{path}#groundtruth"), read_poses(f"{path}#ORB-SLAM")
+    found = evaluate(truth, estimate, name="ORB-SLAM")
+    assert found.n > 0.9 * len(estimate)
+    assert found.path_ratio == pytest.approx(1.0, abs=0.02)

@@ -1,0 +1,234 @@
+"""What a run is given besides the recording: frames, true poses, and where they are refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import gvo
+from gvo.errors import RecordingError, TrajectoryError
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.inputs import (
+    asked_truth,
+    choose_frame,
+    initial_pose,
+    own_truth,
+    read_compared,
+    read_ground_truth,
+    read_transforms,
+)
+from gvo.io.poses.truth import FramedTruth
+from gvo.io.recording import Source
+from gvo.trajectory.formats import write_tum
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure
+from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+from tests.rendered_walk import (
+    CAMERA,
+    STAMPS_NS,
+    START_NS,
+    T_BASE_CAM,
+    Walk,
+    copy_messages,
+    on_a_robot,
+    true_poses,
+    truth_stamps,
+)
+
+
+@pytest.fixture
+def robot(walk_bag: Path, tmp_path: Path) -> Source:
+    return gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
+
+
+def test_the_camera_is_the_frame_that_nobody_asked_for(robot: Source) -> None:
+    frame = choose_frame(robot)
+    assert frame.is_camera
+    assert frame.name == CAMERA
+    assert choose_frame(Walk()).is_camera
+
+
+@pytest.mark.parametrize("name", ["base_link", "/base_link"])
+def test_the_place_of_the_camera_comes_from_the_chain_of_tf(robot: Source, name: str) -> None:
+    frame = choose_frame(robot, name)
+    assert frame.name == "base_link"
+    assert frame.fixed_mount is not None
+    np.testing.assert_allclose(frame.fixed_mount, T_BASE_CAM, atol=1e-12)
+
+
+def test_a_frame_that_nothing_connects_is_refused(robot: Source, walk_bag: Path) -> None:
+    with pytest.raises(RecordingError, match=f"--frame gripper: no transform from .* {CAMERA}"):
+        choose_frame(robot, "gripper")
+    with pytest.raises(RecordingError, match=r"walk: --frame base_link: .*--calibration FILE"):
+        choose_frame(gvo.open_recording(walk_bag), "base_link")
+    with pytest.raises(RecordingError, match=r"walk: --frame body: .*--calibration FILE"):
+        choose_frame(Walk(), "body")
+
+
+def test_transforms_are_there_where_a_bag_holds_them(
+    robot: Source, walk_bag: Path, tmp_path: Path
+) -> None:
+    buffer = read_transforms(robot, ["base_link", ""])
+    assert buffer is not None
+    assert "base_link" in buffer.frames
+    images = copy_messages(
+        [walk_bag], tmp_path / "images.mcap", lambda topic, _: "/tf" not in topic
+    )
+    empty = read_transforms(gvo.open_recording(images), ["base_link"])
+    assert empty is not None
+    assert empty.frames == ()
+    assert read_transforms(Walk(), ["base_link"]) is None
+
+
+@pytest.mark.parametrize("type_", [ODOMETRY, TRANSFORM])
+@pytest.mark.parametrize("frame_name", [None, "base_link"])
+def test_poses_of_the_base_are_brought_to_the_frame_asked_for(
+    walk_bag: Path, tmp_path: Path, type_: str, frame_name: str | None
+) -> None:
+    bag = on_a_robot(tmp_path / "truth.mcap")
+    stamps_ns = truth_stamps()
+    T_map_cam = np.diag([-1.0, -1.0, 1.0, 1.0]) @ true_poses(stamps_ns)
+    for stamp_ns, T in zip(stamps_ns.tolist(), T_map_cam @ np.linalg.inv(T_BASE_CAM), strict=True):
+        bag.pose("/robot", type_, stamp_ns, T, child="base_link")
+        bag.tf(stamp_ns, "map", "base_link", T)
+    source = gvo.open_recording([walk_bag, bag.write()])
+    frame = choose_frame(source, frame_name)
+    expected = T_map_cam if frame_name is None else T_map_cam @ np.linalg.inv(T_BASE_CAM)
+    for text in ("/robot", "topic:/robot", "tf:map:base_link"):
+        truth = asked_truth(source, text, frame=frame).trajectory
+        np.testing.assert_array_equal(truth.stamps_ns, stamps_ns)
+        np.testing.assert_allclose(truth.T_world_cam, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("type_", [STAMPED, WITH_COVARIANCE])
+def test_poses_that_name_no_frame_are_of_the_frame_asked_for(
+    walk_bag: Path, tmp_path: Path, type_: str
+) -> None:
+    bag = on_a_robot(tmp_path / "truth.mcap")
+    poses = true_poses(STAMPS_NS)
+    for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
+        bag.pose("/true/base", type_, stamp_ns, T)
+    source = gvo.open_recording([walk_bag, bag.write()])
+    truth = asked_truth(source, "/true/base", frame=choose_frame(source, "base_link"))
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, poses, atol=1e-12)
+    assert "taken for base_link" in truth.decision
+
+
+def test_poses_of_a_frame_that_nothing_connects_are_refused_where_asked_for(
+    walk_bag: Path, tmp_path: Path
+) -> None:
+    bag = PoseBag(tmp_path / "truth.mcap")
+    bag.pose("/robot", ODOMETRY, START_NS, np.eye(4), child="base_link")
+    source = gvo.open_recording([walk_bag, bag.write()])
+    with pytest.raises(TrajectoryError, match=r"--ground-truth /robot: it is of base_link"):
+        asked_truth(source, "/robot")
+
+
+def test_what_is_in_a_bag_cannot_be_asked_of_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match=r"/robot: names what is in a bag, and walk is none"):
+        asked_truth(Walk(), "/robot")
+    write_tum(tmp_path / "poses.txt", Walk().true_poses())
+    truth = asked_truth(Walk(), str(tmp_path / "poses.txt"))
+    np.testing.assert_allclose(truth.trajectory.T_world_cam, true_poses(STAMPS_NS), atol=1e-8)
+
+
+def test_the_truth_of_a_folder_follows_the_frame_asked_for() -> None:
+    found = own_truth(Walk(has_truth=True), frame=OutputFrame("body", T_BASE_CAM))
+    assert isinstance(found, FramedTruth)
+    expected = true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
+    np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-12)
+    assert not own_truth(Walk())
+
+
+def test_a_name_decides_what_is_the_obvious_truth(walk_bag: Path, tmp_path: Path) -> None:
+    poses = true_poses(STAMPS_NS)
+    for topic, is_truth in (("/mocap/pose", True), ("/odom", False), ("/wheel/odometry", False)):
+        bag = PoseBag(tmp_path / f"{topic.replace('/', '_')}.mcap")
+        for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
+            bag.pose(topic, ODOMETRY, stamp_ns, T, child=CAMERA)
+        found = own_truth(gvo.open_recording([walk_bag, bag.write()]))
+        assert isinstance(found, FramedTruth) is is_truth
+        if isinstance(found, FramedTruth):
+            np.testing.assert_allclose(found.trajectory.T_world_cam, poses, atol=1e-12)
+
+
+def framed(trajectory: Trajectory) -> FramedTruth:
+    return FramedTruth(trajectory=trajectory, T_frame_point=np.eye(4), decision="")
+
+
+def test_the_initial_pose_lies_between_the_true_ones_around_the_first_frame() -> None:
+    stamps_ns = np.array([START_NS - 30, START_NS + 10], dtype=np.int64)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    poses[1, :3, 3] = 4.0, 0.0, 8.0
+    T = initial_pose(framed(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses)), START_NS)
+    np.testing.assert_allclose(T[:3, 3], [3.0, 0.0, 6.0])
+    rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    np.testing.assert_allclose(rotation, [0.0, 0.0, 0.3], atol=1e-12)
+    late = framed(Trajectory(stamps_ns=stamps_ns + 100, T_world_cam=poses))
+    np.testing.assert_array_equal(initial_pose(late, START_NS), poses[0])
+
+
+def test_without_a_true_pose_at_the_first_frame_it_cannot_start_there() -> None:
+    with pytest.raises(TrajectoryError, match=r"--initial-pose truth: there is no .*: nothing"):
+        initial_pose(Failure(reason="nothing"), START_NS)
+    positions = Trajectory.of_positions(STAMPS_NS, np.zeros((len(STAMPS_NS), 3)))
+    with pytest.raises(TrajectoryError, match="has no rotations"):
+        initial_pose(framed(positions), START_NS)
+    past = Trajectory(stamps_ns=STAMPS_NS - 10**12, T_world_cam=true_poses(STAMPS_NS))
+    with pytest.raises(TrajectoryError, match="ends before the first frame"):
+        initial_pose(framed(past), START_NS)
+
+
+def test_true_poses_are_read_from_files_folders_and_bags(tmp_path: Path) -> None:
+    truth = Walk().true_poses()
+    write_tum(tmp_path / "groundtruth.txt", truth)
+    bag = PoseBag(tmp_path / "truth.bag")
+    for stamp_ns, T in zip(truth.stamps_ns.tolist(), truth.T_world_cam, strict=True):
+        bag.pose("/vicon/cam", TRANSFORM, stamp_ns, T, child="cam")
+        bag.tf(stamp_ns, "map", "cam", T)
+    path = bag.write()
+    for text in (
+        tmp_path,
+        tmp_path / "groundtruth.txt",
+        path,
+        f"{path}#tf:map:cam",
+        f"{path}#/vicon/cam",
+    ):
+        found = read_ground_truth(str(text))
+        np.testing.assert_array_equal(found.stamps_ns, truth.stamps_ns)
+        np.testing.assert_allclose(found.T_world_cam, truth.T_world_cam, atol=1e-8)
+
+
+def test_a_recording_without_truth_is_no_reference(tmp_path: Path, walk_bag: Path) -> None:
+    with pytest.raises(RecordingError, match="name the poses"):
+        read_ground_truth(walk_bag)
+    with pytest.raises(TrajectoryError, match=r"none\.txt"):
+        read_ground_truth(tmp_path / "none.txt")
+
+
+def test_estimates_are_brought_to_the_frame_of_the_reference(tmp_path: Path) -> None:
+    bag = on_a_robot(tmp_path / "run.mcap")
+    poses = true_poses(STAMPS_NS)
+    for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
+        bag.pose("/cam", ODOMETRY, stamp_ns, T, child=CAMERA)
+        bag.pose("/base", ODOMETRY, stamp_ns, T @ np.linalg.inv(T_BASE_CAM), child="base_link")
+        bag.pose("/other", ODOMETRY, stamp_ns, T, child="other")
+    path = bag.write()
+    reference, estimates, warnings = read_compared(f"{path}#/cam", [f"{path}#/base"])
+    np.testing.assert_allclose(estimates["/base"].T_world_cam, reference.T_world_cam, atol=1e-9)
+    assert warnings == []
+    _, estimates, (warning,) = read_compared(f"{path}#/cam", [f"{path}#/other"])
+    np.testing.assert_allclose(estimates["/other"].T_world_cam, poses, atol=1e-12)
+    assert warning.startswith(f"/other is of other, the reference of {CAMERA}")
+
+
+def test_estimates_get_the_shortest_names_that_differ(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a/raw.txt", "b/raw.txt", "b/smoothed.txt")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        write_tum(path, Walk().true_poses())
+    texts = [str(path) for path in paths]
+    assert list(read_compared(texts[0], texts)[1]) == ["a/raw", "b/raw", "smoothed"]
+    assert len(read_compared(texts[0], [texts[0], texts[0]])[1]) == 2

@@ -1,0 +1,426 @@
+"""The tf buffer against composition by hand, scipy's Slerp and the rules of tf2."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer
+from scipy.spatial.transform import Rotation, Slerp
+
+from gvo.geometry import se3
+from gvo.io.bag.reader import TF_TYPE, BagReader, typestore
+from gvo.io.poses import tf
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.types import Failure, FloatArray
+
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
+FIRST_NS, LAST_NS = 1_700_000_000_000_000_000, 1_700_000_001_000_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    parent: str
+    child: str
+    stamp_ns: int
+    T: FloatArray
+    is_static: bool
+
+
+def random_transform(rng: np.random.Generator) -> FloatArray:
+    R = Rotation.random(random_state=np.random.RandomState(rng.integers(2**31))).as_matrix()
+    return se3.make_transform(np.asarray(R), 3.0 * rng.normal(size=3))
+
+
+def random_tree(rng: np.random.Generator) -> list[Sample]:
+    """Return the samples of a tree of static and moving frames f0 (the root), f1, ..."""
+    samples = []
+    for n in range(1, int(rng.integers(2, 9))):
+        is_static = bool(rng.integers(2))
+        between = rng.integers(FIRST_NS, LAST_NS, size=int(rng.integers(0, 6)))
+        stamps = [FIRST_NS] if is_static else sorted({FIRST_NS, LAST_NS, *between.tolist()})
+        parent = f"f{rng.integers(n)}"
+        samples += [
+            Sample(
+                parent=parent,
+                child=f"f{n}",
+                stamp_ns=stamp,
+                T=random_transform(rng),
+                is_static=is_static,
+            )
+            for stamp in stamps
+        ]
+    return samples
+
+
+def buffer_of(samples: Sequence[Sample]) -> TfBuffer:
+    buffer = TfBuffer()
+    for s in samples:
+        buffer.add(s.parent, s.child, s.stamp_ns, s.T, is_static=s.is_static)
+    return buffer
+
+
+def found(answer: FloatArray | Failure) -> FloatArray:
+    assert not isinstance(answer, Failure), answer.reason
+    return answer
+
+
+def reason_of(answer: object) -> str:
+    assert isinstance(answer, Failure)
+    assert "\n" not in answer.reason
+    return answer.reason
+
+
+def three(rng: np.random.Generator, buffer: TfBuffer) -> tuple[str, str, str, int]:
+    a, b, c = rng.choice(buffer.frames, size=3)
+    return str(a), str(b), str(c), int(rng.integers(FIRST_NS, LAST_NS + 1))
+
+
+def moving(*stamps_s: float, parent: str = "a", child: str = "b") -> TfBuffer:
+    """Return a buffer with one edge, whose x coordinate is the stamp in seconds."""
+    buffer = TfBuffer()
+    for stamp in stamps_s:
+        buffer.add(parent, child, round(stamp * 1e9), shift(stamp))
+    return buffer
+
+
+def shift(x: float) -> FloatArray:
+    return se3.make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def x_of(buffer: TfBuffer, target: str, source: str, stamp_s: float) -> float:
+    return float(found(buffer.lookup(target, source, round(stamp_s * 1e9)))[0, 3])
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_lookups_over_a_third_frame_compose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    buffer = buffer_of(random_tree(rng))
+    a, b, c, stamp = three(rng, buffer)
+    T_a_c = found(buffer.lookup(a, b, stamp)) @ found(buffer.lookup(b, c, stamp))
+    np.testing.assert_allclose(found(buffer.lookup(a, c, stamp)), T_a_c, rtol=0, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_both_directions_are_inverse(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    buffer = buffer_of(random_tree(rng))
+    a, b, _, stamp = three(rng, buffer)
+    T_a_b, T_b_a = found(buffer.lookup(a, b, stamp)), found(buffer.lookup(b, a, stamp))
+    np.testing.assert_allclose(T_b_a, np.linalg.inv(T_a_b), rtol=0, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_the_root_and_a_frame_are_joined_by_slerp_and_lines_edge_by_edge(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    samples = random_tree(rng)
+    stamp = int(rng.integers(FIRST_NS, LAST_NS + 1))
+    frame, T = samples[-1].child, np.eye(4)
+    while frame != "f0":
+        edge = [s for s in samples if s.child == frame]
+        T = by_scipy(edge, stamp) @ T
+        frame = edge[0].parent
+    answer = found(buffer_of(samples).lookup("f0", samples[-1].child, stamp))
+    np.testing.assert_allclose(answer, T, rtol=0, atol=1e-7)
+
+
+def by_scipy(edge: Sequence[Sample], stamp_ns: int) -> FloatArray:
+    if edge[0].is_static:
+        return edge[-1].T
+    elapsed = [(s.stamp_ns - FIRST_NS) / 1e9 for s in edge]
+    at = (stamp_ns - FIRST_NS) / 1e9
+    slerp = Slerp(elapsed, Rotation.from_matrix(np.array([s.T[:3, :3] for s in edge])))
+    t = [np.interp(at, elapsed, [s.T[axis, 3] for s in edge]) for axis in range(3)]
+    return se3.make_transform(np.asarray(slerp(at).as_matrix()), np.array(t))
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_every_sample_comes_back_at_its_stamp(seed: int) -> None:
+    samples = random_tree(np.random.default_rng(seed))
+    buffer = buffer_of(samples)
+    for s in samples:
+        answer = found(buffer.lookup(s.parent, s.child, s.stamp_ns))
+        np.testing.assert_allclose(answer, s.T, rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_the_order_of_insertion_and_lookups_in_between_change_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    samples = random_tree(rng)
+    buffer, shuffled = buffer_of(samples), TfBuffer()
+    a, b, _, stamp = three(rng, buffer)
+    for n in rng.permutation(len(samples)):
+        s = samples[n]
+        shuffled.add(f"/{s.parent}", f"/{s.child}", s.stamp_ns, s.T, is_static=s.is_static)
+        if rng.integers(2):
+            shuffled.lookup(a, b, stamp)
+    assert np.array_equal(
+        found(shuffled.lookup(f"/{a}", f"/{b}", stamp)), found(buffer.lookup(a, b, stamp))
+    )
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_many_stamps_at_once_give_what_single_ones_give(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    buffer = buffer_of(random_tree(rng))
+    a, b, _, _ = three(rng, buffer)
+    stamps = rng.integers(FIRST_NS - 10**8, LAST_NS + 10**8, size=20)
+    T, is_known = buffer.lookup_many(a, b, stamps)
+    for n, stamp in enumerate(stamps):
+        single = buffer.lookup(a, b, int(stamp))
+        assert bool(is_known[n]) is not isinstance(single, Failure)
+        expected = np.full((4, 4), np.nan) if isinstance(single, Failure) else single
+        np.testing.assert_allclose(T[n], expected, rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_the_stamps_between_two_frames_are_those_of_the_moving_edges_of_the_chain(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    samples = random_tree(rng)
+    buffer = buffer_of(samples)
+    a, b, _, _ = three(rng, buffer)
+    chain = buffer.chain(a, b)
+    assert not isinstance(chain, Failure)
+    steps = {frozenset(step) for step in pairwise(chain)}
+    on_the_way = [s for s in samples if frozenset((s.parent, s.child)) in steps and not s.is_static]
+    assert chain[0] == a
+    assert chain[-1] == b
+    assert buffer.edge_stamps_ns(a, b).tolist() == sorted({s.stamp_ns for s in on_the_way})
+    assert buffer.is_static(a, b) is (not on_the_way)
+
+
+def test_the_rotation_takes_the_shorter_way() -> None:
+    buffer = TfBuffer()
+    for stamp_ns, degrees in ((0, 170.0), (10, -170.0)):
+        R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        buffer.add("a", "b", stamp_ns, se3.make_transform(np.asarray(R), np.zeros(3)))
+    np.testing.assert_allclose(
+        found(buffer.lookup("a", "b", 5))[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12
+    )
+
+
+def test_nothing_is_extrapolated_and_the_answer_names_the_known_range() -> None:
+    buffer = moving(1.0, 2.5)
+    buffer.add("b", "c", 0, shift(1.0), is_static=True)
+    for stamp in (999_999_999, 2_500_000_001):
+        reason = reason_of(buffer.lookup("c", "a", stamp))
+        assert "1.000000000 to 2.500000000 s" in reason
+        assert "a <- b is known" in reason
+    assert "not at 2.500000001 s" in reason
+    assert x_of(buffer, "a", "c", 2.5) == 3.5
+
+
+def test_a_static_transform_holds_at_all_stamps() -> None:
+    buffer = TfBuffer()
+    buffer.add("a", "b", 10**18, shift(1.0), is_static=True)
+    buffer.add("a", "b", 10**18 - 1, shift(2.0), is_static=True)
+    assert x_of(buffer, "a", "b", 0.0) == x_of(buffer, "a", "b", 4e9) == 2.0
+
+
+def test_of_two_transforms_with_one_stamp_the_later_counts() -> None:
+    buffer = moving(1.0, 2.0, 3.0)
+    found(buffer.lookup("a", "b", 2 * 10**9))
+    buffer.add("a", "b", 2 * 10**9, shift(7.0))
+    assert x_of(buffer, "a", "b", 2.0) == 7.0
+    assert x_of(buffer, "a", "b", 1.5) == 4.0
+    assert buffer.edge_stamps_ns("a", "b").tolist() == [10**9, 2 * 10**9, 3 * 10**9]
+
+
+def test_a_frame_is_in_its_own_place_whether_known_or_not() -> None:
+    assert np.array_equal(found(TfBuffer().lookup("cam", "/cam", 5)), np.eye(4))
+
+
+def test_an_unknown_frame_is_answered_with_the_nearest_names() -> None:
+    buffer = moving(1.0, child="base_link")
+    assert "base_lnk (the nearest: base_link)" in reason_of(buffer.lookup("a", "base_lnk", 0))
+    assert "it holds a, base_link" in reason_of(buffer.lookup("zzz", "a", 0))
+    assert "empty" in reason_of(TfBuffer().lookup("a", "b", 0))
+    assert not buffer.is_static("a", "zzz")
+    assert not buffer.chain("a", "zzz")
+    assert len(buffer.edge_stamps_ns("a", "zzz")) == 0
+
+
+def test_frames_of_two_trees_are_answered_with_both_roots() -> None:
+    buffer = moving(1.0, parent="map", child="base")
+    buffer.add("rig", "cam", 0, np.eye(4), is_static=True)
+    reason = reason_of(buffer.lookup("base", "cam", 10**9))
+    assert "base ends at map" in reason
+    assert "cam at rig" in reason
+    assert not buffer.is_static("base", "cam")
+
+
+@pytest.mark.parametrize("is_static", [True, False])
+def test_a_loop_is_named_and_does_not_hang(is_static: bool) -> None:
+    buffer = TfBuffer()
+    for parent, child in (("a", "b"), ("b", "c"), ("c", "a"), ("c", "d")):
+        buffer.add(parent, child, 5, np.eye(4), is_static=is_static)
+    assert "loop: " in reason_of(buffer.lookup("d", "a", 5))
+    assert "a <- " in reason_of(buffer.chain("d", "b"))
+    assert not buffer.lookup_many("d", "a", np.array([5]))[1].any()
+
+
+def test_a_child_that_changes_its_parent_is_followed() -> None:
+    """As tf2: each transform has its own parent, and one counts until another parent's comes."""
+    buffer = moving(1.0, 2.0, parent="a", child="cup")
+    for stamp_s in (4.0, 5.0):
+        buffer.add("hand", "cup", round(stamp_s * 1e9), shift(10.0 * stamp_s))
+    buffer.add("a", "hand", 0, shift(100.0), is_static=True)
+    answers = [x_of(buffer, "a", "cup", stamp_s) for stamp_s in (1.5, 2.0, 3.0, 4.0, 4.5)]
+    np.testing.assert_allclose(answers, [1.5, 2.0, 2.0, 140.0, 145.0], atol=1e-12)
+    T, is_known = buffer.lookup_many("a", "cup", np.array([45, 15, 60, 0]) * 10**8)
+    assert is_known.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(T[:2, 0, 3], [145.0, 1.5])
+    assert buffer.chain("a", "cup") == ("a", "hand", "cup")
+    assert buffer.edge_stamps_ns("a", "cup").tolist() == [n * 10**9 for n in (1, 2, 4, 5)]
+    assert not buffer.is_static("a", "cup")
+    assert "cup changes" in " ".join(buffer.notes)
+    assert buffer.lookup_many("a", "cup", np.empty(0, dtype=np.int64))[0].shape == (0, 4, 4)
+
+
+def test_a_child_both_static_and_moving_moves() -> None:
+    buffer = moving(1.0, 2.0)
+    buffer.add("a", "b", 0, shift(9.0), is_static=True)
+    assert x_of(buffer, "a", "b", 1.5) == 1.5
+    assert not buffer.lookup("a", "b", 0)
+    assert "b published as static and as moving" in buffer.notes[0]
+
+
+def test_what_is_no_transform_is_refused() -> None:
+    buffer = TfBuffer()
+    for T in (np.zeros((4, 4)), np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0])):
+        with pytest.raises(ValueError, match=r"rigid|rotation"):
+            buffer.add("a", "b", 0, T)
+    for parent, child in (("", "b"), ("a", ""), ("a", "/a")):
+        with pytest.raises(ValueError, match=r"empty|own parent"):
+            buffer.add(parent, child, 0, np.eye(4))
+    assert len(buffer) == 0
+    assert buffer.frames == ()
+
+
+# Recordings
+
+STORE = typestore(is_ros1=True)
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def transform_message(
+    parent: str, child: str, stamp_ns: int, pose: Sequence[float] = IDENTITY
+) -> Any:
+    types = STORE.types
+    header = types["std_msgs/msg/Header"](
+        seq=0,
+        stamp=types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)),
+        frame_id=parent,
+    )
+    transform = types["geometry_msgs/msg/Transform"](
+        translation=types["geometry_msgs/msg/Vector3"](*pose[:3]),
+        rotation=types["geometry_msgs/msg/Quaternion"](*pose[3:]),
+    )
+    return types["geometry_msgs/msg/TransformStamped"](
+        header=header, child_frame_id=child, transform=transform
+    )
+
+
+WriteBag = Callable[[Sequence[tuple[str, Any]]], BagReader]
+
+
+@pytest.fixture
+def write_bag(tmp_path: Path) -> WriteBag:
+    """Return a function that writes one message for each (topic, transform)."""
+
+    def write(items: Sequence[tuple[str, Any]]) -> BagReader:
+        path = tmp_path / "tf.bag"
+        with Writer(path) as writer:
+            names = sorted({topic for topic, _ in items})
+            connections = {
+                name: writer.add_connection(name, TF_TYPE, typestore=STORE) for name in names
+            }
+            for n, (topic, transform) in enumerate(items):
+                message = STORE.types[TF_TYPE](transforms=[transform])
+                data = STORE.serialize_ros1(message, TF_TYPE)
+                writer.write(connections[topic], n, data)
+        return BagReader(path)
+
+    return write
+
+
+def test_topics_of_static_transforms_are_known_by_their_name(write_bag: WriteBag) -> None:
+    reader = write_bag(
+        [
+            ("/robot/tf_static", transform_message("base", "/cam", 5, (1, 0, 0, 0, 0, 0, 1))),
+            ("/tf", transform_message("/odom", "base", 7)),
+            ("/tf", transform_message("odom", "base", 9, (2, 0, 0, 0, 0, 0, 1))),
+        ]
+    )
+    buffer = read_tf(reader)
+    assert buffer.frames == ("base", "cam", "odom")
+    assert buffer.is_static("cam", "base")
+    assert buffer.edge_stamps_ns("odom", "cam").tolist() == [7, 9]
+    assert found(buffer.lookup("odom", "cam", 8))[0, 3] == 2.0
+
+
+def test_messages_that_hold_no_transform_are_counted_and_left_out(write_bag: WriteBag) -> None:
+    good = transform_message("a", "b", 1)
+    bad = [
+        transform_message("a", "b", 2, (np.nan, 0, 0, 0, 0, 0, 1)),
+        transform_message("a", "b", 3, (0, 0, 0, 0, 0, 0, 0)),
+        transform_message("a", "b", 4, (0, 0, 0, 0.5, 0.5, 0.5, 0.6)),
+        transform_message("b", "b", 5),
+        transform_message("", "b", 6),
+    ]
+    buffer = read_tf(write_bag([("/tf", m) for m in [good, *bad]]))
+    assert buffer.n_refused == 5
+    assert "a -> b at 0.000000002 s: the numbers are not finite" in buffer.first_refused
+    assert buffer.edge_stamps_ns("a", "b").tolist() == [1]
+    assert "5 transforms were refused" in buffer.notes[0]
+
+
+def test_a_quaternion_that_is_nearly_one_is_taken_for_its_direction(write_bag: WriteBag) -> None:
+    reader = write_bag([("/tf", transform_message("a", "b", 1, (0, 0, 0, 0, 0, 0.702, 0.712)))])
+    R = found(read_tf(reader).lookup("a", "b", 1))[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+
+
+def test_a_recording_without_transforms_gives_an_empty_buffer(tmp_path: Path) -> None:
+    path = tmp_path / "other.bag"
+    with Writer(path) as writer:
+        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=STORE)
+        message = STORE.types["std_msgs/msg/String"](data="tf")
+        writer.write(connection, 0, STORE.serialize_ros1(message, "std_msgs/msg/String"))
+    buffer = read_tf(BagReader(path))
+    assert buffer.frames == ()
+    assert "empty" in reason_of(buffer.lookup("a", "b", 0))
+
+
+def test_of_a_long_recording_only_what_lies_above_the_frames_is_kept(
+    write_bag: WriteBag, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tf, "_N_KEPT_WHOLE", 10)
+    pose = (1.0, 0, 0, 0, 0, 0, 1)
+    edges = [("base", "cam"), ("base", "wheel"), ("wheel", "rim")]
+    items = [("/tf", transform_message(*e, n, pose)) for n in range(10) for e in edges]
+    # found only when the others are many already: what came before must not be lost
+    items += [("/tf", transform_message("odom", "base", n, pose)) for n in range(10)]
+    items += [("/tf", transform_message("map", "odom", 50 - n, pose)) for n in range(50)]
+    items.insert(0, ("/tf", transform_message("map", "odom", 0, pose)))
+    reader = write_bag(items)
+    buffer = read_tf(reader, frames=("/cam", "base"))
+    assert found(buffer.lookup("map", "cam", 0))[0, 3] == 3.0
+    assert buffer.edge_stamps_ns("odom", "base").tolist() == list(range(10))
+    assert len(buffer) == 10 + 10 + 51
+    assert "rim" in buffer.frames
+    assert len(read_tf(reader)) == len(items)

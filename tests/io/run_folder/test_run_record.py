@@ -1,0 +1,139 @@
+"""Run folders read back: whole, cut off at any byte, damaged."""
+
+import json
+import shutil
+from collections.abc import Sized
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.runs import run_recording
+from gvo.trajectory.formats import read_covariances, read_trajectory
+
+N = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run")
+    run_recording(SyntheticRecording("handheld", "rgbd", n_frames=N, scale=0.25), path)
+    return path
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def test_a_folder_is_read_as_its_files_say(folder: Path) -> None:
+    record = read_run(folder)
+    assert record.is_finished
+    assert record.summary == json.loads((folder / "summary.json").read_text())
+    for name, trajectory in record.trajectories.items():
+        other = read_trajectory(folder / f"{name}.txt")
+        stamps_ns, covariances = read_covariances(folder / f"{name}_covariance.csv")
+        assert np.array_equal(trajectory.stamps_ns, stamps_ns)
+        np.testing.assert_allclose(trajectory.T_world_cam, other.T_world_cam, atol=1e-12)
+        assert trajectory.covariances is not None
+        np.testing.assert_array_equal(trajectory.covariances, covariances)
+    assert record.frames.statuses == ("ok",) * N
+    assert record.edges is not None
+    assert len(record.edges.chi2) == len((folder / "edges.csv").read_text().splitlines()) - 1
+    assert record.timings is not None
+    assert [*record.timings.stages_ms] == ["read", "extract", "register", "links", "window"]
+    assert record.truth is not None
+
+
+def test_files_cut_off_at_any_byte_are_read_as_far_as_they_go(copy: Path) -> None:
+    (copy / "summary.json").unlink()
+    for name in ("causal.txt", "causal_covariance.csv", "frames.csv", "edges.csv", "timings.csv"):
+        content = (copy / name).read_bytes()
+        for n_bytes in range(0, len(content), 37):
+            (copy / name).write_bytes(content[:n_bytes])
+            record = read_run(copy)
+            assert not record.is_finished
+        n_lines = content[:n_bytes].count(b"\n")
+        assert len(_part(record, name)) == n_lines - (not name.endswith(".txt"))
+        (copy / name).write_bytes(content)
+
+
+def _part(record: RunRecord, name: str) -> Sized:
+    parts: dict[str, Sized] = {
+        "causal.txt": record.trajectories["causal"].stamps_ns,
+        "causal_covariance.csv": record.trajectories["causal"].stamps_ns,
+        "frames.csv": record.frames.stamps_ns,
+        "edges.csv": () if record.edges is None else record.edges.stamps_ns,
+        "timings.csv": () if record.timings is None else record.timings.stamps_ns,
+    }
+    return parts[name]
+
+
+def test_smoothed_poses_may_come_in_any_order(copy: Path) -> None:
+    path = copy / "smoothed.txt"
+    expected = read_run(copy).trajectories["smoothed"]
+    path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
+    found = read_run(copy).trajectories["smoothed"]
+    np.testing.assert_array_equal(found.T_world_cam, expected.T_world_cam)
+
+
+def test_a_folder_of_smoothed_edges_has_no_tables_of_edges_and_times(copy: Path) -> None:
+    for name in ("edges.csv", "timings.csv", "ground_truth.txt"):
+        (copy / name).unlink()
+    (copy / "frames.csv").write_text(
+        "stamp_ns,frame_id,status,n_edges,n_rejected,reason\n5,a,ok,2,1,\n"
+    )
+    record = read_run(copy)
+    assert (record.edges, record.timings, record.truth) == (None, None, None)
+    assert {name: [*counts] for name, counts in record.frames.counts.items()} == {
+        "edges": [2],
+        "rejected": [1],
+    }
+
+
+def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Path) -> None:
+    (copy / "ground_truth.txt").unlink()
+    (copy / "ground_truth_positions.csv").write_text("stamp_ns,x_m,y_m,z_m\n0,1,2,3\n9,1,2,4\n")
+    summary = json.loads((copy / "summary.json").read_text())
+    T = np.eye(4)
+    T[:3, 3] = (1.0, 0.0, 2.0)
+    (copy / "summary.json").write_text(json.dumps(summary | {"T_frame_truth": T.tolist()}))
+    record = read_run(copy)
+    assert record.truth is not None
+    assert not record.truth.has_rotations
+    moved, raw = record.comparable()["raw"], record.trajectories["raw"]
+    np.testing.assert_allclose(moved.T_world_cam, raw.T_world_cam @ T)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "error", "message"),
+    [
+        ("summary.json", "{", RecordingError, "is damaged"),
+        ("summary.json", "[]", RecordingError, "holds no object"),
+        ("frames.csv", "stamp_ns,reason\n", RecordingError, "no column status"),
+        ("edges.csv", "stamp_ns\n1\n", RecordingError, "no column reference_ns"),
+        ("timings.csv", "stamp_ns,read_ms\n1,fast\n", RecordingError, "fast"),
+        ("timings.csv", "stamp_ns,read_ms\n1\n", RecordingError, "expected 2 fields"),
+        ("raw.txt", "0.000000000 1 2 3\n", TrajectoryError, "raw.txt:1: expected 8 columns, got 4"),
+        ("raw.txt", "a b\n", TrajectoryError, "raw.txt:1"),
+        ("raw.txt", "0.000000000 0 0 0 0 0 0 0\n", TrajectoryError, "raw.txt"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(
+    copy: Path, name: str, text: str, error: type[GvoError], message: str
+) -> None:
+    (copy / name).write_text(text)
+    with pytest.raises(error) as caught:
+        read_run(copy)
+    assert message in str(caught.value)
+    assert name.split(".")[0] in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(RecordingError, match="is no run folder"):
+            read_run(path)

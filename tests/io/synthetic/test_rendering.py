@@ -1,0 +1,298 @@
+"""The renderer, against rays intersected one by one and pixels known in advance."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry.camera import PinholeCamera
+from gvo.geometry.se3 import make_transform
+from gvo.io.synthetic.rendering import render_depth, render_image, to_uint8
+from gvo.io.synthetic.scene import Light, Rectangle, Scene, make_scene
+from gvo.io.synthetic.textures import Texture
+from gvo.io.synthetic.worlds.motion import drive, look_around
+from gvo.io.synthetic.worlds.room import room
+from gvo.io.synthetic.worlds.street import street
+from gvo.types import FloatArray
+
+CAMERA = PinholeCamera(fx=50.0, fy=55.0, cx=31.3, cy=23.6, width=64, height=48)
+EVEN_LIGHT = Light(ambient=1.0, direct=0.0, haze_grey=7.0)
+
+
+Triple = tuple[float, float, float]
+
+
+def texture_of(pixels: Any, size_m: tuple[float, float] = (1.0, 1.0), mask: Any = None) -> Texture:
+    return Texture(pixels=np.asarray(pixels, dtype=np.uint8), size_m=size_m, mask=mask)
+
+
+def noise_texture() -> Texture:
+    return texture_of(np.random.default_rng(5).integers(0, 256, (64, 64)))
+
+
+def screen(z: float, *, half: float = 2.0, texture: str = "t", **options: Any) -> Rectangle:
+    """Return a rectangle square to the optical axis."""
+    return Rectangle(
+        corner=(-half, -half, z),
+        edge_s=(2 * half, 0, 0),
+        edge_t=(0, 2 * half, 0),
+        texture=texture,
+        **options,
+    )
+
+
+def scene_of(*rectangles: Rectangle, light: Light = EVEN_LIGHT, **textures: Texture) -> Scene:
+    return make_scene(rectangles, textures or {"t": noise_texture()}, light)
+
+
+def intersect_one_by_one(
+    rectangle: Rectangle, T_map_cam: FloatArray, camera: PinholeCamera
+) -> tuple[FloatArray, FloatArray]:
+    """Solve corner + a edge_s + b edge_t = z ray for each pixel; NaN outside of the rectangle."""
+    depth = np.full((camera.height, camera.width), np.nan)
+    margin = np.full(depth.shape, np.nan)
+    R, t = T_map_cam[:3, :3], T_map_cam[:3, 3]
+    for v in range(camera.height):
+        for u in range(camera.width):
+            ray = R @ [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]
+            A = np.column_stack([np.asarray(rectangle.edge_s), np.asarray(rectangle.edge_t), -ray])
+            a, b, z = np.linalg.solve(A, t - np.asarray(rectangle.corner))
+            margin[v, u] = min(a, 1 - a, b, 1 - b) if z > 0 else -1.0
+            if margin[v, u] >= 0:
+                depth[v, u] = z
+    return depth, margin
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    angles=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    position=st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)),
+)
+def test_depth_is_that_of_rays_intersected_one_by_one(angles: Triple, position: Triple) -> None:
+    R = Rotation.from_rotvec(angles).as_matrix()
+    rectangle = Rectangle(
+        corner=R @ [-1.5, -1.0, 0.0] + [0, 0, 4.0],
+        edge_s=R @ [3.0, 0, 0],
+        edge_t=R @ [0, 2.0, 0],
+        texture="t",
+        is_two_sided=True,
+    )
+    T_map_cam = make_transform(
+        Rotation.from_rotvec(0.2 * np.array(angles)).as_matrix(), np.array(position)
+    )
+    depth = render_depth(scene_of(rectangle), T_map_cam, CAMERA)
+    expected, margin = intersect_one_by_one(rectangle, T_map_cam, CAMERA)
+    is_clear = np.abs(margin) > 1e-5
+    np.testing.assert_allclose(depth[is_clear], expected[is_clear], rtol=2e-6)
+
+
+def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() -> None:
+    ground = Rectangle(corner=(-50, 1.5, -50), edge_s=(100, 0, 0), edge_t=(0, 0, 100), texture="t")
+    depth = render_depth(scene_of(_turned_up(ground)), np.eye(4), CAMERA)
+    rows = np.arange(CAMERA.height)
+    expected = 1.5 * CAMERA.fy / (rows[30:] - CAMERA.cy)
+    np.testing.assert_allclose(depth[30:], np.broadcast_to(expected[:, None], (18, 64)), rtol=1e-6)
+    assert np.all(np.isnan(depth[:24]))
+
+
+@pytest.mark.parametrize(("build", "move"), [(street, drive), (room, look_around)])
+def test_in_a_whole_world_nothing_is_nearer_than_what_is_seen(build: Any, move: Any) -> None:
+    scene, T_map_cam = build(0), move(np.array([3.1]))[0]
+    camera = PinholeCamera(fx=500.0, fy=500.0, cx=420.0, cy=180.0, width=840, height=360)
+    depth = render_depth(scene, T_map_cam, camera)
+    v, u = np.random.default_rng(0).integers(0, (360, 840), (150, 2)).T
+    rays = camera.unproject(np.stack([u, v], axis=1).astype(float)) @ T_map_cam[:3, :3].T
+    to_origins = scene.origins - T_map_cam[:3, 3]
+    normals = np.cross(scene.axes_s, scene.axes_t)
+    slopes = rays @ normals.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.sum(normals * to_origins, axis=1) / slopes
+    hits = rays[:, np.newaxis] * z[..., np.newaxis] - to_origins
+    is_hit = (z > 0) & ((slopes > 0) | scene.is_two_sided) & ~scene.has_mask
+    for axes, sizes in ((scene.axes_s, scene.sizes[:, 0]), (scene.axes_t, scene.sizes[:, 1])):
+        along = np.sum(hits * axes, axis=-1)
+        is_hit &= (along >= 0) & (along <= sizes)
+    nearest = np.where(is_hit, z, np.inf).min(axis=1)
+    seen = depth[v, u]
+    assert np.all(seen <= nearest * (1 + 1e-5))
+    assert np.mean(np.abs(seen - nearest) < 1e-5 * nearest) > 0.8  # the rest: behind cut-outs
+
+
+def _turned_up(ground: Rectangle) -> Rectangle:
+    return Rectangle(
+        corner=np.add(ground.corner, ground.edge_t),
+        edge_s=ground.edge_s,
+        edge_t=np.negative(ground.edge_t),
+        texture=ground.texture,
+    )
+
+
+def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:
+    near, far = screen(2.0, half=0.3), screen(5.0, half=20.0)
+    depths = [
+        render_depth(scene_of(*pair), np.eye(4), CAMERA) for pair in ((near, far), (far, near))
+    ]
+    np.testing.assert_array_equal(depths[0], depths[1])
+    assert depths[0][24, 31] == 2.0
+    assert depths[0][2, 2] == 5.0
+
+
+def test_two_slanted_walls_hide_each_other_up_to_the_line_where_they_meet() -> None:
+    camera = PinholeCamera(fx=500.0, fy=500.0, cx=149.5, cy=99.5, width=300, height=200)
+    x = np.broadcast_to((np.arange(300) - 149.5) / 500.0, (200, 300))
+    inverse_depths, walls = [], []
+    for distance, slope in ((3.0, 0.5), (4.0, -0.8)):
+        inverse_depths.append((1.0 + slope * x) / distance)
+        along = np.array([1.0, 0.0, -slope])  # z = distance - slope X
+        corner = np.array([0.0, -3.0, distance]) - 3.0 * along
+        walls.append(Rectangle(corner=corner, edge_s=6.0 * along, edge_t=(0, 6, 0), texture="t"))
+    expected = 1.0 / np.maximum(*inverse_depths)
+    assert 0.05 < np.mean(inverse_depths[0] < inverse_depths[1]) < 0.5
+    for pair in (walls, walls[::-1]):
+        depth = render_depth(scene_of(*pair), np.eye(4), camera)
+        np.testing.assert_allclose(depth, expected, rtol=1e-5)
+
+
+def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
+    turned = make_transform(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 5.0]))
+    for is_two_sided in (False, True):
+        scene = scene_of(screen(2.0, is_two_sided=is_two_sided))
+        depth = render_depth(scene, turned, CAMERA)
+        assert np.any(np.isfinite(depth)) == is_two_sided
+
+
+def test_a_scene_without_anything_in_view_is_haze() -> None:
+    away = make_transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    assert np.all(render_image(scene_of(screen(2.0)), away, CAMERA) == 7.0)
+    assert np.all(np.isnan(render_depth(scene_of(screen(2.0)), away, CAMERA)))
+
+
+def test_texels_as_large_as_pixels_come_out_unchanged() -> None:
+    # 64 texels per metre at a depth of 2 m and fx = 128: one texel per pixel.
+    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
+    texture = noise_texture()
+    scene = scene_of(screen(2.0, half=0.5), t=texture)
+    image = to_uint8(render_image(scene, np.eye(4), camera))
+    np.testing.assert_array_equal(image, texture.pixels)
+
+
+@pytest.mark.parametrize("shift", [0.25, 0.5, 0.75])
+def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift: float) -> None:
+    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5 - shift, cy=31.5, width=64, height=64)
+    texture = noise_texture()
+    scene = scene_of(screen(2.0, half=1.5), t=texture)
+    image = render_image(scene, np.eye(4), camera)
+    following = np.roll(texture.pixels, -1, axis=1)
+    expected = (1 - shift) * texture.pixels + shift * following.astype(float)
+    # The image shows the period from -0.5 m to 0.5 m, the screen starts one earlier.
+    np.testing.assert_allclose(image, expected, atol=0.51)
+
+
+@pytest.mark.parametrize("depth", [4.0, 9.0, 15.0])
+def test_far_textures_are_averaged_not_sampled(depth: float) -> None:
+    scene = scene_of(screen(depth, half=100.0), t=noise_texture())
+    image = render_image(scene, np.eye(4), CAMERA)
+    texels_per_pixel = 64 * depth / CAMERA.fx
+    near_std, mean = noise_texture().pixels.std(), noise_texture().pixels.mean()
+    assert abs(image.mean() - mean) < 2.5
+    assert image.std() < 1.6 * near_std / texels_per_pixel
+
+
+def test_a_grazing_surface_is_blurred_along_one_direction_only() -> None:
+    stripes = np.repeat(np.repeat([[0, 255]], 32, axis=1).reshape(1, 64), 64, axis=0)
+    ground = Rectangle(corner=(-20, 1.0, 60), edge_s=(40, 0, 0), edge_t=(0, 0, -60), texture="t")
+    scene = scene_of(ground, t=texture_of(stripes, (2.0, 2.0)))
+    image = render_image(scene, np.eye(4), CAMERA, is_antialiased=False)
+    row = image[round(CAMERA.cy + CAMERA.fy / 12), 20:44]  # 12 m away, under the axis
+    assert np.ptp(row) > 90
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_edges_are_mixed_by_the_share_of_the_pixel_they_cover(axis: int) -> None:
+    camera = PinholeCamera(fx=100.0, fy=100.0, cx=31.5, cy=31.5, width=64, height=64)
+    scene = scene_of(screen(1.0, half=0.1), t=texture_of(np.full((8, 8), 200)))
+    half_a_pixel = make_transform(np.eye(3), 0.005 * np.eye(3)[axis])
+    image = render_image(scene, half_a_pixel, camera)  # from 21 to 41 along the axis
+    line = image[:, 28] if axis else image[28]
+    assert line[20] == 7.0
+    assert line[21] == pytest.approx((200 + 7) / 2)
+    assert line[22] == 200.0
+    plain = render_image(scene, half_a_pixel, camera, is_antialiased=False)
+    assert set(np.unique(plain)) == {7.0, 200.0}
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mixed_pixel_sees_the_part_of_the_texture_that_it_covers(axis: int) -> None:
+    camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5, cy=31.5, width=64, height=64)
+    ramp = np.tile(np.clip(7 * np.arange(-6, 58), 0, 255), (64, 1))
+    texture = texture_of(ramp.T if axis else ramp)
+    shift = make_transform(np.eye(3), 2.0 / 128 * 0.5 * np.eye(3)[axis])
+    part = screen(2.0, half=0.25, offset_m=(0.125, 0.125))  # from texel 8 to 40
+    image = render_image(scene_of(part, t=texture), shift, camera)
+    line = image[:, 30] if axis else image[30]
+    # From 15 to 47 along the axis, the samples a quarter of a pixel inside.
+    assert line[15] == pytest.approx(0.5 * 7.0 + 0.5 * line[17] - 0.5 * 7 * 1.75, abs=0.51)
+    assert line[47] == pytest.approx(0.5 * 7.0 + 0.5 * line[45] + 0.5 * 7 * 1.75, abs=0.51)
+
+
+def test_what_a_mask_leaves_out_shows_what_is_behind() -> None:
+    is_left = np.zeros((64, 64), dtype=bool)
+    is_left[:, :32] = True
+    scene = scene_of(
+        screen(2.0, half=0.5, is_stretched=True, texture="cut"),
+        screen(4.0, half=9.0),
+        cut=texture_of(np.full((64, 64), 99), mask=is_left),
+        t=noise_texture(),
+    )
+    depth = render_depth(scene, np.eye(4), CAMERA)
+    center = round(CAMERA.cx)
+    assert np.all(depth[20:28, center - 8 : center - 1] == 2.0)
+    assert np.all(depth[20:28, center + 2 : center + 8] == 4.0)
+
+
+def test_surfaces_that_face_the_light_are_brighter() -> None:
+    grey = texture_of(np.full((8, 8), 100))
+    images = [
+        render_image(
+            scene_of(screen(2.0), light=Light(direction=to_light, ambient=0.5, direct=0.5), t=grey),
+            np.eye(4),
+            CAMERA,
+        )[24, 31]
+        for to_light in ((0, 0, -1), (0, 0, 1))
+    ]
+    assert images == pytest.approx([100.0, 50.0])
+
+
+def test_haze_hides_what_is_far() -> None:
+    grey = texture_of(np.full((8, 8), 100))
+    light = Light(ambient=1.0, direct=0.0, haze_m=10.0, haze_grey=200.0)
+    for z in (1.0, 10.0, 50.0):
+        image = render_image(scene_of(screen(z, half=99.0), light=light, t=grey), np.eye(4), CAMERA)
+        assert image[24, 31] == pytest.approx(200 - 100 * np.exp(-z / 10), abs=0.01)
+
+
+def test_grey_values_are_rounded_and_clipped() -> None:
+    grey = np.array([[-3.0, 0.4, 0.6, 254.7, 300.0]], dtype=np.float32)
+    np.testing.assert_array_equal(to_uint8(grey), [[0, 0, 1, 255, 255]])
+
+
+@pytest.mark.parametrize("edge_t", [(1.0, 1.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_rectangle_without_right_angles_is_refused(edge_t: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="edges of a rectangle must"):
+        scene_of(Rectangle(corner=(0, 0, 2), edge_s=(1, 0, 0), edge_t=edge_t, texture="t"))
+
+
+@pytest.mark.parametrize("shape", [(8, 16), (12, 12), (2, 2)])
+def test_a_texture_that_cannot_be_halved_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="power of two"):
+        texture_of(np.zeros(shape))
+
+
+def test_a_mask_or_a_texture_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="mask"):
+        texture_of(np.zeros((8, 8)), mask=np.ones((4, 4), dtype=bool))
+    with pytest.raises(ValueError, match="one size"):
+        scene_of(screen(1.0), t=texture_of(np.zeros((8, 8))), s=texture_of(np.zeros((4, 4))))

@@ -1,0 +1,342 @@
+"""The rendered recordings: geometry, photometry, noise, repeatability."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.se3 import invert, rotation_angle, transform_points
+from gvo.io.recording import Source
+from gvo.io.synthetic.recording import SensorNoise, SyntheticRecording, spoil_depth
+from gvo.types import BoolArray, DepthArray, FloatArray
+
+WORLDS = ["driving", "handheld"]
+PERFECT = SensorNoise.none()
+
+
+def perfect(world: Any, sensor: Any = "stereo", **options: Any) -> SyntheticRecording:
+    defaults: dict[str, Any] = {"scale": 0.5, "noise": PERFECT}
+    return SyntheticRecording(world, sensor, **(defaults | options))
+
+
+def load(recording: Source, index: int, stream: int = 0) -> NDArray[Any]:
+    return list(recording.images())[2 * index + stream].load()
+
+
+def pixel_grid(image: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float64)
+    return u, v
+
+
+def sample(image: NDArray[Any], u: FloatArray, v: FloatArray) -> FloatArray:
+    values = map_coordinates(image.astype(np.float64), [v, u], order=1, cval=np.nan)
+    return np.asarray(values)
+
+
+def sample_spline(image: NDArray[Any], u: FloatArray, v: FloatArray) -> FloatArray:
+    """Return the image at (u, v); unlike OpenCV's cubic it does not favour whole pixels."""
+    values = map_coordinates(image.astype(np.float64), [v, u], order=3, mode="nearest")
+    return np.asarray(values)
+
+
+def shrunk(mask: BoolArray, size: int) -> BoolArray:
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    return np.asarray(eroded, dtype=np.bool_)
+
+
+def stereo_camera_of(recording: SyntheticRecording) -> StereoCamera:
+    camera = recording.info.camera
+    assert isinstance(camera, StereoCamera)
+    return camera
+
+
+def unoccluded(
+    expected_depth: FloatArray, other_depth: DepthArray, u: FloatArray, v: FloatArray
+) -> BoolArray:
+    """Tell the pixels whose point is the nearest one in the other image, with its neighbours."""
+    seen = sample(other_depth, u, v)
+    is_same = np.abs(seen - expected_depth) < 0.01 * expected_depth
+    return shrunk(is_same, 7)
+
+
+def right_seen_from_left(
+    recording: SyntheticRecording, index: int, offset: float = 0.0
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return left, right moved by the exact disparity, and where both see the same."""
+    camera = stereo_camera_of(recording)
+    left, right = load(recording, index), load(recording, index, 1)
+    depth = recording.render_depth(index).astype(np.float64)
+    u, v = pixel_grid(depth)
+    u_right = u - camera.fx * camera.baseline / depth - offset
+    is_same = unoccluded(depth, recording.render_depth(index, 1), u_right, v)
+    return left.astype(np.float64), sample_spline(right, u_right, v), is_same
+
+
+def residual_disparities(
+    left: FloatArray, moved: FloatArray, is_same: BoolArray, size: int = 15
+) -> FloatArray:
+    """Return what is left of the disparity of textured patches, by least squares."""
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.asarray(cv2.boxFilter(values, -1, (size, size), normalize=False))
+
+    slope = np.gradient(0.5 * (left + moved), axis=1)
+    energy = total(slope * slope)
+    shifts = total(slope * (moved - left)) / (energy + 1e-9)
+    return shifts[shrunk(is_same, size) & (energy > 30.0 * size**2)]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_right_image_moved_by_the_exact_disparity_is_the_left_image(world: str) -> None:
+    left, moved, is_same = right_seen_from_left(perfect(world, n_frames=20), 15)
+    differences = np.abs(left - moved)[is_same]
+    assert is_same.mean() > 0.35
+    assert np.median(differences) < 2.0
+    assert np.quantile(differences, 0.95) < 14.0
+    shifted = np.abs(left - np.roll(moved, 1, axis=1))[is_same]
+    assert shifted.mean() > 2.0 * differences.mean()
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_disparities_are_unbiased_to_a_few_hundredths_of_a_pixel(world: str) -> None:
+    recording = perfect(world, n_frames=30, scale=1.0)
+    shifts = residual_disparities(*right_seen_from_left(recording, 12))
+    assert len(shifts) > 20_000
+    assert abs(np.median(shifts)) < 0.01
+    assert abs(np.mean(shifts)) < 0.02
+
+
+@pytest.mark.parametrize("offset", [-0.5, 0.4])
+def test_a_planted_offset_makes_every_disparity_larger(offset: float) -> None:
+    noise = replace(PERFECT, disparity_offset_px=offset)
+    recording = perfect("handheld", n_frames=2, noise=noise)
+    honest = perfect("handheld", n_frames=2)
+    assert recording.info.camera == honest.info.camera
+    assert abs(np.mean(residual_disparities(*right_seen_from_left(recording, 0, offset)))) < 0.02
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_points_of_one_frame_lie_where_the_true_motion_puts_them_in_another(world: str) -> None:
+    recording = perfect(world, "rgbd", n_frames=12)
+    truth = recording.ground_truth().T_world_cam
+    camera = recording.info.camera
+    depth = recording.render_depth(3).astype(np.float64)
+    u, v = pixel_grid(depth)
+    points = camera.unproject(np.stack([u, v], axis=-1)) * depth[..., np.newaxis]
+    T_later_earlier = invert(truth[6]) @ truth[3]
+    moved = transform_points(T_later_earlier, points.reshape(-1, 3)).reshape(points.shape)
+    z = np.maximum(moved[..., 2], 0.1)
+    pixels = camera.project(np.concatenate([moved[..., :2], z[..., np.newaxis]], axis=-1))
+    later_depth = recording.render_depth(6)
+    is_same = unoccluded(z, later_depth, pixels[..., 0], pixels[..., 1])
+    assert is_same.mean() > 0.3
+    seen = sample(later_depth, pixels[..., 0], pixels[..., 1])
+    assert np.median(np.abs(seen - z)[is_same] / z[is_same]) < 1e-3
+    grey = sample(load(recording, 6), pixels[..., 0], pixels[..., 1])
+    differences = np.abs(grey - load(recording, 3))[is_same]
+    assert np.median(differences) < 5.0
+
+
+@pytest.mark.parametrize(
+    ("world", "speed", "turn"), [("driving", 12.0, 30.0), ("handheld", 0.6, 60.0)]
+)
+def test_poses_are_rigid_and_move_smoothly(world: str, speed: float, turn: float) -> None:
+    truth = perfect(world, n_frames=900).ground_truth()
+    T = truth.T_world_cam
+    np.testing.assert_array_equal(T[0], np.eye(4))
+    R = T[:, :3, :3]
+    np.testing.assert_allclose(
+        R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-12)
+    steps = invert(T[:-1]) @ T[1:]
+    seconds = 1e-9 * np.diff(truth.stamps_ns)
+    speeds = np.linalg.norm(steps[:, :3, 3], axis=1) / seconds
+    turns = np.rad2deg(rotation_angle(steps)) / seconds
+    assert 0.4 * speed < speeds.max() < speed
+    assert 0.4 * turn < turns.max() < turn
+    jolts = np.diff(np.diff(T[:, :3, 3], axis=0), axis=0)
+    assert np.abs(jolts).max() < 0.25 * speeds.max() * seconds[0]
+
+
+def test_the_drive_turns_forward_and_comes_back_to_its_start() -> None:
+    T = perfect("driving", n_frames=520).ground_truth().T_world_cam
+    assert np.all((invert(T[:-1]) @ T[1:])[:, 2, 3] > 0.4)
+    assert 45 < np.rad2deg(rotation_angle(T[100])) < 95
+    distances = np.linalg.norm(T[:, :3, 3], axis=1)
+    assert distances[100:400].min() > 30.0
+    assert distances[400:].min() < 1.0
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_a_recording_announces_what_it_yields(world: Any, sensor: Any) -> None:
+    recording: Source = SyntheticRecording(world, sensor, n_frames=3, scale=0.25)
+    info, images = recording.info, list(recording.images())
+    assert (info.sensor, info.n_images, len(images)) == (sensor, 3, 6)
+    assert [image.stream for image in images] == [0, 1] * 3
+    assert all(a.stamp_ns == b.stamp_ns for a, b in zip(images[::2], images[1::2], strict=True))
+    interval = {"driving": 100_000_000, "handheld": 33_333_333}[world]
+    assert np.all(np.diff([image.stamp_ns for image in images[::2]]) // 10 == interval // 10)
+    size = (info.camera.height, info.camera.width)
+    left, second = images[0].load(), images[1].load()
+    assert left.shape == second.shape == size
+    assert left.dtype == np.uint8
+    assert second.dtype == (np.uint8 if sensor == "stereo" else np.float32)
+    truth = recording.ground_truth()
+    assert truth is not None
+    np.testing.assert_array_equal(truth.stamps_ns, [image.stamp_ns for image in images[::2]])
+
+
+def test_a_smaller_image_is_the_larger_one_averaged() -> None:
+    large = load(perfect("handheld", n_frames=1, scale=1.0), 0).astype(np.float64)
+    small = load(perfect("handheld", n_frames=1, scale=0.5), 0).astype(np.float64)
+    averaged = np.asarray(cv2.resize(large, small.shape[::-1], interpolation=cv2.INTER_AREA))
+    everywhere = np.ones(small.shape, dtype=np.bool_)
+    assert np.abs(averaged - small).mean() < 4.0
+    for a, b in ((averaged, small), (averaged.T, small.T)):
+        shifts = residual_disparities(
+            np.ascontiguousarray(a), np.ascontiguousarray(b), everywhere.reshape(a.shape)
+        )
+        assert abs(np.mean(shifts)) < 0.03
+
+
+def test_the_kitti_camera_is_rendered_at_full_scale() -> None:
+    camera = stereo_camera_of(SyntheticRecording("driving", n_frames=1))
+    assert (camera.width, camera.height) == (1226, 370)
+    assert (camera.fx, camera.cx, camera.cy) == (707.0912, 601.8873, 183.1104)
+    assert camera.baseline == pytest.approx(0.53715)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_corners_are_spread_over_the_image(world: Any) -> None:
+    image = load(SyntheticRecording(world, n_frames=1), 0)
+    corners = cv2.FastFeatureDetector.create(15).detect(image)
+    assert len(corners) > 1000
+    points = np.array([corner.pt for corner in corners])
+    counts, *_ = np.histogram2d(
+        points[:, 1], points[:, 0], bins=(3, 4), range=((0, image.shape[0]), (0, image.shape[1]))
+    )
+    assert np.count_nonzero(counts >= 25) >= 11
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_the_same_seed_gives_the_same_bytes_in_any_order_and_thread(sensor: Any) -> None:
+    first = list(SyntheticRecording("handheld", sensor, n_frames=4, scale=0.3, seed=3).images())
+    again = list(SyntheticRecording("handheld", sensor, n_frames=9, scale=0.3, seed=3).images())
+    expected = [image.load().tobytes() for image in first]
+    with ThreadPoolExecutor(2) as pool:
+        loaded = list(pool.map(lambda image: image.load().tobytes(), again[7::-1]))
+    assert loaded[::-1] == expected
+    assert len(set(expected)) == 8
+
+
+def test_another_seed_gives_another_scene() -> None:
+    images = [load(perfect("handheld", n_frames=1, seed=seed, scale=0.3), 0) for seed in (0, 3)]
+    assert np.abs(np.subtract(*images, dtype=np.float64)).mean() > 3.0
+
+
+def test_image_noise_has_the_announced_spread_and_differs_between_images() -> None:
+    noise = replace(PERFECT, grey_sigma=3.0)
+    exact, noisy = perfect("handheld", n_frames=2), perfect("handheld", n_frames=2, noise=noise)
+    residuals = []
+    for stream in (0, 1):
+        clean = load(exact, 1, stream).astype(np.float64)
+        is_free = (clean > 20) & (clean < 235)
+        residuals.append(np.where(is_free, load(noisy, 1, stream) - clean, 0.0))
+        assert np.std(residuals[-1][is_free]) == pytest.approx(3.0, rel=0.03)
+        assert abs(np.mean(residuals[-1][is_free])) < 0.05
+    assert abs(np.corrcoef(residuals[0].ravel(), residuals[1].ravel())[0, 1]) < 0.02
+
+
+def test_exposure_drifts_and_differs_between_left_and_right() -> None:
+    noise = replace(PERFECT, exposure_drift=0.1, exposure_mismatch=0.05)
+    drifting = perfect("handheld", n_frames=60, noise=noise, scale=0.2)
+    exact = perfect("handheld", n_frames=60, scale=0.2)
+
+    def gain(index: int, stream: int) -> float:
+        clean, lit = load(exact, index, stream), load(drifting, index, stream)
+        is_free = (clean > 20) & (clean < 200)
+        return float(lit[is_free].mean() / clean[is_free].mean())
+
+    assert gain(0, 0) == pytest.approx(1.0, abs=0.005)
+    assert gain(0, 1) == pytest.approx(1.05, abs=0.005)
+    assert gain(55, 0) == pytest.approx(1.1, abs=0.005)
+
+
+def test_depth_noise_grows_with_the_square_of_the_depth() -> None:
+    noise = replace(PERFECT, depth_sigma=0.002)
+    for z in (1.0, 2.0, 4.0):
+        depth = np.full((200, 300), z, dtype=np.float32)
+        spoilt = spoil_depth(depth, noise, np.random.default_rng(0))
+        assert spoilt.std() == pytest.approx(0.002 * z**2, rel=0.03)
+
+
+def test_noise_never_puts_depth_behind_the_camera() -> None:
+    depth = np.full((50, 50), 500.0, dtype=np.float32)
+    spoilt = spoil_depth(depth, replace(PERFECT, depth_sigma=0.002), np.random.default_rng(0))
+    assert 0.05 < np.isnan(spoilt).mean() < 0.3
+    assert np.nanmin(spoilt) > 0
+
+
+def test_depth_comes_in_steps_of_the_inverse_depth() -> None:
+    depth = np.linspace(0.5, 7.0, 5000, dtype=np.float32).reshape(50, 100)
+    noise = replace(PERFECT, depth_step=0.01)
+    quanta = 1.0 / spoil_depth(depth, noise, np.random.default_rng(0)) / 0.01
+    np.testing.assert_allclose(quanta, np.rint(quanta), atol=1e-3)
+    assert len(np.unique(np.rint(quanta))) == 1 + 200 - 14
+
+
+def test_depth_is_unknown_out_of_range_in_blobs_and_at_steps() -> None:
+    depth = np.full((240, 320), 2.0, dtype=np.float32)
+    depth[:, 160:] = 3.0
+    depth[:20], depth[-20:] = 0.3, 9.0
+    rng = np.random.default_rng(1)
+    in_range = spoil_depth(depth, replace(PERFECT, min_depth_m=0.4, max_depth_m=8.0), rng)
+    np.testing.assert_array_equal(np.isnan(in_range), (depth == 9.0) | (depth < 0.4))
+    blobs = np.isnan(spoil_depth(depth, replace(PERFECT, hole_share=0.1), rng))
+    assert blobs.mean() == pytest.approx(0.1, abs=0.002)
+    n_blobs = cv2.connectedComponents(blobs.astype(np.uint8))[0] - 1
+    assert n_blobs < 0.02 * np.count_nonzero(blobs)
+    edges = np.isnan(spoil_depth(depth, replace(PERFECT, edge_radius_px=2), rng))
+    assert np.all(edges[30:210, 157:163])
+    assert not np.any(edges[30:210, 10:150])
+
+
+def test_sloping_planes_are_no_steps() -> None:
+    recording = perfect("handheld", "rgbd", n_frames=1, noise=replace(PERFECT, edge_radius_px=1))
+    assert np.isnan(load(recording, 0, 1)).mean() < 0.2
+    rows = np.arange(1, 101, dtype=np.float32)[:, np.newaxis]
+    ground = np.broadcast_to(500.0 / rows, (100, 80)).astype(np.float32)
+    spoilt = spoil_depth(ground, replace(PERFECT, edge_radius_px=1), np.random.default_rng(0))
+    assert np.all(np.isfinite(spoilt[5:]))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"world": "moon"}, "world must be one of"),
+        ({"sensor": "lidar"}, "sensor must be one of"),
+        ({"n_frames": 0}, "n_frames must be positive"),
+        ({"seed": -1}, "seed not negative"),
+        ({"scale": 0.0}, "scale must be in"),
+        ({"scale": float("nan")}, "scale must be in"),
+    ],
+)
+def test_a_recording_that_cannot_be_rendered_is_refused(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        SyntheticRecording(**options)
+
+
+@pytest.mark.parametrize("options", [{"grey_sigma": -1.0}, {"hole_share": 1.0}])
+def test_noise_that_no_sensor_has_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="must not be negative"):
+        SensorNoise(**options)

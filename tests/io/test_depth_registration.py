@@ -1,0 +1,226 @@
+"""Depth warped from its own camera into that of the colour images."""
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry.camera import Calibration, PinholeCamera, rectification_maps
+from gvo.geometry.se3 import invert, make_transform
+from gvo.io.depth_registration import DepthRegistration
+from gvo.io.recording import DepthView
+from gvo.io.synthetic.rendering import render_depth
+from gvo.io.synthetic.worlds.motion import look_around
+from gvo.io.synthetic.worlds.room import room
+from gvo.types import DepthArray, FloatArray
+
+_COLOR = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+_TURN = Rotation.from_rotvec([0.005, -0.01, 0.004]).as_matrix()
+
+_DEPTH_CAMERAS = pytest.mark.parametrize(
+    "camera",
+    [
+        _COLOR,
+        PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240),
+        PinholeCamera(fx=920.0, fy=920.0, cx=639.5, cy=359.5, width=1280, height=720),
+    ],
+    ids=["as fine", "coarser", "finer"],
+)
+_PLACES = pytest.mark.parametrize(
+    "t", [(0.025, 0.0, 0.0), (-0.05, 0.003, 0.004), (0.03, 0.02, -0.01)]
+)
+
+
+def _registration(
+    camera: PinholeCamera, T_color_depth: FloatArray, color: PinholeCamera = _COLOR
+) -> DepthRegistration:
+    view = DepthView(calibration=Calibration.from_camera(camera), T_color_depth=T_color_depth)
+    return DepthRegistration(Calibration.from_camera(color), view)
+
+
+def _spread(depth: DepthArray, size: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the least and the largest depth around each pixel."""
+    window = np.ones((size, size), np.uint8)
+    return np.asarray(cv2.erode(depth, window)), np.asarray(cv2.dilate(depth, window))
+
+
+@_DEPTH_CAMERAS
+@_PLACES
+def test_registered_depth_is_what_the_colour_camera_would_measure(
+    camera: PinholeCamera, t: tuple[float, float, float]
+) -> None:
+    T_map_color = look_around(np.array([1.0]))[0]
+    T_color_depth = make_transform(_TURN, np.array(t))
+    truth = render_depth(room(0), T_map_color, _COLOR)
+    depth = render_depth(room(0), T_map_color @ T_color_depth, camera)
+    registered = _registration(camera, T_color_depth)(depth)
+    assert registered.dtype == np.float32
+
+    nearest, farthest = _spread(truth, 7)
+    is_smooth = farthest < 1.03 * nearest
+    is_known = np.isfinite(registered)
+    errors = np.abs(registered - truth)[is_smooth & is_known]
+    assert np.median(errors) < 0.002
+    assert np.percentile(errors / truth[is_smooth & is_known], 95) < 0.01
+    # 720 rows at this focal length see less than the colour camera does
+    assert np.mean(is_known[80:-80, 60:-60]) > 0.97
+
+    # Beside a step either surface may win, but nothing in between or beyond them comes up.
+    nearest, farthest = _spread(truth, 5)
+    is_off = is_known & ((registered < 0.97 * nearest) | (registered > 1.03 * farthest))
+    assert np.mean(is_off) < 2e-4
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    t=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+    coarseness=st.floats(0.5, 3.0),
+    near=st.floats(0.5, 1.5),
+    turn=st.tuples(*[st.floats(-0.02, 0.02)] * 3),
+)
+def test_no_background_shines_through_a_nearer_surface(
+    t: tuple[float, float, float],
+    coarseness: float,
+    near: float,
+    turn: tuple[float, float, float],
+) -> None:
+    color = PinholeCamera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
+    width, height = int(160 / coarseness), int(120 / coarseness)
+    camera = PinholeCamera(
+        fx=120.0 / coarseness,
+        fy=120.0 / coarseness,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        width=width,
+        height=height,
+    )
+    T_color_depth = make_transform(Rotation.from_rotvec(turn).as_matrix(), np.array(t))
+    # a square of 0.3 m side before a wall, both facing the colour camera
+    depth = _square_before_wall(camera, T_color_depth, near=near)
+    registered = _registration(camera, T_color_depth, color)(depth)
+    half = int(120 * 0.15 / near - 1.5 * coarseness - 1)  # the border is as fine as the depth
+    inside = registered[60 - half : 60 + half, 80 - half : 80 + half]
+    np.testing.assert_allclose(inside, near, rtol=1e-4)
+
+
+def _square_before_wall(
+    camera: PinholeCamera, T_color_depth: FloatArray, *, near: float
+) -> DepthArray:
+    """Measure by intersecting the rays of the depth camera with planes of the colour camera."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    directions = camera.unproject(np.stack([u, v], axis=-1)) @ T_color_depth[:3, :3].T
+    origin = T_color_depth[:3, 3]
+    depth = (4.0 - origin[2]) / directions[..., 2]
+    depth_of_square = (near - origin[2]) / directions[..., 2]
+    hits = origin[:2] + directions[..., :2] * depth_of_square[..., np.newaxis]
+    is_hit = np.all(np.abs(hits) < 0.15, axis=-1)
+    return np.asarray(np.where(is_hit, depth_of_square, depth), dtype=np.float32)
+
+
+_LENSES: list[tuple[str, list[float]]] = [
+    ("plumb_bob", [-0.3, 0.1, 0.002, -0.001, 0.0]),
+    ("plumb_bob", [0.26, -0.95, -0.005, 0.003, 1.16]),
+    ("rational_polynomial", [0.6, -0.2, 1e-4, -2e-4, -0.01, 0.9, -0.1, -0.05]),
+    ("equidistant", [-0.01, 0.02, -0.01, 0.002]),
+]
+
+
+@pytest.mark.parametrize(("model", "D"), _LENSES)
+def test_raw_depth_is_undistorted(model: Any, D: list[float]) -> None:
+    R = Rotation.from_rotvec([0.01, 0.02, -0.005]).as_matrix()
+    raw = replace(
+        Calibration.from_camera(_COLOR), D=np.array(D), R=R, is_rectified=False, model=model
+    )
+    T_color_depth = make_transform(_TURN, np.array([0.03, -0.01, 0.005]))
+    registration = DepthRegistration(
+        Calibration.from_camera(_COLOR), DepthView(calibration=raw, T_color_depth=T_color_depth)
+    )
+    # A slanted plane n . p = 2 m of the colour camera, seen along rays that OpenCV undistorts.
+    normal = np.array([0.3, -0.4, 0.9])
+    T_color_raw = T_color_depth @ make_transform(R, np.zeros(3))
+    rays = _undistorted_by_opencv(raw, model) @ T_color_raw[:3, :3].T
+    depth = ((2.0 - normal @ T_color_raw[:3, 3]) / (rays @ normal)).astype(np.float32)
+    registered = registration(depth.reshape(480, 640))
+    v, u = np.mgrid[:480, :640].astype(np.float64)
+    expected = 2.0 / (_COLOR.unproject(np.stack([u, v], axis=-1)) @ normal)
+    middle = (slice(100, -100), slice(150, -150))
+    # half a pixel on this plane is half a thousandth of the depth
+    np.testing.assert_allclose(registered[middle], expected[middle], rtol=1.5e-3)
+
+
+def _undistorted_by_opencv(raw: Calibration, model: str) -> FloatArray:
+    v, u = np.mgrid[: raw.height, : raw.width].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    undistort = cv2.fisheye.undistortPoints if model == "equidistant" else cv2.undistortPoints
+    xy = np.asarray(undistort(pixels, raw.K, raw.D)).reshape(-1, 2)
+    return np.hstack([xy, np.ones((len(xy), 1))])
+
+
+@pytest.mark.parametrize("is_rectified", [True, False])
+def test_the_view_of_the_colour_camera_itself_changes_no_bit(is_rectified: bool) -> None:
+    calibration = replace(Calibration.from_camera(_COLOR), is_rectified=is_rectified)
+    view = DepthView(calibration=calibration, T_color_depth=np.eye(4))
+    depth = np.random.default_rng(0).uniform(0.5, 8.0, (480, 640)).astype(np.float32)
+    depth[100:120, 50:90] = np.nan
+    registered = DepthRegistration(Calibration.from_camera(_COLOR), view)(depth)
+    np.testing.assert_array_equal(registered, depth)
+
+
+def test_a_distorted_view_from_the_same_place_is_rectified_as_colour_is() -> None:
+    raw = replace(
+        Calibration.from_camera(_COLOR), D=np.array([-0.2, 0.05, 0.001, 0, 0]), is_rectified=False
+    )
+    v, u = np.mgrid[:480, :640]
+    depth = (2.0 + 1e-3 * u + 5e-4 * v).astype(np.float32)
+    view = DepthView(calibration=raw, T_color_depth=np.eye(4))
+    registered = DepthRegistration(Calibration.from_camera(_COLOR), view)(depth)
+    maps = rectification_maps(raw)
+    assert maps is not None
+    expected = cv2.remap(depth, *maps, cv2.INTER_LINEAR, borderValue=np.nan)
+    is_known = np.isfinite(expected) & np.isfinite(registered)
+    assert is_known.mean() > 0.95
+    # the value of a pixel that lies up to a pixel away
+    assert np.abs(registered - expected)[is_known].max() < 2e-3
+
+
+def test_unknown_depth_stays_unknown_and_moves_with_what_surrounds_it() -> None:
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[200:240, 300:340] = np.nan
+    T_color_depth = make_transform(np.eye(3), np.array([10.2 * 2.0 / 525, 0.0, 0.0]))
+    registered = _registration(_COLOR, T_color_depth)(depth)
+    expected = np.full((480, 640), np.nan, np.float32)
+    expected[:, 10:] = depth[:, :-10]  # 10.2 pixels to the right
+    np.testing.assert_array_equal(registered, expected)
+
+
+def test_points_behind_the_colour_camera_are_left_out() -> None:
+    T_color_depth = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
+    depth = np.full((480, 640), 0.5, np.float32)
+    registered = _registration(_COLOR, T_color_depth)(depth)
+    assert np.all(np.isnan(registered))
+
+
+def test_registration_and_its_inverse_give_back_the_depth() -> None:
+    T = make_transform(_TURN, np.array([0.03, 0.01, 0.0]))
+    v, u = np.mgrid[:480, :640]
+    depth = (2.0 + 2e-4 * u - 3e-4 * v).astype(np.float32)
+    there = _registration(_COLOR, T)(depth)
+    back = _registration(_COLOR, invert(T))(there)
+    is_known = np.isfinite(back)
+    assert is_known.mean() > 0.9
+    assert np.abs(back - depth)[is_known].max() < 1.5e-3  # a pixel either way
+
+
+def test_wrong_use_is_refused() -> None:
+    registration = _registration(_COLOR, make_transform(np.eye(3), np.array([0.03, 0, 0])))
+    with pytest.raises(ValueError, match=r"shape \(480, 640\), got \(240, 320\)"):
+        registration(np.ones((240, 320), np.float32))
+    for T in (2.0 * np.eye(4), np.full((4, 4), np.nan)):
+        with pytest.raises(ValueError, match="rigid"):
+            _registration(_COLOR, T)

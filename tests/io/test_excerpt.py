@@ -1,0 +1,205 @@
+"""Parts of recordings."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from gvo.errors import RecordingError
+from gvo.io.excerpt import Excerpt, take_excerpt
+from gvo.io.recording import StampedImage
+from gvo.io.sync import Pair, pair_images
+from gvo.types import FaultyFrame
+
+_SECOND = 1_000_000_000
+_FIRST_NS = 1_700_000_000 * _SECOND
+
+
+def _refuse() -> NDArray[Any]:
+    raise AssertionError("an image was decoded")
+
+
+def _image(stream: int, stamp_ns: int) -> StampedImage:
+    return StampedImage(stream=stream, stamp_ns=stamp_ns, load=_refuse)
+
+
+def _item(stamp_ns: int, *, is_pair: bool = True) -> Pair | FaultyFrame:
+    if is_pair:
+        return _image(0, stamp_ns), _image(1, stamp_ns)
+    return FaultyFrame(stamp_ns=stamp_ns, reason="no depth", is_unpaired=True)
+
+
+def _items(seconds: Iterable[float]) -> list[Pair | FaultyFrame]:
+    return [_item(_FIRST_NS + round(second * _SECOND)) for second in seconds]
+
+
+def _stamp_ns(item: Pair | FaultyFrame) -> int:
+    return item.stamp_ns if isinstance(item, FaultyFrame) else item[0].stamp_ns
+
+
+def _seconds(items: Iterable[Pair | FaultyFrame]) -> list[float]:
+    """Return the stamps since the first one, seconds."""
+    return [round((_stamp_ns(item) - _FIRST_NS) / _SECOND, 6) for item in items]
+
+
+_TENTHS = [n / 10 for n in range(50)]
+_recordings = st.lists(st.tuples(st.integers(1, 300), st.booleans()), min_size=1, max_size=40).map(
+    lambda steps: [
+        _item(_FIRST_NS + 10_000_000 * int(since), is_pair=is_pair)
+        for since, (_, is_pair) in zip(
+            np.cumsum([0, *(step for step, _ in steps)]), steps, strict=False
+        )
+    ]
+)
+
+
+def test_all_is_kept_by_default() -> None:
+    items = [_item(5), _item(3, is_pair=False), _item(9)]
+    assert Excerpt().is_everything
+    assert list(take_excerpt(items, Excerpt())) == items
+    assert list(take_excerpt([], Excerpt())) == []
+
+
+def test_start_and_duration_count_from_the_first_image() -> None:
+    taken = take_excerpt(_items(_TENTHS), Excerpt(start_s=1.0, duration_s=0.5))
+    assert _seconds(taken) == [1.0, 1.1, 1.2, 1.3, 1.4]
+
+
+def test_every_third_frame_is_the_first_and_then_each_third() -> None:
+    taken = take_excerpt(_items(_TENTHS), Excerpt(start_s=4.0, every=3))
+    assert _seconds(taken) == [4.0, 4.3, 4.6, 4.9]
+
+
+@given(items=_recordings, cut=st.integers(1, 100), every=st.integers(1, 5))
+def test_an_excerpt_is_what_its_definition_says(
+    items: list[Pair | FaultyFrame], cut: int, every: int
+) -> None:
+    excerpt = Excerpt(start_s=cut / 10, duration_s=cut / 7, every=every)
+    since = [_stamp_ns(item) - _FIRST_NS for item in items]
+    inside = [
+        item
+        for item, stamp in zip(items, since, strict=True)
+        if round(cut / 10 * 1e9) <= stamp < round(cut / 10 * 1e9) + round(cut / 7 * 1e9)
+    ]
+    if not inside:
+        with pytest.raises(RecordingError):
+            list(take_excerpt(items, excerpt))
+        return
+    taken = list(take_excerpt(items, excerpt))
+    pairs = [item for item in inside if not isinstance(item, FaultyFrame)]
+    assert [item for item in taken if not isinstance(item, FaultyFrame)] == pairs[::every]
+    assert taken == [item for item in inside if item in taken]
+    if every == 1:
+        assert taken == inside
+
+
+@given(items=_recordings, cut_s=st.integers(1, 50))
+def test_excerpts_that_follow_one_another_hold_each_frame_once(
+    items: list[Pair | FaultyFrame], cut_s: int
+) -> None:
+    parts = []
+    for excerpt in (Excerpt(duration_s=cut_s), Excerpt(start_s=cut_s)):
+        try:
+            parts += list(take_excerpt(items, excerpt))
+        except RecordingError:
+            assert _stamp_ns(items[-1]) - _FIRST_NS < cut_s * _SECOND
+    assert parts == items
+
+
+def test_colour_of_twice_the_rate_of_depth_is_counted_by_pairs() -> None:
+    images = [_image(0, 33_000_000 * n) for n in range(60)]
+    images += [_image(1, 66_000_000 * n) for n in range(30)]
+    images.sort(key=lambda image: image.stamp_ns)
+    pairs = pair_images(images, limit_ns=10_000_000, partner="depth")
+    taken = list(take_excerpt(pairs, Excerpt(every=2)))
+    stamps = [item[0].stamp_ns for item in taken if not isinstance(item, FaultyFrame)]
+    assert stamps == [132_000_000 * n for n in range(15)]
+
+
+def test_a_faulty_frame_is_given_where_a_frame_is_due() -> None:
+    kinds = [True, False, True, False, True, False]
+    items = [_item(n, is_pair=is_pair) for n, is_pair in enumerate(kinds)]
+    taken = take_excerpt(items, Excerpt(every=2))
+    assert [_stamp_ns(item) for item in taken] == [0, 3, 4]
+
+
+@pytest.mark.parametrize("lag", [0, 40])
+def test_reading_ends_when_both_streams_are_past_the_end(lag: int) -> None:
+    """Depth comes `lag` images late."""
+    n_read = 0
+
+    def images() -> Iterator[StampedImage]:
+        nonlocal n_read
+        for n in range(10_000):
+            n_read += 1
+            yield _image(0, n * _SECOND)
+            if n >= lag:
+                yield _image(1, (n - lag) * _SECOND)
+
+    pairs = pair_images(images(), limit_ns=20_000_000, partner="depth")
+    assert len(list(take_excerpt(pairs, Excerpt(start_s=20, duration_s=10)))) == 10
+    assert n_read == 31 + lag
+
+
+def test_a_wrong_stamp_without_partner_does_not_end_the_excerpt() -> None:
+    items = [*_items([0, 0.1]), _item(_FIRST_NS + 99 * _SECOND, is_pair=False), *_items([0.2, 5])]
+    assert _seconds(take_excerpt(items, Excerpt(duration_s=1))) == [0, 0.1, 0.2]
+
+
+def test_without_a_start_nothing_is_left_out_at_the_beginning() -> None:
+    items = [*_items([0]), _item(_FIRST_NS - _SECOND, is_pair=False), *_items([0.5])]
+    assert _seconds(take_excerpt(items, Excerpt(duration_s=1))) == [0, -1, 0.5]
+
+
+def test_an_excerpt_after_the_end_tells_how_long_the_recording_is() -> None:
+    with pytest.raises(RecordingError, match=r"no frame at 60 s or later: .* is 4\.9 s long"):
+        list(take_excerpt(_items(_TENTHS), Excerpt(start_s=60)))
+    with pytest.raises(RecordingError, match=r"no frame at 5 s or later: .* is 4\.9 s long"):
+        list(take_excerpt(_items(_TENTHS), Excerpt(start_s=5, duration_s=10)))
+
+
+def test_an_excerpt_in_a_gap_tells_where_the_recording_goes_on() -> None:
+    with pytest.raises(RecordingError, match=r"between 3 and 3\.5 s: .* goes on to 8 s"):
+        list(take_excerpt(_items([0, 1, 2, 8]), Excerpt(start_s=3, duration_s=0.5)))
+
+
+def test_what_reading_raises_comes_through() -> None:
+    def items() -> Iterator[Pair | FaultyFrame]:
+        yield _item(0)
+        raise RecordingError("cut off")
+
+    taken = take_excerpt(items(), Excerpt(start_s=1))
+    with pytest.raises(RecordingError, match="cut off"):
+        next(taken)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"start_s": -1.0},
+        {"start_s": float("inf")},
+        {"duration_s": 0.0},
+        {"duration_s": float("nan")},
+        {"every": 0},
+    ],
+)
+def test_numbers_out_of_range_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be"):
+        Excerpt(**options)
+
+
+@pytest.mark.parametrize(
+    "excerpt", [Excerpt(), Excerpt(start_s=4.0), Excerpt(duration_s=2.0), Excerpt(every=7)]
+)
+def test_the_expected_number_is_that_of_an_even_recording(excerpt: Excerpt) -> None:
+    n_taken = len(list(take_excerpt(_items(_TENTHS), excerpt)))
+    assert excerpt.n_expected(len(_TENTHS), length_s=5.0) == n_taken
+
+
+def test_a_start_after_the_end_lets_nothing_be_expected() -> None:
+    assert Excerpt(start_s=9.0).n_expected(100, length_s=5.0) == 0
+    assert Excerpt(start_s=9.0, every=10).n_expected(100) == 10

@@ -1,0 +1,235 @@
+"""From images to frames."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gvo.config import Config, RuntimeConfig, SyncConfig
+from gvo.errors import RecordingError
+from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.io.datasets.kitti import KittiSource
+from gvo.io.datasets.tum import TumSource
+from gvo.io.depth_registration import DepthRegistration
+from gvo.io.frames import frames
+from gvo.io.recording import DepthView, StampedImage
+from gvo.io.sync import pair_images
+from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
+
+_THREADS = pytest.mark.parametrize("threads", [1, 2, 4])
+
+
+def _read(source: Any, threads: int = 2, **sync: float) -> list[Any]:
+    config = Config(runtime=RuntimeConfig(threads=threads), sync=SyncConfig(**sync))
+    return list(frames(source, config))
+
+
+@_THREADS
+def test_rectified_grey_images_come_through_unchanged(tiny: Any, threads: int) -> None:
+    items = [(stream, n, tiny.texture(2 * n + stream)) for n in range(5) for stream in (0, 1)]
+    read = _read(tiny.stereo(items), threads)
+    assert [frame.stamp_ns for frame in read] == list(range(5))
+    for n, frame in enumerate(read):
+        assert isinstance(frame, StereoFrame)
+        np.testing.assert_array_equal(frame.left, tiny.texture(2 * n))
+        np.testing.assert_array_equal(frame.right, tiny.texture(2 * n + 1))
+
+
+@_THREADS
+def test_colour_becomes_grey_and_depth_stays(tiny: Any, threads: int) -> None:
+    color = tiny.texture(1, is_color=True)
+    (frame,) = _read(tiny.rgbd([(0, 5, color), (1, 7, tiny.depth(1))]), threads)
+    assert isinstance(frame, RgbdFrame)
+    weights = np.array([0.114, 0.587, 0.299])  # ITU-R BT.601, in BGR order
+    assert np.abs(frame.image - color @ weights).max() <= 1.0
+    np.testing.assert_array_equal(frame.depth, tiny.depth(1))
+    assert frame.stamp_ns == 5
+
+
+@_THREADS
+def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threads: int) -> None:
+    good, small = tiny.texture(1), tiny.texture(1)[:-1]
+    items = [
+        (0, 10, good), (1, 10, good),
+        (0, 20, RecordingError("a.png: damaged")), (1, 20, good),
+        (0, 30, good), (1, 30, small),
+        (0, 40, good),
+        (0, 50, RecordingError("b")), (1, 50, RecordingError("c")),
+        (0, 45, good), (1, 60, tiny.texture(2)), (0, 60, tiny.texture(3)),
+        (0, 60, good), (1, 70, tiny.texture(4)), (0, 70, tiny.texture(5)),
+    ]  # fmt: skip
+    read = _read(tiny.stereo(items), threads)
+    faults = [(item.stamp_ns, item.reason) for item in read if isinstance(item, FaultyFrame)]
+    assert faults == [
+        (20, "left image: a.png: damaged"),
+        (
+            30,
+            "right image: expected 48x32 pixels by the calibration, got 48x31; give that of these "
+            "images by --calibration FILE",
+        ),
+        (40, "no right image within sync.stereo_tolerance_ms=0: the nearest is 1e-05 ms away"),
+        (50, "left image: b; right image: c"),
+        (45, "the stamp goes back from 50 to 45 ns"),
+        (60, "the stamp 60 ns repeats"),
+    ]
+    assert [item.stamp_ns for item in read if isinstance(item, StereoFrame)] == [10, 60, 70]
+
+
+def test_depth_of_which_nothing_is_known_is_faulty(tiny: Any) -> None:
+    unknown = np.full_like(tiny.depth(1), np.nan)
+    (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
+    assert isinstance(frame, FaultyFrame)
+    assert frame.reason == "depth image: no pixel of the depth image is known"
+    unknown[21, 7] = 1.5
+    (frame,) = _read(tiny.rgbd([(0, 1, tiny.texture(1)), (1, 1, unknown)]))
+    assert isinstance(frame, RgbdFrame)
+
+
+def test_the_tolerances_are_those_of_the_configuration(tiny: Any) -> None:
+    ms = 1_000_000
+    stereo = tiny.stereo([(0, 0, tiny.texture(1)), (1, ms, tiny.texture(2))])
+    assert isinstance(_read(stereo)[0], FaultyFrame)
+    assert isinstance(_read(stereo, stereo_tolerance_ms=1.0)[0], StereoFrame)
+    rgbd = tiny.rgbd([(0, 0, tiny.texture(1)), (1, 20 * ms, tiny.depth(2))])
+    assert isinstance(_read(rgbd)[0], RgbdFrame)
+    assert isinstance(_read(rgbd, max_difference_ms=19.9)[0], FaultyFrame)
+
+
+def test_raw_images_are_rectified(tiny: Any) -> None:
+    ideal = Calibration.from_camera(tiny.camera)
+    D = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
+    raw = replace(ideal, D=D, is_rectified=False)
+    right = replace(Calibration.from_camera(tiny.camera, baseline=0.5), D=D, is_rectified=False)
+    ramp = np.tile(np.arange(48, dtype=np.uint8) * 5, (32, 1))
+    source = tiny.stereo([(0, 0, ramp), (1, 0, ramp)], calibrations=(raw, right))
+    (frame,) = _read(source)
+    expected = np.asarray(cv2.undistort(ramp, raw.K, D), dtype=np.float64)
+    assert np.abs(frame.left - expected).max() <= 1.0
+    np.testing.assert_array_equal(frame.left, frame.right)
+    assert not np.array_equal(frame.left, ramp)
+
+
+def _seen_from_beside() -> DepthView:
+    """Return a depth camera of half the size, two centimetres left of the colour camera."""
+    camera = PinholeCamera(fx=25.0, fy=25.0, cx=11.5, cy=7.5, width=24, height=16)
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = -0.02
+    return DepthView(calibration=Calibration.from_camera(camera), T_color_depth=T_color_depth)
+
+
+@_THREADS
+def test_depth_of_a_camera_of_its_own_is_registered(tiny: Any, threads: int) -> None:
+    view = _seen_from_beside()
+    depth = np.random.default_rng(0).uniform(1.0, 1.1, (16, 24)).astype(np.float32)
+    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, depth)])
+    source.info = replace(source.info, depth_view=view)
+    (frame,) = _read(source, threads)
+    expected = DepthRegistration(source.info.calibrations[0], view)(depth)
+    assert np.isfinite(expected).mean() > 0.8
+    np.testing.assert_array_equal(frame.depth, expected)
+    np.testing.assert_array_equal(frame.image, tiny.texture(1))
+
+
+def test_the_size_of_depth_is_checked_against_its_own_camera(tiny: Any) -> None:
+    source = tiny.rgbd([(0, 5, tiny.texture(1)), (1, 5, tiny.depth(1))])
+    source.info = replace(source.info, depth_view=_seen_from_beside())
+    (faulty,) = _read(source)
+    assert isinstance(faulty, FaultyFrame)
+    assert faulty.reason == (
+        "depth image: expected 24x16 pixels by the calibration, got 48x32; give that of these "
+        "images by --calibration FILE"
+    )
+
+
+@_THREADS
+def test_what_was_read_before_a_recording_breaks_is_delivered(tiny: Any, threads: int) -> None:
+    source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(3) for s in (0, 1)])
+    whole = source.images
+
+    def breaking() -> Iterator[StampedImage]:
+        yield from whole()
+        raise RecordingError("the bag is truncated")
+
+    source.images = breaking
+    iterator = frames(source, Config(runtime=RuntimeConfig(threads=threads)))
+    assert [next(iterator).stamp_ns for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(RecordingError, match="truncated"):
+        next(iterator)
+
+
+def test_reading_can_be_stopped(tiny: Any) -> None:
+    loaded = []
+    source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(50) for s in (0, 1)])
+    whole = source.images
+
+    def counting() -> Iterator[StampedImage]:
+        for image in whole():
+            loaded.append(image.stamp_ns)
+            yield image
+
+    source.images = counting
+    iterator = frames(source, Config())
+    next(iterator)
+    iterator.close()  # type: ignore[attr-defined]
+    assert len(loaded) <= 8
+
+
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_a_reading_that_is_given_up_leaves_no_thread_behind(tiny: Any, is_closed: bool) -> None:
+    source = tiny.stereo([(s, n, tiny.texture(n)) for n in range(50) for s in (0, 1)])
+    iterator = frames(source, Config(runtime=RuntimeConfig(threads=2)))
+    next(iterator)
+    assert _decoding_threads()
+    if is_closed:
+        iterator.close()  # type: ignore[attr-defined]
+    del iterator
+    assert not _decoding_threads()
+
+
+def _decoding_threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("decode")]
+
+
+@pytest.mark.recorded
+def test_recorded_depth_is_the_count_of_the_nearest_pixel(gvo_data: Path) -> None:
+    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
+    frame = next(item for item in frames(source, Config()) if isinstance(item, RgbdFrame))
+    _, second = next(
+        pair
+        for pair in pair_images(source.images(), limit_ns=20_000_000, partner="depth")
+        if isinstance(pair, tuple) and pair[0].stamp_ns == frame.stamp_ns
+    )
+    stamps = {image.stamp_ns: n for n, image in enumerate(_of_stream(source, 1))}
+    table = (gvo_data / "rgbd_dataset_freiburg1_xyz_start" / "depth.txt").read_text()
+    rows = [line.split()[1] for line in table.splitlines() if not line.startswith("#")]
+    path = gvo_data / "rgbd_dataset_freiburg1_xyz_start" / rows[stamps[second.stamp_ns]]
+    counts = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+    camera = source.info.calibrations[0]
+    rng = np.random.default_rng(0)
+    for u, v in rng.integers([0, 0], [640, 480], size=(3000, 2)):
+        ray = np.linalg.solve(camera.P[:, :3], [u, v, 1.0])
+        raw, _ = cv2.projectPoints(ray[np.newaxis], np.zeros(3), np.zeros(3), camera.K, camera.D)
+        column, row = np.rint(raw.ravel()).astype(int)
+        if np.abs(np.abs(raw.ravel() - [column, row]) - 0.5).min() < 1e-3:
+            continue  # a tie, for single precision
+        is_inside = 0 <= column < 640 and 0 <= row < 480
+        count = int(counts[row, column]) if is_inside else 0
+        expected = np.nan if count in (0, 65535) else np.float32(count) / np.float32(5000)
+        np.testing.assert_equal(float(frame.depth[v, u]), float(expected))
+
+
+def _of_stream(source: Any, stream: int) -> list[StampedImage]:
+    return [image for image in source.images() if image.stream == stream]
+
+
+@pytest.mark.recorded
+def test_the_number_of_threads_changes_nothing(gvo_data: Path, tiny: Any) -> None:
+    source = KittiSource(gvo_data / "kitti_06_start")
+    one, two = ([tiny.fingerprint(f) for f in _read(source, n)] for n in (1, 2))
+    assert one == two
+    assert len(one) == 51

@@ -1,0 +1,71 @@
+"""Recognising recordings."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gvo.config import Config, DepthConfig
+from gvo.errors import CalibrationError, RecordingError
+from gvo.io.datasets.kitti import KittiSource
+from gvo.io.datasets.tum import TumSource
+from gvo.io.opening import RecordingOptions, is_bag, open_recording
+
+
+def test_a_missing_path_is_refused_with_what_a_recording_may_be(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"does not exist; a recording is a \.bag"):
+        open_recording(tmp_path / "none")
+
+
+def test_other_files_and_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"is no recording; .*KITTI.*EuRoC.*TUM"):
+        open_recording(tmp_path)
+    path = tmp_path / "drive.mp4"
+    path.write_bytes(b"video")
+    with pytest.raises(RecordingError, match="is no recording"):
+        open_recording(path)
+
+
+def test_folders_are_recognised_by_what_they_hold(tmp_path: Path, tiny: Any) -> None:
+    assert isinstance(open_recording(tiny.write_kitti(tmp_path / "a")), KittiSource)
+    (tmp_path / "a" / "calib.txt").unlink()
+    with pytest.raises(RecordingError, match=r"calib\.txt: the file is missing"):
+        open_recording(str(tmp_path / "a"))
+    assert isinstance(open_recording(tiny.write_tum(tmp_path / "b", ["1"], ["1"])), TumSource)
+    (tmp_path / "mav0").mkdir()
+    with pytest.raises(RecordingError, match=r"cam0.data\.csv"):
+        open_recording(tmp_path)
+    for name in ("a.bag", "a.mcap", "a.db3"):
+        (tmp_path / name).touch()
+        with pytest.raises(RecordingError, match="empty"):
+            open_recording(tmp_path / name)
+
+
+def test_no_path_at_all_is_a_misuse() -> None:
+    with pytest.raises(ValueError, match="at least one path"):
+        open_recording([])
+
+
+def test_compressed_files_of_ros2_are_bags_with_and_without_metadata(tmp_path: Path) -> None:
+    assert not is_bag(tmp_path)
+    file = tmp_path / "drive.mcap.zstd"
+    file.touch()
+    assert is_bag(file)
+    assert is_bag(tmp_path)
+
+
+def test_options_and_configuration_reach_the_source(tmp_path: Path, tiny: Any) -> None:
+    folder = tiny.write_tum(tmp_path / "b", ["1"], ["1"])
+    config = Config(depth=DepthConfig(scale=1234.0))
+    decisions = open_recording(folder, config=config).info.decisions
+    assert "depth: 1234 counts per metre, by depth.scale" in decisions
+    with pytest.raises(CalibrationError, match=r"none\.yaml"):
+        open_recording(folder, options=RecordingOptions(calibration=tmp_path / "none.yaml"))
+
+
+@pytest.mark.parametrize("name", ["left", "right", "color", "depth"])
+def test_topics_of_a_folder_are_refused(tmp_path: Path, tiny: Any, name: str) -> None:
+    folder = tiny.write_kitti(tmp_path / "a")
+    topics: dict[str, Any] = {name: "/topic"}
+    with pytest.raises(RecordingError, match=f"--{name} names a topic of a bag"):
+        open_recording(folder, options=RecordingOptions(**topics))

@@ -1,0 +1,397 @@
+"""Pairing by stamp."""
+
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Reader, Writer
+
+import gvo
+from gvo.errors import RecordingError
+from gvo.io.bag.reader import typestore
+from gvo.io.recording import Source, StampedImage
+from gvo.io.sync import pair_images
+from gvo.types import FaultyFrame
+
+_LIMIT = 20
+_QUEUE = 100
+_any_stamps = st.lists(st.integers(0, 400), max_size=30)
+_stamps = st.one_of(_any_stamps.map(sorted), _any_stamps)
+_rising_stamps = st.lists(st.integers(0, 300), unique=True, max_size=30).map(sorted)
+_order = st.lists(st.booleans(), max_size=60)
+
+
+def _image(stream: int, stamp_ns: int) -> StampedImage:
+    return StampedImage(stream=stream, stamp_ns=stamp_ns, load=lambda: np.zeros((1, 1)))
+
+
+def _interleave(
+    first: list[int], second: list[int], order: Iterable[bool]
+) -> Iterator[StampedImage]:
+    waiting = [list(reversed(first)), list(reversed(second))]
+    for is_second in order:
+        if waiting[is_second]:
+            yield _image(int(is_second), waiting[is_second].pop())
+    for stream in (0, 1):
+        while waiting[stream]:
+            yield _image(stream, waiting[stream].pop())
+
+
+def _pair(
+    first: list[int],
+    second: list[int],
+    order: Iterable[bool] = (),
+    *,
+    limit_ns: int = _LIMIT,
+    age_penalty: float = 0.1,
+) -> list[tuple[int, int] | str]:
+    """Return stamps of pairs, or what is wrong with an image of stream 0."""
+    found: list[tuple[int, int] | str] = []
+    images = _interleave(first, second, order)
+    for item in pair_images(images, limit_ns=limit_ns, partner="depth", age_penalty=age_penalty):
+        if isinstance(item, FaultyFrame):
+            found.append(f"{item.stamp_ns}: {item.reason}")
+        else:
+            found.append((item[0].stamp_ns, item[1].stamp_ns))
+    return found
+
+
+def _pairs(first: list[int], second: list[int], age_penalty: float = 0.1) -> list[tuple[int, int]]:
+    answers = _pair(first, second, age_penalty=age_penalty)
+    return [answer for answer in answers if isinstance(answer, tuple)]
+
+
+def _answered(answers: list[tuple[int, int] | str]) -> list[int]:
+    return [
+        answer[0] if isinstance(answer, tuple) else int(answer.partition(":")[0])
+        for answer in answers
+    ]
+
+
+@given(first=_stamps, second=_stamps, order=_order)
+def test_the_interleaving_of_the_streams_does_not_matter(
+    first: list[int], second: list[int], order: list[bool]
+) -> None:
+    assert _pair(first, second, order) == _pair(first, second)
+
+
+@given(first=_rising_stamps, second=_rising_stamps, order=_order)
+def test_the_interleaving_does_not_matter_for_equal_stamps_that_increase(
+    first: list[int], second: list[int], order: list[bool]
+) -> None:
+    assert _pair(first, second, order, limit_ns=0) == _pair(first, second, limit_ns=0)
+
+
+@given(first=_rising_stamps, second=_rising_stamps, age_penalty=st.floats(0, 10))
+def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
+    first: list[int], second: list[int], age_penalty: float
+) -> None:
+    pairs = _pairs(first, second, age_penalty)
+    assert all(abs(image - partner) <= _LIMIT for image, partner in pairs)
+    for stream in zip(*pairs, strict=True):
+        assert list(stream) == sorted(set(stream))
+
+
+@given(first=_rising_stamps, second=_rising_stamps)
+def test_one_of_a_pair_has_the_neighbour_before_or_after_it(
+    first: list[int], second: list[int]
+) -> None:
+    for pair in _pairs(first, second):
+        between = [[t for t in stream if min(pair) < t < max(pair)] for stream in (first, second)]
+        assert not all(between)
+
+
+@given(first=_rising_stamps, second=_rising_stamps)
+def test_no_two_images_are_left_alone_that_would_make_a_pair_between_others(
+    first: list[int], second: list[int]
+) -> None:
+    pairs = [(-(10**6), -(10**6)), *_pairs(first, second), (10**6, 10**6)]
+    for before, after in pairwise(pairs):
+        alone = [stamp for stamp in first if before[0] < stamp < after[0]]
+        free = [stamp for stamp in second if before[1] < stamp < after[1]]
+        assert all(abs(image - partner) > _LIMIT for image in alone for partner in free)
+
+
+@given(
+    shift=st.integers(-2, 2),
+    noise=st.lists(st.integers(-2, 2), min_size=30, max_size=30),
+    missing=st.sets(st.integers(0, 29)),
+)
+def test_missing_images_do_not_matter_where_partners_are_nearer_than_all_others(
+    shift: int, noise: list[int], missing: set[int]
+) -> None:
+    truth = [(10 * n, 10 * n + shift + noise[n]) for n in range(30)]
+    pairs = [pair for n, pair in enumerate(truth) if n not in missing]
+    partners = [partner for _, partner in truth]
+    assert _pair([image for image, _ in pairs], partners, limit_ns=4) == pairs
+
+
+@given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))
+def test_every_image_of_the_first_stream_is_answered_once(
+    first: list[int], second: list[int], order: list[bool], limit_ns: int
+) -> None:
+    answered = _answered(_pair(first, second, order, limit_ns=limit_ns))
+    assert sorted(answered) == sorted(first)
+    if limit_ns > 0 or first == sorted(set(first)):
+        assert answered == first
+
+
+@given(first=_stamps, second=_stamps, order=_order, limit_ns=st.sampled_from([0, _LIMIT]))
+def test_the_stamps_of_pairs_increase_whatever_comes(
+    first: list[int], second: list[int], order: list[bool], limit_ns: int
+) -> None:
+    answers = _pair(first, second, order, limit_ns=limit_ns)
+    stamps = [answer[0] for answer in answers if isinstance(answer, tuple)]
+    assert stamps == sorted(set(stamps))
+
+
+@given(first=_rising_stamps, second=_rising_stamps, order=_order)
+def test_all_equal_stamps_pair_without_a_tolerance_and_no_others(
+    first: list[int], second: list[int], order: list[bool]
+) -> None:
+    pairs = [a for a in _pair(first, second, order, limit_ns=0) if isinstance(a, tuple)]
+    assert pairs == [(stamp, stamp) for stamp in sorted(set(first) & set(second))]
+
+
+# What message_filters 1.15.15 gives, with a last image of each stream long after: stamps of both
+# streams, limit, age penalty, places of the paired images within their streams.
+_KNOWN = [
+    ([100, 130], [85, 112], 20, 0.1, [(0, 1)]),
+    ([100, 130], [85, 112, 131], 20, 0.1, [(0, 1), (1, 2)]),
+    ([100, 200], [92, 110, 190, 210], 20, 0.1, [(0, 0), (1, 2)]),
+    ([100, 200], [92, 106, 190, 205], 20, 0.1, [(0, 1), (1, 3)]),
+    (
+        [0, 33, 67, 100, 133, 167, 200],
+        [10, 77, 143, 210],
+        20,
+        0.1,
+        [(0, 0), (2, 1), (4, 2), (6, 3)],
+    ),
+    (
+        [0, 33, 67, 100, 133, 167, 200],
+        [10, 77, 143, 210],
+        20,
+        1.0,
+        [(0, 0), (2, 1), (4, 2), (6, 3)],
+    ),
+    (
+        [0, 33, 66, 99, 132],
+        [16, 50, 82, 116, 148],
+        20,
+        0.1,
+        [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4)],
+    ),
+    ([0, 33, 66, 99, 132], [16, 50, 82, 116, 148], 20, 0.0, [(0, 0), (2, 1), (3, 2), (4, 3)]),
+    ([0, 33, 66, 99, 132], [17, 49, 83, 115, 149], 20, 0.0, [(1, 0), (2, 1), (3, 2), (4, 3)]),
+    ([100, 200, 150, 300], [100, 200, 150, 300], 20, 0.1, [(0, 0), (1, 1), (3, 3)]),
+    ([100, 100, 130], [95, 100, 100, 131], 20, 0.1, [(0, 1), (2, 3)]),
+    ([100, 90, 110, 130], [95, 115, 105, 135], 20, 0.1, [(0, 0), (2, 1), (3, 3)]),
+    ([50, 40, 60], [45, 70], 20, 0.1, [(0, 0), (2, 1)]),
+    ([0, 10, 20, 30, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
+    ([0, 10, 20, 31, 100], [31, 101], 40, 0.1, [(3, 0), (4, 1)]),
+    ([31, 101], [0, 10, 20, 30, 100], 40, 0.1, [(0, 3), (1, 4)]),
+    ([5, 26], [0, 21, 30], 20, 0.1, [(0, 0), (1, 2)]),
+    ([0, 20, 40, 60, 80], [19, 41, 59, 81], 20, 0.1, [(1, 0), (2, 1), (3, 2), (4, 3)]),
+    ([100, 200], [200, 100], 0, 0.1, [(1, 0)]),
+    ([1, 3, 2, 4], [1, 2, 3, 4], 0, 0.1, [(0, 0), (2, 1), (1, 2), (3, 3)]),
+    ([1, 1, 2], [1, 2, 2], 0, 0.1, [(1, 0), (2, 1)]),
+]
+
+
+@pytest.mark.parametrize(("first", "second", "limit_ns", "age_penalty", "places"), _KNOWN)
+def test_known_pairs_are_found(
+    first: list[int],
+    second: list[int],
+    limit_ns: int,
+    age_penalty: float,
+    places: list[tuple[int, int]],
+) -> None:
+    answers = _pair(first, second, limit_ns=limit_ns, age_penalty=age_penalty)
+    pairs = [answer for answer in answers if isinstance(answer, tuple)]
+    assert pairs == [(first[n], second[k]) for n, k in places]
+
+
+def test_the_earlier_of_two_partners_is_taken_unless_the_later_one_is_much_nearer() -> None:
+    assert _pairs([100], [90, 110]) == [(100, 90)]
+    assert _pairs([100], [89, 110]) == [(100, 89)]
+    assert _pairs([100], [88, 110]) == [(100, 110)]
+    assert _pairs([100], [88, 110], age_penalty=0.5) == [(100, 88)]
+    assert _pairs([100], [89, 110], age_penalty=0.0) == [(100, 110)]
+
+
+def test_the_tie_of_a_penalty_falls_to_the_earlier_one() -> None:
+    ms = 1_000_000
+    assert _pair([100 * ms], [89 * ms, 110 * ms], limit_ns=20 * ms) == [(100 * ms, 89 * ms)]
+
+
+def test_images_of_twice_the_rate_of_depth_pair_where_their_stamps_are_equal() -> None:
+    color = [0, 17, 33, 50, 67, 83, 100]
+    assert _pairs(color, [17, 50, 83]) == [(17, 17), (50, 50), (83, 83)]
+
+
+def test_a_missing_depth_image_does_not_shift_those_after_it() -> None:
+    color = list(range(0, 1000, 17))
+    assert _pairs(color, color[1:]) == [(stamp, stamp) for stamp in color[1:]]
+    assert _pairs(color, color[:-1]) == [(stamp, stamp) for stamp in color[:-1]]
+
+
+def test_a_pair_is_given_as_soon_as_the_next_image_shows_that_it_is_the_best() -> None:
+    n_pushed = 0
+
+    def images() -> Iterator[StampedImage]:
+        nonlocal n_pushed
+        for stream, stamp_ns in [(0, 0), (1, 5), (1, 35), (0, 30), (0, 60), (1, 60), (0, 90)]:
+            n_pushed += 1
+            yield _image(stream, stamp_ns)
+
+    given_after = [n_pushed for _ in pair_images(images(), limit_ns=20, partner="depth")]
+    assert given_after == [4, 5, 6, 7]
+
+
+def test_pairs_held_back_are_given_at_the_end() -> None:
+    assert _pair([100, 130], [110, 140]) == [(100, 110), (130, 140)]
+
+
+def test_the_pairs_before_a_fault_of_the_recording_come_first() -> None:
+    def images() -> Iterator[StampedImage]:
+        for stamp in (0, 30, 60):
+            yield _image(0, stamp)
+            yield _image(1, stamp + 15)
+        raise RecordingError("cut off")
+
+    pairs = pair_images(images(), limit_ns=20, partner="depth")
+    assert [next(pairs)[0].stamp_ns for _ in range(3)] == [0, 30, 60]  # type: ignore[index]
+    with pytest.raises(RecordingError, match="cut off"):
+        next(pairs)
+
+
+@pytest.mark.parametrize("limit_ms", [0, 20])
+def test_an_image_without_a_partner_says_how_far_the_nearest_is(limit_ms: int) -> None:
+    ms = 1_000_000
+    stamps = [100 * ms, 200 * ms]
+    answer, _ = _pair(stamps, [50 * ms, 133 * ms, 200 * ms], limit_ns=limit_ms * ms)
+    assert answer == f"{100 * ms}: no depth={limit_ms}: the nearest is 33 ms away"
+    assert "there is none" in str(_pair([100], [], limit_ns=limit_ms)[0])
+
+
+def test_an_image_says_that_another_one_got_its_partner() -> None:
+    ms = 1_000_000
+    taken = _pair([0, 5 * ms], [1 * ms], limit_ns=20 * ms)[1]
+    assert str(taken).endswith("the nearest is 4 ms away and belongs to another image")
+
+
+@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
+@pytest.mark.parametrize(("late", "word"), [(200, "repeats"), (150, "goes back from 200 to 150")])
+def test_a_pair_whose_stamp_repeats_or_goes_back_makes_a_faulty_frame(
+    late: int, word: str, limit_ns: int
+) -> None:
+    stamps = [100, 200, late, 300]
+    pairs = _pair(stamps, stamps, [False, True] * 4, limit_ns=limit_ns)
+    assert pairs[:2] == [(100, 100), (200, 200)]
+    assert word in str(pairs[2])
+    assert pairs[3] == (300, 300)
+
+
+def test_of_two_images_of_one_stamp_one_is_paired_and_the_other_is_faulty() -> None:
+    repeated, pair = _pair([100, 100], [100], limit_ns=0)
+    assert "repeats" in str(repeated)
+    assert pair == (100, 100)
+    pair, repeated = _pair([100, 100], [100])
+    assert "repeats" in str(repeated)
+    assert pair == (100, 100)
+
+
+def test_a_wrong_stamp_without_partner_does_not_spoil_those_after_it() -> None:
+    stamps = [100, 200, 300, 400]
+    answers = _pair([100, 10**9, 200, 300, 400], stamps, [False, True] * 5, limit_ns=0)
+    assert [answer for answer in answers if isinstance(answer, tuple)] == [(s, s) for s in stamps]
+
+
+@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
+def test_one_stream_may_run_ahead_as_far_as_the_queue_reaches(limit_ns: int) -> None:
+    stamps = list(range(0, 1000 * _QUEUE, 1000))
+    pairs = [(stamp, stamp) for stamp in stamps]
+    assert _pair(stamps, stamps, [False] * _QUEUE, limit_ns=limit_ns) == pairs
+    lost, *found = _pair([-1000, *stamps], stamps, [False] * (_QUEUE + 1), limit_ns=limit_ns)
+    assert str(lost).endswith("there is none, and sync.queue_size=100 is reached")
+    assert found == pairs
+
+
+def test_an_image_that_follows_a_given_up_one_is_no_pivot() -> None:
+    """The partner of depth 95 might have been the image at 96 that had to go."""
+    images = [_image(0, stamp) for stamp in (96, 100, 200)]
+    images += [_image(1, 95), _image(1, 201)]
+    answers = list(pair_images(images, limit_ns=20, partner="depth", queue_size=2))
+    assert isinstance(answers[0], FaultyFrame)
+    assert isinstance(answers[1], FaultyFrame)
+    assert isinstance(answers[2], tuple)
+
+
+@pytest.mark.parametrize("limit_ns", [0, _LIMIT])
+@pytest.mark.parametrize("stream", [0, 1])
+def test_few_images_are_kept_where_the_other_stream_ends(stream: int, limit_ns: int) -> None:
+    alive = 0
+
+    class Counted:
+        def __init__(self) -> None:
+            nonlocal alive
+            alive += 1
+
+        def __del__(self) -> None:
+            nonlocal alive
+            alive -= 1
+
+        def __call__(self) -> NDArray[np.uint8]:
+            return np.zeros((1, 1), np.uint8)
+
+    def images() -> Iterator[StampedImage]:
+        for stamp_ns in range(10 * _QUEUE):
+            yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=Counted())
+            assert alive <= _QUEUE + 3
+
+    results = list(pair_images(images(), limit_ns=limit_ns, partner="right"))
+    assert len(results) == (10 * _QUEUE if stream == 0 else 0)
+    assert all(isinstance(result, FaultyFrame) for result in results)
+
+
+@pytest.mark.parametrize("options", [{"limit_ns": -1}, {"queue_size": 0}, {"age_penalty": -0.1}])
+def test_parameters_out_of_range_are_refused_before_anything_is_read(
+    options: dict[str, float],
+) -> None:
+    with pytest.raises(ValueError, match="expected limit_ns >= 0, queue_size >= 1"):
+        pair_images([], **({"limit_ns": 1, "partner": "depth"} | options))  # type: ignore[arg-type]
+
+
+def _pairs_of(source: Source) -> list[tuple[int, int] | str]:
+    answers = pair_images(source.images(), limit_ns=20_000_000, partner="depth")
+    return [
+        item.reason if isinstance(item, FaultyFrame) else (item[0].stamp_ns, item[1].stamp_ns)
+        for item in answers
+    ]
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.2])
+def test_the_clock_of_the_recording_does_not_matter(
+    room_bag: Path, tmp_path: Path, delay_s: float
+) -> None:
+    """Log times two years off, by a slow clock, depth later than colour."""
+    store = typestore(is_ros1=True)
+    with Reader(room_bag) as reader, Writer(tmp_path / "late.bag") as writer:
+        connections = {
+            connection.id: writer.add_connection(
+                connection.topic, connection.msgtype, typestore=store
+            )
+            for connection in reader.connections
+        }
+        for connection, log_time_ns, data in reader.messages():
+            late_ns = 63_000_000 * 10**9 + int(delay_s * 1e9) * ("depth" in connection.topic)
+            writer.write(connections[connection.id], log_time_ns * 9 // 10 + late_ns, data)
+    expected = _pairs_of(gvo.open_recording(room_bag))
+    assert len(expected) == 20
+    assert all(isinstance(pair, tuple) for pair in expected)
+    assert _pairs_of(gvo.open_recording(tmp_path / "late.bag")) == expected

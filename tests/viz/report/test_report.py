@@ -1,0 +1,289 @@
+"""The page of a run and of a comparison, seen as text."""
+
+import csv
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gvo.errors import ConfigurationError
+from gvo.geometry import se3
+from gvo.io.run_folder.reader import read_run
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.runs import run_recording
+from gvo.trajectory.evaluation import evaluate
+from gvo.trajectory.formats import write_covariances, write_tum
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.report import write_comparison_report, write_run_report
+from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure
+
+SECTIONS = [
+    "above",
+    "side",
+    "space",
+    "errors_over_time",
+    "errors_over_distance",
+    "drift",
+    "covariance",
+    "nees",
+    "status",
+    "counts",
+    "timings",
+    "chi2",
+    "chi2_histogram",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run")
+    run_recording(SyntheticRecording("driving", "stereo", n_frames=8, scale=0.25), path)
+    return path
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+class _Page(HTMLParser):
+    """Collects ids, links and the sections that hold a drawing."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.drawn: list[str] = []
+        self.scripts = 0
+        self._section = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {name: value or "" for name, value in attrs}
+        if "id" in values:
+            self.ids.append(values["id"])
+        self.links += [values[n] for n in ("href", "src", "xlink:href") if n in values]
+        self.scripts += tag == "script"
+        if tag == "section":
+            self._section = values.get("id", "")
+        if tag == "svg" and values.get("role") == "img":
+            self.drawn.append(self._section)
+
+
+def page_of(folder: Path, *, plots: Path | None = None) -> str:
+    path = folder / "page.html"
+    write_run_report(path, read_run(folder), plots=plots)
+    return path.read_text(encoding="utf-8")
+
+
+def test_each_section_is_there_and_drawn(folder: Path) -> None:
+    page = _Page(page_of(folder))
+    assert [name for name in page.ids if name in SECTIONS] == SECTIONS
+    assert page.drawn == SECTIONS
+
+
+def test_nothing_outside_is_referred_to_and_no_id_is_there_twice(folder: Path) -> None:
+    text = page_of(folder)
+    page = _Page(text)
+    assert len(page.ids) == len({*page.ids})
+    assert "http" not in text
+    assert "@import" not in text
+    references = [link[1:] for link in page.links if link.startswith("#")]
+    references += re.findall(r"url\(#([^)]*)\)", text)
+    assert references
+    assert {*references} <= {*page.ids}
+    assert [link for link in page.links if not link.startswith("#")] == ["data:,"]
+    assert not re.search(r"url\((?!#)", text)
+
+
+def test_equal_input_gives_equal_files(folder: Path, tmp_path: Path) -> None:
+    texts = {page_of(folder, plots=tmp_path / str(n)) for n in range(2)}
+    assert len(texts) == 1
+    first, second = (sorted((tmp_path / str(n)).iterdir()) for n in range(2))
+    names = [f"{n:02d}_{s}{e}" for n, s in enumerate(SECTIONS, 1) for e in (".pdf", ".png")]
+    assert [path.name for path in first] == names
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    assert np.asarray(cv2.imread(str(first[1]))).shape[2] == 3
+
+
+def test_texts_of_the_recording_are_escaped(copy: Path) -> None:
+    evil = "</title></script><script>alert(1)</script>&"
+    summary = json.loads((copy / "summary.json").read_text())
+    n_scripts = _Page(page_of(copy)).scripts
+    summary |= {"recording": evil, "warnings": [evil], "decisions": [evil], "sensor": evil}
+    summary["ground_truth"] = f"none: {evil}"
+    summary["configuration"]["frontend"]["kind"] = evil
+    (copy / "summary.json").write_text(json.dumps(summary))
+    (copy / "ground_truth.txt").unlink()
+    rows = (copy / "frames.csv").read_text().splitlines()
+    (copy / "frames.csv").write_text("\n".join([*rows[:-1], f"{rows[-1]}{evil}", ""]))
+    text = page_of(copy)
+    assert "<script>alert" not in text
+    assert text.count("&lt;script&gt;alert(1)") >= 6
+    assert _Page(text).scripts == n_scripts
+
+
+def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
+    evil = "</script><script>alert(1)</script> $x_1$"
+    path = tmp_path / "page.html"
+    truth = straight(30)
+    estimates = {evil: straight(30, bend=0.01), "other": straight(30)}
+    evaluations = [evaluate(truth, t, name=name) for name, t in estimates.items()]
+    write_comparison_report(path, truth, estimates, evaluations, align="se3")
+    text = path.read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert _Page(text).scripts == 2
+    assert _Page(text).drawn == SECTIONS[:6]
+
+
+def straight(n: int, *, bend: float = 0.0) -> Trajectory:
+    twist = np.array([0.0, bend, 0.0, 0.0, 0.0, 1.0])
+    T = np.array([se3.exp(k * twist) for k in range(n)])
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=T)
+
+
+def test_without_truth_a_sentence_says_why(copy: Path) -> None:
+    (copy / "ground_truth.txt").unlink()
+    summary = json.loads((copy / "summary.json").read_text())
+    (copy / "summary.json").write_text(
+        json.dumps(summary | {"ground_truth": "none: nobody measured it", "errors": []})
+    )
+    text = page_of(copy)
+    assert text.count("nobody measured it") == 1 + len(SECTIONS[3:8])
+    assert _Page(text).drawn == SECTIONS[:3] + SECTIONS[8:]
+
+
+def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) -> None:
+    truth = read_run(copy).truth
+    assert truth is not None
+    (copy / "ground_truth.txt").unlink()
+    stamps_ns = truth.stamps_ns
+    rows = [
+        (int(n), float(x), float(y), float(z))
+        for n, (x, y, z) in zip(stamps_ns, truth.positions, strict=True)
+    ]
+    with (copy / "ground_truth_positions.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([["stamp_ns", "x_m", "y_m", "z_m"], *map(list, rows)])
+    page = page_of(copy)
+    assert {*SECTIONS} - {*_Page(page).drawn} == {"drift", "covariance", "nees"}
+    assert "rotation error [deg]" not in page
+
+
+def test_an_interrupted_run_is_shown_as_far_as_it_went(copy: Path) -> None:
+    for name in ("summary.json", "edges.csv", "timings.csv", "ground_truth.txt"):
+        (copy / name).unlink()
+    text = page_of(copy)
+    assert "has not ended" in text
+    assert _Page(text).drawn == [*SECTIONS[:3], "status", "counts"]
+    for path in copy.glob("*.txt"):
+        path.write_text("")
+    (copy / "frames.csv").write_text("stamp_ns,status,reason\n")
+    assert _Page(page_of(copy)).drawn == []
+
+
+def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
+    rows = (copy / "frames.csv").read_text().splitlines()
+    for index, status in enumerate(("coasting", "lost", "resumed", "skipped"), start=3):
+        rows[index] = rows[index].replace(",ok,", f",{status},")
+    (copy / "frames.csv").write_text("\n".join([*rows, ""]))
+    text = page_of(copy)
+    for label in ("ok: 4", "coasting: 1", "lost: 1", "resumed: 1", "skipped: 1"):
+        assert f">{label}</text>" in text
+
+
+def test_what_differs_from_the_default_is_marked_with_the_default(copy: Path) -> None:
+    assert 'class="changed"' not in page_of(copy)
+    summary = json.loads((copy / "summary.json").read_text())
+    summary["configuration"]["window"]["n_links"] = 7
+    (copy / "summary.json").write_text(json.dumps(summary))
+    marked = re.findall(r'<tr class="changed">(.*?)</tr>', page_of(copy))
+    assert [re.sub("<[^>]*>", " ", row).split() for row in marked] == [
+        ["n_links", "7", "default", "3"]
+    ]
+
+
+def test_labels_are_text_and_keep_their_digits(folder: Path) -> None:
+    text = page_of(folder)
+    for label in ("x [m]", "z [m]", "position error [m]", "rotation error [deg]", "NEES [-]"):
+        assert f">{label}</text>" in text
+    ate_m = json.loads((folder / "summary.json").read_text())["errors"][0]["ate_m"]
+    assert f"raw (RMSE {ate_m:.3g} m)" in text
+
+
+def test_two_frames_are_enough(tmp_path: Path) -> None:
+    recording = SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
+    run_recording(recording, tmp_path)
+    assert {*SECTIONS} - {*_Page(page_of(tmp_path)).drawn} <= {"drift"}
+
+
+def test_a_lone_point_between_gaps_is_drawn() -> None:
+    from gvo.viz.palette import Style
+
+    axes = new_figure(4.0, 3.0).subplots()
+    y = np.array([1.0, np.nan, 2.0, np.nan, 3.0, 3.0])
+    draw_curve(axes, np.arange(6.0), y, Style(color="black"))
+    assert [np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]] == [[0.0, 2.0]]
+    assert axes.lines[1].get_marker() == "."
+
+
+def test_a_long_run_gives_a_small_page_that_shows_an_outlier_of_one_frame(copy: Path) -> None:
+    n = 10_000
+    rng = np.random.default_rng(0)
+    stamps_ns = np.arange(n, dtype=np.int64) * 33_333_333
+    T = se3.exp(np.cumsum(rng.normal(size=(n, 6)) * 0.02, axis=0))
+    covariances = np.tile(1e-4 * np.eye(6), (n, 1, 1))
+    write_tum(copy / "ground_truth.txt", Trajectory(stamps_ns=stamps_ns, T_world_cam=T))
+    for name in ("raw", "causal", "smoothed"):
+        noisy = T @ se3.exp(rng.normal(size=(n, 6)) * 1e-2)
+        noisy[7777, 1, 3] += 50.0
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_cam=noisy, covariances=covariances)
+        write_tum(copy / f"{name}.txt", trajectory)
+        write_covariances(copy / f"{name}_covariance.csv", trajectory)
+    lines = [f"{s},ok,{200 + k % 7},190,{180 + k % 11},170,3," for k, s in enumerate(stamps_ns)]
+    header = "stamp_ns,status,n_keypoints,n_points,n_matches,n_inliers,n_links,reason"
+    lines[5000] = lines[5000].replace(",ok,", ",lost,")
+    (copy / "frames.csv").write_text("\n".join([header, *lines, ""]))
+    path = copy / "page.html"
+    write_run_report(path, read_run(copy))
+    assert path.stat().st_size < 10_000_000
+    assert "lost: 1" in path.read_text()
+    record = read_run(copy)
+    errors = np.abs(record.trajectories["raw"].positions - T[:, :3, 3])[:, 1]
+    assert int(np.argmax(errors)) in kept_of_curve(stamps_ns / 1e9, errors)
+
+
+def test_what_cannot_be_written_is_refused(folder: Path, tmp_path: Path) -> None:
+    record = read_run(folder)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="cannot be written"):
+        write_run_report(tmp_path / "file" / "page.html", record)
+    with pytest.raises(ConfigurationError, match="cannot be made"):
+        write_run_report(tmp_path / "page.html", record, plots=tmp_path / "file")
+    with pytest.raises(ConfigurationError, match=r"ending in \.html, got \.txt"):
+        write_run_report(tmp_path / "page.txt", record)
+    with pytest.raises(ValueError, match="at least one"):
+        write_comparison_report(tmp_path / "page.html", straight(3), {}, [], align="se3")
+
+
+def test_the_page_is_there_though_its_plots_cannot_be_written(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="--plots"):
+        write_run_report(tmp_path / "run.html", read_run(folder), plots=tmp_path / "file")
+    assert "</html>" in (tmp_path / "run.html").read_text()
+    truth, names = straight(9), {"one": straight(9, bend=0.01)}
+    measured = [evaluate(truth, names["one"], name="one")]
+    with pytest.raises(ConfigurationError, match="--plots"):
+        write_comparison_report(
+            tmp_path / "compared.html",
+            truth,
+            names,
+            measured,
+            align="se3",
+            plots=tmp_path / "file",
+        )
+    assert "</html>" in (tmp_path / "compared.html").read_text()

@@ -1,0 +1,115 @@
+"""The report in a real browser: from disk, alone, all to be seen, nothing on one another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import gvo
+from gvo.io.run_folder.reader import read_run
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.run_outputs import RunOutputs
+from gvo.viz.report import write_run_report
+from tests.browser import Browser
+from tests.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
+from tests.outputs.long_run import make_long_run
+
+if TYPE_CHECKING:
+    from selenium.webdriver.remote.webelement import WebElement
+
+MAX_BYTES = 10_000_000
+SECTIONS = 12
+"""Sections with a plot, at least: the paths, errors, drift, covariance, counts, times, edges."""
+
+_SHOWN = """
+return [...document.querySelectorAll('section[id]')].map(section => {
+  const seen = [...section.querySelectorAll('.panel > svg, canvas, p.absent')]
+    .map(e => e.getBoundingClientRect()).filter(b => b.width > 150 && b.height > 15);
+  return [section.id, seen.length];
+});
+"""
+
+
+@pytest.fixture(scope="module")
+def short_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the report of a short rendered run with truth."""
+    out = tmp_path_factory.mktemp("short")
+    source = SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5)
+    gvo.run_recording(source, out, outputs=RunOutputs(report=False))
+    write_run_report(out / "report.html", read_run(out))
+    return out / "report.html"
+
+
+@pytest.fixture(scope="module")
+def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the report of 10,000 frames."""
+    out = tmp_path_factory.mktemp("long")
+    write_run_report(out / "report.html", make_long_run(out, 10_000))
+    return out / "report.html"
+
+
+@pytest.fixture(params=["short", "long"])
+def report(request: pytest.FixtureRequest) -> Path:
+    """Return either report."""
+    path: Path = request.getfixturevalue(f"{request.param}_report")
+    return path
+
+
+def _shown(browser: Browser) -> dict[str, int]:
+    found = browser.run(_SHOWN)
+    assert isinstance(found, list)
+    return {str(name): int(count) for name, count in found}
+
+
+def _drawings(browser: Browser) -> "list[WebElement]":
+    return [svg for svg in browser.all(".panel > svg") if svg.is_displayed()]
+
+
+@pytest.mark.slow
+def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: Path) -> None:
+    browser.open_file(report)
+    others = [url for url in browser.requests() if not url.startswith(("data:", "blob:"))]
+    assert others == [report.as_uri()]
+    assert browser.requests_leaving() == []
+    assert browser.console_errors() == []
+    shown = _shown(browser)
+    assert len(shown) >= SECTIONS
+    assert min(shown.values()) >= 1, f"not to be seen: {shown}"
+
+
+@pytest.mark.slow
+def test_no_text_of_a_plot_lies_on_another_or_is_cut_off(browser: Browser, report: Path) -> None:
+    browser.open_file(report)
+    drawings = _drawings(browser)
+    assert len(drawings) >= SECTIONS - 1
+    for svg in drawings:
+        name = svg.get_attribute("aria-label")
+        assert overlapping_texts(browser, svg) == [], name
+        assert cut_texts(browser, svg) == [], name
+
+
+@pytest.mark.slow
+def test_the_paths_in_space_turn_when_dragged(browser: Browser, report: Path) -> None:
+    browser.open_file(report)
+    canvas = browser.all("canvas")[0]
+    before = browser.picture(canvas)
+    assert n_colours(before) > 4, "the canvas is blank"
+    browser.drag(canvas, 120, 40)
+    assert changed_share(before, browser.picture(canvas)) > 0.002
+    assert browser.console_errors() == []
+
+
+@pytest.mark.slow
+def test_print_shows_all_that_the_page_shows(browser: Browser, report: Path) -> None:
+    browser.open_file(report)
+    on_screen = _shown(browser)
+    with browser.in_print():
+        browser.wait(lambda: not browser.all("canvas")[0].is_displayed())
+        assert _shown(browser) == on_screen
+        for svg in _drawings(browser):
+            assert overlapping_texts(browser, svg) == [], svg.get_attribute("aria-label")
+
+
+@pytest.mark.slow
+def test_the_report_of_ten_thousand_frames_is_small(long_report: Path) -> None:
+    assert long_report.stat().st_size < MAX_BYTES

@@ -1,0 +1,183 @@
+"""Plots of trajectories, seen through their pixels and their SVG text."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gvo.errors import ConfigurationError, TrajectoryError
+from gvo.geometry import se3
+from gvo.trajectory.trajectory import StampsFrom, Trajectory
+from gvo.viz.plots import plot_trajectories
+
+BLACK, RAW, CAUSAL, SMOOTHED, FREE = (
+    (0, 0, 0),
+    (0xE6, 0x9F, 0x00),
+    (0x56, 0xB4, 0xE9),
+    (0x00, 0x9E, 0x73),
+    (0x00, 0x72, 0xB2),
+)
+
+
+def curve(
+    seed: int, *, extents: tuple[float, float, float] = (3.0, 0.2, 5.0), start: float = 0.0
+) -> Trajectory:
+    angle = np.linspace(0.0, 6.0, 60)
+    twists = np.zeros((60, 6))
+    twists[:, 3:] = np.column_stack([np.sin(angle), angle / 6, 1 - np.cos(angle)]) * extents
+    twists[1:, 3:] += np.random.default_rng(seed).normal(size=(59, 3)) * 0.05
+    twists[:, 3:] += start
+    return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_cam=se3.exp(twists))
+
+
+def with_origin(trajectory: Trajectory, stamps_from: StampsFrom) -> Trajectory:
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns,
+        T_world_cam=trajectory.T_world_cam,
+        stamps_from=stamps_from,
+    )
+
+
+def n_pixels(path: Path, rgb: tuple[int, int, int]) -> int:
+    image = np.asarray(cv2.imread(str(path)))
+    return int(np.count_nonzero(np.all(image == rgb[::-1], axis=2)))
+
+
+def svg_text(folder: Path, *arguments: object, **options: object) -> str:
+    # the labels stand in the SVG as comments before their glyphs
+    path = folder / "plot.svg"
+    plot_trajectories(path, *arguments, **options)  # type: ignore[arg-type]
+    return path.read_text()
+
+
+def test_the_meanings_of_the_colours_are_fixed(tmp_path: Path) -> None:
+    path = tmp_path / "plot.png"
+    names = {"raw": RAW, "causal": CAUSAL, "smoothed": SMOOTHED, "other": FREE}
+    for name, colour in names.items():
+        plot_trajectories(path, curve(0), {name: curve(1)})
+        for rgb in names.values():
+            assert (n_pixels(path, rgb) > 100) == (rgb == colour)
+
+
+def test_equal_input_gives_equal_files(tmp_path: Path) -> None:
+    for suffix in ("png", "pdf", "svg"):
+        paths = [tmp_path / f"{n}.{suffix}" for n in range(2)]
+        for path in paths:
+            plot_trajectories(path, curve(0), {"raw": curve(1), "mine": curve(2)})
+        first, second = (path.read_bytes() for path in paths)
+        assert first == second
+        assert first[:5] in (b"\x89PNG\r", b"%PDF-", b"<?xml")
+
+
+@pytest.mark.parametrize(
+    ("extents", "start", "axes"),
+    [
+        ((3.0, 9.0, 5.0), 0.0, "xz"),  # the world of a camera, whatever it did
+        ((3.0, 5.0, 0.2), 1.0, "xy"),
+        ((0.2, 5.0, 3.0), 1.0, "yz"),
+        ((3.0, 0.2, 5.0), 1.0, "xz"),
+    ],
+)
+def test_the_view_shows_the_axes_of_most_motion(
+    tmp_path: Path, extents: tuple[float, float, float], start: float, axes: str
+) -> None:
+    reference = curve(0, extents=extents, start=start)
+    text = svg_text(tmp_path, reference, {"raw": curve(1, extents=extents)})
+    shown = "".join(axis for axis in "xyz" if f"<!-- {axis} [m] -->" in text)
+    assert shown == axes
+
+
+def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:
+    text = svg_text(tmp_path, curve(0), {"raw": curve(0), "_$a$": curve(1)}, align="none")
+    for label in ("elapsed [s]", "position error [m], alignment: none", "reference", "start"):
+        assert f"<!-- {label} -->" in text
+    assert "<!-- raw (ATE 0 m) -->" in text
+    assert "_$a$ (ATE 0.1" in text.replace("\\", "")
+
+
+def test_rows_without_stamps_are_counted(tmp_path: Path) -> None:
+    rows = [with_origin(curve(seed), "rows") for seed in range(2)]
+    text = svg_text(tmp_path, rows[0], {"raw": rows[1]})
+    assert "<!-- row -->" in text
+    assert "elapsed" not in text
+
+
+def test_without_a_reference_the_positions_are_drawn(tmp_path: Path) -> None:
+    text = svg_text(tmp_path, None, {"raw": curve(1), "smoothed": curve(2)})
+    for label in ("x [m]", "y [m]", "z [m]", "elapsed [s]", "raw", "smoothed"):
+        assert f"<!-- {label} -->" in text
+    assert "reference" not in text
+
+
+def test_lines_are_broken_where_poses_are_missing(tmp_path: Path) -> None:
+    whole, path = curve(0), tmp_path / "plot.png"
+    pixels = []
+    for trajectory in (whole, whole.select([*range(10), *range(50, 60)])):
+        plot_trajectories(path, None, {"raw": trajectory})
+        pixels.append(n_pixels(path, RAW))
+    assert pixels[1] < 0.6 * pixels[0]
+
+
+def test_one_pose_and_many_estimates_are_drawn(tmp_path: Path) -> None:
+    plot_trajectories(tmp_path / "one.png", None, {"raw": curve(0).select([0])})
+    estimates = {f"a rather long name of run {n}/raw": curve(n) for n in range(15)}
+    plot_trajectories(tmp_path / "many.png", curve(20), estimates)
+    image = np.asarray(cv2.imread(str(tmp_path / "many.png")))
+    # nothing reaches the edges: the legend breaks its rows before
+    for edge in (image[:3], image[-3:], image[:, :8], image[:, -8:]):
+        assert np.all(edge == 255)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    for name in ("plot.bmp", "plot"):
+        with pytest.raises(ConfigurationError, match=r"expected one of \.png, \.pdf, \.svg"):
+            plot_trajectories(tmp_path / name, None, {"raw": curve(0)})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TrajectoryError, match="cannot be written"):
+        plot_trajectories(tmp_path / "file" / "plot.png", None, {"raw": curve(0)})
+
+
+def test_nothing_to_draw_is_refused(tmp_path: Path) -> None:
+    for estimates in ({}, {"raw": curve(0).select([])}):
+        with pytest.raises(ValueError, match="at least one estimate"):
+            plot_trajectories(tmp_path / "plot.png", None, estimates)
+
+
+def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
+    program = (
+        "import sys; import gvo.viz.plots as plots; assert 'matplotlib' not in sys.modules;"
+        "import matplotlib, numpy as np; from gvo.trajectory.trajectory import Trajectory;"
+        "one = Trajectory(stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None]);"
+        f"plots.plot_trajectories({str(tmp_path / 'p.svg')!r}, None, {{'raw': one}});"
+        "assert 'matplotlib.pyplot' not in sys.modules;"
+        "assert matplotlib.rcParams['svg.hashsalt'] is None"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[2])
+
+
+def test_positions_without_rotations_are_drawn_with_their_errors(tmp_path: Path) -> None:
+    reference = curve(0)
+    points = Trajectory.of_positions(
+        reference.stamps_ns[::7] + 33_000_000, reference.positions[::7], stamps_from="topic"
+    )
+    text = svg_text(tmp_path, points, {"raw": curve(1)})
+    assert "position error [m]" in text
+    assert "raw (ATE" in text
+
+
+def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
+    """They begin with an identity that means nothing: it makes no world of a camera."""
+    path = curve(0, extents=(3.0, 5.0, 0.5))
+    path = path.moved(se3.invert(path.T_world_cam[0]))
+    points = Trajectory.of_positions(path.stamps_ns, path.positions)
+    axes = {
+        name: [letter for letter in "xyz" if f"<!-- {letter} [m] -->" in text]
+        for name, text in (
+            ("camera", svg_text(tmp_path, path, {"raw": path})),
+            ("points", svg_text(tmp_path, points, {"raw": path})),
+        )
+    }
+    assert axes == {"camera": ["x", "z"], "points": ["x", "y"]}

@@ -1,0 +1,70 @@
+"""The picture of a drive there and back: what is in it, not how it looks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gvo.errors import RecordingError
+from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz import plots as shuttle_plot
+from gvo.viz.plots import plot_shuttle
+
+_N = 9000
+
+
+def closing(gap_m: float, n: int = _N) -> Closing:
+    poses = np.tile(np.eye(4), (2 * n - 1, 1, 1))
+    poses[:, 2, 3] = [*range(n), *range(n - 2, -1, -1)]
+    poses[n:, 0, 3] = gap_m
+    stamps_ns = 100_000_000 * np.arange(1 - n, n)
+    found = close(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses), 0)
+    assert isinstance(found, Closing)
+    return found
+
+
+@pytest.fixture
+def closings() -> dict[str, Closing]:
+    return {"raw": closing(0.5), "causal": closing(0.25), "smoothed": closing(0.25)}
+
+
+def test_the_picture_holds_both_ways_and_the_gap(closings: dict[str, Closing]) -> None:
+    figure = shuttle_plot._draw_shuttle_plot(closings)
+    view, end, metres, degrees = figure.axes
+    solid = [line for line in view.lines if line.get_linestyle() == "-"]
+    dashed = [line for line in view.lines if line.get_linestyle() == "--"]
+    assert [line.get_color() for line in solid] == ["#E69F00", "#56B4E9", "#009E73"]
+    assert [line.get_color() for line in dashed] == ["#E69F00", "#56B4E9", "#009E73"]
+    assert view.get_aspect() == end.get_aspect() == 1.0
+    assert solid[0].get_xydata()[-1] == pytest.approx([0.0, _N - 1.0])  # type: ignore[index]
+    marks = [line for line in end.lines if line.get_marker() == "s"]
+    assert [float(line.get_xdata()[0]) for line in marks] == [0.5, 0.25, 0.25]  # type: ignore[index, arg-type]
+    # drawn with fewer points than there are, the ends among them
+    drawn = metres.lines[0].get_xydata()
+    assert len(drawn) < _N  # type: ignore[arg-type]
+    assert drawn[0] == pytest.approx([-0.1 * (_N - 1), 0.5])  # type: ignore[index]
+    assert drawn[-1] == pytest.approx([0.0, 0.0])  # type: ignore[index]
+    assert degrees.get_ylim()[0] == 0.0
+    for axes in figure.axes:
+        assert axes is metres or axes.get_xlabel().endswith("]")
+        assert axes.get_ylabel().endswith("]")
+
+
+def test_equal_input_gives_equal_files(closings: dict[str, Closing], tmp_path: Path) -> None:
+    for name in "ab":
+        plot_shuttle(tmp_path / f"{name}.png", closings)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_drive_that_goes_nowhere_can_be_drawn(tmp_path: Path) -> None:
+    still = closing(0.0, n=2)
+    plot_shuttle(tmp_path / "still.png", {"of another name": still})
+    assert (tmp_path / "still.png").stat().st_size > 0
+
+
+def test_a_folder_that_is_missing_is_named(closings: dict[str, Closing], tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"nowhere/a\.png: cannot be written"):
+        plot_shuttle(tmp_path / "nowhere/a.png", closings)
+    with pytest.raises(ValueError, match="at least one trajectory"):
+        plot_shuttle(tmp_path / "a.png", {})
