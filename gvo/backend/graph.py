@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 
 from gvo.errors import SmoothingError
-from gvo.geometry.validity import is_definite
+from gvo.geometry.se3 import is_definite
 from gvo.types import FloatArray
 
 # Radians and metres: a pose that an update moved farther than the first is updated again, until

@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from gvo.geometry.validity import LAST_ROW, covariance_flaw, is_plain_covariance, is_rigid
+from gvo.geometry import se3
 from gvo.types import Failure, FloatArray, RelativePose
 
 
@@ -134,16 +134,8 @@ def find_fault(result: RelativePose) -> str:
     ):
         if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
             return f"{name} is no array of float64 of shape {shape}"
-    if is_rigid(T) and is_plain_covariance(covariance):
-        return ""
-    for name, array in (("T_reference_current", T), ("the covariance", covariance)):
-        if not np.isfinite(array).all():
-            return f"{name} is not finite"
-    flaw = covariance_flaw(covariance)
-    return _find_fault_of_transform(T) or (f"the covariance is {flaw}" if flaw else "")
-
-
-def _find_fault_of_transform(T: FloatArray) -> str:
-    if T[3].tolist() != LAST_ROW:
-        return "the last row of T_reference_current is not (0, 0, 0, 1)"
-    return "" if is_rigid(T) else "T_reference_current holds no rotation"
+    fault = se3.transform_fault(T)
+    if fault:
+        return f"T_reference_current {fault}"
+    fault = se3.covariance_fault(covariance)
+    return f"the covariance {fault}" if fault else ""

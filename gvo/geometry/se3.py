@@ -1,4 +1,4 @@
-"""Rigid transforms in 3-D, batched over leading dimensions.
+"""Rigid transforms in 3-D and their covariances, batched over leading dimensions.
 
 A twist is (rx, ry, rz, tx, ty, tz); perturbations act on the right:
 T(xi) = T @ exp(xi). This is the order of GTSAM's Pose3.
@@ -11,14 +11,24 @@ doi:10.48550/arXiv.1812.01537.
 
 from __future__ import annotations
 
-from math import atan2, hypot, tan
+from math import atan2, hypot, isfinite, tan
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf
 
-from gvo.types import FloatArray
+from gvo.types import BoolArray, FloatArray
 
 # Radians below which the series of `log` has more digits than its closed form.
 _SMALL_ANGLE = 1e-4
+# The largest deviation of R R^T from the identity, and the largest asymmetry of correlations, that
+# is still rounding.
+_MAX_SKEW = 1e-6
+_LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+# Of correlations: the smallest eigenvalue that is more than rounding.
+_MIN_EIGENVALUE = 1e-12
+# A covariance times this is positive definite where all eigenvalues of its correlations are
+# larger.
+_LESS_DEFINITE = 1.0 - _MIN_EIGENVALUE * np.eye(6)
 
 
 def make_transform(R: FloatArray, t: FloatArray) -> FloatArray:
@@ -241,3 +251,80 @@ def rotation_angle(T: FloatArray) -> FloatArray:
     sine = 0.5 * np.linalg.norm(vee, axis=-1)
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
     return np.asarray(np.arctan2(sine, cosine))
+
+
+def is_rotation(R: FloatArray, *, tolerance: float) -> BoolArray:
+    """Tell which matrices (..., 3, 3) are rotations; the tolerance is that of R R^T."""
+    skews = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray((skews <= tolerance) & (np.linalg.det(R) > 0.0))
+
+
+def is_rigid(T: FloatArray, *, tolerance: float = _MAX_SKEW) -> bool:
+    """Tell whether a matrix (4, 4) is a rigid transform of finite numbers.
+
+    Poses are checked several times per frame: plain numbers take a tenth of the time of numpy's.
+    """
+    # What is not a number fails every comparison.
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last_row = T.tolist()
+    return bool(
+        last_row == _LAST_ROW
+        and isfinite(x + y + z)
+        and abs(a * a + b * b + c * c - 1.0) <= tolerance
+        and abs(d * d + e * e + f * f - 1.0) <= tolerance
+        and abs(g * g + h * h + i * i - 1.0) <= tolerance
+        and abs(a * d + b * e + c * f) <= tolerance
+        and abs(a * g + b * h + c * i) <= tolerance
+        and abs(d * g + e * h + f * i) <= tolerance
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+    )
+
+
+def transform_fault(T: FloatArray, *, tolerance: float = _MAX_SKEW) -> str:
+    """Say why a matrix is no rigid transform (4, 4), to follow its name; empty if it is one."""
+    if T.shape != (4, 4):
+        return f"must have shape (4, 4), got {T.shape}"
+    if is_rigid(T, tolerance=tolerance):
+        return ""
+    if not np.isfinite(T).all():
+        return "is not finite"
+    if T[3].tolist() != _LAST_ROW:
+        return "must have (0, 0, 0, 1) as its last row"
+    return "holds no rotation"
+
+
+def is_definite(symmetric: FloatArray) -> bool:
+    """Tell whether a symmetric matrix of finite numbers is positive definite."""
+    _, failed_minor = dpotrf(symmetric)
+    return bool(failed_minor == 0)
+
+
+def is_plain_covariance(covariance: FloatArray) -> bool:
+    """Tell whether a matrix (6, 6) is finite, exactly symmetric and positive definite.
+
+    One that is symmetric but for rounding is not plain; whether it will do takes longer to tell.
+    """
+    # What is symmetric has the same bytes row by row and column by column. Numbers that are none
+    # pass through LAPACK unnoticed, but not through a sum of squares.
+    return (
+        isfinite(np.vdot(covariance, covariance))
+        and covariance.tobytes() == covariance.tobytes("F")
+        and is_definite(covariance * _LESS_DEFINITE)
+    )
+
+
+def covariance_fault(covariance: FloatArray) -> str:
+    """Say why a matrix (n, n) is no covariance, to follow its name; empty if it is one."""
+    if covariance.shape == (6, 6) and is_plain_covariance(covariance):
+        return ""
+    if not np.isfinite(covariance).all():
+        return "is not finite"
+    variances = np.diag(covariance)
+    if variances.min() <= 0.0:
+        return "is not positive definite"
+    # Of correlations: rounding leaves elements that should be zero at any ratio.
+    sigmas = np.sqrt(variances)
+    correlations = covariance / np.outer(sigmas, sigmas)
+    if np.abs(correlations - correlations.T).max() > _MAX_SKEW:
+        return "is not symmetric"
+    is_sound = np.linalg.eigvalsh(correlations).min() > _MIN_EIGENVALUE
+    return "" if is_sound else "is not positive definite"

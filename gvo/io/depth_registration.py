@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectification_maps
-from gvo.geometry.validity import is_rigid
 from gvo.io.recording import DepthView
 from gvo.types import DepthArray, FloatArray, IntArray
 
@@ -139,8 +139,9 @@ def _close_gaps(painted: DepthArray, square: NDArray[np.uint8]) -> DepthArray:
 
 
 def _check_rigid(T: FloatArray) -> None:
-    if not is_rigid(T):
-        raise ValueError(f"T_color_depth must be a rigid transform, got {T.tolist()}")
+    fault = se3.transform_fault(T)
+    if fault:
+        raise ValueError(f"T_color_depth {fault}, got {T.tolist()}")
 
 
 def _is_done(color: Calibration, view: DepthView) -> bool:

@@ -276,8 +276,7 @@ def _read_euroc(rows: list[Row]) -> Trajectory:
 def _read_kitti(path: Path, rows: list[Row]) -> Trajectory:
     P = read_numbers(rows, slice(0, 12), n_columns=12).reshape(-1, 3, 4)
     M = P[:, :, :3]
-    residuals = np.abs(M @ np.swapaxes(M, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    is_wrong = (residuals > _ROUNDING) | (np.linalg.det(M) <= 0)
+    is_wrong = ~se3.is_rotation(M, tolerance=_ROUNDING)
     refuse(rows, is_wrong, "the first three columns of the pose are no rotation")
     stamps_ns, stamps_from = _kitti_stamps(path, len(rows))
     return Trajectory(

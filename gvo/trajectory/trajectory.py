@@ -262,14 +262,12 @@ def _checked_array(name: str, values: FloatArray, shape: tuple[int, ...]) -> Flo
 
 
 def _check_rigid(poses: FloatArray) -> None:
-    R = poses[:, :3, :3]
-    is_rigid = (
-        np.all(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) < _ROTATION_TOLERANCE, axis=(1, 2))
-        & (np.linalg.det(R) > 0)
-        & np.all(poses[:, 3] == (0.0, 0.0, 0.0, 1.0), axis=1)
-    )
+    is_rigid = se3.is_rotation(poses[:, :3, :3], tolerance=_ROTATION_TOLERANCE)
+    is_rigid &= np.all(poses[:, 3] == (0.0, 0.0, 0.0, 1.0), axis=1)
     if not np.all(is_rigid):
-        raise ValueError(f"T_world_cam[{np.flatnonzero(~is_rigid)[0]}] is no rigid transform")
+        index = int(np.argmin(is_rigid))
+        fault = se3.transform_fault(poses[index], tolerance=_ROTATION_TOLERANCE)
+        raise ValueError(f"T_world_cam[{index}] {fault}")
 
 
 def _unrotated(positions: FloatArray) -> FloatArray:

@@ -62,9 +62,9 @@ def test_wrong_stamps_are_refused(stamps: list[int], match: str) -> None:
     [
         ((1, 0, 3), np.nan, "finite"),
         ((1, 0, 3), np.inf, "finite"),
-        ((1, 0, 0), -1.0, r"\[1\] is no rigid"),
-        ((1, 0, 0), 1.1, r"\[1\] is no rigid"),
-        ((1, 3, 3), 2.0, r"\[1\] is no rigid"),
+        ((1, 0, 0), -1.0, r"\[1\] holds no rotation"),
+        ((1, 0, 0), 1.1, r"\[1\] holds no rotation"),
+        ((1, 3, 3), 2.0, r"\[1\] must have .* last row"),
     ],
 )
 def test_a_matrix_that_is_no_pose_is_refused(

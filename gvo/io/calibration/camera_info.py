@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from gvo.bounded_text import MAX_SHOWN, cut, shortened
 from gvo.errors import CalibrationError
+from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel
 from gvo.io.images import MAX_PIXELS
@@ -134,7 +135,8 @@ def read_numbers(values: object, what: str) -> FloatArray:
 MAX_SIDE_PX = 32767
 """Largest width or height of an image, pixels: what OpenCV rectifies."""
 
-_ROTATION_TOLERANCE = 1e-3
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R R^T from the identity that is the rounding of a file."""
 
 # As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
 _MODELS: dict[str, DistortionModel] = {
@@ -234,18 +236,12 @@ def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibr
         As `make_calibration`, and when R of raw images is not the identity.
     """
     calibration = make_calibration(fields, is_rectified=is_rectified)
-    if not is_rectified and not np.allclose(calibration.R, np.eye(3), atol=_ROTATION_TOLERANCE):
+    if not is_rectified and not np.allclose(calibration.R, np.eye(3), atol=ROTATION_TOLERANCE):
         raise CalibrationError(
             f"{fields.where}: R turns the camera, and depth cannot be turned with it: expected the "
             "identity for an RGB-D camera; give rectified images or a calibration without R"
         )
     return calibration
-
-
-def is_rotation(matrix: FloatArray) -> bool:
-    """Tell whether a matrix of a file, shape (3, 3), is a rotation up to the file's rounding."""
-    is_orthogonal = np.allclose(matrix @ matrix.T, np.eye(3), atol=_ROTATION_TOLERANCE)
-    return bool(is_orthogonal and np.linalg.det(matrix) > 0)
 
 
 def check_camera(calibration: Calibration, where: str) -> None:
@@ -286,7 +282,7 @@ def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
 
 
 def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> None:
-    if not is_rotation(R):
+    if not se3.is_rotation(R, tolerance=ROTATION_TOLERANCE):
         raise CalibrationError(f"{where}: R is no rotation")
     for name, matrix in (("K", K), ("P", P)):
         if not np.allclose(matrix[2, :3], [0.0, 0.0, 1.0], atol=1e-6):

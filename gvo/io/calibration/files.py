@@ -16,9 +16,9 @@ from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import (
+    ROTATION_TOLERANCE,
     CameraFields,
     RegionOfInterest,
-    is_rotation,
     make_calibration,
     make_rgbd_calibration,
     read_numbers,
@@ -294,8 +294,10 @@ def _transform(content: Mapping[Any, Any], key: str, where: str) -> FloatArray |
     if key not in content:
         return None
     T = _array(content, key, (4, 4), where)
-    if not is_rotation(T[:3, :3]) or not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
-        raise CalibrationError(f"{where}: {key} is no rigid transform")
+    T[3] = np.round(T[3], 6)  # programs that invert transforms write their rounding
+    fault = se3.transform_fault(T, tolerance=ROTATION_TOLERANCE)
+    if fault:
+        raise CalibrationError(f"{where}: {key} {fault}")
     return se3.normalize(T)
 
 

@@ -332,12 +332,9 @@ def parse_initial_pose(text: str) -> InitialPose:
 
 def _rigid(name: str, T: FloatArray) -> FloatArray:
     T = np.array(T, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise ValueError(f"{name} must be a finite matrix of shape (4, 4)")
-    R = T[:3, :3]
-    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0
-    if not is_rotation or not np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0)):
-        raise ValueError(f"{name} is no rigid transform")
+    fault = se3.transform_fault(T, tolerance=_ROTATION_TOLERANCE)
+    if fault:
+        raise ValueError(f"{name} {fault}")
     return se3.normalize(T)
 
 

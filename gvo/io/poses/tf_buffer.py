@@ -244,14 +244,14 @@ class TfBuffer:
             Where it is no rigid transform, or a name is empty, or both are the same.
         """
         T = np.array(T_parent_child, dtype=np.float64)
-        R = T[:3, :3]
-        if T.shape != (4, 4) or not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):
-            raise ValueError(f"T_parent_child of {parent} and {child} is no rigid transform")
-        quaternion_xyzw = Rotation.from_matrix(se3.nearest_rotation(R)).as_quat()
+        fault = se3.transform_fault(T, tolerance=_ROTATION_TOLERANCE)
+        if fault:
+            raise ValueError(f"T_parent_child of {parent} and {child} {fault}")
+        quaternion_xyzw = Rotation.from_matrix(se3.nearest_rotation(T[:3, :3])).as_quat()
         pose = (*T[:3, 3].tolist(), *quaternion_xyzw.tolist())
         reason = _fault(bare(parent), bare(child), pose)
-        if reason or np.linalg.det(R) < 0:
-            raise ValueError(f"{parent} -> {child}: {reason or 'a reflection is no rotation'}")
+        if reason:
+            raise ValueError(f"{parent} -> {child}: {reason}")
         self._put(bare(parent), bare(child), stamp_ns, pose, is_static=is_static)
 
     def add_message(self, message: Any, *, is_static: bool = False) -> None:  # noqa: ANN401

@@ -17,7 +17,7 @@ from gvo.bounded_text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.formats import MAX_POSITION_M, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
@@ -26,7 +26,6 @@ COUNTS = ("keypoints", "points", "matches", "inliers", "links", "edges", "reject
 
 _UPPER = np.triu_indices(6)
 _ROUNDING = 1e-2
-_LARGEST_NUMBER = 1e12
 _EXPECTED = "expected a folder that gvo run or gvo smooth wrote"
 
 
@@ -191,23 +190,23 @@ def _read_summary(path: Path) -> dict[str, Any]:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
     if not isinstance(summary, dict):
         raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
-    if not _is_transform(summary.get("T_frame_truth", np.eye(4).tolist())):
-        raise RecordingError(f"{path}: T_frame_truth is no rigid transform; run again")
+    fault = _transform_fault(summary.get("T_frame_truth"))
+    if fault:
+        raise RecordingError(f"{path}: T_frame_truth {fault}; run again")
     return summary
 
 
-def _is_transform(value: object) -> bool:
-    """Tell whether a summary holds four rows of four numbers of a rigid transform, or none."""
+def _transform_fault(value: object) -> str:
+    """Say why what a summary holds is no rigid transform; empty if it is one, or None."""
     if value is None:
-        return True
+        return ""
     try:
         T = np.array(cast(ArrayLike, value), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        return False
-    if T.shape != (4, 4) or not np.all(np.abs(T) < _LARGEST_NUMBER):
-        return False
-    is_rotation = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=_ROUNDING)
-    return bool(is_rotation and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]))
+        return "holds no numbers"
+    if np.any(np.abs(T) > MAX_POSITION_M):
+        return f"holds a number beyond {MAX_POSITION_M:g}"
+    return se3.transform_fault(T, tolerance=_ROUNDING)
 
 
 def _whole_lines(path: Path) -> list[str]:

@@ -350,7 +350,7 @@ def test_a_missing_key_is_named(tmp_path: Path, tiny: Any, key: str) -> None:
         ({"intrinsics": None, "camera_model": "pinhole"}, "lacks image_width"),
         ({"resolution": None}, "resolution must hold 2 numbers, it is missing"),
         ({"resolution": [1280, 480]}, "752x480 and 1280x480"),
-        ({"T_cn_cnm1": [[1.0] * 4] * 4}, "T_cn_cnm1 is no rigid transform"),
+        ({"T_cn_cnm1": [[1.0] * 4] * 4}, "T_cn_cnm1 must have .0, 0, 0, 1. as its last row"),
         ({"T_cn_cnm1": [[1.0, 0.0]]}, "T_cn_cnm1 must hold 16 numbers, got 2"),
         ({"T_cn_cnm1": np.eye(4).tolist()}, "side by side"),
         ({"T_cn_cnm1": None, "T_cam_imu": None}, "the baseline must be positive, got none"),

@@ -106,7 +106,7 @@ def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: An
         ({"distortion_model": "fov", "distortion_coefficients": [0.1]}, "distortion model 'fov'"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics must hold 4"),
         ({"resolution": None}, "resolution must hold"),
-        ({"T_BS": {"data": [1.0] * 16}}, "T_BS is no rigid transform"),
+        ({"T_BS": {"data": [1.0] * 16}}, "T_BS must have .0, 0, 0, 1. as its last row"),
         ({"T_BS": "none"}, "T_BS must hold numbers"),
     ],
 )
