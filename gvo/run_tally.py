@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gvo.backend.ledger import WindowCounts
-from gvo.backend.polish import Polish
+from gvo.backend.batch import Polish
+from gvo.backend.gating import WindowCounts
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, SegmentJoin, Status
 

@@ -9,21 +9,16 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gvo.backend.arrival import ORIGIN, Arrival
-from gvo.backend.checks import find_faults, prior_fault
-from gvo.backend.gating import disagreement
-from gvo.backend.graph import first_line
-from gvo.backend.ledger import Ledger, WindowCounts
-from gvo.backend.members import absence
-from gvo.backend.motion import Motion
-from gvo.backend.polish import Polish
-from gvo.backend.reception import Reception
-from gvo.backend.window_graph import WindowGraph
-from gvo.coasting import StatusClock
+from gvo.backend.batch import Polish
+from gvo.backend.gating import Ledger, Reception, WindowCounts, disagreement
+from gvo.backend.isam2 import first_line
+from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
+from gvo.backend.motion_model import Motion, StatusClock
+from gvo.backend.validation import find_faults, prior_fault
+from gvo.backend.window_graph import ORIGIN, Arrival, WindowGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.keyframe_policy import choose_released, is_needed, proximity
 from gvo.trajectory.g2o import g2o_lines
 from gvo.types import (
     Edge,

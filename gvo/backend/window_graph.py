@@ -3,24 +3,161 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from gvo.backend.arrival import Arrival
-from gvo.backend.checks import place_fault, pose_fault, sane_covariance
+from gvo.backend.batch import Polish, polish
 from gvo.backend.factors import Factors, Measurement
-from gvo.backend.graph import PoseGraph, definite, first_line
-from gvo.backend.members import Member, Members, Tie
-from gvo.backend.polish import Polish, polish
+from gvo.backend.isam2 import PoseGraph, definite, first_line
+from gvo.backend.validation import place_fault, pose_fault, sane_covariance
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, FrameId, GraphEdge, PosePrior, Prior
+from gvo.types import (
+    Edge,
+    Estimate,
+    FloatArray,
+    FrameId,
+    GraphEdge,
+    PosePrior,
+    Prior,
+    Rejected,
+    Status,
+)
 
 _LOGGER = logging.getLogger(__name__)
+
+# Of a first pose without a prior, which defines the world: radians and metres.
+ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
+# Of poses that a smaller window lets go: what they cost together grows with the cube.
+_MAX_LEAVING = 32
+
+
+@dataclass(slots=True, kw_only=True)
+class Arrival:
+    """A pose on its way into the window, with what is usable of its measurements.
+
+    `T_world_references` are the poses of the references at that moment, by their names;
+    `T_world_after` those of the pose and of them once it is in the graph, by their keys. `anchor`
+    and `coasting` hold the pose where the measurements do not; they are none themselves.
+    """
+
+    frame_id: FrameId
+    key: int
+    stamp_ns: int
+    T_world_start: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+    T_world_references: dict[FrameId, gtsam.Pose3] = field(default_factory=dict)
+    T_world_after: dict[int, gtsam.Pose3] = field(default_factory=dict)
+    measurements: list[Measurement] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    rejected: list[Rejected] = field(default_factory=list)
+    anchor: PosePrior | None = None
+    coasting: Edge | None = None
+    is_origin: bool = False
+
+    @property
+    def is_measured(self) -> bool:
+        """Tell whether a measurement ties the pose, or it is the origin."""
+        return bool(self.measurements or self.priors or self.is_origin)
+
+
+class Tie(NamedTuple):
+    """An accepted edge, with the key of its reference and what made its factor: its kernel."""
+
+    edge: Edge
+    factors: Factors
+    reference_key: int
+
+
+@dataclass(slots=True, kw_only=True)
+class Member:
+    """A pose of the window, with what was measured of it.
+
+    Ties to poses that have left since stay among the edges. Each prior comes with what made its
+    factor.
+    """
+
+    key: int
+    stamp_ns: int
+    edges: list[Tie]
+    priors: list[tuple[Prior, Factors]]
+    is_kept: bool = False
+    status: Status = Status.OK
+    causal: Estimate | None = None
+
+
+class Members(dict[FrameId, Member]):
+    """The poses of a window by the caller's names, oldest first."""
+
+    @property
+    def newest(self) -> FrameId:
+        """The newest frame; None where there is none."""
+        return next(reversed(self), None)
+
+    @property
+    def kept(self) -> list[FrameId]:
+        """The kept frames, oldest first."""
+        return [frame_id for frame_id, member in self.items() if member.is_kept]
+
+    def find(self, frame_id: FrameId) -> Member | None:
+        """Return a pose of the window, if it is there.
+
+        Raises
+        ------
+        ValueError
+            Where it can be no name.
+        """
+        try:
+            return self.get(frame_id)
+        except TypeError:
+            raise ValueError(f"a frame_id must be hashable, got {frame_id!r}") from None
+
+    def member(self, frame_id: FrameId) -> Member:
+        """Return a pose of the window.
+
+        Raises
+        ------
+        ValueError
+            Where it is not there.
+        """
+        member = self.find(frame_id)
+        if member is None:
+            raise ValueError(absence(frame_id))
+        return member
+
+    def leaving(self, size: int | None) -> list[FrameId]:
+        """Return who leaves with the next pose: neither recent then, nor kept."""
+        if size is None:
+            return []
+        old = islice(self.items(), max(len(self) + 1 - size, 0))
+        return [frame_id for frame_id, member in old if not member.is_kept][:_MAX_LEAVING]
+
+    def tie_fault(self, frame_id: FrameId, edge: Edge, *, is_new: bool = False) -> str:
+        """Return which end of an edge is not there; empty where both are, or a new pose is one."""
+        if edge.reference_id == frame_id:
+            return "an edge of a pose to itself"
+        ends = [edge.reference_id] if is_new else [edge.reference_id, frame_id]
+        return next((absence(end) for end in ends if end not in self), "")
+
+    def standing_ties(self, member: Member) -> Iterator[Tie]:
+        """Yield the edges of a pose whose references are still in the window.
+
+        A name may have been given again to another pose: the key tells.
+        """
+        for tie in member.edges:
+            reference = self.get(tie.edge.reference_id)
+            if reference is not None and reference.key == tie.reference_key:
+                yield tie
+
+
+def absence(frame_id: FrameId) -> str:
+    """Return what to say of a frame that is not there."""
+    return f"{frame_id!r} is not in the window: it has left, or never was"
 
 
 class WindowGraph:

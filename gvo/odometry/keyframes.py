@@ -8,12 +8,12 @@ from typing import Generic
 import numpy as np
 
 from gvo.backend.gating import disagreement
+from gvo.backend.keyframe_policy import choose_links, proximity
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import ObservationsT
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.keyframe_policy import choose_links, proximity
 from gvo.odometry.chain import RawStep
 from gvo.types import Edge, FloatArray, FrameLink, LinkKind
 

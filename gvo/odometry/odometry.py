@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gvo.backend.keyframe_policy import choose_released, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.descriptor import as_stereo
@@ -19,7 +20,6 @@ from gvo.frontend.protocol import Frontend, Stamped, register_checked, relocaliz
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.keyframe_policy import choose_released, is_needed
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.keyframes import Keyframes, count_steps, judge_links, link_keyframes
 from gvo.odometry.segments import Segments, Sighting

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from gvo.backend.graph import PoseGraph
+from gvo.backend.isam2 import PoseGraph
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3

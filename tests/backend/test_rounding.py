@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.backend.graph import definite, first_line
+from gvo.backend.isam2 import definite, first_line
 from gvo.errors import SmoothingError
 from gvo.types import FloatArray
 

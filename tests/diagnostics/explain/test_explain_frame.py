@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gvo.backend.keyframe_policy import choose_links
 from gvo.config import Config, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import GvoError
@@ -15,7 +16,6 @@ from gvo.geometry import se3
 from gvo.io.frames import frames
 from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.keyframe_policy import choose_links
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
 from gvo.trajectory.trajectory import Trajectory

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gvo.backend.motion import Motion
+from gvo.backend.motion_model import Motion
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.backend.checks import (
+from gvo.backend.validation import (
     covariance_fault,
     find_faults,
     place_fault,

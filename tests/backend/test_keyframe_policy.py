@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gvo.backend.keyframe_policy import choose_links, choose_released, is_needed, proximity
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.keyframe_policy import choose_links, choose_released, is_needed, proximity
 
 twists = st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6).map(np.array)
 

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from gvo.backend.graph import PoseGraph
-from gvo.backend.polish import polish
+from gvo.backend.batch import polish
+from gvo.backend.isam2 import PoseGraph
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.types import FloatArray
