@@ -233,9 +233,8 @@ def _mahalanobis(differences: FloatArray, covariances: FloatArray) -> FloatArray
     # In units of the sigmas, and a trace wider than they: never singular.
     sigmas = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     correlations = covariances / (sigmas[..., :, np.newaxis] * sigmas[..., np.newaxis, :])
-    scaled = differences / sigmas
-    solved = np.linalg.solve(correlations + _TRACE, scaled[..., np.newaxis])[..., 0]
-    return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, axis=-1), 0.0)))
+    squares = se3.mahalanobis(differences / sigmas, correlations + _TRACE)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -253,6 +253,12 @@ def rotation_angle(T: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(sine, cosine))
 
 
+def mahalanobis(xi: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the squared lengths, shape (...), of twists (..., 6) in units of their sigmas."""
+    solved = np.linalg.solve(covariance, xi[..., np.newaxis])[..., 0]
+    return np.asarray(np.sum(xi * solved, axis=-1))
+
+
 def is_rotation(R: FloatArray, *, tolerance: float) -> BoolArray:
     """Tell which matrices (..., 3, 3) are rotations; the tolerance is that of R R^T."""
     skews = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))

@@ -221,4 +221,4 @@ def judge_links(
 def _chi2(edge: Edge, frame_id: int, window: SlidingWindow) -> float:
     T_reference_frame = se3.invert(window.pose(edge.reference_id)) @ window.pose(frame_id)
     residual = se3.log(se3.invert(edge.T_reference_frame) @ T_reference_frame)
-    return float(residual @ np.linalg.solve(edge.covariance, residual))
+    return float(se3.mahalanobis(residual, edge.covariance))

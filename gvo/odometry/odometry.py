@@ -386,7 +386,7 @@ def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
     if not config.zero_motion or not step.is_registered or step.flow_px is None:
         return None
     twist = se3.log(step.T_reference_frame)
-    significance = np.sqrt(twist @ np.linalg.solve(step.covariance, twist))
+    significance = np.sqrt(se3.mahalanobis(twist, step.covariance))
     if step.flow_px > config.zero_motion_flow_px or significance > config.zero_motion_gate:
         return None
     return Edge(

@@ -11,8 +11,6 @@ from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from gvo.geometry import se3
 from gvo.types import Edge, Estimate, FloatArray, SegmentJoin, Status
 
@@ -148,8 +146,7 @@ class Segments:
         T_known_frame = known.T_reference_frame @ edge.T_reference_frame
         found = se3.compose_covariance(known.covariance, edge.T_reference_frame, edge.covariance)
         difference = se3.log(se3.invert(T_seen_frame) @ T_known_frame)
-        distance = difference @ np.linalg.solve(expected + found, difference)
-        return bool(distance <= _AGREEMENT**2)
+        return bool(se3.mahalanobis(difference, expected + found) <= _AGREEMENT**2)
 
     def join(self, stamp_ns: int, reference_ns: int) -> SegmentJoin | None:
         """Join the segment of a frame to that of an earlier one, and to all that are joined to it.

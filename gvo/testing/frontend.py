@@ -243,7 +243,7 @@ def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) 
     rotation, translation = np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])
     if rotation < _NEGLIGIBLE_RAD and translation < _NEGLIGIBLE_M:
         return
-    n_sigmas = float(np.sqrt(max(float(twist @ np.linalg.solve(covariance, twist)), 0.0)))
+    n_sigmas = float(np.sqrt(max(float(se3.mahalanobis(twist, covariance)), 0.0)))
     _require(
         n_sigmas <= _AGREEMENT_SIGMAS,
         f"{name} disagree by {n_sigmas:.1f} sigma of their covariances "

@@ -130,9 +130,8 @@ def _chi2(error: FloatArray, covariances: FloatArray | None) -> float | None:
     """Return the squared Mahalanobis norm of the error of the last pose."""
     if covariances is None:
         return None
-    xi = se3.log(error)
     try:
-        chi2 = float(xi @ np.linalg.solve(covariances[-1], xi))
+        chi2 = float(se3.mahalanobis(se3.log(error), covariances[-1]))
     except np.linalg.LinAlgError:
         return None
     return chi2 if np.isfinite(chi2) else None

@@ -246,3 +246,15 @@ def test_any_number_of_transforms_goes_through_every_function(shape: tuple[int, 
         (se3.covariance_from_ros(se3.adjoint(T), T[..., :3, :3]), (6, 6)),
     ):
         assert found.shape == (*shape, *tail)
+
+
+@given(seeds)
+def test_mahalanobis_lengths_are_those_of_whitened_twists(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    factors = rng.normal(size=(3, 6, 6)) + 3.0 * np.eye(6)
+    whitened = rng.normal(size=(3, 6))
+    twists = (factors @ whitened[..., np.newaxis])[..., 0]
+    covariances = factors @ np.swapaxes(factors, 1, 2)
+    squares = np.sum(whitened**2, axis=1)
+    np.testing.assert_allclose(se3.mahalanobis(twists, covariances), squares, rtol=1e-6)
+    np.testing.assert_allclose(se3.mahalanobis(twists[1], covariances[1]), squares[1], rtol=1e-6)

@@ -256,13 +256,12 @@ def consistency(truth: Trajectory, estimate: Trajectory, *, name: str) -> Consis
     errors, covariances = errors[is_usable], covariances[is_usable]
     if len(errors) == 0:
         return None
-    whitened = np.linalg.solve(covariances, errors[..., np.newaxis])[..., 0]
     return Consistency(
         name=name,
         stamps_ns=est.stamps_ns[1:][is_usable],
         errors=errors,
         sigmas=np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
-        nees=np.einsum("ni,ni->n", errors, whitened),
+        nees=se3.mahalanobis(errors, covariances),
     )
 
 
