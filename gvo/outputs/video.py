@@ -13,7 +13,6 @@ import numpy as np
 
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.images import encode_png
-from gvo.outputs.webm import PERIOD_NS, finish_webm
 from gvo.types import ImageArray
 
 CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
@@ -24,9 +23,12 @@ _FALLBACK_HZ = 10.0
 _SLOWEST_HZ, _FASTEST_HZ = 0.1, 240.0
 # OpenCV takes no option of the encoder. libvpx encodes five times as fast, about as well, where
 # a frame is shown for no less than the time that FFmpeg grants it to encode one: a second.
-_VP8_HZ = 1e9 / PERIOD_NS
-# As WebM, OpenCV complains on the error stream that VP80 is no name of a codec there.
+_VP8_HZ = 1.0
+# OpenCV complains on the error stream where it writes VP8 to WebM, but not to Matroska, of which
+# WebM is a part: only the name of the format in the header differs. An empty element fills up.
 _CONTAINERS = {".webm": ".mkv", ".mp4": ".mp4"}
+_MATROSKA = b"\x42\x82\x88matroska"
+_WEBM = b"\x42\x82\x84webm\xec\x82\x00\x00"
 
 
 class PictureSink(Protocol):
@@ -95,7 +97,7 @@ class Film:
     def __init__(self, path: Path, rate_hz: float | None = None) -> None:
         self.path = path
         self.decisions: tuple[str, ...] = ()
-        self._rate_hz = rate_hz
+        self._rate_hz = rate_hz or 0.0  # unknown
         self._waiting: list[ImageArray] = []
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
@@ -103,6 +105,7 @@ class Film:
         with _refused_on_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
+        self._is_vp8 = path.suffix.lower() == ".webm"
         self._part = Path(self._folder.name) / f"film{_CONTAINERS[path.suffix.lower()]}"
 
     def add(self, picture: ImageArray, stamp_ns: int) -> None:
@@ -130,10 +133,11 @@ class Film:
             raise ValueError(f"expected a picture of {self._size}, got {size}")
         if self._writer is not None:
             self._writer.write(picture)
+            self._n += 1
             return
         self._waiting.append(picture)
         self._stamps_ns.append(stamp_ns)
-        if self._rate_hz is not None or len(self._waiting) > _N_PERIODS:
+        if self._rate_hz or len(self._waiting) > _N_PERIODS:
             self._begin()
 
     def close(self) -> None:
@@ -150,24 +154,42 @@ class Film:
             if self._writer is None:
                 return
             self._writer.release()
-            if self._part.suffix == ".mkv":
-                finish_webm(self._part, round(1e9 / self._known_rate()))
+            if self._is_vp8:
+                self._retime()
             self._part.rename(self.path)
 
     def _begin(self) -> None:
-        self._rate_hz = self._known_rate()
-        is_vp8 = self._part.suffix == ".mkv"
-        rate_hz = _VP8_HZ if is_vp8 else self._rate_hz
-        writer = _open_writer(self._part, CODECS[self.path.suffix.lower()], rate_hz, self._size)
+        self._rate_hz = self._rate_hz or rate_of(self._stamps_ns)
+        self._writer = self._open(self._part, _VP8_HZ if self._is_vp8 else self._rate_hz)
+        for picture in self._waiting:
+            self._writer.write(picture)
+        self._n = len(self._waiting)
+        self._waiting.clear()
+
+    def _open(self, path: Path, rate_hz: float, *, is_encoded: bool = False) -> cv2.VideoWriter:
+        codec = CODECS[self.path.suffix.lower()]
+        writer = _open_writer(path, codec, rate_hz, self._size, is_encoded=is_encoded)
         if writer is None:
             raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
-        for picture in self._waiting:
-            writer.write(picture)
-        self._waiting.clear()
-        self._writer = writer
+        return writer
 
-    def _known_rate(self) -> float:
-        return rate_of(self._stamps_ns) if self._rate_hz is None else self._rate_hz
+    def _retime(self) -> None:
+        """Copy what was encoded, at the rate of the film, as WebM."""
+        encoded, self._part = self._part, self._part.with_stem("timed")
+        packets = cv2.VideoCapture(str(encoded), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        writer = self._open(self._part, self._rate_hz, is_encoded=True)
+        n = 0
+        while (answer := packets.read())[0]:
+            writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, packets.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+            writer.write(answer[1])
+            n += 1
+        writer.release()
+        if n != self._n:
+            raise RecordingError(f"{self.path}: was not written whole: {n} of {self._n} frames")
+        with self._part.open("r+b") as stream:
+            header = stream.read(64)
+            stream.seek(0)
+            stream.write(header.replace(_MATROSKA, _WEBM))
 
 
 class PngFolder:
@@ -242,11 +264,12 @@ def _even(picture: ImageArray) -> ImageArray:
 
 
 def _open_writer(
-    path: Path, codec: str, rate_hz: float, size: tuple[int, int]
+    path: Path, codec: str, rate_hz: float, size: tuple[int, int], *, is_encoded: bool = False
 ) -> cv2.VideoWriter | None:
+    options = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1] if is_encoded else []
     with _quiet_opencv():
         fourcc = cv2.VideoWriter.fourcc(*codec)
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size)
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size, options)
     return writer if writer.isOpened() else None
 
 
@@ -268,5 +291,3 @@ def _refused_on_error(path: Path) -> Iterator[None]:
     except OSError as error:
         detail = error.strerror or error
         raise RecordingError(f"{path}: cannot be written: {detail}") from error
-    except ValueError as error:
-        raise RecordingError(f"{path}: was not written whole: {error}") from error

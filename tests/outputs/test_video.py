@@ -3,8 +3,8 @@
 import os
 import subprocess
 import sys
-import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +14,6 @@ import gvo
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.outputs import video
 from gvo.outputs.video import Film, PngFolder, open_sink
-from gvo.outputs.webm import finish_webm
 from gvo.types import ImageArray
 
 _SUFFIXES = pytest.mark.parametrize("suffix", [".webm", ".mp4"])
@@ -69,7 +68,7 @@ def test_a_film_plays_as_fast_as_its_pictures_were_taken(
     stamps_ms = []
     while capture.grab():
         stamps_ms.append(capture.get(cv2.CAP_PROP_POS_MSEC))
-    np.testing.assert_allclose(np.diff(stamps_ms), 1e3 / rate_hz, rtol=2e-3, atol=0.5)
+    np.testing.assert_allclose(np.diff(stamps_ms), 1e3 / rate_hz, rtol=2e-3, atol=1.0)
 
 
 def test_a_gap_in_the_stamps_does_not_change_the_rate(tmp_path: Path) -> None:
@@ -105,32 +104,23 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
     film.close()
 
 
-def test_a_webm_file_says_so_and_its_checksums_hold(tmp_path: Path) -> None:
+def test_a_webm_file_says_so(tmp_path: Path) -> None:
     path = tmp_path / "film.webm"
     _write(path)
-    data = path.read_bytes()
-    assert b"\x42\x82\x84webm" in data[:64]
-    assert b"matroska" not in data[:64]
-    for name in (b"\x15\x49\xa9\x66", b"\x16\x54\xae\x6b", b"\x12\x54\xc3\x67"):
-        # the first mention is in the index of the file; here the sum follows a size of a byte
-        place = data.index(b"\xbf\x84", data.rindex(name, 0, 1000)) - 1
-        master = data[place + 1 :][: data[place] & 0x7F]
-        assert int.from_bytes(master[2:6], "little") == zlib.crc32(master[6:])
+    header = path.read_bytes()[:64]
+    assert b"\x42\x82\x84webm" in header
+    assert b"matroska" not in header
 
 
-def test_what_is_no_matroska_file_is_not_changed(tmp_path: Path) -> None:
-    for data in (b"", b"\x00" * 100, b"RIFF....WEBPVP8 " * 20, _cut(tmp_path)):
-        path = tmp_path / "other"
-        path.write_bytes(data)
-        with pytest.raises(ValueError, match="its beginning is not that of"):
-            finish_webm(path, 10**8)
-        assert path.read_bytes() == data
-
-
-def _cut(tmp_path: Path) -> bytes:
-    """Return what is left of a film where the disk was full at once."""
-    _write(tmp_path / "whole.mp4")
-    return (tmp_path / "whole.mp4").read_bytes()[:90]
+def test_a_film_that_was_not_written_whole_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = Film(tmp_path / "film.webm")
+    film.add(_picture(80), 0)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: SimpleNamespace(read=lambda: (False, None)))
+    with pytest.raises(RecordingError, match=r"film\.webm: was not written whole: 0 of 1 frames"):
+        film.close()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_existing_files_other_suffixes_and_full_folders_are_refused(tmp_path: Path) -> None:
