@@ -12,34 +12,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.types import (
-    Estimate,
-    FloatArray,
-    FrameLink,
-    FrameResult,
-    ImageArray,
-    IntArray,
-    Rejected,
-    RelativePose,
-    SegmentJoin,
-    Status,
-)
+from gvo.types import Estimate, FloatArray, FrameResult, ImageArray, IntArray
 from gvo.view.clouds import Cloud, KeyframeClouds, put_together
+from gvo.view.disk_list import DiskList
 from gvo.view.moments import Entry, Moment
-from gvo.view.spool import Spool
 
 # Stamps (n,) in nanoseconds, ascending, and positions (n, 3) in the world, metres.
 Path: TypeAlias = tuple[IntArray, FloatArray]
 
 _JPEG_QUALITY = 85
-# What an entry is made of.
-_KINDS = (Entry, Estimate, FrameLink, FrameResult, Rejected, RelativePose, SegmentJoin, Status)
 
 
 class History:
     """The frames that were done, and the paths up to the one that is shown.
 
-    Poses lie in memory, all else in an unnamed temporary file. It may be asked from any thread.
+    Poses and counts lie in memory, pictures, points and the poses of the window in a temporary
+    file. It may be asked from any thread.
 
     Parameters
     ----------
@@ -50,9 +38,10 @@ class History:
     def __init__(self, first_index: int = 0) -> None:
         self.first_index = first_index
         self._shown = first_index - 1
-        self._spool = Spool(_KINDS)
+        self._arrays = DiskList()
         self._lock = RLock()
-        self._stamps_ns: list[int] = []
+        # By frame: stamp, result and reason.
+        self._told: list[tuple[int, FrameResult | None, str]] = []
         self._latest: tuple[int, Entry] | None = None
         # By frame with a pose: index and stamp, and the poses; by smoothed pose: when and of what.
         self._tracked = _Rows(2, np.int64)
@@ -66,7 +55,7 @@ class History:
     @property
     def n_done(self) -> int:
         """Frames that are done: the index of the last one, and 1."""
-        return self.first_index + len(self._spool)
+        return self.first_index + len(self._told)
 
     @property
     def shown(self) -> int:
@@ -77,14 +66,14 @@ class History:
         """Write down the next frame; it is not shown yet."""
         index = self.n_done
         with self._lock:
-            self._spool.append(
-                replace(entry, image=_encode(entry.image), overlay=_encode(entry.overlay))
-            )
-            self._stamps_ns.append(entry.stamp_ns)
-            self._latest = index, entry
-            if entry.result is None:
-                return
+            self._arrays.append(_arrays_of(entry))
             result = entry.result
+            if result is not None:
+                result = replace(result, registration=None)
+            self._told.append((entry.stamp_ns, result, entry.reason))
+            self._latest = index, replace(entry, result=result)
+            if result is None:
+                return
             self._tracked.append((index, entry.stamp_ns))
             self._raw.append(result.raw.T_world_cam.ravel())
             self._causal.append(result.causal.T_world_cam.ravel())
@@ -117,7 +106,7 @@ class History:
     def stamp_ns(self, index: int) -> int:
         """Return the stamp of a frame that is done, nanoseconds."""
         self._check(index)
-        return self._stamps_ns[index - self.first_index]
+        return self._told[index - self.first_index][0]
 
     def moment(self, index: int | None = None, *, fault: str = "") -> Moment:
         """Return all that is known of a frame.
@@ -193,9 +182,8 @@ class History:
     def _entry(self, index: int) -> Entry:
         self._check(index)
         if self._latest is None or self._latest[0] != index:
-            entry: Entry = self._spool[index - self.first_index]
-            image, overlay = _decode(entry.image), _decode(entry.overlay)
-            self._latest = index, replace(entry, image=image, overlay=overlay)
+            row = index - self.first_index
+            self._latest = index, _entry_of(*self._told[row], self._arrays[row])
         return self._latest[1]
 
     def _n_tracked(self, index: int) -> int:
@@ -245,6 +233,34 @@ class _Rows:
     @property
     def rows(self) -> NDArray[Any]:
         return self._array[: self._n]
+
+
+def _arrays_of(entry: Entry) -> dict[str, NDArray[Any]]:
+    return {
+        "image": _encode(entry.image),
+        "overlay": _encode(entry.overlay),
+        "points": entry.cloud[0],
+        "colours": entry.cloud[1],
+        "window_ns": np.array(list(entry.window_poses), dtype=np.int64),
+        "poses": np.array(list(entry.window_poses.values())),
+        "covariances": np.array(list(entry.window_covariances.values())),
+    }
+
+
+def _entry_of(
+    stamp_ns: int, result: FrameResult | None, reason: str, arrays: dict[str, NDArray[Any]]
+) -> Entry:
+    window_ns = arrays["window_ns"].tolist()
+    return Entry(
+        stamp_ns=stamp_ns,
+        result=result,
+        reason=reason,
+        image=_decode(arrays["image"]),
+        overlay=_decode(arrays["overlay"]),
+        cloud=(arrays["points"], arrays["colours"]),
+        window_poses=dict(zip(window_ns, arrays["poses"], strict=True)),
+        window_covariances=dict(zip(window_ns, arrays["covariances"], strict=True)),
+    )
 
 
 def _encode(image: ImageArray) -> ImageArray:

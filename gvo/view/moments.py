@@ -24,7 +24,7 @@ class Moment:
     stamp_ns : int
         Of the frame, nanoseconds.
     result : FrameResult or None
-        None for a faulty frame.
+        None for a faulty frame; without `registration`, whose pictures and points are here.
     reason : str
         Why there is no pose, or no registration; empty where there are.
     image, overlay : ndarray of uint8, shape (height, width, 3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
+from hypothesis.extra.numpy import array_shapes, arrays
 
 from gvo.config import DepthConfig
 from gvo.geometry import se3
@@ -23,9 +23,9 @@ from gvo.types import (
 )
 from gvo.view import clouds
 from gvo.view.clouds import Cloud, KeyframeClouds, frame_cloud, put_together, thin
+from gvo.view.disk_list import DiskList
 from gvo.view.history import History
 from gvo.view.moments import Entry
-from gvo.view.spool import Spool
 
 CAMERA = PinholeCamera(fx=100.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 POINT: Cloud = (
@@ -67,7 +67,7 @@ def entry(frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...]
         overlay=np.full((12, 16, 3), 30 * frame % 256, dtype=np.uint8),
         cloud=POINT,
         window_poses={10 * held: at(held + 0.3) for held in window},
-        window_covariances={},
+        window_covariances={10 * held: np.eye(6) * held for held in window},
     )
 
 
@@ -130,6 +130,9 @@ def test_moments_come_back_from_disk_as_they_were(history: History) -> None:
         assert moment.result is not None
         assert moment.result.raw.T_world_cam[0, 3] == frame + 0.1
         np.testing.assert_array_equal(moment.cloud_cam, POINT[0])
+        assert set(moment.window_poses) == set(moment.window_covariances)
+        assert all(moment.window_poses[ns][0, 3] == ns / 10 + 0.3 for ns in moment.window_poses)
+        assert all(c[0, 0] == ns / 10 for ns, c in moment.window_covariances.items())
     fault = history.moment(4, fault="told")
     assert (fault.result, fault.status, fault.reason, fault.fault) == (None, None, "dark", "told")
     assert fault.keyframes == ()
@@ -244,15 +247,36 @@ def test_the_clouds_of_many_keyframes_are_bounded(monkeypatch: pytest.MonkeyPatc
     assert len(put_together(placed)[0]) <= len(kept)
 
 
-def test_a_spool_gives_back_what_it_was_given() -> None:
-    spool = Spool()
-    values = [np.arange(n) for n in (0, 5, 1000)]
-    for value in values:
-        spool.append({"value": value})
-    for index in (2, 0, 1):
-        np.testing.assert_array_equal(spool[index]["value"], values[index])
-    with pytest.raises(IndexError, match="3 is not among 3 values"):
-        spool[3]
+named_arrays = st.dictionaries(
+    st.sampled_from(["image", "overlay", "poses"]),
+    arrays(
+        st.sampled_from(["<f8", "<f4", "<i8", "|u1", "|b1", ">i4"]).map(np.dtype),
+        array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+    ),
+)
+
+
+@given(st.lists(named_arrays, max_size=4))
+def test_a_list_on_disk_gives_back_what_it_was_given(items: list[dict[str, np.ndarray]]) -> None:
+    kept = DiskList()
+    for item in items:
+        kept.append(item)
+    assert len(kept) == len(items)
+    for index in reversed(range(len(items))):
+        assert list(kept[index]) == list(items[index])
+        for name, array in items[index].items():
+            back = kept[index][name]
+            assert (back.dtype, back.shape) == (array.dtype, array.shape)
+            assert back.tobytes() == array.tobytes()
+    with pytest.raises(IndexError, match=f"{len(items)} is not among {len(items)} items"):
+        kept[len(items)]
+
+
+def test_a_list_on_disk_takes_no_python_objects() -> None:
+    kept = DiskList()
+    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
+        kept.append({"value": np.array([object()])})
+    assert len(kept) == 0
 
 
 def test_the_player_needs_no_browser_page() -> None:
