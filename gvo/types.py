@@ -10,8 +10,8 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo._html import estimate_html
 from gvo.config import Kernel
-from gvo.representations.values import estimate_html
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -458,7 +458,7 @@ class Estimate:
         _freeze(self, "T_world_cam", "covariance")
 
     def _repr_html_(self) -> str:
-        """Return a table and the ellipse of the position from above, for notebooks."""
+        """Return a table for notebooks."""
         return estimate_html(
             self.stamp_ns, self.T_world_cam, self.covariance, status=self.status.value
         )

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from gvo._html import trajectory_html
 from gvo.geometry import se3
-from gvo.representations.values import trajectory_html
 from gvo.types import Estimate, FloatArray, IntArray
 
 StampsFrom = Literal["file", "times", "rows", "topic"]
@@ -117,7 +117,7 @@ class Trajectory:
         return len(self.stamps_ns)
 
     def _repr_html_(self) -> str:
-        """Return a table and the path from above, for notebooks."""
+        """Return a table for notebooks."""
         return trajectory_html(
             self.stamps_ns,
             self.T_world_cam,

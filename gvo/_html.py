@@ -1,4 +1,4 @@
-"""Trajectories and estimates as HTML: a table, and a drawing beside it."""
+"""Trajectories and estimates as HTML tables for notebooks."""
 
 from __future__ import annotations
 
@@ -9,15 +9,9 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.representations.drawings import ellipse_drawing, path_drawing
-
 _FloatArray = NDArray[np.float64]
 
-_FLAT = 0.05
 _LARGE = 1e9  # written with an exponent from here
-_STYLE = (
-    "display:flex;flex-wrap:wrap;gap:1.5em;align-items:center;font-variant-numeric:tabular-nums"
-)
 _CELL = "text-align:left;padding:0.1em 0.8em 0.1em 0"
 
 
@@ -45,7 +39,7 @@ def trajectory_html(
     Returns
     -------
     str
-        HTML: a table, and the path from above.
+        HTML.
     """
     n, positions = len(stamps_ns), poses[:, :3, 3]
     rows = [("poses", f"{n:,}" if has_rotations else f"{n:,}, positions only")]
@@ -59,11 +53,7 @@ def trajectory_html(
         rows.append(("path length", metres(float(np.sum(steps)))))
     rows.append(("extent x, y, z", ", ".join(metres(float(extent)) for extent in extents)))
     rows.append(("covariances", "yes" if has_covariances else "none"))
-    is_camera = has_rotations and np.allclose(poses[0], np.eye(4), atol=1e-3)
-    horizontal, vertical = _seen_axes(extents, is_camera=is_camera)
-    axes = ("xyz"[horizontal], "xyz"[vertical])
-    drawing = path_drawing(positions[:, [horizontal, vertical]], axes=axes)
-    return card("Trajectory", rows, drawing)
+    return card("Trajectory", rows)
 
 
 def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, status: str) -> str:
@@ -83,39 +73,30 @@ def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, 
     Returns
     -------
     str
-        HTML: a table, and the ellipses of the position along x and z of the world.
+        HTML.
     """
     rows = [("status", status), ("stamp", f"{_seconds(stamp_ns)} s")]
     if pose.shape != (4, 4) or covariance.shape != (6, 6):
         return card("Estimate", rows)
     R, positions = pose[:3, :3], pose[:3, 3]
     with np.errstate(invalid="ignore", over="ignore"):
-        covariance_world = R @ covariance[3:, 3:] @ R.T
-        position_sigmas = np.sqrt(np.diag(covariance_world))
+        position_sigmas = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
         rotation_sigmas = np.degrees(np.sqrt(np.diag(covariance)[:3]))
     rows += [
         ("position x, y, z [m]", vector(positions, position_sigmas)),
         ("rotation vector [deg]", vector(_rotation_vector_deg(R), rotation_sigmas)),
     ]
-    ground = covariance_world[np.ix_([0, 2], [0, 2])]
-    return card("Estimate", rows, ellipse_drawing(ground, axes=("x", "z")))
+    return card("Estimate", rows)
 
 
-def card(title: str, rows: Iterable[tuple[str, str]], drawing: str = "") -> str:
-    """Return a title, a table of names and values, and a drawing beside it.
+def card(title: str, rows: Iterable[tuple[str, str]]) -> str:
+    """Return a title above a table of names and values, as HTML that is well-formed XML.
 
     Parameters
     ----------
     title : str
     rows : iterable of (str, str)
         Names and values as text; escaped here.
-    drawing : str
-        An SVG element; nothing where empty.
-
-    Returns
-    -------
-    str
-        One HTML element, also well-formed as XML.
 
     Examples
     --------
@@ -128,8 +109,10 @@ def card(title: str, rows: Iterable[tuple[str, str]], drawing: str = "") -> str:
         for name, value in rows
     )
     table = f'<table style="color:inherit">{lines}</table>' if lines else ""
-    heading = f"<strong>{escape(title)}</strong>"
-    return f'<div style="{_STYLE}"><div>{heading}{table}</div>{drawing}</div>'
+    return (
+        '<div style="font-variant-numeric:tabular-nums">'
+        f"<strong>{escape(title)}</strong>{table}</div>"
+    )
 
 
 def metres(value: float) -> str:
@@ -177,18 +160,6 @@ def _rows_of_stamps(first_ns: int, last_ns: int, n: int) -> list[tuple[str, str]
 def _seconds(stamp_ns: int) -> str:
     seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
-
-
-def _seen_axes(extents: _FloatArray, *, is_camera: bool) -> tuple[int, int]:
-    """Return the axes to look at: x and z of a camera's world, else the two of most motion.
-
-    A world as flat along z as that of a robot is none of a camera, wherever it begins.
-    """
-    if is_camera and extents[2] >= _FLAT * extents[1]:
-        return 0, 2
-    least = 2 - int(np.argmin(extents[::-1]))  # of equal ones the last, as z in most worlds
-    horizontal, vertical = (axis for axis in range(3) if axis != least)
-    return horizontal, vertical
 
 
 def _rotation_vector_deg(R: _FloatArray) -> _FloatArray:

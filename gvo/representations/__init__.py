@@ -1,1 +1,0 @@
-"""What notebooks show of values: HTML with small drawings, as strings."""
