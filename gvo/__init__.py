@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from gvo.errors import GvoError
     from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
-    from gvo.io.convert.bag_writer import convert
-    from gvo.io.convert.convert import convert_recording
+    from gvo.io.convert.convert import convert
     from gvo.io.excerpt import Excerpt
     from gvo.io.frames import frames
     from gvo.io.opening import RecordingOptions, open_recording
@@ -51,8 +50,7 @@ _MODULES = {
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry.odometry": ("Odometry",),
-    "gvo.io.convert.bag_writer": ("convert",),
-    "gvo.io.convert.convert": ("convert_recording",),
+    "gvo.io.convert.convert": ("convert",),
     "gvo.viz.plots": ("plot_trajectories",),
     "gvo.io.poses.inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
     "gvo.run_outputs": ("RunOutputs",),
@@ -115,7 +113,6 @@ __all__ = [
     "asked_truth",
     "choose_frame",
     "convert",
-    "convert_recording",
     "evaluate",
     "format_evaluations",
     "frames",
@@ -137,4 +134,4 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     """List the public names."""
-    return sorted([*globals(), *_MODULE_OF])
+    return sorted(__all__)

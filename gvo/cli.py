@@ -378,8 +378,8 @@ def compare(
         )
 
 
-@app.command()
-def convert(
+@app.command("convert")
+def convert_(
     recordings: Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
@@ -396,14 +396,14 @@ def convert(
     set_: Settings = None,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
-    from gvo.io.convert.convert import convert_recording
+    from gvo.io.convert.convert import convert
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     topics = {"left": left, "right": right, "color": color, "depth": depth}
     settings = load(config, set_)
     source = open_source(recordings, settings, calibration, topics)
     with interruptible() as check:
-        written = convert_recording(
+        written = convert(
             source,
             target,
             layout=None if layout is None else layout.value,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.bag_writer import write_bag
 from gvo.io.opening import open_recording
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_tally import Progress
@@ -38,7 +38,7 @@ def write_demo_bag(path: Path, *, progress: Callable[[int], None] | None = None)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
     drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
-    convert(drive, path, progress=progress)
+    write_bag(drive, path, progress=progress)
 
 
 def run_demo(

@@ -25,7 +25,7 @@ def main() -> int:
     parser.add_argument("--png", action="store_true", help="compress the images of a bag")
     arguments = parser.parse_args()
 
-    written = gvo.convert_recording(
+    written = gvo.convert(
         gvo.open_recording(arguments.recording),
         arguments.target,
         layout=arguments.layout,

@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.geometry.camera import Calibration, stereo_camera
 from gvo.geometry.lens import DistortionModel
-from gvo.io.convert.bag_writer import convert
-from gvo.io.convert.convert import convert_recording
+from gvo.io.convert.convert import convert
 from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
@@ -295,7 +294,7 @@ def test_behind_a_lens_and_rectified_anew_the_motion_is_the_same(
 ) -> None:
     convert(RawPair(_STEREO, model), tmp_path / "raw.bag")
     raw = gvo.open_recording(tmp_path / "raw.bag")
-    convert_recording(raw, tmp_path / "euroc")
+    convert(raw, tmp_path / "euroc")
     anew = gvo.open_recording(tmp_path / "euroc")
     # R and P are others: each is measured against the truth of its own rectified camera.
     assert not np.allclose(anew.info.calibrations[0].P, raw.info.calibrations[0].P, atol=1e-3)

@@ -11,7 +11,7 @@ import pytest
 
 import gvo
 from gvo.config import load_configuration
-from gvo.io.convert.convert import convert_recording
+from gvo.io.convert.convert import convert
 from gvo.io.convert.folder_writer import Layout
 from gvo.io.synthetic.recording import SyntheticRecording
 
@@ -152,12 +152,12 @@ def test_the_kind_of_file_changes_no_bit(
 ) -> None:
     folder = tmp_path / "folder" / "walk"
     folder.parent.mkdir()
-    convert_recording(recordings[sensor], folder, layout=layout)
+    convert(recordings[sensor], folder, layout=layout)
     found = {"folder": run(folder, tmp_path / "of_folder")}
     for ending in ("bag", "mcap", "db3"):
         bag = tmp_path / ending / f"walk.{ending}"
         bag.parent.mkdir()
-        convert_recording(gvo.open_recording(folder), bag)
+        convert(gvo.open_recording(folder), bag)
         found[ending] = run(bag, tmp_path / f"of_{ending}")
     assert differing(found["bag"], found["mcap"]) == []
     assert differing(found["db3"], found["mcap"]) == []

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import gvo
-from gvo.io.convert.convert import convert_recording
+from gvo.io.convert.convert import convert
 from gvo.io.recording import RecordingInfo
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
@@ -377,8 +377,8 @@ def test_a_recording_cannot_choose_where_it_is_written(
     outputs = gvo.RunOutputs(report=False)
     result = gvo.run_recording(source, parent / "out", outputs=outputs)
     assert result.summary["recording"] == name
-    convert_recording(source, parent / "folder", layout="euroc")
-    convert_recording(source, parent / "walk.db3")
+    convert(source, parent / "folder", layout="euroc")
+    convert(source, parent / "walk.db3")
     assert {path.parts[:3] for path in everything(tmp_path)} <= {
         ("a",),
         ("a", "b"),

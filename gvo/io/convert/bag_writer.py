@@ -186,7 +186,7 @@ _SUFFIXES = (".bag", ".mcap", ".db3", "")
 _Progress: TypeAlias = Callable[[int], None]
 
 
-def convert(
+def write_bag(
     source: Source,
     path: str | Path,
     *,

@@ -9,14 +9,14 @@ from typing import Literal
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.bag.source import BagSource
-from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.bag_writer import write_bag
 from gvo.io.convert.common import Conversion
 from gvo.io.convert.folder_writer import Layout, write_folder
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import Source
 
 
-def convert_recording(
+def convert(
     source: Source,
     path: str | Path,
     *,
@@ -61,7 +61,7 @@ def convert_recording(
         not path.suffix and isinstance(source, BagSource) if layout is None else (layout != "bag")
     )
     if not is_folder:
-        return convert(source, path, rectify=rectify, compress=compress, progress=progress)
+        return write_bag(source, path, rectify=rectify, compress=compress, progress=progress)
     if path.suffix in BAG_SUFFIXES:
         raise RecordingError(
             f"{path}: --layout {layout} makes a folder, expected no name of a bag; leave "

@@ -9,7 +9,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from gvo.errors import RecordingError
-from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.bag_writer import write_bag
 from gvo.io.images import encode_png
 from gvo.io.opening import open_recording
 from tests.io.conftest import Item, Tiny
@@ -33,7 +33,7 @@ def test_png_images_are_what_opencv_decodes(
 ) -> None:
     images = [tiny.texture(n, is_color=is_color) for n in range(4)]
     items: list[Item] = [(n % 2, 10 + n // 2, pixels) for n, pixels in enumerate(images)]
-    convert(tiny.stereo(items), tmp_path / name, compress=True)
+    write_bag(tiny.stereo(items), tmp_path / name, compress=True)
     for side, mine in (("left", images[::2]), ("right", images[1::2])):
         messages = _messages(tmp_path / name, f"/stereo/{side}/image_rect/compressed")
         for message, pixels in zip(messages, mine, strict=True):
@@ -62,7 +62,7 @@ def test_depth_comes_back_bit_by_bit_whatever_the_later_images_hold(
         for n, depth in enumerate(depths)
         for item in ((0, 10 + n, tiny.texture(n)), (1, 10 + n, depth))
     ]
-    written = convert(tiny.rgbd(items), tmp_path / name, compress=True)
+    written = write_bag(tiny.rgbd(items), tmp_path / name, compress=True)
     assert written.skipped == ()
     read = [image.load() for image in open_recording(tmp_path / name).images() if image.stream]
     for depth, expected in zip(read, depths, strict=True):
@@ -81,7 +81,7 @@ def test_depth_that_is_not_of_millimetres_stays_as_it_is(
 ) -> None:
     fault = RecordingError("depth.png: damaged")
     items: list[Item] = [(0, 1, tiny.texture(0)), (1, 1, fault), (0, 2, tiny.texture(1))]
-    convert(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
+    write_bag(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
     (message,) = _messages(tmp_path / name, "/camera/depth/image")
     assert message.encoding == "32FC1"
 

@@ -6,7 +6,7 @@ import pytest
 
 from gvo.errors import RecordingError
 from gvo.io.bag.source import BagSource
-from gvo.io.convert.convert import convert_recording
+from gvo.io.convert.convert import convert
 from gvo.io.datasets.euroc import EurocSource
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
@@ -24,38 +24,38 @@ def _rgbd(tiny: Tiny) -> ListSource:
 
 
 def test_a_folder_without_a_suffix_is_the_other_kind(tiny: Tiny, tmp_path: Path) -> None:
-    convert_recording(_pair(tiny), tmp_path / "bag")
+    convert(_pair(tiny), tmp_path / "bag")
     bag = open_recording(tmp_path / "bag")
     assert isinstance(bag, BagSource)
-    convert_recording(bag, tmp_path / "kitti")
+    convert(bag, tmp_path / "kitti")
     assert isinstance(open_recording(tmp_path / "kitti"), KittiSource)
-    convert_recording(_rgbd(tiny), tmp_path / "rgbd.mcap")
-    convert_recording(open_recording(tmp_path / "rgbd.mcap"), tmp_path / "tum")
+    convert(_rgbd(tiny), tmp_path / "rgbd.mcap")
+    convert(open_recording(tmp_path / "rgbd.mcap"), tmp_path / "tum")
     assert isinstance(open_recording(tmp_path / "tum"), TumSource)
 
 
 def test_the_layout_decides_where_it_is_given(tiny: Tiny, tmp_path: Path) -> None:
-    convert_recording(_pair(tiny), tmp_path / "V1.01", layout="euroc")
+    convert(_pair(tiny), tmp_path / "V1.01", layout="euroc")
     folder = open_recording(tmp_path / "V1.01")
     assert isinstance(folder, EurocSource)
-    convert_recording(folder, tmp_path / "again", layout="kitti")
+    convert(folder, tmp_path / "again", layout="kitti")
     assert isinstance(open_recording(tmp_path / "again"), KittiSource)
-    convert_recording(_pair(tiny), tmp_path / "a.bag")
-    convert_recording(open_recording(tmp_path / "a.bag"), tmp_path / "b", layout="bag")
+    convert(_pair(tiny), tmp_path / "a.bag")
+    convert(open_recording(tmp_path / "a.bag"), tmp_path / "b", layout="bag")
     assert isinstance(open_recording(tmp_path / "b"), BagSource)
 
 
 def test_a_suffix_of_a_bag_makes_a_bag_of_a_bag(tiny: Tiny, tmp_path: Path) -> None:
-    convert_recording(_pair(tiny), tmp_path / "a.bag")
-    convert_recording(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap", compress=True)
+    convert(_pair(tiny), tmp_path / "a.bag")
+    convert(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap", compress=True)
     assert isinstance(open_recording(tmp_path / "b.mcap"), BagSource)
 
 
 def test_contradictions_are_refused_with_a_way_out(tiny: Tiny, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"--layout euroc makes a folder, .* leave \.bag away"):
-        convert_recording(_pair(tiny), tmp_path / "a.bag", layout="euroc")
+        convert(_pair(tiny), tmp_path / "a.bag", layout="euroc")
     with pytest.raises(RecordingError, match="--png is for bags"):
-        convert_recording(_pair(tiny), tmp_path / "a", layout="euroc", compress=True)
+        convert(_pair(tiny), tmp_path / "a", layout="euroc", compress=True)
     with pytest.raises(RecordingError, match=r"got \.01; give --layout"):
-        convert_recording(_pair(tiny), tmp_path / "V1.01")
+        convert(_pair(tiny), tmp_path / "V1.01")
     assert list(tmp_path.iterdir()) == []

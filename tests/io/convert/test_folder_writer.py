@@ -17,7 +17,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.bag_writer import convert
+from gvo.io.convert.bag_writer import write_bag
 from gvo.io.convert.folder_writer import Layout, write_folder
 from gvo.io.frames import frames
 from gvo.io.opening import RecordingOptions, open_recording
@@ -132,7 +132,7 @@ def test_kitti_comes_back_from_a_bag_as_it_was(
     tiny: Tiny, tmp_path: Path, cameras: tuple[int, int]
 ) -> None:
     origin = tiny.write_kitti(tmp_path / "origin", n_frames=4, cameras=cameras)
-    convert(open_recording(origin), tmp_path / "a.bag")
+    write_bag(open_recording(origin), tmp_path / "a.bag")
     written = write_folder(open_recording(tmp_path / "a.bag"), tmp_path / "copy")
     source, copy = open_recording(origin), open_recording(tmp_path / "copy")
     assert (written.n_images, written.n_poses, written.skipped) == (8, 4, ())
@@ -156,7 +156,7 @@ def test_euroc_comes_back_from_a_bag_as_it_was(
     tiny: Tiny, tmp_path: Path, model: str, name: str
 ) -> None:
     source = open_recording(_write_euroc(tiny, tmp_path / "origin", model))
-    convert(source, tmp_path / name)
+    write_bag(source, tmp_path / name)
     write_folder(open_recording(tmp_path / name), tmp_path / "copy")
     copy = open_recording(tmp_path / "copy")
     assert source.info.calibrations[0].model == _LENSES[model][1]
@@ -211,7 +211,7 @@ def test_tum_comes_back_from_a_bag_as_it_was(tiny: Tiny, tmp_path: Path) -> None
         distortion_coefficients={"rows": 1, "cols": 5, "data": [0.26, -0.95, -0.005, 0.0026, 1.16]}
     )
     (origin / "calibration.yaml").write_text(yaml.safe_dump(camera))
-    convert(open_recording(origin), tmp_path / "a.mcap")
+    write_bag(open_recording(origin), tmp_path / "a.mcap")
     written = write_folder(open_recording(tmp_path / "a.mcap"), tmp_path / "copy")
     source, copy = open_recording(origin), open_recording(tmp_path / "copy")
     assert (written.n_images, written.n_poses, written.skipped) == (6, 4, ())
@@ -280,7 +280,7 @@ def test_depth_of_another_camera_is_registered_on_writing(
     tiny: Tiny, tmp_path: Path, is_raw: bool, target: str
 ) -> None:
     source = _with_depth_view(tiny, is_raw=is_raw)
-    write: Any = write_folder if target == "tum" else convert
+    write: Any = write_folder if target == "tum" else write_bag
     write(source, tmp_path / target)
     copy = open_recording(tmp_path / target)
     assert copy.info.depth_view is None
@@ -303,7 +303,7 @@ def test_depth_of_a_rectified_camera_with_other_intrinsics_of_its_raw_image_stay
     calibration = replace(Calibration.from_camera(tiny.camera), K=K)
     source = tiny.rgbd(_rgbd_items(tiny), calibrations=(calibration,))
     for name in ("a.bag", "tum"):
-        write: Any = write_folder if name == "tum" else convert
+        write: Any = write_folder if name == "tum" else write_bag
         write(source, tmp_path / name)
         copy = open_recording(tmp_path / name)
         assert copy.info.depth_view is None
@@ -328,7 +328,7 @@ def test_positions_without_rotations_are_left_out_and_told(
     positions = Trajectory.of_positions(truth.stamps_ns, truth.positions)
     source = _source_for(tiny, target, positions)
     path = tmp_path / target
-    written = convert(source, path) if target == "a.bag" else write_folder(source, path)
+    written = write_bag(source, path) if target == "a.bag" else write_folder(source, path)
     assert written.n_poses == 0
     assert written.n_images == 6
     assert written.skipped == (
@@ -347,7 +347,7 @@ def test_what_comes_before_damage_is_kept_and_the_damage_is_told(
     )
     path = tmp_path / target
     is_bag = target.startswith("a.")
-    written = convert(source, path) if is_bag else write_folder(source, path)
+    written = write_bag(source, path) if is_bag else write_folder(source, path)
     assert written.skipped == ("a.bag: 40 % are missing at its end",)
     assert (written.n_images, written.n_poses) == (6, 3)
     _assert_same_images(open_recording(path), whole)
@@ -361,7 +361,7 @@ def test_truth_that_cannot_be_read_does_not_cost_the_images(
     source = _Damaged("stereo", _pairs(tiny), calibrations=tiny.stereo([]).info.calibrations)
     source.truth_fault = "data.csv:7: expected 8 numbers"
     path = tmp_path / target
-    written = convert(source, path) if target == "a.bag" else write_folder(source, path)
+    written = write_bag(source, path) if target == "a.bag" else write_folder(source, path)
     assert "ground truth: data.csv:7: expected 8 numbers" in written.skipped
     assert (written.n_images, written.n_poses) == (6, 0)
 
@@ -375,7 +375,7 @@ def test_nothing_is_left_behind_where_no_image_can_be_written(
     source = tiny.stereo([*items, (1, 2, fault)])
     path = tmp_path / target
     with pytest.raises(RecordingError, match=r"list: no right image can be written: .*empty"):
-        convert(source, path) if target == "a.bag" else write_folder(source, path)
+        write_bag(source, path) if target == "a.bag" else write_folder(source, path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -465,7 +465,7 @@ def test_layouts_that_do_not_fit_the_sensor_are_refused(tiny: Tiny, tmp_path: Pa
 
 def test_body_and_calibration_of_a_file_are_written(tiny: Tiny, tmp_path: Path) -> None:
     origin = _write_euroc(tiny, tmp_path / "origin", "radial-tangential")
-    convert(open_recording(origin), tmp_path / "a.bag")
+    write_bag(open_recording(origin), tmp_path / "a.bag")
     options = RecordingOptions(calibration=[origin])
     source = open_recording(tmp_path / "a.bag", options=options)
     write_folder(source, tmp_path / "copy")
