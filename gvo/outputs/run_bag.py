@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -42,7 +42,6 @@ import numpy as np
 from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
-from gvo.closable import Closable
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_transforms
@@ -76,7 +75,7 @@ _SECOND_NS: Final = 10**9
 _NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
-class RunBag(Closable):
+class RunBag(AbstractContextManager["RunBag"]):
     """A bag of what a run computes, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
@@ -180,6 +179,10 @@ class RunBag(Closable):
                 self._bag.__exit__(None, None, None)
             if self._first_ns is not None:
                 self._bag.result.rename(self.path)
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:

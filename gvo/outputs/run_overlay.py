@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from gvo.closable import Closable
 from gvo.geometry.camera import PinholeCamera
 from gvo.outputs.video import open_sink
 from gvo.types import Estimate, FaultyFrame, Frame, FrameResult
@@ -21,7 +21,7 @@ _N_WAITING = 4  # frames; each holds its images
 _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
 
 
-class RunOverlay(Closable):
+class RunOverlay(AbstractContextManager["RunOverlay"]):
     """A film of a run, open inside a `with` block: one picture per frame, also of faulty ones.
 
     A thread draws and encodes; the run waits for it only where it is four frames behind. The film
@@ -111,6 +111,10 @@ class RunOverlay(Closable):
         finally:
             self._worker.shutdown(cancel_futures=True)
             self._sink.close()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     def _put(self, item: _Item) -> None:
         if len(self._waiting) == _N_WAITING:

@@ -34,11 +34,10 @@ from __future__ import annotations
 import importlib.util
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gvo.closable import Closable
 from gvo.config import Config, describe_configuration
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry.camera import PinholeCamera
@@ -53,7 +52,7 @@ N_FRAMES_HELD: Final = 20
 """Frames after which what was logged must be in the file."""
 
 
-class RunRerun(Closable):
+class RunRerun(AbstractContextManager["RunRerun"]):
     """A Rerun file of what a run computes, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
@@ -158,6 +157,10 @@ class RunRerun(Closable):
                 self._writer.stream.close()
             if self._n_frames > 0:
                 (Path(self._folder.name) / self.path.name).rename(self.path)
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     @contextmanager
     def _refused_on_error(self) -> Iterator[None]:

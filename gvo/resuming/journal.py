@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from array import array
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from gvo.closable import Closable
 from gvo.errors import OutputError, ResumeError
 from gvo.resuming.record_file import RecordFile
 from gvo.resuming.records import FrameRecord, Record, decode, encode
 
 
-class Journal(Closable):
+class Journal(AbstractContextManager["Journal"]):
     """A record for each frame, written before the lines of the frame are.
 
     Parameters
@@ -144,6 +144,10 @@ class Journal(Closable):
     def close(self) -> None:
         """Close the file: the run was interrupted."""
         self._file.close()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     def remove(self) -> None:
         """Remove the file: the run is complete."""

@@ -8,9 +8,9 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from gvo.closable import Closable
 from gvo.errors import RunBusyError
 from gvo.io.run_folder.line_file import append_whole
 
@@ -35,7 +35,7 @@ def refuse_busy(path: Path) -> None:
         return  # none there, or whoever replaces it is told
 
 
-class RecordFile(Closable):
+class RecordFile(AbstractContextManager["RecordFile"]):
     """Records of bytes, each with its length and check sum.
 
     One process at a time: the file is locked until it is closed.
@@ -111,6 +111,10 @@ class RecordFile(Closable):
     def close(self) -> None:
         """Close the file, and let others have it."""
         self._file.close()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     def remove(self) -> None:
         """Close the file and remove it."""

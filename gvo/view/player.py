@@ -7,10 +7,10 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import TypeAlias
 
-from gvo.closable import Closable
 from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -29,7 +29,7 @@ _LOGGER = logging.getLogger(__name__)
 _MAX_GAP_S = 1.0
 
 
-class Player(Closable):
+class Player(AbstractContextManager["Player"]):
     """Runs odometry over a recording on a thread of its own, as it is told.
 
     Nothing is computed before `play`, `step` or `seek`. What was computed is kept, and shown
@@ -212,6 +212,10 @@ class Player(Closable):
             self._changed.notify_all()
         if threading.current_thread() is not self._thread:
             self._thread.join()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     # What it tells
 

@@ -8,13 +8,13 @@ import ipaddress
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 from urllib.parse import urlsplit
 
 import viser
 import websockets.asyncio.server as websockets_server
 
-from gvo.closable import Closable
 from gvo.errors import ConfigurationError
 
 N_PORTS = 20
@@ -29,7 +29,7 @@ class LocalServer(viser.ViserServer):
         return None
 
 
-class ViewServer(Closable):
+class ViewServer(AbstractContextManager["ViewServer"]):
     """A page that is being served.
 
     Parameters
@@ -72,6 +72,10 @@ class ViewServer(Closable):
             with _silence():
                 self.viser.stop()
             self._is_closed.set()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
 
 def open_server(host: str, port: int, *, title: str) -> ViewServer:

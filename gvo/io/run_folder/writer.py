@@ -6,13 +6,12 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gvo.closable import Closable
 from gvo.errors import OutputError
 from gvo.io.run_folder.line_file import LineFile, RewrittenFile, replace_text
 from gvo.trajectory.formats import (
@@ -61,7 +60,7 @@ _OF_EARLIER_RUNS = (
 )
 
 
-class RunFolder(Closable):
+class RunFolder(AbstractContextManager["RunFolder"]):
     """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` puts them in the
@@ -224,6 +223,10 @@ class RunFolder(Closable):
         for name, n_header in (("smoothed.txt", 0), ("smoothed_covariance.csv", 1)):
             with self._refused_on_error(self.path / name):
                 _sort_lines(self.path / name, n_header=n_header)
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
 
     def _close_files(self) -> None:
         for file in self._files.values():
