@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
-
-import cv2
 
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError, ResumeError
 from gvo.frontend.factory import make_frontend
 from gvo.io.excerpt import Excerpt
-from gvo.io.frames import frames
+from gvo.io.frames import frames, one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
@@ -267,18 +264,3 @@ class RunLoop:
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.frame.apply(estimate) for estimate in estimates)
-
-
-@contextmanager
-def one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV, inside the context, from splitting single calls over threads.
-
-    Images are worked on side by side already; splitting the small ones as well costs a tenth more
-    CPU time and gains nothing.
-    """
-    n_before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(n_before)

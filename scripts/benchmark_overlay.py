@@ -15,12 +15,13 @@ from pathlib import Path
 
 import gvo
 from gvo.io.excerpt import Excerpt
+from gvo.io.frames import one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.outputs.run_overlay import RunOverlay, film_width
 from gvo.outputs.video import open_sink
-from gvo.run_loop import RunLoop, one_opencv_thread
+from gvo.run_loop import RunLoop
 from gvo.types import FaultyFrame, Frame, FrameResult
 from gvo.viz.overlay import compose_overlay
 

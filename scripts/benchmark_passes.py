@@ -20,8 +20,8 @@ import numpy as np
 
 import gvo
 from gvo.config import FrontendConfig
+from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import Sensor, Source
-from gvo.run_loop import one_opencv_thread
 from gvo.run_summary import peak_memory_mb
 from gvo.run_tally import Progress
 from gvo.types import FaultyFrame, Frame

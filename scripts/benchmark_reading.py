@@ -23,8 +23,8 @@ from rosbags.highlevel import AnyReader
 import gvo
 from gvo.geometry.camera import rectification_maps
 from gvo.io.bag.source import BagSource
+from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import Source
-from gvo.run_loop import one_opencv_thread
 
 Maps: TypeAlias = list[Any]
 

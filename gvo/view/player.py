@@ -15,8 +15,8 @@ from gvo.config import Config
 from gvo.errors import GvoError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.excerpt import Excerpt
+from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import RecordingInfo, Source
-from gvo.run_loop import one_opencv_thread
 from gvo.view.history import History
 from gvo.view.moments import Moment
 from gvo.view.tracking import OpenSource, Tracking
