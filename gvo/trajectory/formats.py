@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,6 @@ _FORMATS = (
 )
 _SCALAR_FIRST = re.compile(r"q\w*w\b.*q\w*x\b")
 _MAX_HEADER = 2000  # characters; the search takes the square of it
-_UPPER = np.triu_indices(6)
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 # text files round: four decimals in TUM's ground truths, seven digits in KITTI's
 _ROUNDING = 1e-2
@@ -37,7 +38,7 @@ _EUROC_HEADER = (
 )
 
 COVARIANCE_HEADER = "stamp_ns," + ",".join(
-    f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*_UPPER, strict=True)
+    f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(*np.triu_indices(6), strict=True)
 )
 """First line of a covariance file: the upper triangle, row by row."""
 
@@ -103,10 +104,28 @@ def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
     if not rows or rows[0].fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
     values = read_numbers(rows[1:], slice(1, None), n_columns=22)
-    covariances = np.zeros((len(values), 6, 6))
-    covariances[:, _UPPER[0], _UPPER[1]] = values
-    covariances[:, _UPPER[1], _UPPER[0]] = values
-    return read_stamps(rows[1:], unit_ns=1), covariances
+    return read_stamps(rows[1:], unit_ns=1), from_upper_triangle(values)
+
+
+def upper_triangle(matrix: FloatArray) -> FloatArray:
+    """Return the upper triangle of a matrix (n, n), row by row: 21 numbers of a covariance."""
+    return matrix[_upper(len(matrix))]
+
+
+def from_upper_triangle(numbers: FloatArray) -> FloatArray:
+    """Return the symmetric matrices (..., n, n) of upper triangles (..., n (n + 1) / 2)."""
+    n = (math.isqrt(8 * numbers.shape[-1] + 1) - 1) // 2
+    rows, columns = _upper(n)
+    matrices = np.empty((*numbers.shape[:-1], n, n), dtype=numbers.dtype)
+    matrices[..., rows, columns] = numbers
+    matrices[..., columns, rows] = numbers
+    return matrices
+
+
+@cache
+def _upper(n: int) -> tuple[IntArray, IntArray]:
+    rows, columns = np.triu_indices(n)
+    return rows, columns
 
 
 def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
@@ -141,7 +160,7 @@ def format_covariance_line(stamp_ns: int, covariance: FloatArray) -> str:
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz); the upper triangle is written.
     """
-    return ",".join([str(int(stamp_ns)), *(repr(float(value)) for value in covariance[_UPPER])])
+    return ",".join([str(int(stamp_ns)), *map(repr, upper_triangle(covariance).tolist())])
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:

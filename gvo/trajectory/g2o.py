@@ -27,11 +27,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.trajectory.formats import MAX_POSITION_M
+from gvo.trajectory.formats import MAX_POSITION_M, from_upper_triangle, upper_triangle
 from gvo.types import FloatArray, FrameId, GraphEdge
 
-_UPPER = np.triu_indices(6)
-_UNIT_INFORMATION = [f"{float(i == j)}" for i, j in zip(*_UPPER, strict=True)]
+_UNIT_INFORMATION = list(map(repr, upper_triangle(np.eye(6)).tolist()))
 _SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 _NORM_TOLERANCE = 1e-2
 _QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
@@ -154,9 +153,7 @@ def _transform(numbers: FloatArray) -> FloatArray:
 
 
 def _covariance(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
-    information = np.zeros((6, 6))
-    information[_UPPER] = upper
-    information.T[_UPPER] = upper
+    information = from_upper_triangle(upper)
     if is_swapped:
         information = information[np.ix_(_SWAPPED, _SWAPPED)]
     try:
@@ -193,7 +190,7 @@ def format_edge(
     """
     information = np.linalg.inv(covariance)[np.ix_(_SWAPPED, _SWAPPED)]
     information = 0.5 * (information + information.T)
-    upper = " ".join(repr(float(value)) for value in information[_UPPER])
+    upper = " ".join(map(repr, upper_triangle(information).tolist()))
     return f"EDGE_SE3:QUAT {reference_id} {frame_id} {_pose_fields(T)} {upper}"
 
 
@@ -210,11 +207,9 @@ def convert_line(text: str) -> str:
     if not isinstance(line, Measurement) or text.split()[0] != "EDGE3":
         return text
     numbers = text.partition("#")[0].split()[9:] or _UNIT_INFORMATION
-    order = np.zeros((6, 6), dtype=np.int64)
-    order[_UPPER] = np.arange(21)
-    order.T[_UPPER] = np.arange(21)
+    order = from_upper_triangle(np.arange(21.0))[np.ix_(_SWAPPED, _SWAPPED)]
     # The numbers themselves, in the other order: nothing is rounded.
-    upper = " ".join(numbers[i] for i in order[np.ix_(_SWAPPED, _SWAPPED)][_UPPER])
+    upper = " ".join(numbers[int(i)] for i in upper_triangle(order))
     T = line.T_reference_frame
     return f"EDGE_SE3:QUAT {line.reference_id} {line.frame_id} {_pose_fields(T)} {upper}"
 

@@ -14,8 +14,10 @@ from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
     format_tum_line,
+    from_upper_triangle,
     read_covariances,
     read_trajectory,
+    upper_triangle,
     write_covariances,
     write_kitti,
     write_tum,
@@ -281,3 +283,13 @@ def test_positions_without_rotations_are_no_file_of_poses(tmp_path: Path) -> Non
         with pytest.raises(ValueError, match="positions without rotations"):
             write(tmp_path / "poses.txt", points)
     assert not (tmp_path / "poses.txt").exists()
+
+
+@given(seeds, st.sampled_from([3, 6]))
+def test_a_symmetric_matrix_comes_back_from_its_upper_triangle(seed: int, n: int) -> None:
+    matrices = np.random.default_rng(seed).normal(size=(4, n, n))
+    matrices += np.swapaxes(matrices, 1, 2)
+    upper = np.array([upper_triangle(matrix) for matrix in matrices])
+    assert upper[0, :n].tolist() == matrices[0, 0].tolist()
+    np.testing.assert_array_equal(from_upper_triangle(upper), matrices)
+    np.testing.assert_array_equal(from_upper_triangle(upper[1]), matrices[1])

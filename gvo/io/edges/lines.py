@@ -18,7 +18,12 @@ from scipy.spatial.transform import Rotation
 from gvo.bounded_text import shortened
 from gvo.geometry import se3
 from gvo.io.edges.pose_streams import StepSigma
-from gvo.trajectory.formats import COVARIANCE_HEADER, MAX_POSITION_M
+from gvo.trajectory.formats import (
+    COVARIANCE_HEADER,
+    MAX_POSITION_M,
+    from_upper_triangle,
+    upper_triangle,
+)
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, PositionPrior, Prior, Rejected
 
 LineFormat: TypeAlias = Literal["csv", "json"]
@@ -293,11 +298,7 @@ def _noise(numbers: FloatArray, size: int) -> FloatArray | None:
             f"after the measurement come nothing, {size} sigmas or {n_upper} numbers of a "
             f"covariance, got {len(numbers)}"
         )
-    covariance = np.zeros((size, size))
-    upper = np.triu_indices(size)
-    covariance[upper] = numbers
-    covariance.T[upper] = numbers
-    return covariance
+    return from_upper_triangle(numbers)
 
 
 def _pose(numbers: FloatArray) -> FloatArray:
@@ -344,7 +345,6 @@ CSV_HEADER = (
 )
 """Columns of an answer in CSV; written first where the input begins with a header."""
 
-_UPPER = np.triu_indices(6)
 _CHUNK_BYTES = 65536
 _POLL_SECONDS = 0.2
 # What is cut off here is still longer than what is understood.
@@ -367,7 +367,7 @@ def format_estimate(
     T = estimate.T_world_cam
     quaternion = se3.quaternions(T[:3, :3])
     pose = [float(value) for value in (*T[:3, 3], *quaternion)]
-    covariance = [float(value) for value in estimate.covariance[_UPPER]]
+    covariance = upper_triangle(estimate.covariance).tolist()
     reasons = [str(refusal) for refusal in (*estimate.rejected, *rejected)]
     if line_format == "json":
         answer = {

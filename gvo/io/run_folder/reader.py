@@ -17,14 +17,13 @@ from gvo.bounded_text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory.formats import MAX_POSITION_M, read_trajectory
+from gvo.trajectory.formats import MAX_POSITION_M, from_upper_triangle, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
 COUNTS = ("keypoints", "points", "matches", "inliers", "links", "edges", "rejected")
 """What `frames.csv` may count, as columns `n_...`."""
 
-_UPPER = np.triu_indices(6)
 _ROUNDING = 1e-2
 _EXPECTED = "expected a folder that gvo run or gvo smooth wrote"
 
@@ -296,9 +295,7 @@ def _read_estimate(folder: Path, name: str) -> Trajectory:
     upper = _numbers(covariance_path, ",", n_columns=22, n_header=1)
     _, first, second = np.intersect1d(poses[0], upper[0], return_indices=True)
     stamps_ns, values = poses[0][first], poses[1][first]
-    covariances = np.zeros((len(first), 6, 6))
-    covariances[:, _UPPER[0], _UPPER[1]] = upper[1][second]
-    covariances[:, _UPPER[1], _UPPER[0]] = upper[1][second]
+    covariances = from_upper_triangle(upper[1][second])
     try:
         R = Rotation.from_quat(values[:, 3:]).as_matrix() if len(first) else np.empty((0, 3, 3))
         return Trajectory(
