@@ -14,14 +14,14 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from gvo.errors import GvoError
 from gvo.io.bag.reader import TF_TYPE, BagReader, find_files, typestore
+from gvo.io.bag.recovery.inflate import DamageError
+from gvo.io.bag.recovery.mcap import McapScan
+from gvo.io.bag.recovery.ros1 import Ros1Scan
+from gvo.io.bag.recovery.scan import Salvage
+from gvo.io.bag.recovery.sqlite import SqliteScan
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.poses.tf import read_tf
-from gvo.sources.salvage.mcap import McapScan
-from gvo.sources.salvage.ros1 import Ros1Scan
-from gvo.sources.salvage.scan import Salvage
-from gvo.sources.salvage.sqlite import SqliteScan
-from gvo.sources.salvage.window import DamageError
 from tests.fuzz.messages import make_messages, serialise
 from tests.fuzz.mutations import mutate_bytes, mutate_text
 from tests.fuzz.target import Folder, Target

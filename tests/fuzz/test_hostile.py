@@ -22,14 +22,14 @@ from gvo.errors import CalibrationError, ConfigurationError, GvoError, Recording
 from gvo.io.bag.image_encodings import decode_rvl
 from gvo.io.bag.messages import decode_compressed, transform_of
 from gvo.io.bag.reader import BagReader, typestore
+from gvo.io.bag.recovery import inflate
+from gvo.io.bag.recovery.mcap import MAGIC
+from gvo.io.bag.recovery.sqlite import SqliteScan
 from gvo.io.calibration.files import read_cameras
 from gvo.io.edges.lines import MAX_LINE, parse_line, read_lines
 from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
 from gvo.io.poses.ground_truth import parse_truth
 from gvo.io.run_folder.reader import read_run
-from gvo.sources.salvage import inflate
-from gvo.sources.salvage.mcap import MAGIC
-from gvo.sources.salvage.sqlite import SqliteScan
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line

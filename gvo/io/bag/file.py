@@ -26,13 +26,12 @@ from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 from rosbags.serde import SerdeError
 
 from gvo.errors import RecordingError
-from gvo.sources.salvage import mcap, ros1
-from gvo.sources.salvage.inflate import inflate_message, inflate_whole
-from gvo.sources.salvage.mcap import McapScan
-from gvo.sources.salvage.ros1 import Ros1Scan
-from gvo.sources.salvage.scan import Channel, FoundMessage, Salvage, standard_type
-from gvo.sources.salvage.sqlite import SqliteScan, announced_size
-from gvo.sources.salvage.window import DamageError
+from gvo.io.bag.recovery import mcap, ros1
+from gvo.io.bag.recovery.inflate import DamageError, inflate_message, inflate_whole
+from gvo.io.bag.recovery.mcap import McapScan
+from gvo.io.bag.recovery.ros1 import Ros1Scan
+from gvo.io.bag.recovery.scan import Channel, FoundMessage, Salvage, standard_type
+from gvo.io.bag.recovery.sqlite import SqliteScan, announced_size
 
 _Reader: TypeAlias = Reader1 | Reader2
 

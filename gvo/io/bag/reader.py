@@ -18,9 +18,9 @@ from rosbags.typesys.store import Typestore
 from gvo.bounded_text import read_text
 from gvo.errors import RecordingError
 from gvo.io.bag.file import FAULTS, BagFile
+from gvo.io.bag.recovery.inflate import inflate_file
+from gvo.io.bag.recovery.scan import FoundMessage
 from gvo.io.bag.topics import Topic
-from gvo.sources.salvage.inflate import inflate_file
-from gvo.sources.salvage.scan import FoundMessage
 from gvo.yaml_text import YamlError, load_yaml
 
 STORAGE_SUFFIXES = (".mcap", ".db3")

@@ -17,8 +17,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from gvo.errors import RecordingError
 from gvo.io.bag.file import BagFile
 from gvo.io.bag.reader import BagMessage, BagReader, typestore
+from gvo.io.bag.recovery.scan import FoundMessage
 from gvo.io.bag.topics import IMAGE_TYPE, Topic
-from gvo.sources.salvage.scan import FoundMessage
 
 _N = 5
 _KINDS = pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3", "folder"])

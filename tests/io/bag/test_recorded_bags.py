@@ -9,10 +9,10 @@ import pytest
 from gvo.errors import RecordingError
 from gvo.io.bag.file import BagFile
 from gvo.io.bag.reader import BagReader
-from gvo.sources.salvage.mcap import McapScan
-from gvo.sources.salvage.ros1 import Ros1Scan
-from gvo.sources.salvage.scan import Salvage
-from gvo.sources.salvage.sqlite import SqliteScan
+from gvo.io.bag.recovery.mcap import McapScan
+from gvo.io.bag.recovery.ros1 import Ros1Scan
+from gvo.io.bag.recovery.scan import Salvage
+from gvo.io.bag.recovery.sqlite import SqliteScan
 
 pytestmark = pytest.mark.recorded
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from gvo.sources.salvage.inflate import MAX_INFLATED
-from gvo.sources.salvage.scan import Channel, Entry, Losses, Scan, share, standard_type
-from gvo.sources.salvage.window import DamageError, Window
+from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError, Window
+from gvo.io.bag.recovery.scan import Channel, Entry, Losses, Scan, share, standard_type
 
 MAGIC = b"#ROSBAG V2.0\n"
 

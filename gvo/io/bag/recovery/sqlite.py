@@ -10,14 +10,14 @@ from typing import Any, TypeAlias
 
 import apsw
 
-from gvo.sources.salvage.scan import (
+from gvo.io.bag.recovery.inflate import DamageError
+from gvo.io.bag.recovery.scan import (
     Channel,
     FoundMessage,
     describe_damage,
     share,
     standard_type,
 )
-from gvo.sources.salvage.window import DamageError
 
 _MAX_ID = 2**62
 _N_HEADER = 100  # bytes

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 from zlib import crc32
 
-from gvo.sources.salvage.inflate import inflate
-from gvo.sources.salvage.window import DamageError, Window
+from gvo.io.bag.recovery.inflate import DamageError, Window, inflate
 
 
 class Channel(NamedTuple):

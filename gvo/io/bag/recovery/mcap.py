@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TypeAlias
 from zlib import crc32
 
-from gvo.sources.salvage.scan import Channel, Entry, Losses, Scan, standard_type
-from gvo.sources.salvage.window import DamageError, Window
+from gvo.io.bag.recovery.inflate import DamageError, Window
+from gvo.io.bag.recovery.scan import Channel, Entry, Losses, Scan, standard_type
 
 MAGIC = b"\x89MCAP0\r\n"
 

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from gvo.errors import RecordingError
 from gvo.io.bag.file import BagFile
-from gvo.sources.salvage.mcap import McapScan
-from gvo.sources.salvage.ros1 import Ros1Scan
-from gvo.sources.salvage.scan import Salvage
-from gvo.sources.salvage.sqlite import SqliteScan
-from tests.sources.salvage.bags import (
+from gvo.io.bag.recovery.mcap import McapScan
+from gvo.io.bag.recovery.ros1 import Ros1Scan
+from gvo.io.bag.recovery.scan import Salvage
+from gvo.io.bag.recovery.sqlite import SqliteScan
+from tests.io.bag.recovery.bags import (
     TOPICS,
     Message,
     contents,
