@@ -17,8 +17,7 @@ from gvo.io.bag.reader import TF_TYPE, BagReader, find_files, typestore
 from gvo.io.bag.recovery.inflate import DamageError
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import Salvage
-from gvo.io.bag.recovery.sqlite import SqliteScan
+from gvo.io.bag.recovery.scan import Scan
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.poses.tf import read_tf
@@ -35,11 +34,7 @@ _TOPICS = {
     "/left/image_rect/compressed": COMPRESSED_TYPE,
 }
 _LEFT_INFO = "/left/camera_info"
-_SCANS: dict[str, Callable[[Path], Salvage]] = {
-    ".bag": Ros1Scan,
-    ".mcap": McapScan,
-    ".db3": SqliteScan,
-}
+_SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}
 _MAX_MESSAGES = 200
 
 
@@ -51,7 +46,8 @@ def _folder() -> Folder:
 def _read(data: bytes, *, suffix: str) -> None:
     """Open a file as a recording, load what it yields; then walk over its records."""
     path = _folder().write(f"fuzz{suffix}", data)
-    _walk(path)
+    if suffix in _SCANS:
+        _walk(path)
     reader = BagReader(path)
     names = [topic.name for topic in reader.topics]
     for message in islice(reader.messages(names), _MAX_MESSAGES):

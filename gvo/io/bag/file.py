@@ -1,4 +1,4 @@
-"""One bag file, read by rosbags or, where that refuses, by walking over its records.
+"""One bag file, read by rosbags or, where that refuses ROS 1 or MCAP, by walking over its records.
 
 rosbags' readers are used without its `AnyReader`, which parses the definitions of all message
 types: one foreign type that it cannot parse would block the camera's topics.
@@ -6,6 +6,7 @@ types: one foreign type that it cannot parse would block the camera's topics.
 
 from __future__ import annotations
 
+import os
 import struct
 from array import array
 from collections import Counter
@@ -15,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TypeAlias
+from urllib.parse import quote
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Reader1
@@ -23,6 +25,7 @@ from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.rosbag2 import ReaderError as ReaderError2
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.serde import SerdeError
 
 from gvo.errors import RecordingError
@@ -30,10 +33,10 @@ from gvo.io.bag.recovery import mcap, ros1
 from gvo.io.bag.recovery.inflate import DamageError, inflate_message, inflate_whole
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import Channel, FoundMessage, Salvage, standard_type
-from gvo.io.bag.recovery.sqlite import SqliteScan, announced_size
+from gvo.io.bag.recovery.scan import Channel, FoundMessage, Scan, standard_type
 
 _Reader: TypeAlias = Reader1 | Reader2
+_SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}
 
 
 def _storage_faults() -> Iterator[type[Exception]]:
@@ -109,42 +112,42 @@ class BagFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.note = ""
-        self._salvage: Salvage | None = None
+        self._recovered: Scan | None = None
         self._fault = _unread_log(path)
         try:
             with self._opened() as reader:
                 self.counts = _counts(reader)
                 self.start_time_ns = reader.start_time
         except DAMAGE as error:
-            self._salvage = _salvage(path, error)
-            self.counts = self._salvage.counts
-            self.start_time_ns = self._salvage.start_time_ns
-            if not self._salvage.damage:
-                self.note = _describe_order(path, error, self._salvage)
+            self._recovered = scan = _recover(path, error)
+            self.counts, self.start_time_ns = scan.counts, scan.start_time_ns
+            if not scan.damage:
+                self.note = _describe_missing_index(path, error, scan.tool)
 
     @property
     def damage(self) -> str:
         """What cannot be read, in one line; complete when all messages were read."""
-        salvaged = "" if self._salvage is None else self._salvage.damage
-        return "; ".join(text for text in (self._fault, salvaged) if text)
+        lost = "" if self._recovered is None else self._recovered.damage
+        return "; ".join(text for text in (self._fault, lost) if text)
 
     def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
         """Yield the messages of some topics, nearly in the order of recording.
 
-        Where rosbags cannot go on, the rest is found by walking over the records.
+        Where rosbags cannot go on, the rest of a ROS 1 or MCAP file is found by walking over its
+        records; of a database it is lost, and `damage` says so.
         """
         seen = _Seen()
         try:
-            if self._salvage is None:
+            if self._recovered is None:
                 for message in self._indexed(names):
                     seen.add(message)
                     yield message
                 self._check_number(seen.n_messages, names)
                 return
         except DAMAGE as error:
-            self._salvage = self._rescue(error)
+            self._recovered = self._recover_rest(error)
         try:
-            for message in self._salvage.messages(names) if self._salvage else ():
+            for message in self._recovered.messages(names) if self._recovered else ():
                 if message.channel not in self.counts:
                     self._fault = f"{self.path}: messages of a damaged topic are left out"
                 elif not seen.takes(message):
@@ -158,9 +161,9 @@ class BagFile:
         if n_messages < n_announced:
             raise DamageError(f"{n_messages} of {n_announced} messages were found")
 
-    def _rescue(self, error: Exception) -> Salvage | None:
+    def _recover_rest(self, error: Exception) -> Scan | None:
         try:
-            return _salvage(self.path, error)
+            return _recover(self.path, error)
         except RecordingError as refusal:
             self._fault = str(refusal)
             return None
@@ -179,10 +182,16 @@ class BagFile:
                 yield FoundMessage(channels[connection.id], log_time_ns, content)
 
     def _opened(self) -> _Reader:
-        if self.path.suffix == ".db3" and announced_size(self.path) > self.path.stat().st_size:
-            # SQLite fills the last page with zeros, of which rosbags makes messages.
-            raise DamageError("the file is shorter than it says")
-        return Reader1(self.path) if self.path.suffix == ".bag" else Reader2(self.path)
+        if self.path.suffix == ".bag":
+            return Reader1(self.path)
+        reader = Reader2(self.path)
+        if self.path.suffix == ".db3":
+            if _announced_size(self.path) > self.path.stat().st_size:
+                # SQLite fills the last page with zeros, of which rosbags makes messages.
+                raise DamageError("the file is shorter than it says")
+            # rosbags makes a URI of the path without quoting it.
+            reader.storage = Sqlite3Reader(Path(quote(os.fsencode(self.path))))
+        return reader
 
 
 class _Seen:
@@ -226,37 +235,48 @@ def _channel(connection: Connection, reader: _Reader) -> Channel:
     return Channel(connection.topic, standard_type(connection.msgtype), is_ros1)
 
 
-def _salvage(path: Path, error: Exception) -> Salvage:
+def _recover(path: Path, error: Exception) -> Scan:
     """Read a file without its index.
 
     Raises
     ------
     RecordingError
-        When no message is found.
+        When no message is found, and for a database.
     """
     refusal = _refusal(path)
     if refusal or "encryption" in str(error):
         raise RecordingError(refusal or f"{path}: cannot be read ({_one_line(error)})") from error
+    if path.suffix not in _SCANS:
+        raise RecordingError(_advise(path, error)) from error
     try:
-        salvage = _scan(path)
+        scan = _SCANS[path.suffix](path)
     except (OSError, DamageError) as fault:
-        raise RecordingError(_explain(path, fault)) from error
-    if not any(salvage.counts.values()):
-        raise RecordingError(salvage.damage or _explain(path, error)) from error
-    return salvage
+        raise RecordingError(_advise(path, fault)) from error
+    if not any(scan.counts.values()):
+        raise RecordingError(scan.damage or _advise(path, error)) from error
+    return scan
 
 
-def _scan(path: Path) -> Salvage:
-    if path.suffix == ".bag":
-        return Ros1Scan(path)
-    return McapScan(path) if path.suffix == ".mcap" else SqliteScan(path)
+def _announced_size(path: Path) -> int:
+    """Return the bytes that the header of an SQLite database claims; 0 if it claims none.
+
+    References
+    ----------
+    .. [1] Database File Format, section 1.3, https://sqlite.org/fileformat.html.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    if header[24:28] != header[92:96]:
+        return 0  # the number of pages was not kept up to date
+    page_size = int.from_bytes(header[16:18], "big")
+    return (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
 
 
-def _describe_order(path: Path, error: Exception, salvage: Salvage) -> str:
+def _describe_missing_index(path: Path, error: Exception, tool: str) -> str:
     reason = str(error).strip(" .") or "it is damaged"
     return (
         f"bag: {path.name} is read without its index ({' '.join(reason.split())}); "
-        f"`{salvage.tool}` on a copy writes one"
+        f"`{tool}` on a copy writes one"
     )
 
 
@@ -288,11 +308,12 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-def _explain(path: Path, error: Exception) -> str:
-    tools = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "sqlite3 FILE .recover"}
+def _advise(path: Path, error: Exception) -> str:
+    scan = _SCANS.get(path.suffix)
+    tool = scan.tool if scan else "sqlite3 FILE .recover"
     return (
-        f"{path}: holds no message that can be read ({_one_line(error)}); where it is truncated "
-        f"or damaged, try `{tools.get(path.suffix, 'ros2 bag reindex')}` on a copy"
+        f"{path}: cannot be read ({_one_line(error)}); where it is truncated or damaged, "
+        f"try `{tool}` on a copy"
     )
 
 

@@ -326,6 +326,12 @@ def _read_all(path: Path) -> str | None:
     return reader.damage or None
 
 
+def test_the_name_of_a_database_may_hold_any_character(tmp_path: Path) -> None:
+    path = tmp_path / "a#b?c%20 ü.db3"
+    path.write_bytes(_write(tmp_path / "a.db3").read_bytes())
+    assert _read_all(path) is None
+
+
 def test_a_database_without_tables_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     connection = sqlite3.connect(path)

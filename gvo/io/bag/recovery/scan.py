@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 from zlib import crc32
 
 from gvo.io.bag.recovery.inflate import DamageError, Window, inflate
@@ -73,29 +73,6 @@ class Losses:
         open_end = ", and what came after it is missing" if is_open else ""
         said = f"{places[0].reason}{others}"
         return f"{share(n_bytes, n_bytes_file)} cannot be read ({said}){open_end}"
-
-
-class Salvage(Protocol):
-    """What can be read of a file that is not in order."""
-
-    @property
-    def counts(self) -> dict[Channel, int]:
-        """How many messages there are of each topic."""
-
-    @property
-    def start_time_ns(self) -> int:
-        """The time of the first message's recording."""
-
-    @property
-    def damage(self) -> str:
-        """What cannot be read, in one line; nothing where nothing is lost."""
-
-    @property
-    def tool(self) -> str:
-        """The command that mends such a file."""
-
-    def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
-        """Yield the messages of some topics, nearly in the order of recording."""
 
 
 class Scan(ABC):
