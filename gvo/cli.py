@@ -211,14 +211,14 @@ def check_(
     as_json: _AsJson = False,
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
-    from gvo.checkup import check_recording, format_checkup
+    from gvo.diagnostics.check import check_recording, format_check
     from gvo.io.poses.inputs import count_calibration_changes, read_transforms
 
     parameters = load(config, set_)
     topics = {"left": left, "right": right, "color": color, "depth": depth}
     source = open_source(recordings, parameters, calibration, topics)
     with interruptible():
-        checkup = check_recording(
+        result = check_recording(
             source,
             parameters,
             transforms=read_transforms(source, (source.info.frame_id, frame)),
@@ -226,10 +226,10 @@ def check_(
             calibration_changes=count_calibration_changes(source),
         )
     if as_json:
-        typer.echo(json.dumps(checkup.as_json(), allow_nan=False))
+        typer.echo(json.dumps(result.as_json(), allow_nan=False))
     else:
-        typer.echo(format_checkup(checkup), nl=False)
-    raise typer.Exit(0 if checkup.is_healthy else EXIT_FAULTS)
+        typer.echo(format_check(result), nl=False)
+    raise typer.Exit(0 if result.is_healthy else EXIT_FAULTS)
 
 
 @app.command()

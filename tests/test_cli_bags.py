@@ -366,9 +366,9 @@ def test_a_signal_leaves_a_bag_that_can_be_read(walk_bag: Path, tmp_path: Path) 
 
 
 def findings(answer: Any) -> dict[str, str]:
-    checkup = json.loads(answer.out)
-    assert set(checkup) == {"recording", "is_healthy", "n_warnings", "n_faults", "findings"}
-    return {finding["name"]: finding["verdict"] for finding in checkup["findings"]}
+    result = json.loads(answer.out)
+    assert set(result) == {"recording", "is_healthy", "n_warnings", "n_faults", "findings"}
+    return {finding["name"]: finding["verdict"] for finding in result["findings"]}
 
 
 def test_check_finds_nothing_on_a_clean_bag(command: Command, robot_bag: Path) -> None:

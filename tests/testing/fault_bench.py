@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gvo.checkup import check_recording
 from gvo.config import Config
+from gvo.diagnostics.check import check_recording
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
@@ -123,8 +123,8 @@ def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
 def complaints(source: FaultySource) -> set[str]:
     """Return what `gvo check` warns of, without the names of streams."""
     n_samples = 4 if source.info.sensor == "stereo" else 10
-    checkup = check_recording(source, Config(), n_samples=n_samples)
-    found = checkup.with_verdict("warning", "fault")
+    result = check_recording(source, Config(), n_samples=n_samples)
+    found = result.with_verdict("warning", "fault")
     return {finding.name.rpartition(": ")[2] for finding in found}
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.checkup.frame_tree import check_frame_tree
-from gvo.checkup.report import Finding
 from gvo.config import CheckConfig
+from gvo.diagnostics.check.findings import Finding
+from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.io.poses.tf import TfBuffer
 
 S = 1_000_000_000
@@ -97,7 +97,7 @@ def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
     assert complaints(look(cameras, "left")) == set()
 
 
-def test_the_tree_is_part_of_a_checkup(bench: Any) -> None:
+def test_the_tree_is_part_of_a_check(bench: Any) -> None:
     recording = bench.render("handheld", "rgbd")
     names = {finding.name for finding in bench.check(recording, transforms=tree()).findings}
     assert {"tf: frames", "tf: camera"} <= names

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gvo.checkup import check_recording
 from gvo.config import Config
+from gvo.diagnostics.check import check_recording
 from gvo.errors import RecordingError
 
 Fault = Callable[[Any], Any]
@@ -36,10 +36,10 @@ _RNG = np.random.default_rng(5)
 def test_clean_recordings_have_nothing_to_complain_about(
     bench: Any, world: str, sensor: str, seed: int
 ) -> None:
-    checkup = bench.check(bench.render(world, sensor, seed))
-    assert bench.complaints(checkup) == set()
-    assert not checkup.with_verdict("unknown")
-    assert checkup.is_healthy
+    result = bench.check(bench.render(world, sensor, seed))
+    assert bench.complaints(result) == set()
+    assert not result.with_verdict("unknown")
+    assert result.is_healthy
 
 
 def shifted_rows(recording: Any) -> Any:
@@ -112,13 +112,13 @@ def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
 def test_a_stream_that_lags_by_a_frame_is_found_although_its_stamps_are_right(
     bench: Any, world: str, n_frames: int, word: str
 ) -> None:
-    checkup = bench.check(out_of_step(n_frames)(bench.render(world, "stereo")))
-    finding = bench.find(checkup, "left/right: same moment")
+    result = bench.check(out_of_step(n_frames)(bench.render(world, "stereo")))
+    finding = bench.find(result, "left/right: same moment")
     assert finding.verdict == "fault"
     assert f"a frame {word}" in finding.fix
     # Images that were not taken at once have no disparities to speak of.
     others = {"left/right: row spread", "left/right: order", "left/right: lens distortion"}
-    assert bench.complaints(checkup) <= {finding.name} | others
+    assert bench.complaints(result) <= {finding.name} | others
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1000.0, "fault"), (0.001, "fault"), (1, "ok")])
@@ -159,9 +159,9 @@ def through_lens(image: NDArray[Any], K: NDArray[Any], k1: float) -> NDArray[Any
 
 
 def test_swapped_topics_are_to_be_exchanged(bench: Any) -> None:
-    checkup = bench.check(swapped(bench.render("handheld", "stereo")))
-    assert bench.find(checkup, "left/right: order").fix == "exchange --left and --right"
-    assert not checkup.is_healthy
+    result = bench.check(swapped(bench.render("handheld", "stereo")))
+    assert bench.find(result, "left/right: order").fix == "exchange --left and --right"
+    assert not result.is_healthy
 
 
 def nothing_known(share: float) -> Fault:
@@ -295,8 +295,8 @@ def test_torn_images_are_found(bench: Any) -> None:
 
         return replace(image, load=load) if image.stream == 0 and number < 12 else image
 
-    checkup = bench.check(bench.render("handheld", "rgbd").mapped(tear))
-    assert "colour: torn images" in bench.complaints(checkup)
+    result = bench.check(bench.render("handheld", "rgbd").mapped(tear))
+    assert "colour: torn images" in bench.complaints(result)
 
 
 def test_images_that_do_not_decode_are_counted_and_quoted(bench: Any) -> None:
@@ -306,19 +306,19 @@ def test_images_that_do_not_decode_are_counted_and_quoted(bench: Any) -> None:
     def break_some(image: Any, number: int) -> Any:
         return replace(image, load=fail) if image.stream == 1 and number < 12 else image
 
-    checkup = bench.check(bench.render("handheld", "rgbd").mapped(break_some))
-    assert bench.complaints(checkup) == {"frames that cannot be used"}
-    fix = bench.find(checkup, "frames that cannot be used").fix
+    result = bench.check(bench.render("handheld", "rgbd").mapped(break_some))
+    assert bench.complaints(result) == {"frames that cannot be used"}
+    fix = bench.find(result, "frames that cannot be used").fix
     assert fix == "depth image: /camera: the JPEG image is truncated"
 
 
 def test_damage_ends_the_reading_but_not_the_check(bench: Any) -> None:
     recording = bench.render("handheld", "rgbd")
     damaged = replace(recording, items=recording.items[:50], damage="a.bag: truncated at 61 %")
-    checkup = bench.check(damaged)
-    assert bench.complaints(checkup) == {"reading"}
-    assert bench.find(checkup, "reading").value == "a.bag: truncated at 61 %"
-    assert bench.find(checkup, "depth: scale").verdict == "ok"
+    result = bench.check(damaged)
+    assert bench.complaints(result) == {"reading"}
+    assert bench.find(result, "reading").value == "a.bag: truncated at 61 %"
+    assert bench.find(result, "depth: scale").verdict == "ok"
 
 
 @pytest.mark.parametrize(("n_changed", "verdict"), [(0, "ok"), (3, "warning")])
@@ -327,8 +327,8 @@ def test_a_calibration_that_changes_on_the_way_is_told(
 ) -> None:
     recording = bench.render("handheld", "rgbd")
     changes = {"/camera/camera_info": n_changed}
-    checkup = check_recording(recording, Config(), n_samples=2, calibration_changes=changes)
-    found = bench.find(checkup, "changed CameraInfo")
+    result = check_recording(recording, Config(), n_samples=2, calibration_changes=changes)
+    found = bench.find(result, "changed CameraInfo")
     assert found.verdict == verdict
     assert ("3 of /camera/camera_info" in str(found.value)) == (n_changed > 0)
 
@@ -339,10 +339,10 @@ def test_hardly_any_images_are_reported_and_nothing_breaks(
     bench: Any, sensor: str, n_items: int
 ) -> None:
     recording = bench.render("handheld", sensor)
-    checkup = bench.check(replace(recording, items=recording.items[:n_items]))
+    result = bench.check(replace(recording, items=recording.items[:n_items]))
     # a depth image less than colour is no loss, a right one less than left is
-    assert checkup.is_healthy == (n_items in (2, 4) or (n_items, sensor) == (3, "rgbd"))
-    assert json.loads(json.dumps(checkup.as_json(), allow_nan=False))
+    assert result.is_healthy == (n_items in (2, 4) or (n_items, sensor) == (3, "rgbd"))
+    assert json.loads(json.dumps(result.as_json(), allow_nan=False))
 
 
 def test_a_recording_without_a_single_usable_image_is_no_crash(bench: Any) -> None:
@@ -373,8 +373,8 @@ def test_only_the_samples_are_decoded(bench: Any) -> None:
 def test_recorded_stereo_is_healthy(gvo_data: Path, bench: Any, name: str) -> None:
     from gvo.io.opening import open_recording
 
-    checkup = check_recording(open_recording(gvo_data / name), Config(), n_samples=6)
-    assert bench.complaints(checkup) == set()
+    result = check_recording(open_recording(gvo_data / name), Config(), n_samples=6)
+    assert bench.complaints(result) == set()
 
 
 @pytest.mark.recorded
@@ -382,11 +382,11 @@ def test_a_free_running_kinect_is_usable_with_its_known_flaws(gvo_data: Path, be
     from gvo.io.opening import open_recording
 
     source = open_recording(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
-    checkup = check_recording(source, Config())
-    assert checkup.is_healthy
+    result = check_recording(source, Config())
+    assert result.is_healthy
     # Colour and depth are half a period apart; its driver registers to about three pixels.
     known = {"colour/depth: stamp difference", "depth: misregistration"}
-    assert "colour/depth: stamp difference" in bench.complaints(checkup) <= known
+    assert "colour/depth: stamp difference" in bench.complaints(result) <= known
 
 
 @pytest.mark.recorded
@@ -395,11 +395,11 @@ def test_depth_that_is_not_registered_is_found_in_a_recorded_sequence(
 ) -> None:
     from gvo.io.opening import open_recording
 
-    checkup = check_recording(open_recording(gvo_data / "sevenscenes_start"), Config())
-    finding = bench.find(checkup, "depth: misregistration")
+    result = check_recording(open_recording(gvo_data / "sevenscenes_start"), Config())
+    finding = bench.find(result, "depth: misregistration")
     assert finding.verdict == "fault"
     # Focal lengths of a Kinect: 525 px of colour, 585 px of depth.
     assert "zoom 0.90" in finding.text
     # Some of its images are the same as the one before, byte by byte.
     frozen = {"colour: frozen images", "depth: frozen images"}
-    assert bench.complaints(checkup) <= {finding.name} | frozen
+    assert bench.complaints(result) <= {finding.name} | frozen

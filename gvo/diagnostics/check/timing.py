@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
-from gvo.checkup.sampling import StreamStamps, Survey
 from gvo.config import CheckConfig, Config
+from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
+from gvo.diagnostics.check.sampling import StreamStamps, Survey
 from gvo.io.frames import pair_limit_key
 from gvo.io.recording import RecordingInfo, Sensor
 from gvo.types import FloatArray, IntArray

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.checkup import Checkup, Finding, format_checkup
-from gvo.checkup.report import Limits, measured
+from gvo.diagnostics.check import CheckResult, Finding, format_check
+from gvo.diagnostics.check.findings import Limits, measured
 
 WORDS = st.text(st.characters(codec="ascii", categories=["L", "N"]), min_size=1, max_size=12)
 VERDICTS = st.sampled_from(["ok", "warning", "fault", "info", "unknown"])
@@ -23,15 +23,15 @@ FINDINGS = st.builds(
     verdict=VERDICTS,
     fix=WORDS,
 )
-CHECKUPS = st.builds(Checkup, recording=WORDS, findings=st.lists(FINDINGS).map(tuple))
+RESULTS = st.builds(CheckResult, recording=WORDS, findings=st.lists(FINDINGS).map(tuple))
 
 
-@given(CHECKUPS)
-def test_json_holds_every_finding_and_no_nan(checkup: Checkup) -> None:
-    content = json.loads(json.dumps(checkup.as_json(), allow_nan=False))
-    assert [row["name"] for row in content["findings"]] == [f.name for f in checkup.findings]
+@given(RESULTS)
+def test_json_holds_every_finding_and_no_nan(result: CheckResult) -> None:
+    content = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert [row["name"] for row in content["findings"]] == [f.name for f in result.findings]
     assert content["is_healthy"] == (content["n_faults"] == 0)
-    for row, finding in zip(content["findings"], checkup.findings, strict=True):
+    for row, finding in zip(content["findings"], result.findings, strict=True):
         is_number = isinstance(finding.value, float)
         if is_number and not math.isfinite(float(finding.value)):
             assert row["value"] is None
@@ -39,18 +39,18 @@ def test_json_holds_every_finding_and_no_nan(checkup: Checkup) -> None:
             assert row["value"] == finding.value
 
 
-@given(CHECKUPS)
-def test_the_table_has_a_line_per_finding_and_aligned_columns(checkup: Checkup) -> None:
-    n_told = next((n for n, f in enumerate(checkup.findings) if f.verdict != "info"), None)
-    told = checkup.findings[:n_told]
-    text = format_checkup(checkup)
+@given(RESULTS)
+def test_the_table_has_a_line_per_finding_and_aligned_columns(result: CheckResult) -> None:
+    n_told = next((n for n, f in enumerate(result.findings) if f.verdict != "info"), None)
+    told = result.findings[:n_told]
+    text = format_check(result)
     assert text.endswith("\n")
     lines = text.splitlines()
     assert lines[: len(told)] == [finding.value_text for finding in told]
     header, *rows, last = lines[len(told) :]
-    assert last.startswith(checkup.recording)
+    assert last.startswith(result.recording)
     column = header.index("verdict")
-    for row, finding in zip(rows, checkup.findings[len(told) :], strict=True):
+    for row, finding in zip(rows, result.findings[len(told) :], strict=True):
         assert row.startswith(finding.name)
         if finding.verdict != "info":
             assert row[column:].startswith(finding.verdict)
@@ -94,16 +94,16 @@ def test_shares_are_shown_in_percent() -> None:
 def test_warnings_alone_do_not_make_a_recording_unusable() -> None:
     warning = Finding(name="a", value=1.0, verdict="warning", fix="do")
     fault = Finding(name="b", value=1.0, verdict="fault", fix="do")
-    assert Checkup(recording="r", findings=(warning,)).is_healthy
-    checkup = Checkup(recording="r", findings=(warning, fault, warning))
-    assert not checkup.is_healthy
-    assert format_checkup(checkup).endswith("\nr: 1 fault, 2 warnings\n")
+    assert CheckResult(recording="r", findings=(warning,)).is_healthy
+    result = CheckResult(recording="r", findings=(warning, fault, warning))
+    assert not result.is_healthy
+    assert format_check(result).endswith("\nr: 1 fault, 2 warnings\n")
 
 
 def _of_streams(**second: str) -> list[str]:
     first = {"name": "left: rows", "value": "3", "threshold": "<= 5", "verdict": "ok"}
     findings = (Finding(**first), Finding(**(first | second)))  # type: ignore[arg-type]
-    return format_checkup(Checkup(recording="r", findings=findings)).splitlines()[1:-1]
+    return format_check(CheckResult(recording="r", findings=findings)).splitlines()[1:-1]
 
 
 def test_two_streams_share_a_line_where_both_are_well() -> None:

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.checkup.report import Finding, Limits, lost_limits, measured, unknown
-from gvo.checkup.sampling import Sample
 from gvo.config import CheckConfig, Config
+from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
+from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.tracking import detect_corners
 from gvo.types import BoolArray, FaultyFrame, FloatArray, Frame, ImageArray, RgbdFrame, StereoFrame
 

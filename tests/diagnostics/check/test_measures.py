@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.checkup.images import blur_sigma_px, n_torn_rows
-from gvo.checkup.misregistration import Misregistration, depth_steps, estimate_misregistration
-from gvo.checkup.stereo import row_error
-from gvo.checkup.stereo_matches import FreeMatcher, FreeMatches
 from gvo.config import Config
+from gvo.diagnostics.check.depth import Misregistration, depth_steps, estimate_misregistration
+from gvo.diagnostics.check.images import blur_sigma_px, n_torn_rows
+from gvo.diagnostics.check.stereo import FreeMatcher, FreeMatches, row_error
 from gvo.types import Failure, RgbdFrame
 
 

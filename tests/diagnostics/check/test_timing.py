@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.checkup.report import Finding
-from gvo.checkup.sampling import StreamStamps, Survey
-from gvo.checkup.timing import check_timing
 from gvo.config import Config
+from gvo.diagnostics.check.findings import Finding
+from gvo.diagnostics.check.sampling import StreamStamps, Survey
+from gvo.diagnostics.check.timing import check_timing
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo
 
@@ -146,12 +146,12 @@ def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not(bench: Any)
     def late(stamp_ns: int, _: int) -> int:
         return stamp_ns + 5 * MS - 1000
 
-    checkup = bench.check(bench.render("handheld", "stereo").with_stamps(late, stream=1))
-    finding = bench.find(checkup, "left/right: frames without partner")
+    result = bench.check(bench.render("handheld", "stereo").with_stamps(late, stream=1))
+    finding = bench.find(result, "left/right: frames without partner")
     assert (finding.verdict, finding.value) == ("fault", 100.0)
     assert "--set sync.stereo_tolerance_ms=5" in finding.fix
     # The images are looked at all the same.
-    assert bench.find(checkup, "left/right: row offset").verdict == "ok"
+    assert bench.find(result, "left/right: row offset").verdict == "ok"
 
 
 def test_dropped_images_of_a_rendered_recording_are_found(bench: Any) -> None:
@@ -186,7 +186,7 @@ def test_the_recording_clock_reaches_the_check_from_the_images(bench: Any) -> No
     recording = bench.render("handheld", "rgbd").mapped(
         lambda image, number: replace(image, log_time_ns=image.stamp_ns + 7 * MS)
     )
-    checkup = bench.check(recording)
-    assert bench.find(checkup, "colour: recording clock").value == "7 ms after the header"
-    assert bench.find(checkup, "depth: clock drift").value == 0.0
-    assert bench.complaints(checkup) == set()
+    result = bench.check(recording)
+    assert bench.find(result, "colour: recording clock").value == "7 ms after the header"
+    assert bench.find(result, "depth: clock drift").value == 0.0
+    assert bench.complaints(result) == set()

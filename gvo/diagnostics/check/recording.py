@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from gvo.checkup.depth import check_depth
-from gvo.checkup.frame_tree import check_frame_tree
-from gvo.checkup.images import check_images, check_usable
-from gvo.checkup.report import Checkup, Finding, Limits, judged, measured
-from gvo.checkup.sampling import Survey, survey
-from gvo.checkup.stereo import check_stereo
-from gvo.checkup.timing import check_timing
 from gvo.config import Config
+from gvo.diagnostics.check.depth import check_depth
+from gvo.diagnostics.check.findings import CheckResult, Finding, Limits, judged, measured
+from gvo.diagnostics.check.frame_tree import check_frame_tree
+from gvo.diagnostics.check.images import check_images, check_usable
+from gvo.diagnostics.check.sampling import Survey, survey
+from gvo.diagnostics.check.stereo import check_stereo
+from gvo.diagnostics.check.timing import check_timing
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.poses.tf import TfBuffer
@@ -32,7 +32,7 @@ def check_recording(
     transforms: TfBuffer | None = None,
     base_frame: str = "base_link",
     calibration_changes: Mapping[str, int] | None = None,
-) -> Checkup:
+) -> CheckResult:
     """Look for what makes odometry fail or err, before it runs.
 
     All stamps are read, and a few frames are decoded as odometry gets them. No more than these
@@ -55,7 +55,7 @@ def check_recording(
 
     Returns
     -------
-    Checkup
+    CheckResult
         What is damaged or missing is a finding, no exception.
 
     Examples
@@ -89,7 +89,7 @@ def check_recording(
             base_frame=base_frame,
             check=config.check,
         )
-    return Checkup(recording=info.name, findings=tuple(findings))
+    return CheckResult(recording=info.name, findings=tuple(findings))
 
 
 def _check_changes(changes: Mapping[str, int]) -> Finding:

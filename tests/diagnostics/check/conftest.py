@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from numpy.typing import NDArray
 
-from gvo.checkup import Checkup, Finding, check_recording
 from gvo.config import Config
+from gvo.diagnostics.check import CheckResult, Finding, check_recording
 from gvo.errors import RecordingError
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
@@ -81,18 +81,18 @@ def render(world: WorldName, sensor: Sensor, seed: int = 0) -> Held:
     return Held(info=source.info, items=items)
 
 
-def check(recording: Held, *, n_samples: int = 4, **options: Any) -> Checkup:
+def check(recording: Held, *, n_samples: int = 4, **options: Any) -> CheckResult:
     return check_recording(recording, Config(), n_samples=n_samples, **options)
 
 
-def complaints(checkup: Checkup) -> set[str]:
+def complaints(result: CheckResult) -> set[str]:
     """Return the names of all warnings and faults."""
-    return {finding.name for finding in checkup.with_verdict("warning", "fault")}
+    return {finding.name for finding in result.with_verdict("warning", "fault")}
 
 
-def find(checkup: Checkup, name: str) -> Finding:
+def find(result: CheckResult, name: str) -> Finding:
     """Return the finding of this name."""
-    (found,) = [finding for finding in checkup.findings if finding.name == name]
+    (found,) = [finding for finding in result.findings if finding.name == name]
     return found
 
 
@@ -101,9 +101,9 @@ class Bench:
     """What the tests of the checks share."""
 
     render: Callable[..., Held] = render
-    check: Callable[..., Checkup] = check
-    complaints: Callable[[Checkup], set[str]] = complaints
-    find: Callable[[Checkup, str], Finding] = find
+    check: Callable[..., CheckResult] = check
+    complaints: Callable[[CheckResult], set[str]] = complaints
+    find: Callable[[CheckResult, str], Finding] = find
     n_frames: int = N_FRAMES
 
 

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator
 
 import numpy as np
 
-from gvo.checkup.report import Finding, Limits, judged, measured, unknown
 from gvo.config import CheckConfig
+from gvo.diagnostics.check.findings import Finding, Limits, judged, measured, unknown
 from gvo.io.poses.ground_truth import TRUTH_FRAMES
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.poses.tf_paths import bare

@@ -1,17 +1,19 @@
-"""What a check found: values with their limits, verdicts and fixes."""
+"""What a check found: values with their limits, verdicts and fixes, and their table."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import takewhile
 from typing import Literal, TypeAlias
 
 from gvo.config import CheckConfig
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
-
 _N_DIGITS = 3
 _MAX_PLAIN = 1e7
+_HEADER = ("check", "value", "threshold", "verdict", "fix")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,7 +23,7 @@ class Finding:
     Parameters
     ----------
     name : str
-        What was looked at; no two findings of a checkup share it.
+        What was looked at; no two findings of a check share it.
     value : float or str
         A number in `unit`, or text. Shares are in percent.
     unit : str
@@ -70,7 +72,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Checkup:
+class CheckResult:
     """All findings on a recording.
 
     Parameters
@@ -224,3 +226,81 @@ def _number_text(value: float) -> str:
     if value == 0 or 10 ** (_N_DIGITS - 1) <= abs(value) < _MAX_PLAIN:
         return f"{value:.0f}"
     return f"{value:.{_N_DIGITS}g}"
+
+
+def format_check(result: CheckResult) -> str:
+    """Return what is told first, an aligned table of the rest, and a line that sums it up.
+
+    Where two streams (left and right, colour and depth) were judged alike, and nothing is wrong,
+    they share a line.
+
+    Examples
+    --------
+    >>> findings = (
+    ...     Finding(name="recording", value="stereo, 50 + 50 images"),
+    ...     Finding(name="left: gaps", value=0.1, unit="s", threshold="<= 0.5 s", verdict="ok"),
+    ...     Finding(name="right: gaps", value=0.2, unit="s", threshold="<= 0.5 s", verdict="ok"),
+    ... )
+    >>> print(format_check(CheckResult(recording="drive", findings=findings)), end="")
+    stereo, 50 + 50 images
+    check              value          threshold  verdict  fix
+    left, right: gaps  0.1 s | 0.2 s  <= 0.5 s   ok
+    drive: healthy
+    """
+    head = [finding.value_text for finding in takewhile(_is_told, result.findings)]
+    findings = list(_merged(result.findings[len(head) :]))
+    rows = [_HEADER, *map(_row, findings)]
+    # What is only told, however long, does not push the verdicts aside.
+    judged = [_HEADER, *(_row(finding) for finding in findings if not _is_told(finding))]
+    widths = [max(len(row[column]) for row in judged) for column in range(len(_HEADER))]
+    widths[0] = max(len(row[0]) for row in rows)
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    return "\n".join([*head, *lines, _sum_up(result)]) + "\n"
+
+
+def _is_told(finding: Finding) -> bool:
+    return finding.verdict == "info"
+
+
+def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:
+    """Yield the findings, those of two streams as one where they are alike and nothing is wrong."""
+    left = list(findings)
+    while left:
+        finding = left.pop(0)
+        partner = next((other for other in left if _are_alike(finding, other)), None)
+        if partner is not None:
+            left.remove(partner)
+            finding = _joined(finding, partner)
+        yield finding
+
+
+def _are_alike(first: Finding, second: Finding) -> bool:
+    (one, _, what), (other, _, its) = first.name.partition(": "), second.name.partition(": ")
+    return (
+        bool(what)
+        and (what, first.threshold, first.verdict) == (its, second.threshold, second.verdict)
+        and first.verdict in ("ok", "info")
+        and one != other
+    )
+
+
+def _joined(first: Finding, second: Finding) -> Finding:
+    (one, _, what), (other, *_) = first.name.partition(": "), second.name.partition(": ")
+    values = dict.fromkeys((first.value_text, second.value_text))
+    return replace(first, name=f"{one}, {other}: {what}", text=" | ".join(values))
+
+
+def _row(finding: Finding) -> tuple[str, ...]:
+    return (finding.name, finding.value_text, finding.threshold, finding.verdict, finding.fix)
+
+
+def _sum_up(result: CheckResult) -> str:
+    counts = {
+        "fault": len(result.with_verdict("fault")),
+        "warning": len(result.with_verdict("warning")),
+    }
+    parts = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    return f"{result.recording}: {', '.join(parts) or 'healthy'}"

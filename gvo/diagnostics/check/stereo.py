@@ -1,0 +1,388 @@
+"""Stereo pairs: rectified or not, left and right swapped, out of step, distorted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.config import CheckConfig, Config
+from gvo.diagnostics.check.findings import Finding, Limits, judged, measured, unknown
+from gvo.diagnostics.check.sampling import Sample
+from gvo.frontend.features import FeatureExtractor, Features
+from gvo.frontend.matching import descriptor_distances, mutual_best
+from gvo.geometry.camera import PinholeCamera
+from gvo.types import BoolArray, Failure, FloatArray, ImageArray, IntArray, StereoFrame
+
+# Enough for a percentile, and a quarter of the cost of the front-end's budget.
+_N_FEATURES = 600
+# How far a match may lie off its row and along it, as a share of the image.
+_ROW_SHARE, _MIN_ROW_BAND_PX = 0.06, 12.0
+_COLUMN_SHARE = 0.35
+# The best must be so much nearer than the best elsewhere (D. G. Lowe's ratio).
+_MAX_RATIO = 0.8
+_ELSEWHERE_PX = 3.0
+_WINDOW = (15, 15)
+_MAX_RETURN_PX, _MAX_STEP_PX = 0.3, 3.0
+_Pixels = NDArray[np.float32]
+_MAX_ROW_PX = 8.0
+_N_ROUNDS = 5
+_N_SIGMAS = 3.0
+_MAX_SIGMA = 0.03
+# Disparities nearer to zero have no sure sign: far points and the noise of a match.
+_SIGN_PX = 1.0
+# Wrong matches lie anywhere; what is so far from the median is none of the rig's doing.
+_OUTLIER_PX, _OUTLIER_SIGMAS = 3.0, 8.0
+# Another pairing must leave so much less of the rows' spread, and the present one so much.
+_STEP_RATIO, _MIN_STEP_SPREAD_PX = 0.6, 0.5
+_MIN_STEPS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FreeMatches:
+    """Matched pixels of left and right.
+
+    Parameters
+    ----------
+    pixels_left, pixels_right : ndarray of float64, shape (n, 2)
+        (u, v), the right ones to a fraction of a pixel.
+    """
+
+    pixels_left: FloatArray
+    pixels_right: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[FreeMatches]) -> FreeMatches:
+        """Return the matches of several pairs as one."""
+        return cls(
+            pixels_left=np.concatenate([part.pixels_left for part in parts]),
+            pixels_right=np.concatenate([part.pixels_right for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        """Return the number of matches."""
+        return len(self.pixels_left)
+
+    @property
+    def disparities(self) -> FloatArray:
+        """u_left - u_right, pixels, of either sign, shape (n,)."""
+        return np.asarray(self.pixels_left[:, 0] - self.pixels_right[:, 0])
+
+    @property
+    def row_differences(self) -> FloatArray:
+        """v_right - v_left, pixels, shape (n,)."""
+        return np.asarray(self.pixels_right[:, 1] - self.pixels_left[:, 1])
+
+
+class FreeMatcher:
+    """Match two images without the epipolar constraint and without a sign of the disparity.
+
+    Mutual best of ORB descriptors that beat all others elsewhere, in a band of rows far wider
+    than any rectified pair needs, then Lucas-Kanade in both axes, there and back.
+
+    Parameters
+    ----------
+    config : Config
+        `features` and `stereo.max_distance`.
+    """
+
+    def __init__(self, config: Config) -> None:
+        features = config.features.model_copy(update={"n_features": _N_FEATURES, "kind": "orb"})
+        self._extractor = FeatureExtractor(features)
+        self._max_distance = config.stereo.max_distance
+
+    def match(self, left: ImageArray, right: ImageArray) -> FreeMatches:
+        """Return the matches of two images, uint8 (height, width)."""
+        features_left = self._extractor.extract(left)
+        features_right = self._extractor.extract(right)
+        pairs = self._pair(features_left, features_right, left.shape)
+        pixels_left = features_left.keypoints[pairs[:, 0]]
+        pixels_right = features_right.keypoints[pairs[:, 1]]
+        return _refine(left, _as_bright(right, left), pixels_left, pixels_right)
+
+    def _pair(self, left: Features, right: Features, shape: tuple[int, ...]) -> IntArray:
+        if len(left) == 0 or len(right) == 0:
+            return np.zeros((0, 2), dtype=np.int64)
+        steps = right.keypoints[np.newaxis] - left.keypoints[:, np.newaxis]
+        band = max(_MIN_ROW_BAND_PX, _ROW_SHARE * shape[0])
+        is_near = (np.abs(steps[:, :, 1]) <= band) & (
+            np.abs(steps[:, :, 0]) <= _COLUMN_SHARE * shape[1]
+        )
+        pairs = np.argwhere(is_near)
+        distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
+        table = np.full(is_near.shape, 1.0)
+        table[pairs[:, 0], pairs[:, 1]] = distances
+        chosen = mutual_best(pairs, distances, len(left), len(right))
+        best, nearest = pairs[chosen], distances[chosen]
+        to_best = right.keypoints[np.newaxis] - right.keypoints[best[:, 1]][:, np.newaxis]
+        is_elsewhere = np.abs(to_best).max(axis=2) > _ELSEWHERE_PX
+        others = np.where(is_elsewhere, table[best[:, 0]], 1.0).min(axis=1)
+        is_kept = (nearest <= self._max_distance) & (nearest < _MAX_RATIO * others)
+        return np.asarray(best[is_kept])
+
+
+def _as_bright(image: ImageArray, other: ImageArray) -> ImageArray:
+    """Return an image with mean and contrast of another one: Lucas-Kanade takes both as given."""
+    gain = float(other.std()) / max(float(image.std()), 1.0)
+    offset = float(other.mean()) - gain * float(image.mean())
+    return np.asarray(cv2.addWeighted(image, gain, image, 0.0, offset), dtype=np.uint8)
+
+
+def _refine(
+    left: ImageArray, right: ImageArray, pixels_left: FloatArray, pixels_right: FloatArray
+) -> FreeMatches:
+    """Move the right pixels to a fraction of a pixel; drop what does not find back."""
+    if len(pixels_left) == 0:
+        return FreeMatches(pixels_left=pixels_left, pixels_right=pixels_right)
+    start = pixels_left.astype(np.float32)
+    guess = pixels_right.astype(np.float32)
+    there, is_there = _follow(left, right, start, guess)
+    back, is_back = _follow(right, left, there, start)
+    is_kept = is_there & is_back
+    is_kept &= np.linalg.norm(back - start, axis=1) <= _MAX_RETURN_PX
+    is_kept &= np.linalg.norm(there - guess, axis=1) <= _MAX_STEP_PX
+    return FreeMatches(
+        pixels_left=pixels_left[is_kept], pixels_right=there[is_kept].astype(np.float64)
+    )
+
+
+def _follow(
+    first: ImageArray, second: ImageArray, start: _Pixels, guess: _Pixels
+) -> tuple[_Pixels, BoolArray]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        start,
+        guess.copy(),
+        winSize=_WINDOW,
+        maxLevel=0,
+        criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(found), np.asarray(status)[:, 0] > 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensError:
+    """Radial distortion that is left in a pair.
+
+    Parameters
+    ----------
+    k1 : float
+        First radial coefficient, as of `plumb_bob`; the same in both cameras.
+    sigma : float
+        Its standard deviation.
+    """
+
+    k1: float
+    sigma: float
+
+
+def lens_error(matches: FreeMatches, camera: PinholeCamera) -> LensError | Failure:
+    """Estimate the radial distortion that both images of a pair still have.
+
+    With distortion a point moves along its radius by the factor 1 + k1 r^2. Left and right see it
+    at other radii, so that its rows differ by fy y k1 (r_left^2 - r_right^2): a pattern that
+    neither an offset nor a turn of the cameras makes. These are fitted along.
+
+    Parameters
+    ----------
+    matches : FreeMatches
+        Of images that should be rectified.
+    camera : PinholeCamera
+        Of the left one.
+
+    Returns
+    -------
+    LensError or Failure
+        The failure says that the matches do not show it: all far away, or near the centre.
+
+    References
+    ----------
+    D. C. Brown, "Decentering distortion of lenses", Photogrammetric Engineering, 1966.
+    """
+    left = camera.unproject(matches.pixels_left)[:, :2]
+    right = camera.unproject(matches.pixels_right)[:, :2]
+    rows = -matches.row_differences
+    y = camera.fy * left[:, 1]
+    pattern = y * (np.sum(left**2, axis=1) - np.sum(right**2, axis=1))
+    columns = np.column_stack([np.ones(len(y)), y, camera.fy * left[:, 0], pattern])
+    is_kept = np.abs(rows - np.median(rows)) < _MAX_ROW_PX
+    for _ in range(_N_ROUNDS):
+        errors = rows - columns @ _solve(columns[is_kept], rows[is_kept])
+        spread = 1.4826 * np.median(np.abs(errors[is_kept]))
+        is_kept = np.abs(errors) <= _N_SIGMAS * spread + 1e-6
+    kept = columns[is_kept]
+    variance = float(np.var(errors[is_kept]))
+    sigma = float(np.sqrt(variance * np.linalg.pinv(kept.T @ kept)[3, 3]))
+    if np.linalg.matrix_rank(kept) < kept.shape[1] or sigma > _MAX_SIGMA:
+        return Failure(reason=f"{len(rows)} matches do not show it (k1 to +/- {sigma:.2f})")
+    return LensError(k1=float(_solve(kept, rows[is_kept])[3]), sigma=sigma)
+
+
+def _solve(columns: FloatArray, values: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(columns, values, rcond=None)[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowError:
+    """By how much the rows of left and right differ.
+
+    Parameters
+    ----------
+    median_px : float
+        Of v_right - v_left.
+    percentile_95_px : float
+        Of the sizes.
+    """
+
+    median_px: float
+    percentile_95_px: float
+
+
+def row_error(matches: FreeMatches) -> RowError:
+    """Measure the rows over matches that were made without the epipolar constraint.
+
+    Wrong matches are those beyond eight robust sigmas of the median (at least 3 px): a rotated
+    or distorted pair spreads its rows evenly, and keeps them all.
+    """
+    rows = matches.row_differences
+    if len(rows) == 0:
+        return RowError(median_px=math.nan, percentile_95_px=math.nan)
+    median = np.median(rows)
+    sigma = 1.4826 * np.median(np.abs(rows - median))
+    kept = rows[np.abs(rows - median) <= max(_OUTLIER_PX, _OUTLIER_SIGMAS * sigma)]
+    return RowError(
+        median_px=float(np.median(kept)),
+        percentile_95_px=float(np.percentile(np.abs(kept), 95)),
+    )
+
+
+def check_stereo(
+    samples: Sequence[Sample], camera: PinholeCamera, config: Config
+) -> Iterator[Finding]:
+    """Yield what the matches of left and right say."""
+    check = config.check
+    pairs = [sample.first for sample in samples if isinstance(sample.first, StereoFrame)]
+    if not pairs:
+        yield unknown("left/right: matches", "no stereo frame to look at")
+        return
+    matcher = FreeMatcher(config)
+    found = [matcher.match(frame.left, frame.right) for frame in pairs]
+    count = float(np.median([len(matches) for matches in found]))
+    yield measured(
+        "left/right: matches",
+        count,
+        Limits(low=check.min_stereo_matches, fault_low=config.ransac.min_inliers),
+        text=f"{count:.0f} per frame (median)",
+        fix="make sure that the topics are of one pair, in focus, lit and textured",
+    )
+    matches = FreeMatches.joined(found)
+    if len(matches) < check.min_stereo_matches:
+        yield unknown("left/right: rows", f"{len(matches)} matches are too few")
+        return
+    yield from _check_rows(matches, check)
+    yield _check_lens(matches, camera, check)
+    yield _check_order(matches, check)
+    yield _check_step(samples, matcher)
+
+
+def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
+    error = row_error(matches)
+    fix = (
+        "calibrate the pair anew, or check R and P and that the topic is as (un)rectified as its "
+        "CameraInfo says"
+    )
+    yield measured(
+        "left/right: row offset",
+        error.median_px,
+        Limits(fault_low=-check.max_row_offset_px, fault_high=check.max_row_offset_px),
+        unit="px",
+        text=f"{error.median_px:+.2f} px median",
+        fix=fix,
+    )
+    yield measured(
+        "left/right: row spread",
+        error.percentile_95_px,
+        Limits(fault_high=check.max_row_spread_px),
+        unit="px",
+        text=f"{error.percentile_95_px:.2f} px at 95 %",
+        fix=fix,
+    )
+    # Corners lie on whole pixels: half a row on either side is theirs.
+    seed = math.ceil(2.0 * (error.percentile_95_px + 0.25)) / 2.0
+    yield Finding(
+        name="left/right: row search",
+        value=f"+/- {seed:g} px would hold 95 % (stereo.row_tolerance_px)",
+    )
+
+
+def _check_lens(matches: FreeMatches, camera: PinholeCamera, check: CheckConfig) -> Finding:
+    error = lens_error(matches, camera)
+    if isinstance(error, Failure):
+        return unknown("left/right: lens distortion", error.reason)
+    return measured(
+        "left/right: lens distortion",
+        error.k1,
+        Limits(fault_low=-check.max_lens_k1, fault_high=check.max_lens_k1),
+        text=f"k1 of about {error.k1:+.2f} is left, sigma {error.sigma:.3f}",
+        fix="the images are raw or wrongly calibrated: choose the raw topics with their D, or give "
+        "a --calibration FILE with D",
+    )
+
+
+def _check_order(matches: FreeMatches, check: CheckConfig) -> Finding:
+    disparities = matches.disparities
+    sure = disparities[np.abs(disparities) > _SIGN_PX]
+    share = float(np.mean(sure < 0)) if len(sure) >= check.min_stereo_matches else math.nan
+    is_swapped = share > 0.5
+    median_px = float(np.median(disparities))
+    return measured(
+        "left/right: order",
+        share,
+        Limits(high=check.max_negative_share, fault_high=0.5),
+        unit="%",
+        text=f"{share:.1%} of the disparities are negative, median {median_px:+.1f} px",
+        fix="exchange --left and --right"
+        if is_swapped
+        else "points behind infinity: the rectification turns the cameras apart",
+    )
+
+
+def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:
+    """Look whether the right image of the next or the last frame fits the left one better.
+
+    While the camera turns or shakes, rows of images that were not taken at once differ. Where
+    they differ with equal stamps and much less for another pairing, one stream lags by a frame.
+    """
+    name = "left/right: same moment"
+    spreads = [
+        _spreads(sample.first, sample.second, matcher)
+        for sample in samples
+        if isinstance(sample.first, StereoFrame) and isinstance(sample.second, StereoFrame)
+    ]
+    known = np.array([row for row in spreads if np.all(np.isfinite(row))])
+    if len(known) < _MIN_STEPS:
+        return unknown(name, "too few consecutive frames")
+    same, later, earlier = np.median(known, axis=0)
+    is_off = same > _MIN_STEP_SPREAD_PX and min(later, earlier) < _STEP_RATIO * same
+    return judged(
+        name,
+        f"rows spread {same:.2f} px; next right image {later:.2f}, last {earlier:.2f}",
+        is_ok=not is_off,
+        threshold=f"others >= {_STEP_RATIO:g} of it",
+        otherwise="fault",
+        fix=f"the right images are a frame {'late' if later < earlier else 'early'}: trigger both "
+        "cameras together, or correct the stamps",
+    )
+
+
+def _spreads(first: StereoFrame, second: StereoFrame, matcher: FreeMatcher) -> FloatArray:
+    """Return the rows' spread of left 1 and right 1, left 1 and right 2, left 2 and right 1."""
+    pairs = ((first.left, first.right), (first.left, second.right), (second.left, first.right))
+    errors = (row_error(matcher.match(*pair)).percentile_95_px for pair in pairs)
+    return np.array(list(errors))
