@@ -43,7 +43,7 @@ COVARIANCE_HEADER = "stamp_ns," + ",".join(
 """First line of a covariance file: the upper triangle, row by row."""
 
 
-def read_trajectory(path: str | Path) -> Trajectory:
+def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory:
     """Read a file of poses; TUM, KITTI or EuRoC by its columns and header.
 
     A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside the
@@ -55,6 +55,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     ----------
     path : str or Path
         Text; fields separated by blanks or commas, comments start with #.
+    is_growing : bool
+        A TUM file that a run still writes: it may be empty, end within a line, which is left
+        out, and hold its rows in any order.
 
     Returns
     -------
@@ -67,7 +70,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
         Naming file and line, where the file is missing, empty or malformed.
     """
     path = Path(path)
-    header, rows = read_rows(path, of="poses")
+    header, rows = read_rows(path, of="poses", is_growing=is_growing)
+    if is_growing:
+        return _read_growing(rows)
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
     n_columns = len(rows[0].fields)
@@ -80,13 +85,15 @@ def read_trajectory(path: str | Path) -> Trajectory:
     raise rows[0].error(f"expected {_FORMATS}, got {n_columns}")
 
 
-def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
+def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[IntArray, FloatArray]:
     """Read the covariances of a run folder, or what `write_covariances` wrote.
 
     Parameters
     ----------
     path : str or Path
         CSV with `COVARIANCE_HEADER` as its first line.
+    is_growing : bool
+        A run still writes it: it may be empty, or end within a line, which is left out.
 
     Returns
     -------
@@ -100,7 +107,9 @@ def read_covariances(path: str | Path) -> tuple[IntArray, FloatArray]:
         Where the file is missing or malformed.
     """
     path = Path(path)
-    _, rows = read_rows(path, of="covariances")
+    _, rows = read_rows(path, of="covariances", is_growing=is_growing)
+    if is_growing and not rows:
+        return np.empty(0, dtype=np.int64), np.empty((0, 6, 6))
     if not rows or rows[0].fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
     values = read_numbers(rows[1:], slice(1, None), n_columns=22)
@@ -271,6 +280,13 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
         raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
 
 
+def _read_growing(rows: list[Row]) -> Trajectory:
+    if not rows:
+        return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_cam=np.empty((0, 4, 4)))
+    order = np.argsort(read_stamps(rows, unit_ns=1_000_000_000), kind="stable")
+    return _read_tum([rows[index] for index in order])
+
+
 def _read_tum(rows: list[Row]) -> Trajectory:
     values = read_numbers(rows, slice(1, 8), n_columns=8)
     stamps_ns = read_stamps(rows, unit_ns=1_000_000_000)
@@ -345,7 +361,7 @@ class Row:
         return TrajectoryError(f"{self.path}:{self.number}: {cut(text, _MAX_REASON)}")
 
 
-def read_rows(path: Path, *, of: str) -> tuple[str, list[Row]]:
+def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, list[Row]]:
     """Read the fields of a text file, separated by blanks or commas; comments start with #.
 
     Parameters
@@ -354,6 +370,8 @@ def read_rows(path: Path, *, of: str) -> tuple[str, list[Row]]:
         Text file.
     of : str
         What its rows hold, in the plural, for messages.
+    is_growing : bool
+        Whether it may be missing yet, or end within a line, which is left out.
 
     Returns
     -------
@@ -367,17 +385,21 @@ def read_rows(path: Path, *, of: str) -> tuple[str, list[Row]]:
     TrajectoryError
         When the file cannot be read.
     """
+    if is_growing and not path.exists():
+        return "", []
     try:
-        lines = read_text(path, encoding="utf-8-sig").splitlines()
+        content = read_text(path, encoding="utf-8-sig")
     except OSError as error:
         raise TrajectoryError(
             f"{path}: cannot be read: {error.strerror}; give a file of {of}"
         ) from error
     except UnicodeDecodeError as error:
         raise TrajectoryError(f"{path}: is no text; expected rows of {of}") from error
+    if is_growing:
+        content = content[: content.rfind("\n") + 1]
     header: list[str] = []
     rows: list[Row] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(content.splitlines(), start=1):
         text, mark, comment = line.partition("#")
         fields = text.replace(",", " ").split()
         if mark and not rows:

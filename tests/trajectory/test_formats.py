@@ -293,3 +293,20 @@ def test_a_symmetric_matrix_comes_back_from_its_upper_triangle(seed: int, n: int
     assert upper[0, :n].tolist() == matrices[0, 0].tolist()
     np.testing.assert_array_equal(from_upper_triangle(upper), matrices)
     np.testing.assert_array_equal(from_upper_triangle(upper[1]), matrices[1])
+
+
+def test_growing_files_are_read_as_far_as_they_go_and_sorted(tmp_path: Path) -> None:
+    poses, covariances = tmp_path / "poses.txt", tmp_path / "covariances.csv"
+    assert len(read_trajectory(poses, is_growing=True)) == 0
+    assert [len(part) for part in read_covariances(covariances, is_growing=True)] == [0, 0]
+    trajectory = random_trajectory(3)
+    write_tum(poses, trajectory)
+    write_covariances(covariances, trajectory)
+    lines = poses.read_text().splitlines(keepends=True)
+    poses.write_text("".join([*reversed(lines[:-1]), lines[-1][:-1]]))
+    covariances.write_text(covariances.read_text()[:-1])
+    expected = trajectory.stamps_ns[:-1].tolist()
+    assert read_trajectory(poses, is_growing=True).stamps_ns.tolist() == expected
+    stamps_ns, found = read_covariances(covariances, is_growing=True)
+    assert stamps_ns.tolist() == expected
+    assert len(found) == len(expected)

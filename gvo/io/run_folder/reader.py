@@ -11,13 +11,12 @@ from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from gvo.bounded_text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory.formats import MAX_POSITION_M, from_upper_triangle, read_trajectory
+from gvo.trajectory.formats import MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
@@ -287,45 +286,11 @@ def _read_timings(path: Path) -> TimingTable | None:
 
 def _read_estimate(folder: Path, name: str) -> Trajectory:
     """Read poses and covariances; in the middle of a run either may be a line ahead."""
-    poses = _numbers(folder / f"{name}.txt", " ", n_columns=8)
-    norms = np.linalg.norm(poses[1][:, 3:], axis=1)
-    if not np.all(np.abs(norms - 1.0) < _ROUNDING):
-        raise TrajectoryError(f"{folder / name}.txt: a quaternion is not of length one; run again")
-    covariance_path = folder / f"{name}_covariance.csv"
-    upper = _numbers(covariance_path, ",", n_columns=22, n_header=1)
-    _, first, second = np.intersect1d(poses[0], upper[0], return_indices=True)
-    stamps_ns, values = poses[0][first], poses[1][first]
-    covariances = from_upper_triangle(upper[1][second])
-    try:
-        R = Rotation.from_quat(values[:, 3:]).as_matrix() if len(first) else np.empty((0, 3, 3))
-        return Trajectory(
-            stamps_ns=stamps_ns,
-            T_world_cam=se3.make_transform(np.asarray(R), values[:, :3]),
-            covariances=covariances,
-        )
-    except ValueError as error:
-        raise TrajectoryError(f"{folder / name}.txt: {error}; run again") from error
-
-
-def _numbers(
-    path: Path, separator: str, *, n_columns: int, n_header: int = 0
-) -> tuple[IntArray, FloatArray]:
-    """Return the stamps, shape (n,), and the other columns of a file of this project."""
-    lines = _whole_lines(path) if path.is_file() else []
-    stamps = np.empty(max(len(lines) - n_header, 0), dtype=np.int64)
-    values = np.empty((len(stamps), n_columns - 1))
-    for index, line in enumerate(lines[n_header:]):
-        stamp, *fields = line.split(separator)
-        try:
-            # seconds with nine decimals, or nanoseconds: without the point both are nanoseconds
-            stamps[index] = int(stamp.replace(".", ""))
-            if len(fields) != n_columns - 1:
-                raise ValueError(f"expected {n_columns} columns, got {len(fields) + 1}")
-            values[index] = fields
-        except (ValueError, OverflowError) as error:
-            where = f"{path}:{index + n_header + 1}"
-            raise TrajectoryError(f"{where}: {error}; run again") from error
-    return stamps, values
+    poses = read_trajectory(folder / f"{name}.txt", is_growing=True)
+    path = folder / f"{name}_covariance.csv"
+    stamps_ns, covariances = read_covariances(path, is_growing=True)
+    _, first, second = np.intersect1d(poses.stamps_ns, stamps_ns, return_indices=True)
+    return replace(poses.select(first), covariances=covariances[second])
 
 
 def _read_truth(folder: Path, summary: dict[str, Any]) -> Trajectory | None:
