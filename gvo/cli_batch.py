@@ -187,8 +187,8 @@ def _clock(seconds: float) -> str:
 
 def _report(table: pd.DataFrame, out: str) -> NoReturn:
     """Print what a batch gave, and end with its exit code."""
+    from gvo.batch.rows import RunStatus
     from gvo.io.run_folder.writer import REPORT
-    from gvo.outputs.batch_rows import RunStatus
     from gvo.runs import EXIT_COMPLETE, EXIT_PARTLY
 
     counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}

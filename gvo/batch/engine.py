@@ -15,11 +15,11 @@ from typing import Any
 import dask
 from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, Security
 
+from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import Task, TaskOptions
 from gvo.batch.worker import work
 from gvo.bounded_text import cut
 from gvo.errors import ConfigurationError, GvoError
-from gvo.outputs.batch_rows import BatchRow
 
 # Handed out at once, at least: a cluster that grows with its work must see some.
 _MIN_IN_FLIGHT = 100
@@ -96,7 +96,7 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
                 # Whoever has none is given port 8787, which another batch may have.
                 scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                 silence_logs=logging.CRITICAL,
-                preload="gvo.batch.quiet",
+                preload="gvo.batch.worker",
                 # Else whoever has a login here could have the workers run what he likes.
                 security=_make_security(),
             ) as cluster,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from gvo.batch.names import free_name, safe_name
 from gvo.batch.results import CSV, PARQUET
 from gvo.batch.storage import Place, is_url
 from gvo.batch.tasks import MARK
@@ -17,6 +16,8 @@ from gvo.errors import RecordingError
 from gvo.io.opening import BAG_SUFFIXES, FOLDER_MARKERS
 from gvo.io.run_folder.writer import REPORT
 
+_UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
+_MAX_NAME = 150
 _LIST_SUFFIX = ".txt"
 _PATTERN = re.compile(r"[*?\[]")
 # Folders within folders that are looked through: a link to a folder above must have an end.
@@ -161,3 +162,28 @@ def _number(names: dict[str, str]) -> dict[str, str]:
         numbered[each] = free_name(name, taken)
         taken.add(numbered[each])
     return numbered
+
+
+def safe_name(text: str) -> str:
+    """Return a text as the name of a folder.
+
+    Examples
+    --------
+    >>> safe_name("day 1/../drive")
+    'day_1_.._drive'
+    """
+    return _UNSAFE.sub("_", text).lstrip(".")[:_MAX_NAME] or "_"
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """Return a name that is not taken: with a number where it is.
+
+    Examples
+    --------
+    >>> free_name("drive", {"drive", "drive-2"})
+    'drive-3'
+    """
+    free, number = name, 2
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free

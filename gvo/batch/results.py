@@ -10,9 +10,9 @@ from pathlib import Path
 import pandas as pd
 import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
 
+from gvo.batch.rows import BatchRow, Value
 from gvo.errors import OutputError
 from gvo.io.run_folder.line_file import replace_bytes
-from gvo.outputs.batch_rows import BatchRow, Value
 
 CSV = "results.csv"
 PARQUET = "results.parquet"

@@ -17,6 +17,7 @@ from distributed import Client
 from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.results import to_frame, write_results
+from gvo.batch.rows import BatchRow
 from gvo.batch.storage import is_url, store
 from gvo.batch.tasks import MARK, Task, TaskOptions
 from gvo.batch.variants import Variant, differences, name_variants
@@ -26,7 +27,6 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions
 from gvo.io.run_folder.line_file import replace_text
 from gvo.io.run_folder.writer import REPORT
-from gvo.outputs.batch_rows import BatchRow
 from gvo.version import __version__
 
 # How often the table is written while the batch goes.
@@ -219,7 +219,7 @@ class _Table:
             raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
 
     def _draw(self, folder: Path) -> None:
-        from gvo.outputs.report.batch_report import write_batch_report
+        from gvo.batch.report.report import write_batch_report
 
         n_missing = len(self._places) - len(self._rows)
         note = f"{n_missing} runs were not made: the batch was stopped" if n_missing else ""

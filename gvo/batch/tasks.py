@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from gvo.batch.rows import BatchRow, RunStatus, Value, figures_of
 from gvo.batch.storage import fetch, fetch_file, is_url, store
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, OutputError, ResumeError, RunBusyError
 from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.run_folder.writer import SUMMARY
-from gvo.outputs.batch_rows import BatchRow, RunStatus, Value, figures_of
 from gvo.run_outputs import RunOutputs
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, RunResult, run_recording

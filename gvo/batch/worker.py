@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from distributed import get_worker
 
-from gvo.batch.tasks import Task, TaskOptions, run_task
 from gvo.errors import GvoError
-from gvo.outputs.batch_rows import BatchRow
-from gvo.run_tally import Progress
+
+if TYPE_CHECKING:
+    from gvo.batch.rows import BatchRow
+    from gvo.batch.tasks import Task, TaskOptions
+    from gvo.run_tally import Progress
 
 _NEWS_S = 1.0
 
 
 class BatchStoppedError(GvoError):
     """The batch that the task belongs to was stopped."""
+
+
+def dask_setup(worker: object) -> None:
+    """Ignore SIGINT in a worker of this machine, which Dask calls when it starts.
+
+    A terminal sends Ctrl-C to all of its processes; the client ends its workers itself.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  # noqa: ANN401
@@ -33,6 +44,8 @@ def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  #
     key : tuple
         Of the task, as the scheduler knows it.
     """
+    from gvo.batch.tasks import run_task
+
     worker: Any = get_worker()
     return run_task(
         task,

@@ -17,10 +17,10 @@ from distributed import Client
 import gvo
 from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
 from gvo.batch.recordings import NamedRecording
+from gvo.batch.rows import BatchRow
 from gvo.batch.running import make_tasks
 from gvo.batch.tasks import MARK, Task, TaskOptions
 from gvo.batch.variants import make_variants
-from gvo.outputs.batch_rows import BatchRow
 from tests.batch.conftest import is_complete, wait_until
 
 N_MANY = 300

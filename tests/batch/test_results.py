@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.batch.results import CSV, PARQUET, to_frame, write_results
+from gvo.batch.rows import BatchRow, Value
 from gvo.errors import OutputError
-from gvo.outputs.batch_rows import BatchRow, Value
 
 HOSTILE = ['a,b"c\nd\re', "=1+1", " blank ", "NULL", "ü\u2028🤖", "\x00", "<script>", "\\N", "'"]
 

@@ -11,10 +11,10 @@ import fsspec
 import pytest
 
 import gvo
+from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import JOURNAL
-from gvo.outputs.batch_rows import BatchRow
 from gvo.resuming.record_file import RecordFile
 from gvo.run_tally import Progress
 from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of

@@ -1,5 +1,7 @@
 """A worker tells how far it is, and stops where nobody wants the answer any more."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +11,13 @@ from gvo.batch.worker import BatchStoppedError, _teller
 from gvo.run_tally import Progress
 
 KEY = ("batch", 7)
+_PROGRAM = """
+import os, signal
+from gvo.batch.worker import dask_setup
+dask_setup(None)
+os.kill(os.getpid(), signal.SIGINT)
+print("goes on")
+"""
 
 
 class Worker:
@@ -56,3 +65,9 @@ def test_a_task_that_nobody_wants_any_more_stops(
     with pytest.raises(BatchStoppedError):
         tell(progress(3))
     assert len(worker.events) == 1
+
+
+def test_a_worker_goes_on_when_ctrl_c_is_pressed() -> None:
+    command = [sys.executable, "-c", _PROGRAM]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (answer.returncode, answer.stdout, answer.stderr) == (0, "goes on\n", "")

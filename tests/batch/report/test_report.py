@@ -15,19 +15,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.cbook import boxplot_stats
 
+from gvo.batch.report.boxes import MAX_ROWS, box_of
+from gvo.batch.report.report import write_batch_report
+from gvo.batch.report.table import run_address
+from gvo.batch.report.values import log_limits, log_ticks
+from gvo.batch.rows import BatchRow, Value
 from gvo.config import Config
 from gvo.errors import ConfigurationError
-from gvo.outputs.batch_rows import BatchRow, Value
-from gvo.outputs.report.batch_axes import log_limits, log_ticks
-from gvo.outputs.report.batch_boxes import MAX_ROWS, box_of
-from gvo.outputs.report.batch_report import write_batch_report
-from gvo.outputs.report.batch_table import run_address
 
 SWEEP: Mapping[str, Sequence[Value]] = {
     "window.n_links": [1, 3, 5],
     "frontend.subpixel": [True, False],
 }
-SECTIONS = ["boxes", "importance", "error_by_value", "time_by_value", "front", "runs"]
+SECTIONS = ["boxes", "error_by_value", "time_by_value", "front", "runs"]
 
 
 def made_up(
@@ -302,8 +302,6 @@ def test_the_table_of_values_holds_the_planted_effect(tmp_path: Path) -> None:
     rows[0] = failed(rows[0])
     rows[7] = replace(rows[7], status="partly", coverage_percent=50.0, ate_smoothed_m=1e-9)
     page = page_of(tmp_path, rows)
-    importance = page.rows["importance"]
-    assert importance[1][:4] == ["window.n_links", "100.0", "11.1", "4.000"]
     head, *values = page.rows["time_by_value"]
     assert [row[:3] for row in values] == [
         ["window.n_links", "1", "0.500"],
@@ -353,10 +351,9 @@ def test_the_configuration_with_all_defaults_is_marked(tmp_path: Path) -> None:
 def test_without_truth_coverage_and_time_are_left(tmp_path: Path) -> None:
     rows = [replace(row, ate_raw_m=None, ate_smoothed_m=None) for row in made_up(SWEEP, 3)]
     page = page_of(tmp_path, rows)
-    assert page.drawn == ["boxes", "importance", "time_by_value"]
+    assert page.drawn == ["boxes", "time_by_value"]
     assert "ATE smoothed [m]" not in page.text
-    assert "What matters for the time" in page.text
-    assert page.rows["importance"][1][:2] == ["window.n_links", "100.0"]
+    assert page.rows["time_by_value"][1][:5] == ["window.n_links", "1", "-", "-", "2.000"]
     assert page.facts()["Ground truth"] == "no run has an error"
     assert not {"ATE smoothed [m]", "over the best"} & {*page.rows["runs"][0]}
 
@@ -381,11 +378,11 @@ def test_one_row_is_enough(is_failed: bool, tmp_path: Path) -> None:
     assert len(page.rows["runs"]) == 2
 
 
-def test_one_recording_has_effects_without_intervals(tmp_path: Path) -> None:
-    page = page_of(tmp_path, made_up(SWEEP, 1))
-    assert page.drawn == SECTIONS[:-1]
-    assert "There is one recording" in page.text
-    assert {row[3] for row in page.rows["time_by_value"][1:]} == {"-"}
+def test_values_of_every_kind_stand_in_order(tmp_path: Path) -> None:
+    sweep: dict[str, list[Value]] = {"a.kind": ["orb", "klt"], "b.limit": [2.5, None, 1.0]}
+    page = page_of(tmp_path, made_up(sweep, 2))
+    values = {row[1]: row[0] for row in page.rows["time_by_value"][1:]}
+    assert [*values] == ["orb", "klt", "1", "2.5", "null"]
 
 
 @pytest.mark.parametrize("n", [MAX_ROWS, MAX_ROWS + 15])

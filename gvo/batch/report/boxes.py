@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.outputs.report.batch_axes import logarithmic_axis
-from gvo.outputs.report.batch_values import N_LABEL, Batch, shown
+from gvo.batch.effects import ERROR, TIME, relative
+from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.palette import ESTIMATES, REFUSED
 from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
@@ -57,13 +57,13 @@ def box_plot(batch: Batch) -> Plot:
         return Plot(slug="boxes", title=title, text="Not drawn: no run has an error or a coverage.")
     rows, words = _variant_rows(batch) if batch.is_sweep else _recording_rows(batch)
     if any(panel.reference is not None for panel in panels):
-        words += " The relative ATE is that over the geometric mean of all runs of its recording."
+        words += " The relative ATE is that over the median of all runs of its recording."
     words += (
         " Boxes hold the middle half of the runs, the line in them is the median; whiskers reach "
         f"to the farthest run within {_WHISKER} box lengths. Points are runs: all of them up to "
         f"{_MAX_POINTS} in a row, of more those beyond the whiskers."
     )
-    if np.any(~batch.runs.is_comparable() & ~np.isnan(batch.errors_m)):
+    if np.any(~batch.is_comparable() & ~np.isnan(batch.numbers(ERROR))):
         words += (
             " Hollow points are runs with less than 95 % of the poses of the best run of their "
             "recording: their errors are of the easy part, and in no box."
@@ -72,14 +72,13 @@ def box_plot(batch: Batch) -> Plot:
 
 
 def _panels(batch: Batch) -> list[_Panel]:
-    is_run = ~batch.runs.is_failed
+    is_run = ~batch.is_failed()
     panels = _error_panels(batch) if batch.has_errors else []
-    if not np.all(np.isnan(batch.coverages_percent)):
-        coverages = batch.coverages_percent
+    coverages, times_ms = batch.numbers("coverage_percent"), batch.numbers(TIME)
+    if not np.all(np.isnan(coverages)):
         panels.append(_Panel(label=_COVERAGE, values=coverages, is_counted=is_run))
-    if batch.has_times:
-        times_ms = batch.times_ms
-        known = times_ms[batch.runs.has(times_ms)]
+    known = times_ms[batch.is_comparable(TIME)]
+    if len(known):
         is_wide = bool(known.max() > 10.0 * known.min())
         panels.append(
             _Panel(label="frame [ms]", values=times_ms, is_counted=is_run, is_logarithmic=is_wide)
@@ -89,27 +88,27 @@ def _panels(batch: Batch) -> list[_Panel]:
 
 def _error_panels(batch: Batch) -> list[_Panel]:
     looks: dict[str, Any] = {
-        "is_counted": batch.runs.is_comparable(),
+        "is_counted": batch.is_comparable(),
         "colour": ESTIMATES["smoothed"],
         "is_logarithmic": True,
     }
-    panels = [_Panel(label="ATE smoothed [m]", values=batch.errors_m, **looks)]
-    if batch.is_sweep and len(set(batch.runs.recordings)) > 1:
-        over_mean = batch.over_mean()
-        panels.append(_Panel(label="relative ATE [-]", values=over_mean, reference=1.0, **looks))
+    panels = [_Panel(label="ATE smoothed [m]", values=batch.numbers(ERROR), **looks)]
+    if batch.is_sweep and batch.table["recording"].nunique() > 1:
+        ratios = np.asarray(relative(batch.table, ERROR), dtype=np.float64)
+        panels.append(_Panel(label="relative ATE [-]", values=ratios, reference=1.0, **looks))
     return panels
 
 
 def _variant_rows(batch: Batch) -> tuple[list[_Row], str]:
-    special = {mean.name for mean in batch.means if mean.is_on_front} | {batch.default}
+    is_comparable = batch.is_comparable()
     rows = []
-    for mean in batch.means:
-        is_in = batch.is_of(mean.name)
-        is_good = is_in & batch.runs.is_comparable()
+    for variant in batch.means.index:
+        is_in = (batch.table["variant"] == variant).to_numpy(dtype=np.bool_)
+        is_good = is_in & is_comparable
         missing = f" ({np.sum(is_good)} of {np.sum(is_in)})" if np.any(is_good != is_in) else ""
-        name = shown(batch.labels[mean.name], N_LABEL) + missing
-        rows.append(_Row(name=name, is_in=is_in, is_marked=mean.name == batch.default))
-    is_kept = [mean.name in special for mean in batch.means]
+        name = shown(batch.labels[variant], N_LABEL) + missing
+        rows.append(_Row(name=name, is_in=is_in, is_marked=variant == batch.default))
+    is_kept = [*(batch.means["is_on_front"] | (batch.means.index == batch.default))]
     order = "the most complete first, of these the most accurate"
     if not batch.has_errors:
         order = "the best covered first"
@@ -124,10 +123,10 @@ def _variant_rows(batch: Batch) -> tuple[list[_Row], str]:
 
 
 def _recording_rows(batch: Batch) -> tuple[list[_Row], str]:
-    measure = batch.errors_m if batch.has_errors else -batch.coverages_percent
+    measure = batch.numbers(ERROR) if batch.has_errors else -batch.numbers("coverage_percent")
     # what failed is the worst
     order = np.argsort(np.where(np.isnan(measure), np.inf, measure), kind="stable")
-    is_run = ~batch.runs.is_failed
+    is_run = ~batch.is_failed()
     n_run = int(np.sum(is_run))
     if len(order) > MAX_ROWS:
         order = order[is_run[order]]

@@ -11,20 +11,21 @@ from urllib.parse import quote, urlsplit
 
 import numpy as np
 
+from gvo.batch.effects import ERROR, relative
+from gvo.batch.report.values import Batch, number_text, printable
+from gvo.batch.rows import BatchRow
 from gvo.io.run_folder.writer import REPORT
-from gvo.outputs.batch_rows import BatchRow
-from gvo.outputs.report.batch_values import Batch, number_text, printable
 from gvo.types import FloatArray
 
 _SCHEMES = ("http", "https")
-_ERROR = "ATE smoothed [m]"
+_ATE = "ATE smoothed [m]"
 _RANKS = {"failed": 0, "partly": 1, "complete": 2}
 _COLUMNS: tuple[tuple[str, Callable[[BatchRow], float | None], str], ...] = (
     ("frames", lambda row: row.frames, "d"),
     ("coverage [%]", lambda row: row.coverage_percent, ".1f"),
     ("segments", lambda row: row.segments, "d"),
     ("ATE raw [m]", lambda row: row.ate_raw_m, ".4g"),
-    (_ERROR, lambda row: row.ate_smoothed_m, ".4g"),
+    (_ATE, lambda row: row.ate_smoothed_m, ".4g"),
     ("RPE [m]", lambda row: row.rpe_smoothed_m, ".4g"),
     ("RPE [deg]", lambda row: row.rpe_smoothed_deg, ".4g"),
     ("t_err [%]", lambda row: row.t_smoothed_percent, ".4g"),
@@ -43,8 +44,9 @@ def runs_html(batch: Batch, folder: Path) -> str:
     folder : Path
         That of the page: links are relative to it.
     """
-    over_best = batch.over_best()
-    order = sorted(range(len(batch.rows)), key=lambda n: _rank(batch, n, float(over_best[n])))
+    over_best = np.asarray(relative(batch.table, ERROR, to="min"), dtype=np.float64)
+    errors = over_best if batch.is_sweep else batch.numbers(ERROR)
+    order = sorted(range(len(batch.rows)), key=lambda n: _rank(batch.rows[n], float(errors[n])))
     rows = [batch.rows[n] for n in order]
     columns = dict(_number_columns(rows, over_best[order] if batch.is_sweep else None))
     header = ["recording", *(["configuration"] if batch.is_sweep else []), "status"]
@@ -73,10 +75,8 @@ def _words(batch: Batch) -> str:
     )
 
 
-def _rank(batch: Batch, n: int, over_best: float) -> tuple[float | str, ...]:
+def _rank(row: BatchRow, error: float) -> tuple[float | str, ...]:
     """Return what sorts the worst to the top."""
-    row = batch.rows[n]
-    error = over_best if batch.is_sweep else float(batch.errors_m[n])
     coverage = math.inf if row.coverage_percent is None else row.coverage_percent
     by_error = math.inf if math.isnan(error) else -error
     by_status = (coverage, by_error) if row.status == "partly" else (by_error, coverage)
@@ -91,7 +91,7 @@ def _number_columns(
         values = [value(row) for row in rows]
         if any(each is not None for each in values):
             yield name, [number_text(each, form) for each in values]
-        if name == _ERROR and over_best is not None and not np.all(np.isnan(over_best)):
+        if name == _ATE and over_best is not None and not np.all(np.isnan(over_best)):
             yield "over the best", [number_text(float(ratio), ".3f") for ratio in over_best]
 
 

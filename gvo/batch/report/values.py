@@ -6,18 +6,29 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import pandas as pd
 
+from gvo.batch.effects import ERROR, comparable
+from gvo.batch.pareto import variant_means
+from gvo.batch.results import to_frame
+from gvo.batch.rows import BatchRow
+from gvo.batch.variants import DEFAULT
 from gvo.config import Config
-from gvo.outputs.batch_rows import BatchRow, Value
-from gvo.parameter_effects import Runs, VariantMean, accuracy_front
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.plots import plain
 
-DEFAULT = "default"
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 N_LABEL = 40
 """Letters of a name in a picture."""
+_LEAST = 1.25
+"""Of end over start: less would make much of nothing."""
+_MARGIN = 0.06
+_SERIES: tuple[tuple[float, ...], ...] = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -27,11 +38,10 @@ class Batch:
     Parameters
     ----------
     rows : tuple of BatchRow, length n
-    runs : Runs
-    errors_m, times_ms, coverages_percent : ndarray of float64, shape (n,)
-        Smoothed ATE, time of a frame, coverage; NaN where there is none.
-    means : tuple of VariantMean
-        The configurations, the best first.
+    table : DataFrame
+        The rows, as `results.csv` holds them.
+    means : DataFrame
+        A row for each configuration, the best first; see `variant_means`.
     default : str or None
         Name of the configuration whose swept parameters have their defaults.
     labels : dict of str to str
@@ -41,11 +51,8 @@ class Batch:
     """
 
     rows: tuple[BatchRow, ...]
-    runs: Runs
-    errors_m: FloatArray
-    times_ms: FloatArray
-    coverages_percent: FloatArray
-    means: tuple[VariantMean, ...]
+    table: pd.DataFrame
+    means: pd.DataFrame
     default: str | None
     labels: Mapping[str, str]
     label_words: str
@@ -53,26 +60,12 @@ class Batch:
     @classmethod
     def of(cls, rows: Sequence[BatchRow]) -> Batch:
         """Take the numbers out of the rows."""
-        errors_m = _numbers([row.ate_smoothed_m for row in rows])
-        times_ms = _numbers([row.frame_ms for row in rows])
-        coverages = _numbers([row.coverage_percent for row in rows])
-        frames = _numbers([None if row.frames is None else float(row.frames) for row in rows])
-        runs = Runs(
-            recordings=[row.recording for row in rows],
-            variants=[row.variant for row in rows],
-            parameters=_parameters(rows),
-            is_failed=np.array([row.status == "failed" for row in rows], dtype=np.bool_),
-            n_poses=frames * coverages / 100.0,
-        )
-        means = accuracy_front(runs, errors_m, times_ms)
+        table = to_frame(rows)
         labels, label_words = _labels(rows)
         return cls(
             rows=tuple(rows),
-            runs=runs,
-            errors_m=errors_m,
-            times_ms=times_ms,
-            coverages_percent=coverages,
-            means=_ranked(means, rows),
+            table=table,
+            means=variant_means(table),
             default=_default_of(rows),
             labels=labels,
             label_words=label_words,
@@ -85,53 +78,20 @@ class Batch:
 
     @property
     def has_errors(self) -> bool:
-        """Whether any run has a true trajectory beside it."""
-        return bool(np.any(self.runs.has(self.errors_m)))
+        """Whether any comparable run has a true trajectory beside it."""
+        return bool(self.is_comparable(ERROR).any())
 
-    @property
-    def has_times(self) -> bool:
-        """Whether any comparable run tells how long a frame took."""
-        return bool(np.any(self.runs.has(self.times_ms)))
+    def numbers(self, column: str) -> FloatArray:
+        """Return a column of the table, shape (n,); NaN where there is no number."""
+        return self.table[column].to_numpy(dtype=np.float64, na_value=np.nan)
 
-    def is_of(self, variant: str) -> BoolArray:
-        """Tell which rows are of a configuration, shape (n,)."""
-        return np.array([row.variant == variant for row in self.rows], dtype=np.bool_)
+    def is_comparable(self, measure: str | None = None) -> BoolArray:
+        """Tell which runs can be compared, by a measure if given, shape (n,)."""
+        return comparable(self.table, measure).to_numpy()
 
-    def over_best(self) -> FloatArray:
-        """Return each error over the least comparable one of its recording, shape (n,)."""
-        return self.errors_m / self._by_recording(np.fmin.reduce)
-
-    def over_mean(self) -> FloatArray:
-        """Return each error over the geometric mean of its recording, shape (n,)."""
-        return self.errors_m / self._by_recording(lambda errors: np.exp(np.mean(np.log(errors))))
-
-    def _by_recording(self, summary: object) -> FloatArray:
-        codes, is_used = self.runs.recording_codes(), self.runs.has(self.errors_m)
-        found = np.full(len(codes), np.nan)
-        for code in np.unique(codes[is_used]):
-            found[code] = summary(self.errors_m[is_used & (codes == code)])  # type: ignore[operator]
-        return found[codes]
-
-
-def _numbers(values: Sequence[float | None]) -> FloatArray:
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-
-
-def _parameters(rows: Sequence[BatchRow]) -> dict[str, list[Value]]:
-    names = dict.fromkeys(name for row in rows for name in row.parameters)
-    return {name: [row.parameters.get(name) for row in rows] for name in names}
-
-
-def _ranked(means: Sequence[VariantMean], rows: Sequence[BatchRow]) -> tuple[VariantMean, ...]:
-    """Return those that completed most first, of these the most accurate; else by coverage."""
-
-    def rank(mean: VariantMean) -> tuple[float, ...]:
-        own = [row for row in rows if row.variant == mean.name]
-        coverage = sum(row.coverage_percent or 0.0 for row in own) / len(own)
-        ratio = math.inf if mean.error_ratio is None else mean.error_ratio
-        return -mean.n_compared, ratio, -coverage, sum(row.frame_ms or 0.0 for row in own)
-
-    return tuple(sorted(means, key=rank))
+    def is_failed(self) -> BoolArray:
+        """Tell which runs failed, shape (n,)."""
+        return (self.table["status"] == "failed").to_numpy(dtype=np.bool_)
 
 
 def _labels(rows: Sequence[BatchRow]) -> tuple[dict[str, str], str]:
@@ -224,9 +184,9 @@ def shown(text: str, n_most: int) -> str:
 
 def value_text(value: object) -> str:
     """Return a value as YAML has it."""
-    if value is None:
+    if value is None or value is pd.NA or value != value:
         return "null"
-    if isinstance(value, bool):
+    if isinstance(value, bool | np.bool_):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else printable(str(value))
 
@@ -234,3 +194,65 @@ def value_text(value: object) -> str:
 def number_text(value: float | None, form: str = ".4g") -> str:
     """Return a number, a dash where there is none."""
     return "-" if value is None or math.isnan(value) else f"{value:{form}}"
+
+
+def logarithmic_axis(
+    axes: Axes, which: Literal["x", "y"], *, ends: tuple[float, float], n_ticks: int = 6
+) -> None:
+    """Make an axis logarithmic, with some labelled ticks.
+
+    Parameters
+    ----------
+    axes : Axes
+    which : {"x", "y"}
+    ends : tuple of float
+        Least and largest of what is drawn.
+    n_ticks : int
+        At most so many.
+    """
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    low, high = log_limits(*ends)
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    if which == "x":
+        axes.set_xscale("log")
+        axes.set_xlim(low, high)
+    else:
+        axes.set_yscale("log")
+        axes.set_ylim(low, high)
+    axis.set_major_locator(FixedLocator(log_ticks(low, high, n_ticks)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def log_limits(low: float, high: float) -> tuple[float, float]:
+    """Return ends of an axis around positive numbers, with margins."""
+    if not 0.0 < low <= high < np.inf:
+        return 0.1, 10.0
+    widening = max(0.0, 0.5 * float(np.log(_LEAST * low / high)))
+    margin = np.exp(widening + _MARGIN * np.log(max(high / low, _LEAST)))
+    return float(low / margin), float(high * margin)
+
+
+def log_ticks(low: float, high: float, n_most: int) -> list[float]:
+    """Return round numbers between the ends of a logarithmic axis, two at least.
+
+    Examples
+    --------
+    >>> log_ticks(0.02, 30.0, 6)
+    [0.1, 1.0, 10.0]
+    >>> log_ticks(0.8, 2.1, 6)
+    [1.0, 1.5, 2.0]
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
+    for series in reversed(_SERIES):
+        ticks = [float(f"{s}e{n}") for n in range(first, last + 1) for s in series]
+        ticks = [tick for tick in ticks if low <= tick <= high]
+        if 3 <= len(ticks) <= n_most:
+            return ticks
+    if len(ticks) > n_most:
+        return ticks[:: -(-len(ticks) // n_most)]
+    even = MaxNLocator(n_most - 1, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    return [float(tick) for tick in even if low <= tick <= high]

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from gvo.outputs.batch_rows import BatchRow
-from gvo.outputs.report.batch_boxes import box_plot
-from gvo.outputs.report.batch_effects import effect_sheets
-from gvo.outputs.report.batch_front import front_sheet
-from gvo.outputs.report.batch_table import runs_html
-from gvo.outputs.report.batch_values import Batch, printable
+from gvo.batch.effects import ERROR, swept
+from gvo.batch.report.boxes import box_plot
+from gvo.batch.report.effects import effect_sheets, front_sheet
+from gvo.batch.report.table import runs_html
+from gvo.batch.report.values import Batch, printable
+from gvo.batch.rows import BatchRow
 from gvo.viz.report.page import facts_html, list_html, plots_html, write_page
 from gvo.viz.report.sheets import Plot, settings, write_plots
 
@@ -66,8 +66,7 @@ def write_batch_report(
 def _sheets(batch: Batch) -> list[tuple[Plot, str]]:
     """Return the plots, each with the table below it."""
     sheets = [(box_plot(batch), "")]
-    if batch.runs.parameters:
-        sheets += effect_sheets(batch)
+    sheets += effect_sheets(batch)
     if batch.is_sweep:
         sheets.append(front_sheet(batch))
     return sheets
@@ -100,12 +99,12 @@ def _facts(batch: Batch) -> dict[str, str]:
     rows = batch.rows
     statuses = Counter(row.status for row in rows)
     seconds = [row.run_s for row in rows if row.run_s is not None]
-    n_true = int(batch.runs.has(batch.errors_m).sum())
+    n_true = int(batch.is_comparable(ERROR).sum())
     n_found = sum(row.is_found for row in rows)
     return {
         "Recordings": str(len({row.recording for row in rows})),
         "Configurations": str(len(batch.means)),
-        "Swept": ", ".join(map(printable, batch.runs.parameters)),
+        "Swept": ", ".join(map(printable, swept(batch.table))),
         "Runs": f"{len(rows)}: {statuses['complete']} complete, {statuses['partly']} partly, "
         f"{statuses['failed']} failed",
         "Found finished": str(n_found) if n_found else "",

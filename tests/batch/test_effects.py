@@ -1,0 +1,111 @@
+"""Medians at the values of swept parameters, against planted effects."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gvo.batch.effects import ERROR, comparable, relative, value_medians
+from gvo.batch.results import to_frame
+from gvo.batch.rows import BatchRow
+
+SIZES, KINDS = (5, 10, 20), ("orb", "klt")
+RATIOS = {5: 1.0, 10: 2.0, 20: 1.5, "orb": 1.0, "klt": 1.1}
+
+
+def crossed(n_recordings: int) -> list[BatchRow]:
+    """Return every recording with every pair of values; errors are products of what is planted."""
+    return [
+        BatchRow(
+            recording=f"recording {number}",
+            variant=f"{size} {kind}",
+            status="complete",
+            source="",
+            folder="",
+            parameters={"frontend.kind": kind, "window.size": size},
+            frames=100,
+            coverage_percent=100.0,
+            ate_smoothed_m=10.0**number * RATIOS[size] * RATIOS[kind],
+            frame_ms=5.0 / RATIOS[size],
+        )
+        for number, size, kind in itertools.product(range(n_recordings), SIZES, KINDS)
+    ]
+
+
+def failing(rows: Sequence[BatchRow], fails: Callable[[BatchRow], bool]) -> list[BatchRow]:
+    names = ("frames", "coverage_percent", "ate_smoothed_m", "frame_ms")
+    nothing: dict[str, Any] = dict.fromkeys(names)
+    return [replace(row, status="failed", **nothing) if fails(row) else row for row in rows]
+
+
+def medians(effect: pd.DataFrame, measure: str = "error") -> list[float]:
+    values: list[float] = effect[measure, "median"].tolist()
+    return values
+
+
+def test_planted_ratios_come_back_those_of_the_largest_change_first() -> None:
+    effects = value_medians(to_frame(crossed(4)))
+    assert [*effects] == ["window.size", "frontend.kind"]
+    size, kind = effects.values()
+    assert size.index.tolist() == [5, 10, 20]
+    assert kind.index.tolist() == ["orb", "klt"]
+    assert np.array(medians(size)) / medians(size)[0] == pytest.approx([1.0, 2.0, 1.5])
+    assert medians(size, "time") == pytest.approx([1.5, 0.75, 1.0])
+    assert medians(kind)[1] / medians(kind)[0] == pytest.approx(1.1)
+    assert size["runs", "compared"].tolist() == [8, 8, 8]
+
+
+def test_quartiles_are_those_of_numpy_over_all_runs_of_a_value() -> None:
+    rng = np.random.default_rng(3)
+    errors = np.exp(rng.normal(size=(5, 3, 2)))
+    rows = [
+        replace(row, ate_smoothed_m=float(error))
+        for row, error in zip(crossed(5), errors.ravel(), strict=True)
+    ]
+    size = value_medians(to_frame(rows))["window.size"]
+    ratios = errors / np.median(errors, axis=(1, 2), keepdims=True)
+    expected = np.quantile(ratios, [0.25, 0.5, 0.75], axis=(0, 2)).T
+    np.testing.assert_allclose(size["error"][["low", "median", "high"]].to_numpy(), expected)
+
+
+def test_a_value_that_always_fails_is_counted_and_leaves_the_others_to_be_compared() -> None:
+    table = to_frame(failing(crossed(4), lambda row: row.parameters["window.size"] == 20))
+    size = value_medians(table)["window.size"]
+    assert np.isnan(medians(size)[2])
+    assert medians(size)[1] / medians(size)[0] == pytest.approx(2.0)
+    assert size["runs", "failed"].tolist() == [0, 0, 8]
+    assert size["runs", "set aside"].tolist() == [0, 0, 0]
+
+
+def test_a_run_that_lost_the_camera_is_set_aside_where_others_did_not() -> None:
+    rows = crossed(2)
+    rows[0] = replace(rows[0], coverage_percent=40.0, ate_smoothed_m=1e-6)
+    # there all lost it: nothing is wrong with either
+    rows[6:] = [replace(row, coverage_percent=40.0) for row in rows[6:]]
+    table = to_frame(rows)
+    assert comparable(table).tolist() == [False, *[True] * 11]
+    assert value_medians(table)["window.size"]["runs", "set aside"].tolist() == [1, 0, 0]
+    # what is set aside has its ratio, but is in no median
+    assert relative(table, ERROR)[0] < 1e-5
+
+
+def test_without_truth_times_are_compared() -> None:
+    rows = [replace(row, ate_smoothed_m=None) for row in crossed(2)]
+    effects = value_medians(to_frame(rows))
+    assert [*effects] == ["window.size", "frontend.kind"]
+    assert np.isnan(medians(effects["window.size"])).all()
+    assert effects["window.size"]["runs", "compared"].tolist() == [4, 4, 4]
+
+
+def test_where_all_runs_failed_they_are_counted() -> None:
+    effects = value_medians(to_frame(failing(crossed(1), lambda _: True)))
+    assert [effect["runs", "failed"].tolist() for effect in effects.values()] == [[3, 3], [2] * 3]
+
+
+def test_one_configuration_has_nothing_to_compare() -> None:
+    rows = [replace(row, parameters={}) for row in crossed(2)]
+    assert value_medians(to_frame(rows)) == {}
