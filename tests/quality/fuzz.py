@@ -1,9 +1,9 @@
 """Feed what reads files and messages with input that means harm, guided by coverage.
 
-    python scripts/fuzz.py --list
-    python scripts/fuzz.py --target edge_lines --seconds 60
-    python scripts/fuzz.py --all --seconds 3600 --json counts.json
-    python scripts/fuzz.py --target edge_lines --replay fuzz-findings/edge_lines-3f2a.bin
+    python tests/quality/fuzz.py --list
+    python tests/quality/fuzz.py --target edge_lines --seconds 60
+    python tests/quality/fuzz.py --all --seconds 3600 --json counts.json
+    python tests/quality/fuzz.py --target edge_lines --replay fuzz-findings/edge_lines-3f2a.bin
 
 Nothing but a `GvoError` may come out, in a bounded time and a bounded memory; docs/fuzzing.md says
 how much. Anything else is a finding: its input is written to a folder, and the exit code is 1.
@@ -26,7 +26,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 FINDINGS = Path("fuzz-findings")
 # libFuzzer ends the process on these; the parent goes on with the rest of the time.
 CRASHES = ("crash-*", "timeout-*", "oom-*", "slow-unit-*")

@@ -7,7 +7,7 @@
 
 A sample (--sample, --seed) comes with the 95 % interval of the share of all (Wilson's).
 
-Example: python scripts/assurance.py --mutation --sample 400 --seed 0 --jobs 2
+Example: python tests/quality/assurance.py --mutation --sample 400 --seed 0 --jobs 2
 """
 
 import argparse
@@ -30,7 +30,7 @@ from mutation import (  # type: ignore[import-not-found]
     Mutation,
 )
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PATHS = ("gvo/geometry", "gvo/backend", "gvo/trajectory/evaluation.py")
 TESTS = ("tests/geometry", "tests/backend", "tests/trajectory/test_evaluation.py")
 MIN_COVERAGE = 0.95

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_scripts import run
+from tests.acceptance.test_scripts import run
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 MAX_BYTES = 250_000
 NAMES = {"explain", "report", "overlay", "view"}
 

@@ -6,7 +6,7 @@ its end, milliseconds per frame (median of the elapsed, mean of the CPU time), a
 folder per frame. It fails where memory or CPU time of the last tenth is more than a tenth above
 that of the second. CPU time, because that says less of what else the machine does.
 
-Example: python scripts/soak.py --frames 20000
+Example: python tests/quality/soak.py --frames 20000
 """
 
 import argparse

@@ -17,8 +17,9 @@ from gvo.frontend.klt import KltFrontend
 from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.run_tally import Progress
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
-BENCHMARK = SCRIPTS / "benchmark.py"
+ROOT = Path(__file__).parents[2]
+BENCHMARK = ROOT / "scripts/benchmark.py"
+SOAK = ROOT / "tests/quality/soak.py"
 ENVIRONMENT = {
     **os.environ,
     "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
@@ -62,7 +63,7 @@ MAX_GROWTH_OBJECTS = 20
 @pytest.fixture(scope="module")
 def drive() -> Any:
     """Return the script's names, and its drive made to go back and forth over a few frames."""
-    script = runpy.run_path(str(SCRIPTS / "soak.py"))
+    script = runpy.run_path(str(SOAK))
     poses = script["lap_poses"](500)[:N_LAP]
     there_and_back = np.concatenate([poses, poses[-2:0:-1]])
     return script["EndlessDrive"](3 * N_THIRD + N_BEYOND, T_map_cam=there_and_back)
@@ -123,7 +124,7 @@ def test_frames_that_are_kept_are_seen(
 
 def test_the_lap_of_the_soak_closes() -> None:
     n = 50
-    poses = runpy.run_path(str(SCRIPTS / "soak.py"))["lap_poses"](n)
+    poses = runpy.run_path(str(SOAK))["lap_poses"](n)
     steps = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0, append=poses[:1, :2, 3]), axis=1)
     # Chords of a road of LAP_M, all of the same length but where it turns: the last one, too.
     assert steps.max() <= LAP_M / n + 1e-9

@@ -14,7 +14,7 @@ import pytest
 import gvo
 from gvo.geometry import se3
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
+SCRIPTS = Path(__file__).parents[2] / "scripts"
 # The scripts import the same package as the tests do.
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)}
 

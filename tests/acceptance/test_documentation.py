@@ -20,7 +20,7 @@ from gvo.io.bag.image_encodings import DEPTHS, IMAGES
 from gvo.io.bag.reader import BagReader
 from tests.io.pose_bags import PoseBag
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = [name for _, name, _ in pkgutil.walk_packages(gvo.__path__, "gvo.")]
 

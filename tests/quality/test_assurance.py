@@ -7,7 +7,7 @@ from pathlib import Path
 
 import gvo
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
+HERE = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)}
 
 MODULE = '''
@@ -55,7 +55,7 @@ def test_faults_that_no_test_sees_survive_and_others_do_not(tmp_path: Path) -> N
     (tmp_path / "module.py").write_text(MODULE)
     (tmp_path / "test_module.py").write_text(TESTS)
     options = ["--paths", tmp_path / "module.py", "--tests", tmp_path / "test_module.py"]
-    command = [sys.executable, SCRIPTS / "assurance.py", "--mutation", *options]
+    command = [sys.executable, HERE / "assurance.py", "--mutation", *options]
     first, second = (
         subprocess.run(
             [*map(str, command), "--results", str(tmp_path / "results.json"), "--spare-s", "1"],
