@@ -108,8 +108,8 @@ def view(
     depth: Depth = None,
 ) -> None:
     """Watch odometry in the browser, with its parameters as controls."""
-    from gvo.view import serve
-    from gvo.view.player import Player
+    from gvo.viz.view import serve
+    from gvo.viz.view.player import Player
 
     with interruptible() as check, ExitStack() as stack:
         shown: Player | Path = recordings[0]

@@ -20,10 +20,10 @@ from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.outputs.run_overlay import RunOverlay, film_width
-from gvo.outputs.video import open_sink
 from gvo.run_loop import RunLoop
 from gvo.types import FaultyFrame, Frame, FrameResult
 from gvo.viz.overlay import compose_overlay
+from gvo.viz.video import open_sink
 
 Spent = tuple[float, float]  # milliseconds per frame: wall, CPU
 

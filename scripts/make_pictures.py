@@ -29,11 +29,11 @@ from gvo.errors import GvoError, RecordingError
 from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
 from gvo.run_outputs import RunOutputs
-from gvo.view import serve
-from gvo.view.player import Player
 from gvo.viz.explanation.extraction import draw_stereo
 from gvo.viz.overlay import compose_overlay
 from gvo.viz.report import write_run_report
+from gvo.viz.view import serve
+from gvo.viz.view.player import Player
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.outputs.video import open_sink
 from gvo.types import Estimate, FaultyFrame, Frame, FrameResult
 from gvo.viz.overlay import MIN_WIDTH_PX, Layout, compose_faulty, compose_overlay
+from gvo.viz.video import open_sink
 
 _MAX_WIDTH_PX: Final = 960
 _MAX_PIXELS: Final = 300_000  # of which each costs, at every frame

@@ -1,0 +1,388 @@
+"""Every parameter of the configuration as a control of the page."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import NoneType
+from typing import Any, Literal, TypeAlias, get_args
+
+import viser
+import yaml
+
+from gvo.config import Config, Section, load_configuration
+from gvo.errors import ConfigurationError
+
+DELAY_S = 0.4
+"""A value is taken so long after the last change: a number is typed digit by digit."""
+
+PATIENCE_S = 2.0
+"""How long a value that was refused may be mended before the one that holds is shown again."""
+
+Value: TypeAlias = bool | int | float | str | None
+Kind = Literal["switch", "choice", "integer", "number"]
+_WIDEST_SLIDER = 1000.0
+_N_STEPS = 200
+# what a number starts from where its default is null
+_STARTS: Mapping[tuple[str, str], float] = {
+    ("depth", "scale"): 1000.0,
+    ("window", "kernel_threshold"): 3.55,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Control:
+    """The handles of one parameter; `empty` is the check box of null."""
+
+    parameter: Parameter
+    handle: Any
+    empty: Any = None
+
+    @property
+    def value(self) -> Value:
+        """What the page shows."""
+        if self.empty is not None and self.empty.value:
+            return None
+        value = self.handle.value
+        return int(value) if self.parameter.kind == "integer" else value
+
+    def show(self, value: Value) -> None:
+        """Show a value."""
+        if self.empty is not None:
+            self.empty.value = value is None
+            self.handle.disabled = value is None
+        if value is not None:
+            self.handle.value = value
+
+
+class ParameterControls:
+    """A control for every parameter, in folders by section.
+
+    Parameters
+    ----------
+    gui : viser.GuiApi
+        Where they are added.
+    config : Config
+        Shown at first.
+    apply : callable
+        Is given each new configuration; raises `ConfigurationError` to refuse it.
+    say : callable
+        Is given one line on what was refused; an empty one where all is well again.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        config: Config,
+        *,
+        apply: Callable[[Config], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self._config = config
+        self._apply = apply
+        self._say = say
+        self._refusal = ""
+        self._lock = threading.RLock()
+        self._timer: threading.Timer | None = None
+        self._is_closed = False
+        self._controls: dict[tuple[str, str], _Control] = {}
+        values = values_of(config)
+        for section, parameters in list_parameters().items():
+            with gui.add_folder(section, expand_by_default=False):
+                gui.add_markdown(f"*{section_meaning(section)}*")
+                for parameter in parameters:
+                    control = _add(gui, parameter, values[section][parameter.key])
+                    self._controls[section, parameter.key] = control
+        for control in self._controls.values():
+            for handle in filter(None, (control.handle, control.empty)):
+                handle.on_update(self._on_update)
+
+    @property
+    def config(self) -> Config:
+        """The configuration that was taken last."""
+        return self._config
+
+    def handle(self, section: str, key: str) -> Any:  # noqa: ANN401 - one of viser's handles
+        """Return the handle of a parameter's value."""
+        return self._controls[section, key].handle
+
+    def null_handle(self, section: str, key: str) -> Any:  # noqa: ANN401 - a check box or None
+        """Return the handle of a parameter's null, where it may be null."""
+        return self._controls[section, key].empty
+
+    def flush(self) -> None:
+        """Take what the controls show; where it is refused, say why and show what holds."""
+        self._take(is_typing=False)
+
+    def _take(self, *, is_typing: bool) -> None:
+        """Take what the controls show; nothing moves under the hand of who still types."""
+        with self._lock:
+            self._stop_timer()
+            values = values_of(self._config)
+            for (section, key), control in self._controls.items():
+                values[section][key] = _kept(values[section][key], control.value)
+            if values == values_of(self._config):
+                self._tell("")
+                return
+            try:
+                config = configuration_of(values)
+                self._apply(config)
+            except ConfigurationError as error:
+                self._tell(str(error))
+                if is_typing:
+                    self._start_timer(PATIENCE_S, is_typing=False)
+                    return
+            else:
+                self._config = config
+                self._tell("")
+            self._show()
+
+    def close(self) -> None:
+        """Forget changes that were not taken yet."""
+        with self._lock:
+            self._is_closed = True
+            self._stop_timer()
+
+    def _tell(self, refusal: str) -> None:
+        if refusal != self._refusal:
+            self._refusal = refusal
+            self._say(refusal)
+
+    def _show(self) -> None:
+        values = values_of(self._config)
+        for (section, key), control in self._controls.items():
+            control.show(values[section][key])
+
+    def _on_update(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is None:  # the program's own change
+            return
+        with self._lock:
+            self._stop_timer()
+            if self._is_closed:
+                return
+            self._start_timer(DELAY_S, is_typing=True)
+
+    def _start_timer(self, delay_s: float, *, is_typing: bool) -> None:
+        self._timer = threading.Timer(delay_s, self._take, kwargs={"is_typing": is_typing})
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+def _kept(old: Value, new: Value) -> Value:
+    """Return the old value where the new one is the same number, seen through rounding."""
+    if isinstance(old, float) and isinstance(new, float) and math.isclose(old, new, rel_tol=1e-9):
+        return old
+    return new
+
+
+def _add(gui: viser.GuiApi, parameter: Parameter, value: Value) -> _Control:
+    empty = None
+    if parameter.is_optional:
+        empty = gui.add_checkbox(f"{parameter.key}: null", value is None, hint=parameter.hint)
+    shown = parameter.start if value is None else value
+    handle = _add_value(gui, parameter, shown)
+    if empty is not None:
+        handle.disabled = value is None
+    return _Control(parameter=parameter, handle=handle, empty=empty)
+
+
+def _add_value(gui: viser.GuiApi, parameter: Parameter, value: Value) -> Any:  # noqa: ANN401
+    key, hint = parameter.key, parameter.hint
+    if parameter.kind == "switch":
+        return gui.add_checkbox(key, bool(value), hint=hint)
+    if parameter.kind == "choice":
+        return gui.add_dropdown(key, parameter.choices, initial_value=str(value), hint=hint)
+    return _add_number(gui, parameter, value)
+
+
+def _add_number(gui: viser.GuiApi, parameter: Parameter, value: Any) -> Any:  # noqa: ANN401
+    """Add a slider or a field; their type is that of the value that they start with."""
+    cast: type[int] | type[float] = int if parameter.kind == "integer" else float
+    lower = None if parameter.minimum is None else cast(parameter.minimum)
+    upper = None if parameter.maximum is None else cast(parameter.maximum)
+    step, hint = cast(parameter.step), parameter.hint
+    if parameter.is_slider and lower is not None and upper is not None:
+        lower, upper = min(lower, cast(value)), max(upper, cast(value))
+        handle: Any = gui.add_slider(parameter.key, lower, upper, step, cast(value), hint=hint)
+    else:
+        handle = gui.add_number(
+            parameter.key, cast(value), min=lower, max=upper, step=step, hint=hint
+        )
+    if cast is float:  # finer values than the step can be typed
+        handle.precision = max(handle.precision, 2 - math.floor(math.log10(step)))
+    return handle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """How a parameter is shown and changed.
+
+    Parameters
+    ----------
+    section, key : str
+        Its name is `section.key`.
+    kind : {"switch", "choice", "integer", "number"}
+    is_optional : bool
+        Whether null is a value, too.
+    choices : tuple of str
+        Of a choice.
+    minimum, maximum : float or None
+        Smallest and largest value that the control offers, where there is one.
+    step : float
+        Between two values that the control offers.
+    is_slider : bool
+        Whether both bounds are near enough for a slider.
+    default, start : bool, int, float, str or None
+        The default; what a number starts from that was null.
+    hint : str
+        Meaning, unit, range and default, on one line.
+    """
+
+    section: str
+    key: str
+    kind: Kind
+    is_optional: bool
+    choices: tuple[str, ...]
+    minimum: float | None
+    maximum: float | None
+    step: float
+    is_slider: bool
+    default: Value
+    start: Value
+    hint: str
+
+
+def list_parameters() -> dict[str, list[Parameter]]:
+    """Return the parameters by section, in the order of the configuration."""
+    sections = {
+        name: field.annotation
+        for name, field in Config.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
+    }
+    return {
+        section: [_parameter(section, key, field) for key, field in model.model_fields.items()]
+        for section, model in sections.items()
+    }
+
+
+def section_meaning(section: str) -> str:
+    """Return one line on a section."""
+    model = Config.model_fields[section].annotation
+    return (getattr(model, "__doc__", None) or "").strip().splitlines()[0]
+
+
+def values_of(config: Config) -> dict[str, dict[str, Value]]:
+    """Return the values by section and key."""
+    return config.model_dump()
+
+
+def configuration_of(values: Mapping[str, Mapping[str, Value]]) -> Config:
+    """Return the configuration of values by section and key.
+
+    Raises
+    ------
+    ConfigurationError
+        Where a value is out of its range or does not go with another.
+    """
+    return load_configuration(
+        settings=[
+            f"{section}.{key}={_yaml(value)}"
+            for section, group in values.items()
+            for key, value in group.items()
+        ]
+    )
+
+
+def _yaml(value: Value) -> str:
+    return str(yaml.safe_dump(value)).splitlines()[0]
+
+
+def _parameter(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
+    options = get_args(field.annotation)
+    limits = {type(limit).__name__: limit for limit in field.metadata}
+    kind = _kind(field.annotation)
+    lower, upper = _bound(limits, "Ge", "Gt"), _bound(limits, "Le")
+    start = field.default
+    if start is None:
+        start = _STARTS.get((section, key), 1.0)
+    is_slider = kind in ("integer", "number") and _is_near(lower, upper)
+    step = _step(kind, float(start) if is_number(start) else 0.0, lower, upper, is_slider)
+    if lower is not None and "Gt" in limits and (is_slider or kind == "integer"):
+        lower += step
+    return Parameter(
+        section=section,
+        key=key,
+        kind=kind,
+        is_optional=NoneType in options,
+        choices=tuple(options) if kind == "choice" else (),
+        minimum=lower,
+        maximum=upper,
+        step=step,
+        is_slider=is_slider,
+        default=field.default,
+        start=start,
+        hint=_hint(field, limits),
+    )
+
+
+def is_number(value: object) -> bool:
+    """Tell whether a value is a number; True and False are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _kind(annotation: Any) -> Kind:  # noqa: ANN401
+    options = [option for option in get_args(annotation) if option is not NoneType]
+    if options and all(isinstance(option, str) for option in options):
+        return "choice"
+    plain = options[0] if options else annotation
+    kinds: dict[type, Kind] = {bool: "switch", int: "integer", float: "number"}
+    return kinds[plain]
+
+
+def _bound(limits: Mapping[str, Any], *names: str) -> float | None:
+    found = [getattr(limits[name], name.lower()) for name in names if name in limits]
+    return float(found[0]) if found else None
+
+
+def _is_near(lower: float | None, upper: float | None) -> bool:
+    return lower is not None and upper is not None and upper - lower <= _WIDEST_SLIDER
+
+
+def _step(
+    kind: Kind, start: float, lower: float | None, upper: float | None, is_slider: bool
+) -> float:
+    """Return a step of one digit, fine enough for the range, or for the start value."""
+    if kind == "integer":
+        return 1.0
+    if is_slider and lower is not None and upper is not None:
+        return _one_digit((upper - lower) / _N_STEPS)
+    return 10.0 ** (math.floor(math.log10(start)) - 1) if start > 0 else 0.1
+
+
+def _one_digit(value: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above a value."""
+    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
+    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= value * 1.001))
+
+
+def _hint(field: Any, limits: Mapping[str, Any]) -> str:  # noqa: ANN401
+    unit = str((field.json_schema_extra or {}).get("unit", ""))
+    signs = {"Ge": ">=", "Gt": ">", "Le": "<="}
+    ranges = [
+        f"{sign} {getattr(limits[name], name.lower()):g}"
+        for name, sign in signs.items()
+        if name in limits
+    ]
+    shape = ", ".join([*ranges, *([f"in {unit}"] if unit else [])])
+    return (
+        f"{field.description}"
+        + (f"; {shape}" if shape else "")
+        + (f"; default {_yaml(field.default)}")
+    )

@@ -1,0 +1,322 @@
+"""The page of a finished run, and what plays it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from gvo.errors import RecordingError, TrajectoryError
+from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.trajectory.alignment import alignment, pair
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FloatArray, IntArray
+from gvo.viz.view.layers import COLOURS
+from gvo.viz.view.panels import (
+    UP,
+    Painter,
+    Playback,
+    ViewPoint,
+    add_frame_panel,
+    add_layer_switches,
+    frame_rows,
+    grid_cell,
+    legend_html,
+    numbers_html,
+    pose_rows,
+)
+from gvo.viz.view.scene import Scene, Up
+from gvo.viz.view.server import ViewServer, open_server
+
+N_ELLIPSOIDS = 60
+"""How many covariances are drawn at most along the path."""
+
+_RATE_HZ = 15.0
+_MAX_START_SIGMAS = 10
+# Of the extent of the path, the largest half axis at first.
+_ELLIPSOID_SHARE = 0.07
+_PATHS = ("raw", "causal", "smoothed")
+
+
+def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewServer:
+    """Serve the page of a run folder; see `gvo.viz.view.serve_run`."""
+    record = read_run(folder)
+    if len(record.frames.stamps_ns) == 0:
+        raise RecordingError(f"{folder}: holds no frames: there is nothing to show; run again")
+    view = open_server(host, port, title=f"gvo {name or record.name}")
+    page = FinishedPage(view.viser, record)
+    view.on_close(page.close)
+    return view
+
+
+def world_up(record: RunRecord) -> Up:
+    """Return which axis points up: -y where the world is the first camera, else +z."""
+    causal = record.trajectories["causal"]
+    is_first = len(causal) == 0 or np.allclose(causal.T_world_cam[0], np.eye(4), atol=1e-6)
+    return "-y" if is_first and record.summary.get("frame", "camera") == "camera" else "+z"
+
+
+def aligned_truth(record: RunRecord) -> Trajectory | None:
+    """Return the truth in the world of the run, fitted to the smoothed positions."""
+    estimates = record.comparable()
+    estimate = estimates.get("smoothed") or estimates.get("causal")
+    if record.truth is None or estimate is None or len(record.truth) == 0:
+        return None
+    try:
+        truth, paired = pair(record.truth, estimate)
+    except TrajectoryError:
+        return None
+    return alignment(paired, truth, "se3").apply(record.truth)
+
+
+def start_sigmas(record: RunRecord) -> int:
+    """Return how many sigmas make ellipsoids that can be seen and do not hide the path."""
+    smoothed = record.trajectories["smoothed"]
+    if smoothed.covariances is None or len(smoothed) == 0:
+        return _MAX_START_SIGMAS
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(smoothed.covariances[:, 3:, 3:]).max()))
+    reach_m = float(np.linalg.norm(np.ptp(smoothed.positions, axis=0)))
+    n_sigmas = _ELLIPSOID_SHARE * reach_m / max(sigma_m, 1e-9)
+    return int(np.clip(n_sigmas, 1, _MAX_START_SIGMAS))
+
+
+class FinishedPage:
+    """Shows a run frame by frame.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    record : RunRecord
+        Of at least one frame.
+    """
+
+    def __init__(self, server: viser.ViserServer, record: RunRecord) -> None:
+        self._server = server
+        self._record = record
+        self._truth = aligned_truth(record)
+        up = world_up(record)
+        self.scene = Scene(server.scene, up=up)
+        self._add_frame_panel()
+        self.player = RunPlayer(record.frames.stamps_ns, lambda index: self._painter.offer())
+        self.playback = Playback(server.gui, self.player, before=lambda: None)
+        self._view = ViewPoint(server, up, is_following=False)
+        self._sigmas = server.gui.add_slider(
+            "ellipsoid sigmas", 1, 100, 1, start_sigmas(record), hint="Half axes of the ellipsoids"
+        )
+        self._painter = Painter(self.draw, rate_hz=_RATE_HZ)
+        self._sigmas.on_update(lambda _: self._painter.offer())
+        hidden = {"keyframes", "links", "image", "points", "cloud"}
+        hidden |= set() if self._truth is not None else {"truth"}
+        layers = [layer for layer in self.scene.layers if layer not in hidden]
+        add_layer_switches(server.gui, self.scene, layers)
+        self._show_all()
+        self.player.seek(self.player.n_frames - 1)
+
+    def close(self) -> None:
+        """End what runs beside the page."""
+        self.player.close()
+        self._painter.close()
+
+    @property
+    def numbers_text(self) -> str:
+        """The numbers of the frame as they are shown, HTML."""
+        return str(self._numbers.content)
+
+    def settle(self) -> None:
+        """Wait until the frame that was asked for last is drawn."""
+        self._painter.settle()
+
+    def draw(self) -> None:
+        """Show the frame that the player is at."""
+        index = self.player.index
+        stamp_ns = int(self._record.frames.stamps_ns[index])
+        with self.scene.lock, self._server.atomic():
+            self.playback.show(index)
+            self._numbers.content = numbers_html(self._rows(index, stamp_ns))
+            for name in _PATHS:
+                trajectory = self._record.trajectories[name]
+                self.scene.show_path(name, trajectory.positions[trajectory.stamps_ns <= stamp_ns])
+            if self._truth is not None:
+                is_past = self._truth.stamps_ns <= stamp_ns
+                self.scene.show_path("truth", self._truth.positions[is_past])
+            self._draw_ellipsoids(stamp_ns)
+            T_world_cam = self._pose(stamp_ns)
+            if T_world_cam is not None:
+                self.scene.show_pose(T_world_cam)
+                self._view.show_pose(T_world_cam)
+
+    def _add_frame_panel(self) -> None:
+        with add_frame_panel(self._server):
+            self._numbers = self._server.gui.add_html("")
+            names = [*_PATHS, *(["truth"] if self._truth is not None else []), "ellipsoids"]
+            self._server.gui.add_html(legend_html(name for name in COLOURS if name in names))
+
+    def _show_all(self) -> None:
+        """Choose sizes and the view by the whole path."""
+        positions = [t.positions for t in self._record.trajectories.values() if len(t) > 0]
+        if not positions:
+            return
+        points = np.concatenate(positions)
+        reach = max(0.1, float(np.linalg.norm(np.ptp(points, axis=0))))
+        self.scene.set_camera(4, 3, 3.0, size_m=0.04 * reach)
+        lowest = points[np.argmin(points @ UP[self.scene.up])]
+        self.scene.show_ground(lowest - 0.02 * reach * UP[self.scene.up], grid_cell(0.1 * reach))
+        self._view.look_down(points)
+
+    def _rows(self, index: int, stamp_ns: int) -> dict[str, str]:
+        frames = self._record.frames
+        rows = frame_rows(index, self.player.n_frames, stamp_ns, frames.statuses[index])
+        if frames.reasons[index]:
+            rows["reason"] = frames.reasons[index]
+        rows |= {name: f"{counts[index]}" for name, counts in frames.counts.items()}
+        rows |= self._milliseconds(stamp_ns)
+        causal = self._record.trajectories["causal"]
+        row = int(np.searchsorted(causal.stamps_ns, stamp_ns))
+        if row < len(causal) and causal.stamps_ns[row] == stamp_ns:
+            covariance = None if causal.covariances is None else causal.covariances[row]
+            rows |= pose_rows(causal.T_world_cam[row], covariance)
+        return rows
+
+    def _milliseconds(self, stamp_ns: int) -> dict[str, str]:
+        timings = self._record.timings
+        if timings is None:
+            return {}
+        (found,) = np.nonzero(timings.stamps_ns == stamp_ns)
+        stages = {name: float(ms[found[0]]) for name, ms in timings.stages_ms.items() if len(found)}
+        known = {name: ms for name, ms in stages.items() if np.isfinite(ms)}
+        parts = ", ".join(f"{name} {ms:.1f}" for name, ms in known.items())
+        return {"ms": f"{sum(known.values()):.1f} ({parts})"} if known else {}
+
+    def _pose(self, stamp_ns: int) -> FloatArray | None:
+        """Return the causal pose of the newest frame that has one, until a stamp."""
+        causal = self._record.trajectories["causal"]
+        row = int(np.searchsorted(causal.stamps_ns, stamp_ns, side="right")) - 1
+        return causal.T_world_cam[row] if row >= 0 else None
+
+    def _draw_ellipsoids(self, stamp_ns: int) -> None:
+        """Draw covariances along the smoothed path, the same ones whatever frame is shown."""
+        smoothed = self._record.trajectories["smoothed"]
+        every = max(1, -(-len(smoothed) // N_ELLIPSOIDS))
+        thinned = smoothed.select(slice(None, None, every))
+        is_past = thinned.stamps_ns <= stamp_ns
+        if thinned.covariances is not None:
+            self.scene.show_ellipsoids(
+                thinned.T_world_cam[is_past], thinned.covariances[is_past], self._sigmas.value
+            )
+
+
+class RunPlayer:
+    """Goes through frames by their stamps.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the frames, nanoseconds.
+    show : callable
+        Is told the index of each frame that is to be shown.
+    period_s : float
+        How often it looks whether the next frame is due.
+    """
+
+    def __init__(
+        self, stamps_ns: IntArray, show: Callable[[int], None], *, period_s: float = 0.02
+    ) -> None:
+        self._stamps_ns = stamps_ns
+        self._period_s = period_s
+        self._show = show
+        self._lock = threading.RLock()
+        self._index = 0
+        self._is_playing = False
+        self._speed: float | None = 1.0
+        self._ahead_ns = 0.0
+        self._is_closing = threading.Event()
+        self._is_due = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gvo run player", daemon=True)
+        self._thread.start()
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self._stamps_ns)
+
+    @property
+    def index(self) -> int:
+        """Frame that is shown."""
+        return self._index
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether frames follow by themselves."""
+        return self._is_playing
+
+    def play(self) -> None:
+        """Go on; from the end, begin again."""
+        with self._lock:
+            if self._index >= self.n_frames - 1:
+                self.seek(0)
+            self._ahead_ns = 0.0
+            self._is_playing = True
+        self._is_due.set()
+
+    def pause(self) -> None:
+        """Stay."""
+        self._is_playing = False
+
+    def step(self) -> None:
+        """Go to the next frame and stay."""
+        self.pause()
+        self.seek(self._index + 1)
+
+    def seek(self, index: int) -> None:
+        """Go to a frame, or the nearest there is."""
+        with self._lock:
+            self._index = int(np.clip(index, 0, max(0, self.n_frames - 1)))
+            self._ahead_ns = 0.0
+            self._show(self._index)
+
+    def set_speed(self, factor: float | None) -> None:
+        """Play as recorded (1), faster, slower, or frame by frame without waiting (None)."""
+        self._speed = factor
+
+    def advance(self, elapsed_s: float) -> None:
+        """Let time pass while it plays."""
+        with self._lock:
+            if not self._is_playing:
+                return
+            if self._speed is None:
+                self.seek(self._index + 1)
+            else:
+                self._advance_by(1e9 * elapsed_s * self._speed)
+            if self._index >= self.n_frames - 1:
+                self._is_playing = False
+
+    def _advance_by(self, span_ns: float) -> None:
+        ahead_ns = self._ahead_ns + span_ns
+        now_ns = int(self._stamps_ns[self._index]) + int(ahead_ns)
+        index = int(np.searchsorted(self._stamps_ns, now_ns, side="right")) - 1
+        if index > self._index:
+            self.seek(index)
+            ahead_ns = float(now_ns - int(self._stamps_ns[index]))
+        self._ahead_ns = ahead_ns
+
+    def close(self) -> None:
+        """End the thread."""
+        self._is_closing.set()
+        self._is_due.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._is_closing.is_set():
+            if not self._is_playing:
+                self._is_due.wait()
+                self._is_due.clear()
+                before = time.monotonic()
+            elif not self._is_closing.wait(self._period_s):
+                now = time.monotonic()
+                self.advance(now - before)
+                before = now

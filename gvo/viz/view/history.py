@@ -1,0 +1,356 @@
+"""What was done, kept so that any frame can be shown again."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from threading import RLock
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, ImageArray, IntArray, Status
+from gvo.viz.view.clouds import Cloud, KeyframeClouds, put_together
+from gvo.viz.view.disk_list import DiskList
+
+# Stamps (n,) in nanoseconds, ascending, and positions (n, 3) in the world, metres.
+Path: TypeAlias = tuple[IntArray, FloatArray]
+_JPEG_QUALITY = 85
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """All that a page shows of one frame.
+
+    Parameters
+    ----------
+    index : int
+        Of the frame in the recording, from 0; faulty ones count.
+    n_done : int
+        Frames that are done: the index of the last one, and 1.
+    stamp_ns : int
+        Of the frame, nanoseconds.
+    result : FrameResult or None
+        None for a faulty frame; without `registration`, whose pictures and points are here.
+    reason : str
+        Why there is no pose, or no registration; empty where there are.
+    image, overlay : ndarray of uint8, shape (height, width, 3)
+        The current image, small, and with what was matched in it, BGR.
+    cloud_cam : ndarray of float32, shape (n, 3)
+        What the frame measured, in the `cam` frame, metres.
+    colours : ndarray of uint8, shape (n, 3)
+        Of these points, RGB.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Causal pose; for a faulty frame that of the frame before, the identity before any.
+    window_poses : dict of int to ndarray of float64, shape (4, 4)
+        T_world_cam of the poses in the window by their stamps; of a window that keeps all, the
+        newest ones and the keyframes.
+    window_covariances : dict of int to ndarray of float64, shape (6, 6)
+        Of the same, in the poses' own frames.
+    fault : str
+        What the player has to tell; empty while all is well.
+    """
+
+    index: int
+    n_done: int
+    stamp_ns: int
+    result: FrameResult | None
+    reason: str
+    image: ImageArray
+    overlay: ImageArray
+    cloud_cam: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    T_world_cam: FloatArray
+    window_poses: dict[int, FloatArray]
+    window_covariances: dict[int, FloatArray]
+    fault: str = ""
+
+    @property
+    def status(self) -> Status | None:
+        """What ties the frame to earlier ones; None for a faulty frame."""
+        return None if self.result is None else self.result.status
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Stamps of the kept frames, oldest first."""
+        return () if self.result is None else self.result.keyframes_ns
+
+    @property
+    def links(self) -> tuple[FrameLink, ...]:
+        """The edges that were offered to the window with the frame."""
+        return () if self.result is None else self.result.links
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Entry:
+    """What is written down of a frame.
+
+    Parameters
+    ----------
+    stamp_ns, result, reason, image, overlay, window_poses, window_covariances
+        As of `Moment`.
+    cloud : tuple of points and colours
+        In the `cam` frame.
+    """
+
+    stamp_ns: int
+    result: FrameResult | None
+    reason: str
+    image: ImageArray
+    overlay: ImageArray
+    cloud: Cloud
+    window_poses: dict[int, FloatArray]
+    window_covariances: dict[int, FloatArray]
+
+
+class History:
+    """The frames that were done, and the paths up to the one that is shown.
+
+    Poses and counts lie in memory, pictures, points and the poses of the window in a temporary
+    file. It may be asked from any thread.
+
+    Parameters
+    ----------
+    first_index : int
+        Of the first frame in the recording.
+    """
+
+    def __init__(self, first_index: int = 0) -> None:
+        self.first_index = first_index
+        self._shown = first_index - 1
+        self._arrays = DiskList()
+        self._lock = RLock()
+        # By frame: stamp, result and reason.
+        self._told: list[tuple[int, FrameResult | None, str]] = []
+        self._latest: tuple[int, Entry] | None = None
+        # By frame with a pose: index and stamp, and the poses; by smoothed pose: when and of what.
+        self._tracked = _Rows(2, np.int64)
+        self._raw = _Rows(16, np.float64)
+        self._causal = _Rows(16, np.float64)
+        self._finishing = _Rows(2, np.int64)
+        self._finished = _Rows(16, np.float64)
+        self._keyframes: list[int] = []
+        self._clouds = KeyframeClouds()
+
+    @property
+    def n_done(self) -> int:
+        """Frames that are done: the index of the last one, and 1."""
+        return self.first_index + len(self._told)
+
+    @property
+    def shown(self) -> int:
+        """Index of the frame that is shown, up to which the paths go."""
+        return self._shown
+
+    def add(self, entry: Entry) -> None:
+        """Write down the next frame; it is not shown yet."""
+        index = self.n_done
+        with self._lock:
+            self._arrays.append(_arrays_of(entry))
+            result = entry.result
+            if result is not None:
+                result = replace(result, registration=None)
+            self._told.append((entry.stamp_ns, result, entry.reason))
+            self._latest = index, replace(entry, result=result)
+            if result is None:
+                return
+            self._tracked.append((index, entry.stamp_ns))
+            self._raw.append(result.raw.T_world_cam.ravel())
+            self._causal.append(result.causal.T_world_cam.ravel())
+            self._note_finished(index, result.finished)
+            if entry.stamp_ns in result.keyframes_ns:
+                self._keyframes.append(index)
+                self._clouds.add(index, entry.cloud)
+
+    def finish(self, estimates: Iterable[Estimate]) -> None:
+        """Take the smoothed poses that are known with the last frame."""
+        with self._lock:
+            self._note_finished(self.n_done - 1, estimates)
+
+    def _note_finished(self, index: int, estimates: Iterable[Estimate]) -> None:
+        for estimate in estimates:
+            self._finishing.append((index, estimate.stamp_ns))
+            self._finished.append(estimate.T_world_cam.ravel())
+
+    def show(self, index: int) -> None:
+        """Let the paths go up to a frame that is done.
+
+        Raises
+        ------
+        ValueError
+            When it is not done, or was before the first.
+        """
+        self._check(index)
+        self._shown = index
+
+    def stamp_ns(self, index: int) -> int:
+        """Return the stamp of a frame that is done, nanoseconds."""
+        self._check(index)
+        return self._told[index - self.first_index][0]
+
+    def moment(self, index: int | None = None, *, fault: str = "") -> Moment:
+        """Return all that is known of a frame.
+
+        Parameters
+        ----------
+        index : int, optional
+            The one that is shown where omitted.
+        fault : str
+            Handed through.
+
+        Raises
+        ------
+        ValueError
+            When it is not done.
+        """
+        with self._lock:
+            index = self._shown if index is None else index
+            entry = self._entry(index)
+            n = self._n_tracked(index)
+            return Moment(
+                index=index,
+                n_done=self.n_done,
+                stamp_ns=entry.stamp_ns,
+                result=entry.result,
+                reason=entry.reason,
+                image=entry.image,
+                overlay=entry.overlay,
+                cloud_cam=entry.cloud[0],
+                colours=entry.cloud[1],
+                T_world_cam=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
+                window_poses=entry.window_poses,
+                window_covariances=entry.window_covariances,
+                fault=fault,
+            )
+
+    def raw_path(self) -> Path:
+        """Return stamps (n,) and positions (n, 3) of the raw chain."""
+        return self._path(self._raw)
+
+    def causal_path(self) -> Path:
+        """Return stamps (n,) and positions (n, 3) as they were known when each frame came."""
+        return self._path(self._causal)
+
+    def smoothed_path(self) -> Path:
+        """Return stamps (n,) and positions (n, 3) as they are known with the frame shown."""
+        with self._lock:
+            stamps_ns, T_world_cam = self._smoothed()
+            return stamps_ns, T_world_cam[:, :3, 3]
+
+    def accumulated_cloud(self) -> Cloud:
+        """Return the points of all keyframes in the world, metres, and their colours, RGB.
+
+        They stand where the smoothed poses known with the frame shown put them, thinned to at
+        most 200,000.
+        """
+        with self._lock:
+            _, T_world_cam = self._smoothed()
+            n = len(T_world_cam)
+            indices = self._tracked.rows[:n, 0]
+            keyframes = self._keyframes[: bisect_right(self._keyframes, self._shown)]
+            rows = np.searchsorted(indices, keyframes)
+            wanted = dict(zip(keyframes, T_world_cam[rows], strict=True))
+            clouds = self._clouds.select(wanted)
+        return put_together(clouds)
+
+    def _check(self, index: int) -> None:
+        if not self.first_index <= index < self.n_done:
+            raise ValueError(
+                f"frame {index} is not among those done: {self.first_index} to {self.n_done - 1}"
+            )
+
+    def _entry(self, index: int) -> Entry:
+        self._check(index)
+        if self._latest is None or self._latest[0] != index:
+            row = index - self.first_index
+            self._latest = index, _entry_of(*self._told[row], self._arrays[row])
+        return self._latest[1]
+
+    def _n_tracked(self, index: int) -> int:
+        """Return how many frames up to one have a pose."""
+        return int(np.searchsorted(self._tracked.rows[:, 0], index, side="right"))
+
+    def _path(self, poses: _Rows) -> Path:
+        with self._lock:
+            n = self._n_tracked(self._shown)
+            stamps_ns = self._tracked.rows[:n, 1].copy()
+            return stamps_ns, poses.rows[:n].reshape(-1, 4, 4)[:, :3, 3].copy()
+
+    def _smoothed(self) -> tuple[IntArray, FloatArray]:
+        """Return stamps and the best poses known with the frame shown.
+
+        Those that are final, else those of the window then, else the causal ones.
+        """
+        n = self._n_tracked(self._shown)
+        stamps_ns = self._tracked.rows[:n, 1].copy()
+        poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()
+        if n == 0:
+            return stamps_ns, poses
+        window = self._entry(self._shown).window_poses
+        known = [stamp_ns for stamp_ns in window if stamp_ns <= stamps_ns[-1]]
+        if known:
+            poses[np.searchsorted(stamps_ns, known)] = [window[stamp_ns] for stamp_ns in known]
+        is_final = self._finishing.rows[:, 0] <= self._shown
+        final_ns = self._finishing.rows[is_final, 1]
+        rows = np.searchsorted(stamps_ns, final_ns)
+        poses[rows] = self._finished.rows[is_final].reshape(-1, 4, 4)
+        return stamps_ns, poses
+
+
+class _Rows:
+    """An array that grows by rows."""
+
+    def __init__(self, width: int, dtype: type) -> None:
+        self._array: NDArray[Any] = np.empty((64, width), dtype=dtype)
+        self._n = 0
+
+    def append(self, row: Any) -> None:  # noqa: ANN401 - whatever numpy takes
+        if self._n == len(self._array):
+            self._array = np.concatenate([self._array, np.empty_like(self._array)])
+        self._array[self._n] = row
+        self._n += 1
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        return self._array[: self._n]
+
+
+def _arrays_of(entry: Entry) -> dict[str, NDArray[Any]]:
+    return {
+        "image": _encode(entry.image),
+        "overlay": _encode(entry.overlay),
+        "points": entry.cloud[0],
+        "colours": entry.cloud[1],
+        "window_ns": np.array(list(entry.window_poses), dtype=np.int64),
+        "poses": np.array(list(entry.window_poses.values())),
+        "covariances": np.array(list(entry.window_covariances.values())),
+    }
+
+
+def _entry_of(
+    stamp_ns: int, result: FrameResult | None, reason: str, arrays: dict[str, NDArray[Any]]
+) -> Entry:
+    window_ns = arrays["window_ns"].tolist()
+    return Entry(
+        stamp_ns=stamp_ns,
+        result=result,
+        reason=reason,
+        image=_decode(arrays["image"]),
+        overlay=_decode(arrays["overlay"]),
+        cloud=(arrays["points"], arrays["colours"]),
+        window_poses=dict(zip(window_ns, arrays["poses"], strict=True)),
+        window_covariances=dict(zip(window_ns, arrays["covariances"], strict=True)),
+    )
+
+
+def _encode(image: ImageArray) -> ImageArray:
+    """Return a picture as the bytes of a JPEG."""
+    _, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return np.asarray(content, dtype=np.uint8)
+
+
+def _decode(content: ImageArray) -> ImageArray:
+    return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), dtype=np.uint8)

@@ -1,0 +1,333 @@
+"""The page of a recording that is tracked while one looks, with the truth in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+
+from gvo.config import describe_configuration
+from gvo.errors import TrajectoryError
+from gvo.geometry import se3
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.trajectory.alignment import alignment, associate
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FloatArray, ImageArray, IntArray
+from gvo.viz.view.controls import ParameterControls
+from gvo.viz.view.history import Moment
+from gvo.viz.view.layers import COLOURS
+from gvo.viz.view.panels import (
+    UP,
+    Painter,
+    Playback,
+    ViewPoint,
+    add_frame_panel,
+    add_layer_switches,
+    frame_rows,
+    grid_cell,
+    legend_html,
+    message_html,
+    numbers_html,
+    result_rows,
+    state_html,
+)
+from gvo.viz.view.player import Player
+from gvo.viz.view.scene import Scene
+from gvo.viz.view.server import ViewServer, open_server
+
+RATE_HZ = 15.0
+FILE_NAME = "gvo.yaml"
+"""Name under which the browser saves the configuration."""
+
+_JPEG_QUALITY = 80
+_START_SIGMAS = 10
+# the camera is drawn so deep, as a share of the median depth of what it sees first
+_CAMERA_SHARE = 0.15
+_GROUND_SHARE = 0.15
+_DEPTH_PER_BASELINE = 30.0
+_VIEW_SHARE = 0.5
+_NOTHING = np.zeros((0, 3))
+
+
+def serve_player(
+    player: Player, *, host: str, port: int, truth: Trajectory | None = None, name: str = ""
+) -> ViewServer:
+    """Serve a player's page; see `gvo.viz.view.serve`."""
+    view = open_server(host, port, title=f"gvo {name or player.info.name}".strip())
+    page = Page(view.viser, player, truth=truth)
+    view.on_close(page.close)
+    return view
+
+
+class Page:
+    """Shows what a player does, and steers it.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    player : Player
+    truth : Trajectory, optional
+        Of the camera, in any world.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, player: Player, *, truth: Trajectory | None = None
+    ) -> None:
+        self._server = server
+        self._player = player
+        self._truth = None if truth is None else TruthPath(truth)
+        self._shown_cloud: tuple[int, int] | None = None
+        self._placed_for: int | None = None
+        self._refusal = ""
+        self.scene = Scene(server.scene)
+        self._add_frame_panel()
+        self._add_main_panel()
+        self._painter = Painter(self._draw_newest, rate_hz=RATE_HZ, idle=self._show_state)
+        self._unsubscribe = player.subscribe(lambda moment: self._painter.offer())
+        if player.moment is not None:
+            self._painter.offer()
+
+    def close(self) -> None:
+        """Let go of the player."""
+        self._unsubscribe()
+        self._painter.close()
+        self.controls.close()
+
+    @property
+    def numbers_text(self) -> str:
+        """The numbers of the frame as they are shown, HTML."""
+        return str(self._numbers.content)
+
+    @property
+    def message_text(self) -> str:
+        """The line on what was refused, HTML."""
+        return str(self._message.content)
+
+    def settle(self) -> None:
+        """Wait until what the player told last is drawn."""
+        self._painter.settle()
+
+    def draw(self, moment: Moment) -> None:
+        """Show a frame with all that was known when it was done."""
+        with self.scene.lock, self._server.atomic():
+            self._place(moment)
+            self.playback.show(moment.index)
+            self._numbers.content = numbers_html(self._rows(moment))
+            self._show_state()
+            self._draw_images(moment)
+            self._draw_paths()
+            self._draw_window(moment)
+            self._view.show_pose(moment.T_world_cam)
+
+    def _draw_newest(self) -> None:
+        moment = self._player.moment
+        if moment is not None:
+            self.draw(moment)
+
+    def _add_frame_panel(self) -> None:
+        gui = self._server.gui
+        with add_frame_panel(self._server):
+            empty = np.full((90, 160, 3), 230, dtype=np.uint8)
+            self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
+            self._message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
+            start = {"frame": f"none of {self._player.n_frames} yet: play or step"}
+            self._numbers = gui.add_html(numbers_html(start))
+            hidden = {"standstill"} if self._truth is not None else {"standstill", "truth"}
+            gui.add_html(legend_html(name for name in COLOURS if name not in hidden))
+
+    def _add_main_panel(self) -> None:
+        gui = self._server.gui
+        self.playback = Playback(gui, self._player, before=self.flush)
+        self._view = ViewPoint(self._server, "-y", is_following=True)
+        gui.add_button(
+            "restart from here", hint="Begin anew at this frame, with the parameters as they are"
+        ).on_click(self._on_restart)
+        gui.add_button(
+            "save as YAML", hint="For gvo run --config; the browser saves the file"
+        ).on_click(self._on_save)
+        self._state = gui.add_html(state_html(player_state(self._player)))
+        self._sigmas = gui.add_slider(
+            "ellipsoid sigmas", 1, 100, 1, _START_SIGMAS, hint="Half axes of the ellipsoids"
+        )
+        self._sigmas.on_update(lambda _: self._painter.offer())
+        hidden = () if self._truth is not None else ("truth",)
+        layers = [layer for layer in self.scene.layers if layer not in hidden]
+        add_layer_switches(gui, self.scene, layers)
+        with gui.add_folder("Parameters", expand_by_default=False):
+            self.controls = ParameterControls(
+                gui, self._player.config, apply=self._player.reconfigure, say=self._say
+            )
+
+    def flush(self) -> None:
+        """Take the parameters as they are shown now."""
+        self.controls.flush()
+
+    def _say(self, refusal: str) -> None:
+        self._refusal = refusal
+        self._show_state()
+
+    def _show_state(self) -> None:
+        """Show what the player is doing, and what it cannot do."""
+        self._state.content = state_html(player_state(self._player))
+        problems = [problem for problem in (self._refusal, self._player.fault) if problem]
+        self._message.content = message_html("; ".join(problems))
+
+    def _on_restart(self, event: viser.GuiEvent[Any]) -> None:
+        self.flush()
+        self._player.restart()
+
+    def _on_save(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            self.save(event.client)
+
+    def save(self, client: viser.ClientHandle) -> None:
+        """Send the configuration to a browser, which saves it as a file."""
+        self.flush()
+        content = describe_configuration(self.controls.config).encode()
+        client.send_file_download(FILE_NAME, content, save_immediately=True)
+
+    def _rows(self, moment: Moment) -> dict[str, str]:
+        status = moment.status or "skipped"
+        rows = frame_rows(moment.index, self._player.n_frames, moment.stamp_ns, status)
+        if moment.reason:
+            rows["reason"] = moment.reason
+        return rows if moment.result is None else rows | result_rows(moment.result)
+
+    def _place(self, moment: Moment) -> None:
+        """Choose sizes and the view by what the first frame sees."""
+        if self._placed_for == self._player.first_index:
+            return
+        self._placed_for = self._player.first_index
+        camera = self._player.camera
+        depth = _depth_of(moment, camera)
+        self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
+        start = moment.T_world_cam[:3, 3]
+        self.scene.show_ground(start - _GROUND_SHARE * depth * UP["-y"], grid_cell(0.1 * depth))
+        self._view.look_along(moment.T_world_cam, _VIEW_SHARE * depth)
+
+    def _draw_images(self, moment: Moment) -> None:
+        self._overlay.image = _rgb(moment.overlay)
+        self.scene.show_image(_rgb(moment.image))
+        self.scene.show_points(moment.cloud_cam, moment.colours)
+        self.scene.show_pose(moment.T_world_cam)
+
+    def _draw_paths(self) -> None:
+        history = self._player.history
+        self.scene.show_path("raw", history.raw_path()[1])
+        stamps_ns, positions = history.causal_path()
+        self.scene.show_path("causal", positions)
+        self.scene.show_path("smoothed", history.smoothed_path()[1])
+        if self._truth is not None:
+            self.scene.show_path("truth", self._truth.until(stamps_ns, positions))
+
+    def _draw_window(self, moment: Moment) -> None:
+        poses = moment.window_poses
+        keyframes = [poses[stamp] for stamp in moment.keyframes if stamp in poses]
+        self.scene.show_keyframes(np.array(keyframes).reshape(-1, 4, 4))
+        self.scene.show_links(_link_lines(moment))
+        stamps = [stamp for stamp in moment.window_covariances if stamp in poses]
+        self.scene.show_ellipsoids(
+            np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4),
+            np.array([moment.window_covariances[stamp] for stamp in stamps]).reshape(-1, 6, 6),
+            float(self._sigmas.value),
+        )
+        self._draw_cloud(moment)
+
+    def _draw_cloud(self, moment: Moment) -> None:
+        """Draw the accumulated points; they change with keyframes alone."""
+        newest = moment.keyframes[-1] if moment.keyframes else 0
+        if self._shown_cloud != (newest, self._player.first_index):
+            self._shown_cloud = (newest, self._player.first_index)
+            self.scene.show_cloud(*self._player.history.accumulated_cloud())
+
+
+def player_state(player: Player) -> str:
+    """Return what a player is doing, in a word."""
+    if player.is_playing:
+        return "playing"
+    if player.is_busy:
+        return "working"
+    is_last = player.is_finished and player.index + 1 >= player.n_done
+    return "at the end" if is_last else "paused"
+
+
+def _depth_of(moment: Moment, camera: StereoCamera | PinholeCamera) -> float:
+    """Return how far away, metres, most of what is seen is; a guess before anything is."""
+    if len(moment.cloud_cam) > 0:
+        return float(np.median(moment.cloud_cam[:, 2]))
+    return _DEPTH_PER_BASELINE * getattr(camera, "baseline", 0.05)
+
+
+def _link_lines(moment: Moment) -> dict[str, FloatArray]:
+    """Return the frame's links as lines (n, 2, 3), by how they are drawn."""
+    lines: dict[str, list[FloatArray]] = {}
+    for link in moment.links:
+        if link.reference_ns in moment.window_poses:
+            start = moment.window_poses[link.reference_ns][:3, 3]
+            name = "keyframe link" if link.kind == "keyframe" else link.kind
+            ends = np.stack([start, moment.T_world_cam[:3, 3]])
+            lines.setdefault(name if link.is_accepted else "refused", []).append(ends)
+    return {name: np.stack(ends) for name, ends in lines.items()}
+
+
+def _rgb(image: ImageArray) -> ImageArray:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+class TruthPath:
+    """Lays the truth onto a growing estimate.
+
+    Where the truth has a rotation for the first frame, its pose there is laid onto the estimate's,
+    so that drift shows; else the positions are fitted by a rigid motion.
+
+    Parameters
+    ----------
+    truth : Trajectory
+        In any world, stamped by the estimate's clock.
+    """
+
+    def __init__(self, truth: Trajectory) -> None:
+        self._truth = truth
+        self._first_ns: int | None = None
+        self._moved: Trajectory | None = None
+
+    def until(self, stamps_ns: IntArray, positions_world: FloatArray) -> FloatArray:
+        """Return the truth's positions (m, 3) between the first and last stamp, metres.
+
+        Parameters
+        ----------
+        stamps_ns : ndarray of int64, shape (n,)
+            Of the estimate; its first frame is the world.
+        positions_world : ndarray of float64, shape (n, 3)
+            Metres.
+        """
+        if len(stamps_ns) == 0:
+            return _NOTHING
+        if self._first_ns != int(stamps_ns[0]):
+            self._first_ns = int(stamps_ns[0])
+            self._moved = self._laid_by_first(stamps_ns[:1])
+        moved = self._moved or self._fitted(stamps_ns, positions_world)
+        if moved is None:
+            return _NOTHING
+        is_in = (moved.stamps_ns >= stamps_ns[0]) & (moved.stamps_ns <= stamps_ns[-1])
+        return np.asarray(moved.positions[is_in])
+
+    def _laid_by_first(self, first_ns: IntArray) -> Trajectory | None:
+        stamps_ns = self._truth.stamps_ns
+        if not self._truth.has_rotations or len(stamps_ns) == 0:
+            return None
+        if not stamps_ns[0] <= first_ns[0] <= stamps_ns[-1]:
+            return None
+        T_truth_first = self._truth.interpolate(first_ns).T_world_cam[0]
+        return self._truth.moved(se3.invert(T_truth_first))
+
+    def _fitted(self, stamps_ns: IntArray, positions_world: FloatArray) -> Trajectory | None:
+        estimate = Trajectory.of_positions(stamps_ns, positions_world)
+        try:
+            rows_truth, rows = associate(self._truth, estimate)
+        except TrajectoryError:
+            return None
+        fit = alignment(estimate.select(rows), self._truth.select(rows_truth), "se3")
+        return fit.apply(self._truth)

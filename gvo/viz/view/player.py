@@ -1,0 +1,461 @@
+"""Plays odometry over a recording: forward as it is computed, backward as it was."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+from typing import TypeAlias
+
+from gvo.config import Config
+from gvo.errors import GvoError
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import one_opencv_thread
+from gvo.io.recording import RecordingInfo, Source
+from gvo.viz.view.history import History, Moment
+from gvo.viz.view.tracking import OpenSource, Tracking
+
+Subscriber: TypeAlias = Callable[[Moment], None]
+_LOGGER = logging.getLogger(__name__)
+
+# A gap of the stamps is not waited for longer, seconds of the recording.
+_MAX_GAP_S = 1.0
+
+
+class Player(AbstractContextManager["Player"]):
+    """Runs odometry over a recording on a thread of its own, as it is told.
+
+    Nothing is computed before `play`, `step` or `seek`. What was computed is kept, and shown
+    again when it is sought: odometry is never rewound. All methods may be called from any
+    thread, and return at once; what they ask for begins within the frame under way.
+
+    Parameters
+    ----------
+    open_source : callable
+        Opens the recording as a configuration says; is called again for `restart`, and where
+        parameters change that only matter when reading (`sync`, `images`, `runtime`,
+        `depth.scale`).
+    config : Config
+    excerpt : Excerpt, optional
+        The part of the recording that is played; the whole where omitted.
+
+    Raises
+    ------
+    GvoError
+        When the recording cannot be opened.
+
+    Examples
+    --------
+    >>> from gvo.io.synthetic.recording import SyntheticRecording
+    >>> recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
+    >>> with Player(lambda config: recording, Config()) as player:
+    ...     player.seek(2)
+    ...     player.wait(), player.index, len(player.history.raw_path()[0])
+    (True, 2, 3)
+    """
+
+    def __init__(
+        self, open_source: OpenSource, config: Config, *, excerpt: Excerpt | None = None
+    ) -> None:
+        self._open_source = open_source
+        self._excerpt = excerpt or Excerpt()
+        self._tracking = Tracking(open_source, config, self._excerpt)
+        self._history = History()
+        # All below is guarded by this condition, which tells the thread of every change.
+        self._changed = threading.Condition()
+        self._config = config
+        self._speed: float | None = 1.0
+        self._is_playing = False
+        self._is_stepping = False
+        self._goal: int | None = None
+        self._restart_index: int | None = None
+        self._is_closed = False
+        self._is_working = False
+        self._is_finished = False
+        self._fault = ""
+        self._due_s = -math.inf  # when the frame shown was due, by the clock of `monotonic`
+        self._subscribers: list[Subscriber] = []
+        self._thread = threading.Thread(target=self._work, name="player", daemon=True)
+        self._thread.start()
+
+    # What it is told
+
+    def play(self) -> None:
+        """Go on from the frame shown, at the speed that is set."""
+        with self._changed:
+            self._is_playing = True
+            self._due_s = -math.inf
+            self._changed.notify_all()
+
+    def pause(self) -> None:
+        """Stop, also on the way to a frame that is sought."""
+        with self._changed:
+            self._is_playing = self._is_stepping = False
+            self._goal = None
+            self._changed.notify_all()
+
+    def step(self) -> None:
+        """Show the next frame, and pause; each further call is one frame more."""
+        with self._changed:
+            base = self._goal if self._is_stepping and self._goal is not None else self.index
+            self._goal = base + 1
+            self._is_stepping, self._is_playing = True, False
+            self._changed.notify_all()
+
+    def seek(self, index: int) -> None:
+        """Show a frame: at once where it is done, else as soon as all up to it are.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame in the recording; before the first one, the first is shown, and after
+            the last one the last. Playing goes on from there.
+        """
+        with self._changed:
+            self._goal = max(int(index), self.first_index)
+            self._is_stepping = False
+            self._changed.notify_all()
+
+    def set_speed(self, factor: float | None) -> None:
+        """Play by the recording's stamps, or as fast as it goes; no frame is ever left out.
+
+        Parameters
+        ----------
+        factor : float or None
+            1: as it was recorded, 2: in half the time; None: as fast as it goes.
+
+        Raises
+        ------
+        ValueError
+            When the factor is not positive.
+        """
+        if factor is not None and not (math.isfinite(factor) and factor > 0):
+            raise ValueError(f"the speed must be positive or None, got {factor}")
+        with self._changed:
+            self._speed = factor
+            self._changed.notify_all()
+
+    def reconfigure(self, config: Config) -> None:
+        """Compute with another configuration from the next frame on.
+
+        Where the recording has to be opened again for that, and cannot be, `fault` tells why,
+        and the former configuration stays.
+
+        Raises
+        ------
+        ValueError
+            When it is no Config.
+        """
+        if not isinstance(config, Config):
+            raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
+        with self._changed:
+            self._config, self._fault = config, ""
+            self._changed.notify_all()
+
+    def restart(self, index: int | None = None) -> None:
+        """Begin odometry anew, with the present configuration.
+
+        What was computed before is dropped, and the world begins at the first frame that is
+        tracked. The numbers of the frames stay.
+
+        Parameters
+        ----------
+        index : int, optional
+            Where to begin: 0, or a frame that is done; the one that is shown where omitted.
+
+        Raises
+        ------
+        ValueError
+            When the frame is not known yet.
+        """
+        with self._changed:
+            index = max(self.index, 0) if index is None else int(index)
+            if index != 0 and not self.first_index <= index < self.n_done:
+                raise ValueError(f"frame {index} is not known: {self.n_done} are done")
+            self._restart_index = index
+            self._goal, self._is_stepping = None, False
+            self._changed.notify_all()
+
+    def subscribe(self, callback: Subscriber) -> Callable[[], None]:
+        """Have something called with each moment that is shown, on the thread of the player.
+
+        Returns
+        -------
+        callable
+            Ends that.
+        """
+        with self._changed:
+            self._subscribers.append(callback)
+        return partial(self._unsubscribe, callback)
+
+    def _unsubscribe(self, callback: Subscriber) -> None:
+        with self._changed:
+            if callback in self._subscribers:
+                self._subscribers.remove(callback)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until nothing is left to do; return False where that takes too long."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self.is_busy, timeout_s)
+
+    def close(self) -> None:
+        """End the thread, after the frame under way; what was computed can still be read."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
+
+    # What it tells
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the recording as it announces them; those there were, once it is finished."""
+        if self._is_finished:
+            return self.n_done
+        announced = self._excerpt.n_expected(self.info.n_images)
+        return max(announced, self.n_done)
+
+    @property
+    def n_done(self) -> int:
+        """Frames that are done: the index of the last one, and 1."""
+        return self._history.n_done
+
+    @property
+    def index(self) -> int:
+        """Index of the frame shown; one less than `first_index` before there is any."""
+        return self._history.shown
+
+    @property
+    def first_index(self) -> int:
+        """Where odometry began."""
+        return self._history.first_index
+
+    @property
+    def is_playing(self) -> bool:
+        """Tell whether it goes on by itself."""
+        return self._is_playing
+
+    @property
+    def is_finished(self) -> bool:
+        """Tell whether all of the recording is done that can be read."""
+        return self._is_finished
+
+    @property
+    def is_busy(self) -> bool:
+        """Tell whether something is under way or left to do."""
+        if self._is_closed:
+            return self._is_working
+        is_asked = self._goal is not None or self._restart_index is not None
+        return self._is_playing or self._is_working or is_asked
+
+    @property
+    def speed(self) -> float | None:
+        """Factor on the recording's own speed; None: as fast as it goes."""
+        return self._speed
+
+    @property
+    def fault(self) -> str:
+        """What went wrong last, in one line; empty after a restart or another configuration."""
+        return self._fault
+
+    @property
+    def config(self) -> Config:
+        """What the next frame is computed with."""
+        return self._config
+
+    @property
+    def source(self) -> Source:
+        """The recording, as odometry began with it."""
+        return self._tracking.source
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What the recording says of itself."""
+        return self._tracking.info
+
+    @property
+    def camera(self) -> StereoCamera | PinholeCamera:
+        """The camera of the rectified frames."""
+        return self._tracking.camera
+
+    @property
+    def history(self) -> History:
+        """What was done since the start or the last restart."""
+        return self._history
+
+    @property
+    def moment(self) -> Moment | None:
+        """The frame shown; None before there is any."""
+        history = self._history
+        if history.shown < history.first_index:
+            return None
+        return history.moment(fault=self._fault)
+
+    # What the thread does
+
+    def _work(self) -> None:
+        with one_opencv_thread():
+            while self._wait_for_work():
+                if not self._guarded(self._turn):
+                    self._end_wishes()
+                    self._publish()
+        self._guarded(self._tracking.close)
+
+    def _wait_for_work(self) -> bool:
+        """Return whether there is work; False at the end of the thread."""
+        with self._changed:
+            self._is_working = False
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._is_closed or self.is_busy)
+            self._is_working = not self._is_closed
+            return self._is_working
+
+    def _guarded(self, work: Callable[[], None]) -> bool:
+        """Do something; keep and tell what goes wrong, for a thread that dies tells nobody."""
+        try:
+            work()
+        except GvoError as error:
+            self._fault = str(error)
+        except Exception as error:
+            _LOGGER.exception("the player failed")
+            self._fault = f"{type(error).__name__}: {error}"
+        else:
+            return True
+        return False
+
+    def _end_wishes(self) -> None:
+        with self._changed:
+            self._is_playing = self._is_stepping = False
+            self._goal = self._restart_index = None
+
+    def _publish(self) -> None:
+        """Tell all subscribers of the frame shown."""
+        with self._changed:
+            subscribers = tuple(self._subscribers)
+        moment = self.moment if subscribers else None
+        if moment is not None:
+            for callback in subscribers:
+                self._guarded(partial(callback, moment))
+
+    def _turn(self) -> None:
+        """Do one thing of those that were asked for: start anew, show or compute one frame."""
+        with self._changed:
+            restart_index, goal = self._restart_index, self._goal
+        if restart_index is not None:
+            self._start_anew(restart_index)
+        elif goal is not None:
+            self._approach(goal)
+        elif self._wait_until_due() and not self._show_next():
+            with self._changed:
+                self._is_playing = False
+
+    def _start_anew(self, index: int) -> None:
+        from_ns = None if index == 0 else self._history.stamp_ns(index)
+        tracking = Tracking(self._open_source, self._config, self._excerpt, from_ns=from_ns)
+        self._tracking.close()
+        with self._changed:
+            self._tracking, self._history = tracking, History(index)
+            self._is_finished, self._fault = False, ""
+            if self._restart_index == index:
+                self._restart_index = None
+            if self._goal is None:
+                self._goal = index
+
+    def _approach(self, goal: int) -> None:
+        """Show a frame that is sought, or the next one on the way to it."""
+        if goal < self.n_done:
+            self._show(goal)
+        elif not self._advance() and self.index < self.n_done - 1:
+            self._show(self.n_done - 1)
+        with self._changed:
+            is_arrived = self.index == goal or self._is_finished
+            if is_arrived and self._goal == goal:  # another one may be sought by now
+                self._goal, self._is_stepping = None, False
+            self._due_s = time.monotonic()
+
+    def _wait_until_due(self) -> bool:
+        """Wait until the next frame is to be shown; return False where something else is."""
+        gap_s = self._gap_s()
+        with self._changed:
+            while self._is_only_playing():
+                pause_s = 0.0 if self._speed is None else gap_s / self._speed
+                now_s, due_s = time.monotonic(), self._due_s + pause_s
+                if now_s >= due_s:
+                    # Who is late by more than a frame does not catch up.
+                    self._due_s = due_s if now_s - due_s <= pause_s else now_s
+                    return True
+                self._changed.wait(due_s - now_s)
+        return False
+
+    def _is_only_playing(self) -> bool:
+        is_asked = self._goal is not None or self._restart_index is not None
+        return self._is_playing and not is_asked and not self._is_closed
+
+    def _gap_s(self) -> float:
+        """Return how long after the frame shown the next one was recorded."""
+        if not self.first_index <= self.index:
+            return 0.0
+        following = self.index + 1
+        if following < self.n_done:
+            next_ns = self._history.stamp_ns(following)
+        elif (item := self._tracking.peek()) is not None:
+            next_ns = item.stamp_ns
+        else:
+            return 0.0
+        gap_s = 1e-9 * (next_ns - self._history.stamp_ns(self.index))
+        return min(max(gap_s, 0.0), _MAX_GAP_S)
+
+    def _show_next(self) -> bool:
+        if self.index + 1 < self.n_done:
+            self._show(self.index + 1)
+            return True
+        return self._advance()
+
+    def _show(self, index: int) -> None:
+        self._history.show(index)
+        self._publish()
+
+    def _advance(self) -> bool:
+        """Compute and show the next frame; return False at the end."""
+        if self._is_finished:
+            return False
+        try:
+            self._take_configuration()
+            entry = self._tracking.advance(self.n_done)
+            if entry is not None:
+                self._history.add(entry)
+                self._show(self.n_done - 1)
+                self._tracking.peek()  # is it the last one?
+        finally:
+            if self._tracking.is_finished:
+                self._finish()
+        return entry is not None
+
+    def _take_configuration(self) -> None:
+        config = self._config
+        if config is self._tracking.config:
+            return
+        try:
+            self._tracking.reconfigure(config)
+        except GvoError as error:
+            with self._changed:
+                self._fault = str(error)
+                if self._config is config:
+                    self._config = self._tracking.config
+
+    def _finish(self) -> None:
+        """Take the smoothed poses of the frames that the window still holds."""
+        self._is_finished = True
+        if self.n_done > self.first_index:
+            self._history.finish(self._tracking.finish())
+            self._publish()

@@ -1,0 +1,301 @@
+"""The 3-D scene: paths, camera, clouds, keyframes, links, ellipsoids, truth."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gvo.types import FloatArray, ImageArray, IntArray
+from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, rgb
+
+Up = Literal["-y", "+z"]
+LINKS = ("step", "keyframe link", "standstill", "refused")
+"""Kinds of lines between poses."""
+
+_NO_LINES = np.zeros((0, 2, 3))
+_N_GRID_CELLS = 100
+_JPEG_QUALITY = 80
+
+
+class Scene:
+    """What is drawn in 3-D; sends only what changed.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    up : {"-y", "+z"}
+        Which axis of the world points up: -y where the world is the first camera.
+    """
+
+    def __init__(self, scene: viser.SceneApi, *, up: Up = "-y") -> None:
+        self._scene = scene
+        self.lock = threading.RLock()
+        """Held by whoever draws: layers are switched from other threads."""
+        self.up = up
+        scene.set_up_direction(up)
+        scene.world_axes.visible = False
+        self._paths = {name: Path(scene, name) for name in ("raw", "causal", "smoothed", "truth")}
+        self._cloud = Cloud(scene)
+        self._links = {name: Segments(scene, name) for name in LINKS}
+        self._keyframes = Segments(scene, "keyframes")
+        self._ellipsoids: Any = None
+        self._camera = scene.add_frame("/camera", show_axes=False)
+        self._frustum: Any = None
+        self._points: Any = None
+        self._ground: Any = None
+        self._size = 1.0
+        self._aspect, self._fov = 4 / 3, 1.0
+        self._shown = dict.fromkeys(self.layers, True)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """What can be hidden, by name."""
+        return (
+            *self._paths,
+            "keyframes",
+            "links",
+            "ellipsoids",
+            "image",
+            "points",
+            "cloud",
+            "ground",
+        )
+
+    def set_camera(self, width: int, height: int, fy: float, *, size_m: float) -> None:
+        """Set the shape of the camera; its image is drawn at a distance of `size_m`.
+
+        Parameters
+        ----------
+        width, height : int
+            Pixels.
+        fy : float
+            Focal length, pixels.
+        size_m : float
+            Metres.
+        """
+        self._aspect, self._fov = width / height, 2.0 * np.arctan2(0.5 * height, fy)
+        self._size = size_m
+        if self._frustum is not None:
+            self._frustum.remove()
+        self._frustum = self._scene.add_camera_frustum(
+            "/camera/image",
+            float(self._fov),
+            float(self._aspect),
+            scale=_frustum_scale(float(self._fov), float(self._aspect), size_m),
+            thickness=2.0,
+            thickness_units="screen",
+            color=rgb(COLOURS["causal"]),
+            format="jpeg",
+            jpeg_quality=_JPEG_QUALITY,
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=self._shown["image"],
+        )
+
+    def show_ground(self, center: FloatArray, cell_m: float) -> None:
+        """Draw a grid through a position (3,) of the world, thick lines ten cells apart."""
+        self._ground = self._scene.add_grid(
+            "/ground",
+            width=_N_GRID_CELLS * cell_m,
+            height=_N_GRID_CELLS * cell_m,
+            plane="xz" if self.up == "-y" else "xy",
+            cell_size=cell_m,
+            section_size=10.0 * cell_m,
+            cell_color=(232, 232, 232),
+            section_color=(205, 205, 205),
+            shadow_opacity=0.0,
+            infinite_grid=True,
+            fade_distance=_N_GRID_CELLS * cell_m,
+            position=_position(center),
+            visible=self._shown["ground"],
+        )
+
+    def show_path(self, name: str, positions_world: FloatArray) -> None:
+        """Draw a path: raw, causal, smoothed or truth.
+
+        Parameters
+        ----------
+        positions_world : ndarray of float64, shape (n, 3)
+            Metres.
+        """
+        self._paths[name].show(positions_world, is_visible=self._shown[name])
+
+    def show_pose(self, T_world_cam: FloatArray) -> None:
+        """Move the camera with all that hangs on it."""
+        self._camera.wxyz = quaternions_wxyz(T_world_cam[np.newaxis, :3, :3])[0]
+        self._camera.position = _position(T_world_cam[:3, 3])
+
+    def show_image(self, image: ImageArray | None) -> None:
+        """Show an RGB image (h, w, 3) in the camera."""
+        if self._frustum is not None:
+            self._frustum.image = image
+
+    def show_points(self, points_cam: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        """Draw the points of the current frame, shape (n, 3), metres, in the camera frame."""
+        if len(points_cam) == 0:  # the browser complains of clouds without points
+            if self._points is not None:
+                self._points.remove()
+                self._points = None
+            return
+        if self._points is None:
+            self._points = self._scene.add_point_cloud(
+                "/camera/points",
+                points_cam,
+                colours,
+                point_size=0.035 * self._size,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+                visible=self._shown["points"],
+            )
+            return
+        self._points.points = points_cam
+        self._points.colors = colours
+
+    def show_cloud(self, points_world: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        """Draw the accumulated points, shape (n, 3), metres, in the world."""
+        self._cloud.show(
+            points_world, colours, point_size=0.025 * self._size, is_visible=self._shown["cloud"]
+        )
+
+    def show_keyframes(self, T_world_keyframes: FloatArray) -> None:
+        """Draw small cameras at poses of shape (n, 4, 4), metres."""
+        corners = _frustum_corners(self._fov, self._aspect, 0.35 * self._size)
+        homogeneous = np.concatenate([corners, np.ones((*corners.shape[:2], 1))], axis=2)
+        segments = np.einsum("nij,ekj->neki", T_world_keyframes, homogeneous)[..., :3]
+        self._keyframes.show(segments.reshape(-1, 2, 3), is_visible=self._shown["keyframes"])
+
+    def show_links(self, segments: Mapping[str, FloatArray]) -> None:
+        """Draw lines between poses, shape (n, 2, 3), metres, by a name of `LINKS`."""
+        for name, node in self._links.items():
+            node.show(segments.get(name, _NO_LINES), is_visible=self._shown["links"])
+
+    def show_ellipsoids(
+        self, T_world_cam: FloatArray, covariances: FloatArray, n_sigmas: float
+    ) -> None:
+        """Draw the covariances of positions; see `position_ellipsoids`."""
+        if self._ellipsoids is not None:
+            self._ellipsoids.remove()
+            self._ellipsoids = None
+        if len(T_world_cam) == 0:
+            return
+        half_axes, quaternions = position_ellipsoids(T_world_cam, covariances, n_sigmas)
+        vertices, faces = unit_sphere()
+        self._ellipsoids = self._scene.add_batched_meshes_simple(
+            "/ellipsoids",
+            vertices,
+            faces,
+            quaternions,
+            T_world_cam[:, :3, 3],
+            batched_scales=np.maximum(half_axes, 1e-6).astype(np.float32),
+            batched_colors=rgb(COLOURS["ellipsoids"]),
+            opacity=0.4,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=self._shown["ellipsoids"],
+        )
+
+    def set_visible(self, layer: str, is_visible: bool) -> None:
+        """Show or hide one of `layers`."""
+        with self.lock:
+            self._shown[layer] = is_visible
+            for node in self._nodes(layer):
+                node.set_visible(is_visible)
+            single = {
+                "image": self._frustum,
+                "points": self._points,
+                "ellipsoids": self._ellipsoids,
+                "ground": self._ground,
+            }
+            if single.get(layer) is not None:
+                single[layer].visible = is_visible
+
+    def _nodes(self, layer: str) -> list[Path | Cloud | Segments]:
+        named: dict[str, list[Path | Cloud | Segments]] = {
+            "keyframes": [self._keyframes],
+            "cloud": [self._cloud],
+            "links": [*self._links.values()],
+        }
+        return [self._paths[layer]] if layer in self._paths else named.get(layer, [])
+
+
+def _position(position: FloatArray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in position)
+    return x, y, z
+
+
+def _frustum_scale(fov: float, aspect: float, depth: float) -> float:
+    """Return viser's scale of a frustum that is `depth` metres deep: it asks for the volume."""
+    return float(depth * np.cbrt(aspect * np.tan(0.5 * fov) ** 2 / 3.0))
+
+
+def _frustum_corners(fov: float, aspect: float, depth: float) -> FloatArray:
+    """Return the 8 edges (8, 2, 3) of a camera, in its frame."""
+    y = depth * np.tan(0.5 * fov)
+    x = aspect * y
+    far = np.array([[-x, -y, depth], [x, -y, depth], [x, y, depth], [-x, y, depth]])
+    rays = np.stack([np.zeros_like(far), far], axis=1)
+    rim = np.stack([far, np.roll(far, -1, axis=0)], axis=1)
+    return np.concatenate([rays, rim])
+
+
+def position_ellipsoids(
+    T_world_cam: FloatArray, covariances: FloatArray, n_sigmas: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the half axes and orientations of the positions' ellipsoids.
+
+    Parameters
+    ----------
+    T_world_cam : ndarray of float64, shape (n, 4, 4)
+        Poses, metres.
+    covariances : ndarray of float64, shape (n, 6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+    n_sigmas : float
+        Half axes are so many standard deviations.
+
+    Returns
+    -------
+    half_axes : ndarray of float64, shape (n, 3)
+        Metres, the smallest first.
+    quaternions_wxyz : ndarray of float64, shape (n, 4)
+        Of the axes in the world.
+    """
+    variances, axes_cam = np.linalg.eigh(covariances[:, 3:, 3:])
+    axes_world = T_world_cam[:, :3, :3] @ axes_cam
+    axes_world[:, :, 2] *= np.sign(np.linalg.det(axes_world))[:, np.newaxis]
+    half_axes = n_sigmas * np.sqrt(np.maximum(variances, 0.0))
+    return half_axes, quaternions_wxyz(axes_world)
+
+
+def quaternions_wxyz(rotations: FloatArray) -> FloatArray:
+    """Return unit quaternions (n, 4), w first, of rotation matrices (n, 3, 3)."""
+    return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
+
+
+def position_sigmas(T_world_cam: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard deviations (3,) of a position along the axes of the world, metres."""
+    R = T_world_cam[:3, :3]
+    return np.asarray(np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T)))
+
+
+def unit_sphere(n_rings: int = 10) -> tuple[FloatArray, IntArray]:
+    """Return the corners (v, 3) and triangles (f, 3) of a sphere of radius 1."""
+    n_around = 2 * n_rings
+    polar = np.linspace(0.0, np.pi, n_rings + 1)
+    around = np.linspace(0.0, 2.0 * np.pi, n_around, endpoint=False)
+    z = np.repeat(np.cos(polar), n_around)
+    x = np.outer(np.sin(polar), np.cos(around)).ravel()
+    y = np.outer(np.sin(polar), np.sin(around)).ravel()
+    ring, step = np.divmod(np.arange(n_rings * n_around), n_around)
+    a = ring * n_around + step
+    b = ring * n_around + (step + 1) % n_around
+    lower = np.stack([a, a + n_around, b], axis=1)
+    upper = np.stack([b, a + n_around, b + n_around], axis=1)
+    return np.stack([x, y, z], axis=1), np.concatenate([lower, upper])

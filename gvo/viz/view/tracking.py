@@ -1,0 +1,276 @@
+"""Odometry over a recording for a view, a frame at a time."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from gvo.config import Config
+from gvo.geometry.camera import PinholeCamera
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames, paired
+from gvo.io.recording import Source
+from gvo.odometry.odometry import Odometry
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, ImageArray, StereoFrame
+from gvo.viz.overlay import compose_overlay, draw_matches
+from gvo.viz.view.clouds import empty_cloud, frame_cloud
+from gvo.viz.view.history import Entry
+
+OpenSource: TypeAlias = Callable[[Config], Source]
+# Newest poses of the window that are written down with each frame; it may keep all there are.
+_N_POSES = 24
+_RATE_SHARE = 0.1  # of the newest frame in the rate that is told
+_SECTIONS = ("sync", "images", "runtime")
+
+MAX_WIDTH_PX = 480
+
+
+class Tracking:
+    """Reads frames, tracks them, and gathers what a view shows of each.
+
+    Parameters
+    ----------
+    open_source : callable
+        Opens the recording as a configuration says.
+    config : Config
+    excerpt : Excerpt
+        The part of the recording that is wanted.
+    from_ns : int, optional
+        Stamp of the frame to start with.
+
+    Attributes
+    ----------
+    config : Config
+        Of the next frame.
+    is_finished : bool
+        The recording was read to its end, or something went wrong for good.
+
+    Raises
+    ------
+    GvoError
+        When the recording cannot be opened.
+    """
+
+    def __init__(
+        self,
+        open_source: OpenSource,
+        config: Config,
+        excerpt: Excerpt,
+        *,
+        from_ns: int | None = None,
+    ) -> None:
+        self._open_source = open_source
+        self._excerpt = excerpt
+        self.config = config
+        self.is_finished = False
+        source = self.source = open_source(config)
+        self.info = source.info
+        self.camera = source.info.camera
+        self._odometry = Odometry(self.camera, config)
+        self._items: Iterator[Frame | FaultyFrame] = read_frames(
+            source, config, excerpt, from_ns=from_ns
+        )
+        self._from_ns = from_ns
+        self._last_ns: int | None = None
+        self._next: Frame | FaultyFrame | None = None
+        self._read_ms = 0.0
+        self._frame_ms: float | None = None
+        self._stamps_ns: deque[int] = deque(maxlen=_N_POSES)
+        self._keyframes_ns: tuple[int, ...] = ()
+
+    def peek(self) -> Frame | FaultyFrame | None:
+        """Return the next frame; None at the end.
+
+        Raises
+        ------
+        RecordingError
+            When the recording breaks off; it is finished then.
+        """
+        if self._next is None and not self.is_finished:
+            self.is_finished = True  # unless there is one
+            start = time.perf_counter()
+            self._next = next(self._items, None)
+            self._read_ms = 1e3 * (time.perf_counter() - start)
+            self.is_finished = self._next is None
+        return self._next
+
+    def reconfigure(self, config: Config) -> None:
+        """Take another configuration for the next frame; open the recording again if it must be.
+
+        Raises
+        ------
+        GvoError
+            When that fails; the configuration is the former one then.
+        """
+        if is_read_differently(self.config, config) and not self.is_finished:
+            self._reopen(config)
+        self._odometry.reconfigure(config)
+        self.config = config
+
+    def _reopen(self, config: Config) -> None:
+        last_ns = self._last_ns
+        source = self._open_source(config)
+        from_ns = self._from_ns if last_ns is None else last_ns
+        items = read_frames(source, config, self._excerpt, from_ns=from_ns)
+        coming = (item for item in items if last_ns is None or item.stamp_ns > last_ns)
+        following = next(coming, None)
+        self.close()
+        self._items, self._next = coming, following
+        self.is_finished = following is None
+
+    def advance(self, index: int) -> Entry | None:
+        """Track the next frame and return what there is to show of it; None at the end.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame, to be told in the overlay.
+
+        Raises
+        ------
+        RecordingError
+            When the recording breaks off; it is finished then.
+        """
+        item = self.peek()
+        if item is None:
+            return None
+        self.is_finished = True  # unless all goes well
+        entry = self._faulty(item) if isinstance(item, FaultyFrame) else self._track(item, index)
+        self._last_ns, self._next, self.is_finished = item.stamp_ns, None, False
+        return entry
+
+    def finish(self) -> tuple[Estimate, ...]:
+        """Return the smoothed poses that the window still holds."""
+        return self._odometry.finish()
+
+    def close(self) -> None:
+        """Give threads and files of the reading back."""
+        if isinstance(self._items, Generator):
+            self._items.close()
+
+    def _faulty(self, frame: FaultyFrame) -> Entry:
+        picture = draw_fault(self.camera, frame.reason)
+        poses, covariances = self._window()
+        return Entry(
+            stamp_ns=frame.stamp_ns,
+            result=None,
+            reason=frame.reason,
+            image=small_picture(picture),
+            overlay=picture,
+            cloud=empty_cloud(),
+            window_poses=poses,
+            window_covariances=covariances,
+        )
+
+    def _track(self, frame: Frame, index: int) -> Entry:
+        result = self._odometry.track(frame)
+        result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
+        self._stamps_ns.append(frame.stamp_ns)
+        self._keyframes_ns = result.keyframes_ns
+        poses, covariances = self._window()
+        image = frame.left if isinstance(frame, StereoFrame) else frame.image
+        return Entry(
+            stamp_ns=frame.stamp_ns,
+            result=result,
+            reason=result.reason,
+            image=small_picture(image),
+            overlay=compose_overlay(
+                frame, result, self.camera, index=index, rate_hz=self._rate_hz(result)
+            ),
+            cloud=frame_cloud(frame, result.registration, self.camera, self.config.depth),
+            window_poses=poses,
+            window_covariances=covariances,
+        )
+
+    def _window(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
+        """Return poses and covariances of the newest frames in the window and of keyframes."""
+        window = self._odometry.window
+        known = [ns for ns in sorted({*self._keyframes_ns, *self._stamps_ns}) if ns in window]
+        estimates = {ns: window.estimate(ns) for ns in known}
+        return (
+            {ns: estimate.T_world_cam for ns, estimate in estimates.items()},
+            {ns: estimate.covariance for ns, estimate in estimates.items()},
+        )
+
+    def _rate_hz(self, result: FrameResult) -> float:
+        spent_ms = sum(result.stage_ms.values())
+        before_ms = spent_ms if self._frame_ms is None else self._frame_ms
+        self._frame_ms = (1.0 - _RATE_SHARE) * before_ms + _RATE_SHARE * spent_ms
+        return 1e3 / max(self._frame_ms, 1e-3)
+
+
+def is_read_differently(former: Config, config: Config) -> bool:
+    """Tell whether a recording must be opened again for another configuration to matter."""
+    return former.depth.scale != config.depth.scale or any(
+        getattr(former, name) != getattr(config, name) for name in _SECTIONS
+    )
+
+
+def read_frames(
+    source: Source, config: Config, excerpt: Excerpt, *, from_ns: int | None = None
+) -> Iterator[Frame | FaultyFrame]:
+    """Read the frames of a recording that a run counts.
+
+    Parameters
+    ----------
+    source : Source
+    config : Config
+    excerpt : Excerpt
+        The part that is wanted.
+    from_ns : int, optional
+        Stamp of the frame of it to start with; the others are found, but not decoded.
+
+    Yields
+    ------
+    StereoFrame, RgbdFrame or FaultyFrame
+        Colour images without depth, and the reverse, are left out: those of a free-running
+        sensor need not pair.
+
+    Raises
+    ------
+    RecordingError
+        When the recording cannot be read on.
+    """
+    if from_ns is not None:
+        excerpt = _excerpt_from(from_ns, source, config, excerpt)
+    is_stereo = source.info.sensor == "stereo"
+    for item in frames(source, config, excerpt):
+        if is_stereo or not isinstance(item, FaultyFrame) or not item.is_unpaired:
+            yield item
+
+
+def _excerpt_from(from_ns: int, source: Source, config: Config, excerpt: Excerpt) -> Excerpt:
+    """Return what is left of an excerpt from a frame of it on."""
+    first = next(paired(source.images(), source.info.sensor, config.sync))
+    first_ns = first.stamp_ns if isinstance(first, FaultyFrame) else first[0].stamp_ns
+    start_s = max(1e-9 * (from_ns - first_ns), 0.0)
+    duration_s = None
+    if excerpt.duration_s is not None:
+        duration_s = max(excerpt.start_s + excerpt.duration_s - start_s, 1e-9)
+    return replace(excerpt, start_s=start_s, duration_s=duration_s)
+
+
+def draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
+    """Return a dark picture that tells why there is no frame, BGR."""
+    none = np.zeros((0, 2))
+    dark = np.full((camera.height, camera.width), 40, dtype=np.uint8)
+    return draw_matches(
+        dark, none, none, np.zeros(0, dtype=np.bool_), lines=[f"no frame: {reason}"]
+    )
+
+
+def small_picture(image: ImageArray) -> ImageArray:
+    """Return a grey or BGR image as BGR, at most 480 pixels wide."""
+    height, width = image.shape[:2]
+    if width > MAX_WIDTH_PX:
+        size = MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1)
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if image.ndim == 2:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    return image

@@ -1,0 +1,205 @@
+"""Films, decoded again, and what stands in for them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+import gvo
+from gvo.errors import ConfigurationError, RecordingError
+from gvo.types import ImageArray
+from gvo.viz import video
+from gvo.viz.video import Film, PngFolder, open_sink
+
+_SUFFIXES = pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+_LEVELS = range(30, 240, 16)
+_SECOND_NS = 10**9
+
+
+def _picture(level: int, width: int = 96, height: int = 64) -> ImageArray:
+    """Return a picture of two colours, of which one tells the number of the frame."""
+    picture = np.empty((height, width, 3), dtype=np.uint8)
+    picture[:, : width // 2] = (level, level, level)
+    picture[:, width // 2 :] = (0, 159, 230)
+    return picture
+
+
+def _write(path: Path, period_ns: int = _SECOND_NS // 25, **size: int) -> None:
+    sink = open_sink(path)
+    for n, level in enumerate(_LEVELS):
+        sink.add(_picture(level, **size), 10**18 + n * period_ns)
+    sink.close()
+
+
+def _decoded(path: Path) -> list[ImageArray]:
+    capture = cv2.VideoCapture(str(path))
+    pictures = []
+    while (answer := capture.read())[0]:
+        pictures.append(np.asarray(answer[1], dtype=np.uint8))
+    return pictures
+
+
+@_SUFFIXES
+def test_a_film_holds_each_picture_once_in_its_order(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"film{suffix}"
+    _write(path)
+    pictures = _decoded(path)
+    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * len(_LEVELS)
+    for picture, level in zip(pictures, _LEVELS, strict=True):
+        np.testing.assert_allclose(picture[32, 20].astype(int), level, atol=7)
+        np.testing.assert_allclose(picture[32, 70].astype(int), (0, 159, 230), atol=14)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@_SUFFIXES
+@pytest.mark.parametrize("rate_hz", [0.7, 9.63, 30.0, 60.0])
+def test_a_film_plays_as_fast_as_its_pictures_were_taken(
+    tmp_path: Path, suffix: str, rate_hz: float
+) -> None:
+    path = tmp_path / f"film{suffix}"
+    _write(path, round(_SECOND_NS / rate_hz))
+    capture = cv2.VideoCapture(str(path))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(rate_hz, rel=2e-3)
+    stamps_ms = []
+    while capture.grab():
+        stamps_ms.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+    np.testing.assert_allclose(np.diff(stamps_ms), 1e3 / rate_hz, rtol=2e-3, atol=1.0)
+
+
+def test_a_gap_in_the_stamps_does_not_change_the_rate(tmp_path: Path) -> None:
+    film = Film(tmp_path / "film.mp4")
+    for n, level in enumerate(_LEVELS):
+        film.add(_picture(level), n * 10**8 + (n > 2) * 5 * _SECOND_NS)
+    film.close()
+    assert cv2.VideoCapture(str(film.path)).get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
+
+
+@_SUFFIXES
+def test_a_single_picture_makes_a_film_and_none_makes_no_file(tmp_path: Path, suffix: str) -> None:
+    film = Film(tmp_path / f"one{suffix}")
+    film.add(_picture(80), 0)
+    film.close()
+    Film(tmp_path / f"none{suffix}").close()
+    assert len(_decoded(film.path)) == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == [film.path.name]
+
+
+@_SUFFIXES
+def test_an_odd_last_row_and_column_are_left_out(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"film{suffix}"
+    _write(path, width=97, height=65)
+    assert {picture.shape for picture in _decoded(path)} == {(64, 96, 3)}
+
+
+def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
+    film = Film(tmp_path / "film.webm")
+    film.add(_picture(80), 0)
+    with pytest.raises(ValueError, match="expected a picture of"):
+        film.add(_picture(80, width=128), 1)
+    film.close()
+
+
+def test_a_webm_file_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "film.webm"
+    _write(path)
+    header = path.read_bytes()[:64]
+    assert b"\x42\x82\x84webm" in header
+    assert b"matroska" not in header
+
+
+def test_a_film_that_was_not_written_whole_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = Film(tmp_path / "film.webm")
+    film.add(_picture(80), 0)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: SimpleNamespace(read=lambda: (False, None)))
+    with pytest.raises(RecordingError, match=r"film\.webm: was not written whole: 0 of 1 frames"):
+        film.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_files_other_suffixes_and_full_folders_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "there.webm").write_bytes(b"mine")
+    with pytest.raises(RecordingError, match="exists already"):
+        open_sink(tmp_path / "there.webm")
+    with pytest.raises(ConfigurationError, match=r"expected a name ending in \.webm") as caught:
+        open_sink(tmp_path / "film.avi")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(RecordingError, match="is not empty"):
+        open_sink(tmp_path)
+    with pytest.raises(RecordingError, match="cannot be written"):
+        open_sink(tmp_path / "there.webm" / "film.webm")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["there.webm"]
+
+
+def test_a_name_without_suffix_is_a_folder_of_numbered_pictures(tmp_path: Path) -> None:
+    _write(tmp_path / "frames")
+    _check_folder(tmp_path / "frames")
+    PngFolder(tmp_path / "empty").close()
+    assert not (tmp_path / "empty").exists()
+
+
+def _check_folder(folder: Path) -> None:
+    files = sorted(folder.iterdir())
+    assert [file.name for file in files] == [f"{n:06d}.png" for n in range(len(_LEVELS))]
+    for file, level in zip(files, _LEVELS, strict=True):
+        np.testing.assert_array_equal(cv2.imread(str(file)), _picture(level))
+
+
+def test_where_no_encoder_is_there_pictures_are_written_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # FFmpeg knows this codec, but nothing encodes it
+    monkeypatch.setitem(video.CODECS, ".webm", "VP60")
+    sink = open_sink(tmp_path / "film.webm")
+    assert isinstance(sink, PngFolder)
+    assert sink.decisions == (
+        f"{tmp_path / 'film.webm'}: OpenCV has no encoder for .webm here: PNG files in "
+        f"{tmp_path / 'film_frames'} instead",
+    )
+    _write(tmp_path / "other.webm")
+    _check_folder(tmp_path / "other_frames")
+
+
+def _in_a_process(code: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    package = Path(gvo.__file__).parent.parent
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(package), **environment},
+        check=True,
+    )
+
+
+_PROGRAM = """
+from pathlib import Path
+import numpy as np
+from gvo.viz.video import open_sink
+for name in ("one.webm", "two.mp4", "no.webm"):
+    sink = open_sink(Path(name))
+    print(type(sink).__name__)
+    for n in range(3 * (name != "no.webm")):
+        sink.add(np.zeros((64, 64, 3), dtype=np.uint8), n)
+    sink.close()
+"""
+
+
+@pytest.mark.parametrize(("priority", "kind"), [("1000", "Film"), ("0", "PngFolder")])
+def test_opencv_says_nothing_on_the_error_stream(tmp_path: Path, priority: str, kind: str) -> None:
+    # a priority of 0 switches FFmpeg off
+    answer = _in_a_process(_PROGRAM, tmp_path, OPENCV_VIDEOIO_PRIORITY_FFMPEG=priority)
+    assert answer.stderr == ""
+    assert set(answer.stdout.split()) == {kind}
+
+
+def test_the_log_level_of_opencv_is_left_as_it_was(tmp_path: Path) -> None:
+    before = cv2.utils.logging.getLogLevel()
+    _write(tmp_path / "film.webm")
+    assert cv2.utils.logging.getLogLevel() == before

@@ -1,0 +1,173 @@
+"""A player that computes nothing, and moments of a camera that drives ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.geometry.camera import PinholeCamera
+from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, IntArray, Status
+from gvo.viz.view.history import Moment
+
+PERIOD_NS = 100_000_000
+CAMERA = PinholeCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0)
+
+
+def pose_of(index: int) -> FloatArray:
+    """A metre ahead per frame."""
+    T = np.eye(4)
+    T[2, 3] = float(index)
+    return T
+
+
+def stamps_of(n: int) -> IntArray:
+    """Of the first n frames, nanoseconds."""
+    return PERIOD_NS * np.arange(n, dtype=np.int64)
+
+
+def result_of(index: int) -> FrameResult:
+    """What a frame gives: a link to the frame before and a refused one to the first."""
+    stamp_ns = PERIOD_NS * index
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 4e-4, 9e-4]) * (index + 1)
+    estimate = Estimate(stamp_ns=stamp_ns, T_world_cam=pose_of(index), covariance=covariance)
+    links = (
+        FrameLink(reference_ns=stamp_ns - PERIOD_NS, kind="step", chi2=6.0, is_accepted=True),
+        FrameLink(reference_ns=0, kind="keyframe", chi2=None, is_accepted=False),
+    )
+    return FrameResult(
+        raw=estimate,
+        causal=estimate,
+        finished=(),
+        status=Status.OK,
+        reason="",
+        n_keypoints=200,
+        n_points=150,
+        n_matches=100 + index,
+        n_inliers=90 + index,
+        n_links=1,
+        links=links if index else (),
+        keyframes_ns=(0,),
+        stage_ms={"extract": 4.0, "window": 1.5},
+    )
+
+
+def moment_of(index: int, *, fault: str = "", is_faulty: bool = False) -> Moment:
+    """What the page is given of a frame."""
+    picture = np.full((120, 160, 3), index, dtype=np.uint8)
+    points = np.random.default_rng(index).uniform(1.0, 9.0, (50, 3)).astype(np.float32)
+    known = {int(stamp): pose_of(i) for i, stamp in enumerate(stamps_of(index + 1))}
+    return Moment(
+        index=index,
+        n_done=index + 1,
+        stamp_ns=PERIOD_NS * index,
+        result=None if is_faulty else result_of(index),
+        reason="truncated image" if is_faulty else "",
+        image=picture,
+        overlay=picture,
+        cloud_cam=points,
+        colours=np.zeros((50, 3), dtype=np.uint8),
+        T_world_cam=pose_of(index),
+        window_poses=known,
+        window_covariances={stamp: np.eye(6) * 1e-4 for stamp in known},
+        fault=fault,
+    )
+
+
+class FakeHistory:
+    """The paths of a camera that drives ahead."""
+
+    def __init__(self) -> None:
+        self.n = 0
+
+    def raw_path(self) -> tuple[IntArray, FloatArray]:
+        """A path aside of the others."""
+        return stamps_of(self.n), self._positions() + np.array([0.1, 0.0, 0.0])
+
+    def causal_path(self) -> tuple[IntArray, FloatArray]:
+        """The path of the moments."""
+        return stamps_of(self.n), self._positions()
+
+    def smoothed_path(self) -> tuple[IntArray, FloatArray]:
+        """A frame behind."""
+        return stamps_of(self.n)[:-1], self._positions()[:-1]
+
+    def accumulated_cloud(self) -> tuple[Any, Any]:
+        """A point per frame."""
+        return self._positions().astype(np.float32), np.zeros((self.n, 3), dtype=np.uint8)
+
+    def _positions(self) -> FloatArray:
+        return np.array([pose_of(index)[:3, 3] for index in range(self.n)]).reshape(-1, 3)
+
+
+class FakePlayer:
+    """Writes down what it is asked for."""
+
+    n_frames = 40
+    first_index = 0
+    camera = CAMERA
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+        self.config = Config()
+        self.info = SimpleNamespace(name="drive")
+        self.history = FakeHistory()
+        self.moment: Moment | None = None
+        self.is_playing = self.is_busy = self.is_finished = False
+        self.fault = ""
+        self.callbacks: list[Callable[[Moment], None]] = []
+
+    def show(self, moment: Moment) -> None:
+        """Be at a frame, and tell."""
+        self.moment = moment
+        self.fault = moment.fault
+        self.history.n = moment.index + 1
+        for callback in self.callbacks:
+            callback(moment)
+
+    @property
+    def index(self) -> int:
+        """Frame that is shown."""
+        return self.history.n - 1
+
+    @property
+    def n_done(self) -> int:
+        """Frames that are done."""
+        return self.history.n
+
+    def subscribe(self, callback: Callable[[Moment], None]) -> Callable[[], None]:
+        """Tell of every frame, until it is called back."""
+        self.callbacks.append(callback)
+        return lambda: self.callbacks.remove(callback)
+
+    def reconfigure(self, config: Config) -> None:
+        """Keep it."""
+        self.calls.append(("reconfigure",))
+        self.config = config
+
+    def seek(self, index: int) -> None:
+        """Write it down."""
+        self.calls.append(("seek", index))
+
+    def set_speed(self, factor: float | None) -> None:
+        """Write it down."""
+        self.calls.append(("speed", factor))
+
+    def play(self) -> None:
+        """Write it down."""
+        self.calls.append(("play",))
+
+    def pause(self) -> None:
+        """Write it down."""
+        self.calls.append(("pause",))
+
+    def step(self) -> None:
+        """Write it down."""
+        self.calls.append(("step",))
+
+    def restart(self) -> None:
+        """Write it down."""
+        self.calls.append(("restart",))

@@ -1,0 +1,138 @@
+"""The page of a finished run."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gvo.errors import GvoError
+from gvo.geometry import se3
+from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.run_folder.writer import RunFolder
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FaultyFrame
+from gvo.viz.view import serve, serve_run
+from gvo.viz.view.finished import FinishedPage, aligned_truth, start_sigmas, world_up
+from gvo.viz.view.server import ViewServer
+from tests.viz.view.fakes import pose_of, result_of, stamps_of
+
+N_FRAMES = 12
+SKIPPED = 7
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run straight ahead with a frame that was skipped, its truth in a world of its own."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    with RunFolder(out) as written:
+        for index in range(N_FRAMES):
+            if index == SKIPPED:
+                fault = FaultyFrame(stamp_ns=int(stamps_of(N_FRAMES)[index]), reason="no image")
+                written.add_faulty(fault)
+                continue
+            result = result_of(index)
+            written.add_frame(None, result)
+            written.add_smoothed([result.causal])
+        poses = np.array([pose_of(index) for index in range(N_FRAMES)])
+        T_map_world = se3.exp(np.array([0.3, 0.1, -2.0, 5.0, 6.0, 7.0]))
+        written.write_truth(
+            Trajectory(stamps_ns=stamps_of(N_FRAMES), T_world_cam=T_map_world @ poses)
+        )
+        written.write_summary({"recording": "drive", "frame": "camera"})
+    return out
+
+
+@pytest.fixture
+def record(folder: Path) -> RunRecord:
+    """The run read back."""
+    return read_run(folder)
+
+
+@pytest.fixture
+def page(view: ViewServer, record: RunRecord) -> Iterator[FinishedPage]:
+    """Its page."""
+    opened = FinishedPage(view.viser, record)
+    yield opened
+    opened.close()
+
+
+def cells(page: FinishedPage) -> dict[str, str]:
+    """The numbers as a browser would find them."""
+    page.settle()
+    return dict(re.findall(r'data-gvo="([^"]+)">([^<]*)<', page.numbers_text))
+
+
+def drawn(view: ViewServer, path: str) -> float:
+    """Metres of a path as it is drawn."""
+    nodes: list[Any] = [
+        view.viser.scene.get_handle_by_name(f"/paths/{path}/{number}") for number in range(3)
+    ]
+    points = [np.asarray(node.points) for node in nodes if node is not None]
+    return float(sum(np.linalg.norm(p[:, 1] - p[:, 0], axis=1).sum() for p in points))
+
+
+def test_every_frame_shows_its_row_of_the_table(page: FinishedPage, folder: Path) -> None:
+    header, *lines = (folder / "frames.csv").read_text(encoding="utf-8").splitlines()
+    for index in (0, SKIPPED, N_FRAMES - 1):
+        row = dict(zip(header.split(","), lines[index].split(","), strict=True))
+        page.player.seek(index)
+        numbers = cells(page)
+        assert numbers["frame"] == f"{index} of {N_FRAMES}"
+        assert numbers["status"] == row["status"]
+        assert numbers["matches"] == row["n_matches"]
+        assert numbers["links"] == row["n_links"]
+        assert numbers.get("reason", "") == row["reason"]
+        assert ("position" in numbers) == (index != SKIPPED)
+        assert ("ms" in numbers) == (index != SKIPPED)
+
+
+def test_the_paths_end_at_the_frame(page: FinishedPage, view: ViewServer, folder: Path) -> None:
+    poses = np.loadtxt(folder / "causal.txt")[:, 1:4]
+    for index in (N_FRAMES - 1, 4):
+        page.player.seek(index)
+        page.settle()
+        steps = np.diff(poses[: index + 1], axis=0)
+        assert drawn(view, "causal") == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
+
+
+def test_the_truth_lies_on_the_estimate(record: RunRecord) -> None:
+    truth = aligned_truth(record)
+    assert truth is not None
+    ahead = np.array([pose_of(index)[:3, 3] for index in range(N_FRAMES)])
+    np.testing.assert_allclose(truth.positions, ahead, atol=1e-6)
+
+
+def test_the_world_of_the_first_camera_has_its_up_against_y(record: RunRecord) -> None:
+    assert world_up(record) == "-y"
+    record.summary["frame"] = "base_link"
+    assert world_up(record) == "+z"
+
+
+def test_a_folder_is_served_by_either_name(folder: Path) -> None:
+    for start in (serve, serve_run):
+        with start(folder, port=0) as view:
+            assert view.url.startswith("http://127.0.0.1:")
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(GvoError, match="is no run folder"):
+        serve_run(tmp_path, port=0)
+
+
+@pytest.mark.parametrize(
+    ("factor", "n_sigmas"),
+    # 0.07 of 11 m by the largest sigma: that of the last frame, 0.03 m times the root of 12
+    [(1.0, 7), (1e-4, 10), (1e4, 1), (4.0, 3)],
+)
+def test_ellipsoids_do_not_hide_the_path_at_first(
+    record: RunRecord, factor: float, n_sigmas: int
+) -> None:
+    smoothed = record.trajectories["smoothed"]
+    assert smoothed.covariances is not None
+    wider = replace(smoothed, covariances=factor * smoothed.covariances)
+    trajectories = {**record.trajectories, "smoothed": wider}
+    assert start_sigmas(replace(record, trajectories=trajectories)) == n_sigmas

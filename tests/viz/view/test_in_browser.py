@@ -1,0 +1,125 @@
+"""`gvo view` in a real browser: it plays, a parameter changes the next frame, nothing leaks."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import gvo
+from gvo.config import Config, load_configuration
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.run_outputs import RunOutputs
+from gvo.viz.view import serve
+from gvo.viz.view.player import Player
+from tests.browser import Browser
+from tests.browser_checks import changed_share, n_colours
+from tests.viz.view.page_driver import ViewPage
+
+N_FRAMES = 20
+
+
+def _long_recording(config: Config) -> SyntheticRecording:
+    """Return so many frames that a pause comes before the end; they are rendered as asked for."""
+    return SyntheticRecording("driving", "stereo", n_frames=100 * N_FRAMES, scale=0.5)
+
+
+@pytest.fixture
+def player() -> Iterator[Player]:
+    with Player(_long_recording, Config()) as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser: Browser, player: Player) -> Iterator[ViewPage]:
+    with serve(player, port=0) as view:
+        yield ViewPage(browser, view.url)
+        assert browser.requests_leaving() == []
+        assert browser.console_errors() == []
+
+
+@pytest.mark.slow
+def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> None:
+    page.press("step")
+    page.wait_for_frame(0)
+    first = page.scene()
+    page.press("play")
+    page.browser.wait(lambda: page.number("frame") >= 5, message="it does not play")
+    page.press("pause")
+    assert player.wait(10.0)
+    at = player.index
+    page.wait_for_frame(at)
+    assert 5 <= at < player.n_frames - 1
+    assert len(player.history.causal_path()[0]) == at + 1
+    assert not player.is_playing
+    later = page.scene()
+    assert n_colours(later) > 20
+    assert changed_share(first, later) > 0.01
+
+    page.press("step")
+    page.wait_for_frame(at + 1)
+    page.move_slider("frame", -2)
+    page.wait_for_frame(at - 1)
+    assert len(player.history.causal_path()[0]) == at
+    assert player.n_done == at + 2
+
+
+@pytest.mark.slow
+def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player: Player) -> None:
+    page.press("step")
+    page.wait_for_frame(0)
+    before = page.number("keypoints")
+    assert before > 100, "too few keypoints to halve them"
+
+    page.unfold("Parameters", "klt")
+    page.type_number("n_corners", str(before // 2))
+    page.press("step")
+    page.wait_for_frame(1)
+    assert player.config.klt.n_corners == before // 2
+    assert 0 < page.number("keypoints") <= 0.6 * before
+    assert page.cell("message") == ""
+
+    page.type_number("n_corners", "1")  # below its range
+    page.browser.wait(lambda: "n_corners" in page.cell("message"), message="1 is not refused")
+    assert player.config.klt.n_corners == before // 2
+    shown = str(before // 2)
+    page.browser.wait(
+        lambda: page.field("n_corners").get_attribute("value") == shown,
+        message="the value that holds is not shown again",
+    )
+
+    page.type_number("n_corners", "120")
+    page.press("save as YAML")
+    path = page.browser.downloads / "gvo.yaml"
+    page.browser.wait(path.exists, message="nothing was saved")
+    saved = load_configuration(path)
+    assert saved.klt.n_corners == 120
+    assert saved == player.config
+
+    page.press("restart from here")
+    page.browser.wait(lambda: player.first_index == 1, message="it does not start again")
+    assert player.wait(30.0), "frame 1 is not tracked anew"
+    page.press("step")
+    page.wait_for_frame(2)
+    assert len(player.history.causal_path()[0]) == 2, "the world does not begin at frame 1"
+
+
+@pytest.mark.slow
+def test_the_page_of_a_finished_run_plays_and_seeks(browser: Browser, tmp_path: Path) -> None:
+    source = SyntheticRecording("driving", "stereo", n_frames=N_FRAMES, scale=0.5)
+    gvo.run_recording(source, tmp_path, outputs=RunOutputs(report=False))
+    with serve(tmp_path, port=0) as view:
+        page = ViewPage(browser, view.url)
+        page.wait_for_frame(N_FRAMES - 1)  # all of the run is shown at first
+        page.type_number("frame", "0")
+        page.wait_for_frame(0)
+        first = page.scene()
+        page.press("step")
+        page.wait_for_frame(1)
+        page.move_slider("frame", 3)
+        page.wait_for_frame(4)
+        assert page.cell("status") == "ok"
+        assert changed_share(first, page.scene()) > 0.0
+        page.press("play")
+        page.wait_for_frame(N_FRAMES - 1)
+        assert browser.requests_leaving() == []
+        assert browser.console_errors() == []

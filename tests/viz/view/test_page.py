@@ -1,0 +1,195 @@
+"""The page of a recording shows the moment and steers the player."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from gvo.config import Config, load_configuration
+from gvo.geometry import se3
+from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.view.page import Page
+from gvo.viz.view.server import ViewServer
+from tests.viz.view.fakes import FakePlayer, moment_of, pose_of, stamps_of
+
+
+@pytest.fixture
+def player() -> FakePlayer:
+    """At no frame yet."""
+    return FakePlayer()
+
+
+@pytest.fixture
+def page(view: ViewServer, player: FakePlayer) -> Iterator[Page]:
+    """The page of a fake player."""
+    opened = Page(view.viser, cast(Any, player))
+    yield opened
+    opened.close()
+
+
+def show(page: Page, player: FakePlayer, index: int, **options: Any) -> None:
+    """Be at a frame, drawn."""
+    player.show(moment_of(index, **options))
+    page.settle()
+
+
+def cells(page: Page) -> dict[str, str]:
+    """The numbers as a browser would find them."""
+    return dict(re.findall(r'data-gvo="([^"]+)">([^<]*)<', page.numbers_text))
+
+
+def nodes(view: ViewServer, prefix: str) -> list[Any]:
+    """Scene nodes whose name begins so."""
+    names = [*view.viser.scene._handle_from_node_name]
+    found = [view.viser.scene.get_handle_by_name(name) for name in names if name.startswith(prefix)]
+    return [node for node in found if node is not None]
+
+
+def length(view: ViewServer, path: str) -> float:
+    """Metres of a path as it is drawn."""
+    points = [node.points for node in nodes(view, f"/paths/{path}/")]
+    return float(sum(np.linalg.norm(p[:, 1] - p[:, 0], axis=1).sum() for p in points))
+
+
+def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> None:
+    show(page, player, 7)
+    numbers = cells(page)
+    assert numbers["frame"] == "7 of 40"
+    assert numbers["stamp"] == "0.700000000"
+    assert (numbers["status"], numbers["matches"], numbers["inliers"]) == ("ok", "107", "97")
+    assert numbers["position"] == "0.000, 0.000, 7.000"
+    assert numbers["sigma"].split(", ") == ["0.0283", "0.0566", "0.0849"]
+    assert numbers["ms"].startswith("5.5 ")
+
+
+def test_a_faulty_frame_tells_its_reason_and_no_counts(page: Page, player: FakePlayer) -> None:
+    show(page, player, 3, is_faulty=True)
+    numbers = cells(page)
+    assert (numbers["status"], numbers["reason"]) == ("skipped", "truncated image")
+    assert "matches" not in numbers
+
+
+def test_the_paths_grow_and_shrink_with_the_frame(
+    page: Page, player: FakePlayer, view: ViewServer
+) -> None:
+    for index in (10, 30, 5):
+        show(page, player, index)
+        assert length(view, "causal") == pytest.approx(index, abs=1e-4)
+        assert length(view, "smoothed") == pytest.approx(index - 1, abs=1e-4)
+
+
+def test_links_are_told_apart(page: Page, player: FakePlayer, view: ViewServer) -> None:
+    show(page, player, 4)
+    (step,) = nodes(view, "/step")
+    (refused,) = nodes(view, "/refused")
+    np.testing.assert_allclose(step.points, [[[0, 0, 3], [0, 0, 4]]])
+    np.testing.assert_allclose(refused.points, [[[0, 0, 0], [0, 0, 4]]])
+
+
+def test_the_camera_stands_at_the_pose(page: Page, player: FakePlayer, view: ViewServer) -> None:
+    show(page, player, 12)
+    (camera,) = [node for node in nodes(view, "/camera") if node.name == "/camera"]
+    np.testing.assert_allclose(camera.position, [0.0, 0.0, 12.0])
+
+
+def test_a_frame_without_points_sends_no_cloud(
+    page: Page, player: FakePlayer, view: ViewServer
+) -> None:
+    """Browsers complain of an empty one."""
+    empty: dict[str, Any] = {
+        "cloud_cam": np.zeros((0, 3), np.float32),
+        "colours": np.zeros((0, 3), np.uint8),
+    }
+    for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
+        moment = moment_of(index)
+        player.show(moment if n_clouds else replace(moment, **empty))
+        page.settle()
+        assert len(nodes(view, "/camera/points")) == n_clouds
+
+
+def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer, view: ViewServer) -> None:
+    page.scene.set_visible("raw", False)
+    show(page, player, 4)
+    assert [node.visible for node in nodes(view, "/paths/raw/")] == [False]
+    page.scene.set_visible("raw", True)
+    assert [node.visible for node in nodes(view, "/paths/raw/")] == [True]
+
+
+def test_buttons_take_the_parameters_first(page: Page, player: FakePlayer) -> None:
+    page.controls.handle("klt", "n_corners").value = 300
+    page.playback.press("step")
+    assert player.calls == [("reconfigure",), ("step",)]
+    assert player.config == load_configuration(settings=["klt.n_corners=300"])
+
+
+def test_a_client_seeks_by_the_slider_and_the_program_does_not(
+    page: Page, player: FakePlayer
+) -> None:
+    show(page, player, 9)
+    assert page.playback.frame.value == 9
+    assert player.calls == []
+    page.playback.frame.value = 4
+    page.playback.on_seek(cast(Any, SimpleNamespace(client_id=1)))
+    assert player.calls == [("seek", 4)]
+
+
+def test_speeds_have_names(page: Page, player: FakePlayer) -> None:
+    for name in ("2 x", "fastest"):
+        page.playback.speed.value = name
+        page.playback.on_speed(cast(Any, SimpleNamespace(client_id=1)))
+    assert player.calls == [("speed", 2.0), ("speed", None)]
+
+
+def test_a_fault_is_shown(page: Page, player: FakePlayer) -> None:
+    show(page, player, 2, fault="the recording <breaks> off")
+    assert "the recording &lt;breaks&gt; off" in page.message_text
+
+
+def test_the_saved_yaml_is_the_configuration(page: Page, tmp_path: Any) -> None:
+    page.controls.handle("window", "kernel").value = "cauchy"
+    page.controls.null_handle("window", "size").value = True
+    sent: list[tuple[str, bytes]] = []
+    client = SimpleNamespace(
+        send_file_download=lambda name, content, save_immediately: sent.append((name, content))
+    )
+    page.save(cast(Any, client))
+    ((name, content),) = sent
+    (tmp_path / name).write_bytes(content)
+    saved = load_configuration(tmp_path / name)
+    assert saved == page.controls.config
+    assert saved != Config()
+
+
+def test_the_truth_is_laid_onto_the_first_pose(view: ViewServer, player: FakePlayer) -> None:
+    T_map_world = se3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
+    T_map_cam = T_map_world @ np.array([pose_of(index) for index in range(40)])
+    page = Page(
+        view.viser,
+        cast(Any, player),
+        truth=Trajectory(stamps_ns=stamps_of(40), T_world_cam=T_map_cam),
+    )
+    show(page, player, 20)
+    ends = np.concatenate([node.points.reshape(-1, 3) for node in nodes(view, "/paths/truth/")])
+    np.testing.assert_allclose(ends[:, :2], 0.0, atol=1e-5)
+    assert 18.9 < ends[:, 2].max() <= 20.0001
+    page.close()
+
+
+def test_a_closed_page_lets_go_of_the_player(view: ViewServer, player: FakePlayer) -> None:
+    page = Page(view.viser, cast(Any, player))
+    assert len(player.callbacks) == 1
+    page.close()
+    assert player.callbacks == []
+
+
+def test_the_painter_draws_the_last_moment(
+    page: Page, player: FakePlayer, view: ViewServer
+) -> None:
+    for index in range(25):
+        player.show(moment_of(index))
+    page.settle()
+    assert cells(page)["frame"] == "24 of 40"

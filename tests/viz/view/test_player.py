@@ -1,0 +1,436 @@
+"""The player: what it shows, in what order, and what it makes of trouble."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.odometry.odometry import Odometry
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Estimate, FrameResult, RgbdFrame
+from gvo.viz.view.history import Moment
+from gvo.viz.view.player import Player
+
+N_FRAMES = 12
+LIMIT_S = 60.0  # ends a test that hangs; none waits for it
+
+Change = Callable[[Iterator[StampedImage]], Iterator[StampedImage]]
+
+
+class Recording:
+    """A short walk with an RGB-D camera; a test may change its images."""
+
+    def __init__(self, change: Change | None = None) -> None:
+        self._walk = walk()
+        self._change = change or (lambda images: images)
+        self.n_opened = 0
+
+    def open(self, config: Config) -> Source:
+        self.n_opened += 1
+        return self
+
+    @property
+    def info(self) -> RecordingInfo:
+        return self._walk.info
+
+    def images(self) -> Iterator[StampedImage]:
+        return self._change(iter(rendered()))
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+@cache
+def rendered() -> tuple[StampedImage, ...]:
+    """Return the images of the walk, rendered once."""
+    loaded = [(image, image.load()) for image in walk().images()]
+    return tuple(replace(image, load=partial(np.copy, pixels)) for image, pixels in loaded)
+
+
+@cache
+def walk() -> SyntheticRecording:
+    return SyntheticRecording("handheld", "rgbd", n_frames=N_FRAMES, scale=0.3)
+
+
+def stamps_ns() -> list[int]:
+    return [int(stamp_ns) for stamp_ns in walk().ground_truth().stamps_ns]
+
+
+@cache
+def computed(first: int = 0) -> tuple[tuple[FrameResult, ...], tuple[Estimate, ...]]:
+    """Return what odometry gives without a player: results, and all smoothed poses."""
+    items = [item for item in frames(Recording(), Config()) if isinstance(item, RgbdFrame)]
+    odometry = Odometry(walk().info.camera, Config())
+    results = tuple(odometry.track(frame) for frame in items[first:])
+    smoothed = [estimate for result in results for estimate in result.finished]
+    smoothed += odometry.finish()
+    return results, tuple(sorted(smoothed, key=lambda estimate: estimate.stamp_ns))
+
+
+def positions(estimates: list[Estimate]) -> list[list[float]]:
+    return [estimate.T_world_cam[:3, 3].tolist() for estimate in estimates]
+
+
+def change(**sections: dict[str, object]) -> Config:
+    return Config.model_validate(sections)
+
+
+def follow(player: Player) -> list[Moment]:
+    """Return a list that each moment shown is added to."""
+    moments: list[Moment] = []
+    player.subscribe(moments.append)
+    return moments
+
+
+def test_playing_shows_each_frame_once_with_the_poses_of_a_run() -> None:
+    with Player(Recording().open, Config()) as player:
+        moments = follow(player)
+        assert player.index == -1
+        assert player.moment is None
+        player.set_speed(None)
+        player.play()
+        assert player.wait(LIMIT_S)
+        assert not player.is_playing
+        assert player.is_finished
+        assert player.fault == ""
+        # Once more at the end, with the smoothed poses of all.
+        assert [moment.index for moment in moments] == [*range(N_FRAMES), N_FRAMES - 1]
+        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+        results, smoothed = computed()
+        for moment, result in zip(moments, results, strict=False):
+            np.testing.assert_array_equal(moment.T_world_cam, result.causal.T_world_cam)
+            assert moment.keyframes == result.keyframes_ns
+            assert set(moment.keyframes) <= set(moment.window_poses)
+            assert set(moment.window_poses) == set(moment.window_covariances)
+        paths = player.history.raw_path(), player.history.causal_path()
+        for (stamps, path), kind in zip(paths, ("raw", "causal"), strict=True):
+            assert stamps.tolist() == stamps_ns()
+            assert path.tolist() == positions([getattr(result, kind) for result in results])
+        stamps, path = player.history.smoothed_path()
+        assert stamps.tolist() == stamps_ns()
+        assert path.tolist() == positions(list(smoothed))
+
+
+def test_a_frame_that_is_done_is_shown_as_it_was() -> None:
+    with Player(Recording().open, Config()) as player:
+        moments = follow(player)
+        player.seek(7)
+        assert player.wait(LIMIT_S)
+        player.seek(3)
+        assert player.wait(LIMIT_S)
+        then, now = moments[3], moments[-1]
+        assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
+        assert now.status == then.status
+        np.testing.assert_array_equal(now.T_world_cam, then.T_world_cam)
+        np.testing.assert_array_equal(now.cloud_cam, then.cloud_cam)
+        assert now.image.shape == then.image.shape
+        assert np.abs(now.overlay.astype(int) - then.overlay).mean() < 6  # JPEG
+        assert len(player.history.raw_path()[0]) == 4
+        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4]
+
+
+def test_steps_go_through_what_is_done_and_on() -> None:
+    with Player(Recording().open, Config()) as player:
+        player.seek(2)
+        player.wait(LIMIT_S)
+        player.seek(0)
+        player.wait(LIMIT_S)
+        moments = follow(player)
+        for _ in range(4):
+            player.step()
+        assert player.wait(LIMIT_S)
+        assert [(moment.index, moment.n_done) for moment in moments][-2:] == [(3, 4), (4, 5)]
+        assert not player.is_playing
+
+
+@pytest.mark.parametrize("tell", ["pause", "seek"])
+def test_the_way_to_a_frame_can_be_interrupted(tell: str) -> None:
+    with Player(Recording().open, Config()) as player:
+
+        def interrupt(moment: Moment) -> None:
+            if (moment.index, moment.n_done) == (4, 5):
+                player.pause() if tell == "pause" else player.seek(1)
+
+        player.subscribe(interrupt)
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        assert (player.index, player.n_done) == (4 if tell == "pause" else 1, 5)
+
+
+def test_a_seek_beyond_the_end_shows_the_last_frame_and_before_the_start_the_first() -> None:
+    with Player(Recording().open, Config()) as player:
+        player.seek(10_000)
+        assert player.wait(LIMIT_S)
+        assert (player.index, player.n_frames, player.is_finished) == (N_FRAMES - 1, N_FRAMES, True)
+        player.seek(-5)
+        player.wait(LIMIT_S)
+        assert player.index == 0
+        player.seek(10_000)
+        assert player.wait(LIMIT_S)
+        assert player.index == N_FRAMES - 1
+
+
+def test_pause_ends_a_wait_for_the_next_frame() -> None:
+    with Player(Recording().open, Config()) as player:
+        player.set_speed(1e-6)  # hours from frame to frame
+        player.seek(0)
+        player.wait(LIMIT_S)
+        player.play()
+        assert not player.wait(0.05)
+        player.pause()
+        assert player.wait(LIMIT_S)
+        assert player.index < 2
+
+
+def test_a_jump_of_the_stamps_is_not_waited_for() -> None:
+    def jump(images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        for image in images:
+            is_late = image.stamp_ns > stamps_ns()[5]
+            yield replace(image, stamp_ns=image.stamp_ns + is_late * 10**15)
+
+    with Player(Recording(jump).open, Config()) as player:
+        player.set_speed(200.0)  # the jump alone: more than an hour
+        player.play()
+        assert player.wait(LIMIT_S)
+        assert player.index == N_FRAMES - 1
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_speed_that_is_none_is_refused(factor: float) -> None:
+    with (
+        Player(Recording().open, Config()) as player,
+        pytest.raises(ValueError, match="positive or None"),
+    ):
+        player.set_speed(factor)
+
+
+def test_after_a_restart_the_world_begins_at_the_frame_shown() -> None:
+    with Player(Recording().open, Config()) as player:
+        player.seek(8)
+        player.wait(LIMIT_S)
+        player.seek(5)
+        player.wait(LIMIT_S)
+        player.restart()
+        assert player.wait(LIMIT_S)
+        assert (player.index, player.first_index, player.n_done) == (5, 5, 6)
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        results, smoothed = computed(5)
+        stamps, path = player.history.smoothed_path()
+        assert stamps.tolist() == stamps_ns()[5:]
+        assert path.tolist() == positions(list(smoothed))
+        player.seek(0)
+        player.wait(LIMIT_S)
+        assert player.index == 5
+        assert player.moment is not None
+        np.testing.assert_array_equal(player.moment.T_world_cam, results[0].causal.T_world_cam)
+        player.restart(0)
+        assert player.wait(LIMIT_S)
+        assert (player.index, player.first_index, player.n_done) == (0, 0, 1)
+        with pytest.raises(ValueError, match="frame 4 is not known"):
+            player.restart(4)
+
+
+def test_another_configuration_counts_from_the_next_frame_on() -> None:
+    recording = Recording()
+    with Player(recording.open, Config()) as player:
+        moments = follow(player)
+        player.seek(3)
+        player.wait(LIMIT_S)
+        player.reconfigure(change(klt={"n_corners": 50}))
+        player.step()
+        assert player.wait(LIMIT_S)
+        before, after = moments[-2].result, moments[-1].result
+        assert before is not None
+        assert after is not None
+        assert after.n_matches <= 50 < before.n_matches
+        assert player.config.klt.n_corners == 50
+        assert recording.n_opened == 1
+        with pytest.raises(ValueError, match=r"gvo\.Config, got dict"):
+            player.reconfigure({})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "other", [change(sync={"max_difference_ms": 5.0}), change(runtime={"threads": 1})]
+)
+def test_what_matters_when_reading_opens_the_recording_again_without_a_gap(other: Config) -> None:
+    recording = Recording()
+    with Player(recording.open, Config()) as player:
+        moments = follow(player)
+        player.seek(3)
+        player.wait(LIMIT_S)
+        player.reconfigure(other)
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        assert recording.n_opened == 2
+        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+        expected = positions([result.raw for result in computed()[0]])
+        assert player.history.raw_path()[1].tolist() == expected
+
+
+def test_a_configuration_that_cannot_be_read_with_leaves_the_former_one() -> None:
+    recording = Recording()
+
+    def open_source(config: Config) -> Source:
+        if config.images.black > 0:
+            raise RecordingError("black is not black; take 0")
+        return recording.open(config)
+
+    with Player(open_source, Config()) as player:
+        moments = follow(player)
+        player.seek(3)
+        player.wait(LIMIT_S)
+        player.reconfigure(change(images={"black": 7}, klt={"n_corners": 50}))
+        player.step()
+        assert player.wait(LIMIT_S)
+        assert moments[-1].fault == player.fault == "black is not black; take 0"
+        assert player.config == Config()
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+
+
+def test_a_faulty_frame_is_a_moment_without_result() -> None:
+    def fail() -> np.ndarray:
+        raise RecordingError("cut off")
+
+    def spoil(images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        for image in images:
+            is_bad = image.stamp_ns == stamps_ns()[4]
+            yield replace(image, load=fail) if is_bad else image
+
+    with Player(Recording(spoil).open, Config()) as player:
+        moments = follow(player)
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        moment = moments[4]
+        assert moment.result is None
+        assert moment.status is None
+        assert "cut off" in moment.reason
+        np.testing.assert_array_equal(moment.T_world_cam, moments[3].T_world_cam)
+        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
+        player.restart(4)
+        player.seek(6)
+        assert player.wait(LIMIT_S)
+        assert player.history.raw_path()[0].tolist() == stamps_ns()[5:7]
+
+
+def test_images_without_partner_are_no_frames() -> None:
+    def drop(images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        return (i for i in images if (i.stamp_ns, i.stream) != (stamps_ns()[4], 1))
+
+    with Player(Recording(drop).open, Config()) as player:
+        player.seek(N_FRAMES)
+        assert player.wait(LIMIT_S)
+        assert player.n_frames == N_FRAMES - 1
+        assert player.history.raw_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
+
+
+def break_off(error: Exception) -> Change:
+    def change_images(images: Iterator[StampedImage]) -> Iterator[StampedImage]:
+        yield from islice(images, 12)
+        raise error
+
+    return change_images
+
+
+def test_a_recording_that_breaks_off_is_told_and_its_poses_are_there() -> None:
+    recording = Recording(break_off(RecordingError("the file ends here")))
+    with Player(recording.open, Config()) as player:
+        player.set_speed(None)
+        player.play()
+        assert player.wait(LIMIT_S)
+        assert player.fault == "the file ends here"
+        assert player.is_finished
+        assert not player.is_playing
+        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:6]
+        player.seek(1)
+        assert player.wait(LIMIT_S)
+        assert player.index == 1
+
+
+def test_a_recording_without_a_frame_is_told() -> None:
+    recording = Recording(lambda images: islice(images, 0))
+    with Player(recording.open, Config()) as player:
+        player.step()
+        assert player.wait(LIMIT_S)
+        assert player.is_finished
+        assert player.moment is None
+
+
+def test_a_fault_of_the_program_is_told_and_a_restart_goes_on() -> None:
+    broken = [Recording(break_off(ZeroDivisionError("an odd image"))), Recording()]
+    with Player(lambda config: broken.pop(0), Config()) as player:
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        assert player.fault == "ZeroDivisionError: an odd image"
+        player.restart(0)
+        player.seek(N_FRAMES - 1)
+        assert player.wait(LIMIT_S)
+        assert player.fault == ""
+        assert player.index == N_FRAMES - 1
+
+
+def test_a_subscriber_that_fails_stops_nobody() -> None:
+    with Player(Recording().open, Config()) as player:
+        page: dict[str, Moment] = {}
+        player.subscribe(lambda moment: page["page"])  # type: ignore[arg-type]
+        moments = follow(player)
+        player.seek(2)
+        assert player.wait(LIMIT_S)
+        assert player.fault == "KeyError: 'page'"
+        assert [moment.index for moment in moments] == [0, 1, 2]
+
+
+def test_who_unsubscribes_is_not_called() -> None:
+    with Player(Recording().open, Config()) as player:
+        moments: list[Moment] = []
+        end = player.subscribe(moments.append)
+        player.step()
+        player.wait(LIMIT_S)
+        end()
+        end()
+        player.step()
+        player.wait(LIMIT_S)
+        assert [moment.index for moment in moments] == [0]
+
+
+def test_an_excerpt_is_played_and_restarted_within() -> None:
+    excerpt = Excerpt(start_s=0.1, duration_s=0.25, every=2)
+    expected = [ns for ns in stamps_ns() if 0.1 <= 1e-9 * (ns - stamps_ns()[0]) < 0.35][::2]
+    with Player(Recording().open, Config(), excerpt=excerpt) as player:
+        player.seek(100)
+        assert player.wait(LIMIT_S)
+        assert player.history.raw_path()[0].tolist() == expected
+        player.restart(2)
+        player.seek(100)
+        assert player.wait(LIMIT_S)
+        assert player.history.raw_path()[0].tolist() == expected[2:]
+
+
+def test_what_was_done_can_be_read_after_the_end() -> None:
+    player = Player(Recording().open, Config())
+    player.seek(4)
+    player.wait(LIMIT_S)
+    player.close()
+    player.close()
+    assert player.history.moment(1).index == 1
+    with pytest.raises(ValueError, match="frame 5 is not among those done: 0 to 4"):
+        player.history.moment(5)
+
+
+def test_closing_while_it_plays_ends_it() -> None:
+    player = Player(Recording().open, Config())
+    player.set_speed(1e-6)
+    player.play()
+    player.close()
+    assert not player.is_busy

@@ -1,0 +1,130 @@
+"""The page is served to this machine, and ends cleanly."""
+
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from http.client import HTTPConnection
+from pathlib import Path
+
+import pytest
+
+from gvo.errors import ConfigurationError
+from gvo.viz.view import serve, serve_run
+from gvo.viz.view.server import ViewServer, find_port, is_own_page, open_server
+
+
+def listeners(port: int) -> set[str]:
+    """Local addresses that listen on a port, as the kernel lists them."""
+    lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()
+    rows = [line.split() for line in lines[1:]]
+    found = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return {address for address, hexadecimal in found if int(hexadecimal, 16) == port}
+
+
+def taken_port() -> socket.socket:
+    """A socket that holds a port of this machine."""
+    holder = socket.socket()
+    holder.bind(("127.0.0.1", 0))
+    holder.listen()
+    return holder
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_page_listens_on_loopback_alone(view: ViewServer) -> None:
+    assert view.url.startswith("http://127.0.0.1:")
+    assert listeners(int(view.url.rpartition(":")[2])) == {"0100007F"}
+
+
+def test_closing_frees_the_port_and_ends_its_threads() -> None:
+    before = set(threading.enumerate())
+    closed = []
+    with open_server("127.0.0.1", 0, title="gvo") as view:
+        port = view.viser.get_port()
+        view.on_close(lambda: closed.append(True))
+        assert not view.wait(0.0)
+    assert view.wait(0.0)
+    view.close()
+    assert closed == [True]
+    assert find_port("127.0.0.1", port) == port
+    left = [thread for thread in set(threading.enumerate()) - before if thread.is_alive()]
+    assert [thread for thread in left if "ThreadPool" not in thread.name] == []
+
+
+def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+    with open_server("127.0.0.1", 0, title="gvo"):
+        pass
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_taken_port_is_told_with_the_one_that_serves() -> None:
+    with taken_port() as holder:
+        port = holder.getsockname()[1]
+        with open_server("127.0.0.1", port, title="gvo") as view:
+            assert view.viser.get_port() > port
+            assert view.note == (
+                f"port {port} of 127.0.0.1 is taken: serving on {view.viser.get_port()}"
+            )
+
+
+def test_a_free_port_needs_no_note(view: ViewServer) -> None:
+    assert view.note == ""
+
+
+def test_an_address_of_another_machine_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"--host 192\.0\.2\.1: no address of this"):
+        find_port("192.0.2.1", 8080)
+
+
+def answer(port: int, origin: str | None, host: str) -> int:
+    """What the server answers who wants to steer the page."""
+    headers = {
+        "Host": host,
+        "Connection": "Upgrade",
+        "Upgrade": "websocket",
+        "Sec-WebSocket-Version": "13",
+        "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        **({} if origin is None else {"Origin": origin}),
+    }
+    connection = HTTPConnection("127.0.0.1", port, timeout=10)
+    try:
+        connection.request("GET", "/", headers=headers)
+        return connection.getresponse().status
+    finally:
+        connection.close()
+
+
+def test_another_page_in_the_browser_cannot_steer(view: ViewServer) -> None:
+    port = view.viser.get_port()
+    here = f"127.0.0.1:{port}"
+    refused = 403
+    assert answer(port, "http://example.org", here) == refused
+    assert answer(port, f"http://localhost:{port + 1}", f"localhost:{port}") == refused
+    # a name of the net that leads to this machine
+    assert answer(port, f"http://example.org:{port}", f"example.org:{port}") == refused
+
+
+def test_the_page_itself_can_steer(view: ViewServer) -> None:
+    port = view.viser.get_port()
+    upgraded = 101
+    assert answer(port, f"http://127.0.0.1:{port}", f"127.0.0.1:{port}") == upgraded
+    assert answer(port, None, f"127.0.0.1:{port}") == upgraded
+    assert answer(port, "http://localhost:9999", "localhost:9999") == upgraded  # forwarded
+
+
+def test_other_names_of_the_machine_serve_the_network() -> None:
+    assert is_own_page("http://robot:8080", "robot:8080", is_local=False)
+    assert not is_own_page("http://example.org", "robot:8080", is_local=False)
+
+
+def test_no_client_gets_a_tunnel_to_a_public_address(view: ViewServer) -> None:
+    assert view.viser.request_share_url() is None
+
+
+@pytest.mark.parametrize("start", [lambda path: serve(path), serve_run])
+def test_without_viser_it_says_what_to_install(
+    start: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'gvo\[view\]'"):
+        start(tmp_path)
