@@ -34,7 +34,7 @@ from gvo.terminal import (
     progress,
     report,
     report_smoothed,
-    told_how_to_go_on,
+    told_where_it_stands,
     warn,
 )
 from gvo.version import __version__
@@ -152,9 +152,6 @@ def run(
     right: Right = None,
     color: Color = None,
     depth: Depth = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on where a run into DIR was interrupted.")
-    ] = False,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.io.excerpt import make_excerpt
@@ -177,7 +174,7 @@ def run(
         typer.echo(line)
     with (
         interruptible() as check,
-        told_how_to_go_on(out),
+        told_where_it_stands(out),
         progress(source.info.name) as show,
     ):
         result = run_recording(
@@ -189,7 +186,6 @@ def run(
             starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
             outputs=outputs,
-            resume=resume,
             on_progress=both(show, check),
         )
     report(result, out)

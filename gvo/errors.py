@@ -35,11 +35,7 @@ class OutputError(RecordingError):
         self.is_partly = is_partly
 
 
-class ResumeError(GvoError):
-    """A run cannot go on where it was interrupted."""
-
-
-class RunBusyError(ResumeError):
+class RunBusyError(GvoError):
     """Another process is writing the run."""
 
 

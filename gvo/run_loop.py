@@ -5,21 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any, Protocol
 
 from gvo.config import Config
-from gvo.errors import OutputError, RecordingError, ResumeError
-from gvo.frontend.factory import make_frontend
+from gvo.errors import OutputError, RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.resuming.frontend import RepeatableFrontend
-from gvo.resuming.journal import Journal
-from gvo.resuming.records import FaultyRecord, FrameRecord, Record
-from gvo.resuming.skipping import skip_done
 from gvo.run_tally import Progress, RunTally
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
 
@@ -28,10 +22,7 @@ class Output(Protocol):
     """What writes a run as it goes; all poses are of the frame that was asked for."""
 
     def add_frame(self, frame: Any, result: FrameResult) -> None:  # noqa: ANN401
-        """Write what one frame gave, and the smoothed poses that are final with it.
-
-        Where an interrupted run is repeated from its journal, there is no frame but its record.
-        """
+        """Write what one frame gave, and the smoothed poses that are final with it."""
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write that a frame has no pose."""
@@ -56,16 +47,11 @@ class RunLoop:
         Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
     items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
         The frames in another order than that of the recording.
-    journal : Journal, optional
-        Is given what comes of each frame before the outputs are. What it holds already is
-        repeated from it, and the recording read on after that.
 
     Attributes
     ----------
     tally : RunTally
         What was counted.
-    n_repeated : int
-        Frames, also faulty ones, that the journal held.
     """
 
     def __init__(
@@ -77,24 +63,17 @@ class RunLoop:
         excerpt: Excerpt | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
         items: Iterable[Frame | FaultyFrame] | None = None,
-        journal: Journal | None = None,
     ) -> None:
         self.source = source
         self.config = config
         self.frame = frame
         self.tally = RunTally()
-        self.n_repeated = 0
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
         self._items = items
         self._read_ms = 0.0
         self._first_ns: int | None = None
-        camera = source.info.camera
-        self._journal = journal
-        self._frontend: RepeatableFrontend | None = None
-        if journal is not None:
-            self._frontend = RepeatableFrontend(make_frontend(camera, config))
-        self._odometry = Odometry(camera, config, frontend=self._frontend)
+        self._odometry = Odometry(source.info.camera, config)
 
     @property
     def is_excerpt(self) -> bool:
@@ -102,11 +81,7 @@ class RunLoop:
         return not self._excerpt.is_everything
 
     def run(
-        self,
-        outputs: Iterable[Output],
-        on_progress: Callable[[Progress], None] | None,
-        *,
-        on_repeated: Callable[[], None] | None = None,
+        self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
     ) -> None:
         """Take all frames; where the recording breaks off, note it and end.
 
@@ -116,20 +91,15 @@ class RunLoop:
             Are given the poses, also those that the window still holds where it is interrupted.
         on_progress : callable, optional
             Called after each frame.
-        on_repeated : callable, optional
-            Called once, when what the journal holds was repeated.
         """
         outputs = tuple(outputs)
-        tell = partial(self._tell, on_progress)
         with one_opencv_thread():
-            self._repeat(outputs, tell)
-            if on_repeated is not None:
-                on_repeated()
             is_writable = True
             try:
                 for item in self._read():
                     self._take(item, outputs)
-                    tell(item.stamp_ns)
+                    if on_progress is not None:
+                        on_progress(self.tally.progress(self._n_expected(item.stamp_ns)))
             except OutputError:
                 is_writable = False
                 raise
@@ -146,32 +116,6 @@ class RunLoop:
         self.tally.rig_offsets = self._odometry.rig_offsets
         self.tally.n_guessed = self.frame.n_guessed
         self.tally.mount_travel_m = self.frame.mount_travel_m
-        if self._frontend is not None:
-            self.tally.n_unknown = self._frontend.n_unknown
-
-    def _tell(self, on_progress: Callable[[Progress], None] | None, stamp_ns: int) -> None:
-        if on_progress is not None:
-            on_progress(self.tally.progress(self._n_expected(stamp_ns)))
-
-    def _repeat(self, outputs: tuple[Output, ...], tell: Callable[[int], None]) -> None:
-        """Do again from the journal what was done before."""
-        if self._journal is None or self._frontend is None:
-            return
-        for index, record in enumerate(self._journal.past()):
-            self._take_record(record, index, outputs)
-            tell(record.stamp_ns)
-            self.n_repeated = index + 1
-
-    def _take_record(self, record: Record, index: int, outputs: tuple[Output, ...]) -> None:
-        if isinstance(record, FaultyRecord):
-            self.tally.add_duration("read", record.read_ms)
-            self._take_faulty(record.frame, outputs)
-            return
-        if self._frontend is not None:
-            self._frontend.repeat(record, index)
-        self._start(record.stamp_ns)
-        result = replace(self._odometry.track(record), stage_ms=record.stage_ms)
-        self._hand_out(record, result, outputs)
 
     def _n_expected(self, stamp_ns: int) -> int:
         """Estimate how many images are to come in all, from the stamps so far."""
@@ -185,7 +129,8 @@ class RunLoop:
         return self._excerpt.n_expected(n_images, length_s=length_s or None)
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
-        iterator = self._items_left()
+        items = self._items
+        iterator = frames(self.source, self.config, self._excerpt) if items is None else iter(items)
         while True:
             start = time.perf_counter()
             try:
@@ -198,69 +143,33 @@ class RunLoop:
             self._read_ms = 1e3 * (time.perf_counter() - start)
             yield item
 
-    def _items_left(self) -> Iterator[Frame | FaultyFrame]:
-        """Return the frames that are to be taken."""
-        if self._items is not None:
-            return iter(self._items)
-        journal, frontend = self._journal, self._frontend
-        if journal is None or frontend is None or self.n_repeated == 0:
-            return frames(self.source, self.config, self._excerpt)
-        held = frontend.held()
-        choose = partial(skip_done, done_ns=journal.stamps_ns, needed={each.index for each in held})
-        items = frames(self.source, self.config, self._excerpt, choose=choose)
-        for each in held:
-            frame = next(items)
-            if isinstance(frame, FaultyFrame):
-                raise ResumeError(
-                    f"frame at {frame.stamp_ns} ns: cannot be read again: {frame.reason}; run "
-                    "without --resume"
-                )
-            frontend.renew(each, frame)
-        frontend.go_on()
-        return items
-
     def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
+        """Count a frame, and give the outputs its poses as those of the frame asked for."""
         if isinstance(item, FaultyFrame):
-            if self._journal is not None:
-                self._journal.append(FaultyRecord(frame=item, read_ms=self._read_ms))
-            self.tally.add_duration("read", self._read_ms)
             self._take_faulty(item, outputs)
             return
-        self._start(item.stamp_ns)
-        result = self._odometry.track(item)
-        result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
-        if self._journal is not None and self._frontend is not None:
-            is_keyframe = item.stamp_ns in result.keyframes_ns
-            record = self._frontend.record(result.stage_ms, is_keyframe=is_keyframe)
-            # Before the lines: of a frame that has any, all can be written again.
-            self._journal.append(record)
-        self._hand_out(item, result, outputs)
-
-    def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
-        # Colour and depth of a free-running sensor need not pair; the images of a stereo
-        # camera are taken together, and one without the other is a loss.
-        is_loss = not item.is_unpaired or self.source.info.sensor == "stereo"
-        self.tally.add_faulty(item, is_loss=is_loss)
-        for output in outputs if is_loss else ():
-            output.add_faulty(item)
-
-    def _start(self, stamp_ns: int) -> None:
         if self._first_pose is not None and self.frame.first_stamp_ns is None:
-            self.frame.start(stamp_ns, self._first_pose(stamp_ns))
-
-    def _hand_out(
-        self, item: Frame | FrameRecord, result: FrameResult, outputs: tuple[Output, ...]
-    ) -> None:
-        """Count a frame, and give the outputs its poses as those of the frame asked for."""
-        self.tally.add_result(result)
+            self.frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
+        result = self._odometry.track(item)
         placed = replace(
             result,
             raw=self.frame.apply(result.raw),
             causal=self.frame.apply(result.causal),
             finished=self._placed(result.finished),
+            stage_ms={"read": self._read_ms, **result.stage_ms},
         )
+        self.tally.add_result(placed)
         for output in outputs:
             output.add_frame(item, placed)
+
+    def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
+        # Colour and depth of a free-running sensor need not pair; the images of a stereo
+        # camera are taken together, and one without the other is a loss.
+        is_loss = not item.is_unpaired or self.source.info.sensor == "stereo"
+        self.tally.add_duration("read", self._read_ms)
+        self.tally.add_faulty(item, is_loss=is_loss)
+        for output in outputs if is_loss else ():
+            output.add_faulty(item)
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.frame.apply(estimate) for estimate in estimates)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 from gvo.errors import GvoError, OutputError
-from gvo.resuming.beginning import Beginning, State, identity
+from gvo.io.run_folder.writer import RunFolder
 from gvo.run_loop import RunLoop
-from gvo.run_summary import summarize
+from gvo.run_summary import State, summarize
 from gvo.run_tally import Progress
 from gvo.types import Failure
 
 _EVERY_S = 3.0
 _NOT_YET = Failure(reason="the run has not ended")
-_HOW_TO_GO_ON = "the same command with --resume goes on"
 
 
 class RunningSummary:
@@ -24,7 +24,9 @@ class RunningSummary:
     Parameters
     ----------
     loop : RunLoop
-    begun : Beginning
+    folder : RunFolder
+    identity : dict
+        See `run_identity`.
     on_progress : callable, optional
         Called before, after each frame.
     """
@@ -32,12 +34,13 @@ class RunningSummary:
     def __init__(
         self,
         loop: RunLoop,
-        begun: Beginning,
+        folder: RunFolder,
+        identity: dict[str, Any],
         on_progress: Callable[[Progress], None] | None = None,
     ) -> None:
         self._loop = loop
-        self._begun = begun
-        self._identity = identity(begun.journal.header)
+        self._folder = folder
+        self._identity = identity
         self._on_progress = on_progress
         self._written_s: float | None = None
 
@@ -45,10 +48,8 @@ class RunningSummary:
         """Take that a frame is done."""
         if self._on_progress is not None:
             self._on_progress(progress)
-        is_due = self._written_s is None or time.monotonic() - self._written_s > _EVERY_S
-        if is_due and self._begun.folder.is_settled:
+        if self._written_s is None or time.monotonic() - self._written_s > _EVERY_S:
             self._loop.count()
-            self._begun.journal.sync()
             self.write("running")
 
     def write(self, state: State, *warnings: str) -> None:
@@ -61,12 +62,12 @@ class RunningSummary:
         """
         lines = [*warnings, *self._loop.tally.warnings()]
         summary = summarize(self._loop, _NOT_YET, lines, state=state)
-        self._begun.folder.write_summary(summary | {"run": self._identity})
+        self._folder.write_summary(summary | {"run": self._identity})
         self._written_s = time.monotonic()
 
     @contextmanager
     def told(self) -> Iterator[None]:
-        """Say in the summary, and in an error of writing, what stands and how to go on.
+        """Say in the summary, and in an error of writing, what stands.
 
         Raises
         ------
@@ -83,15 +84,10 @@ class RunningSummary:
             raise
 
     def _write_interrupted(self, what: str) -> None:
-        # Before all was repeated, the summary of the interruption before holds as it is.
-        if self._begun.folder.is_settled:
-            with suppress(OutputError):
-                self.write("interrupted", f"{what}: {_HOW_TO_GO_ON}")
+        with suppress(OutputError):
+            self.write("interrupted", what)
 
     def _explained(self, error: OutputError) -> OutputError:
         tally = self._loop.tally
-        text = (
-            f"{error}; {tally.n_frames} frames stand whole in {self._begun.folder.path}: when "
-            f"there is room again, {_HOW_TO_GO_ON}"
-        )
+        text = f"{error}; {tally.n_frames} frames stand whole in {self._folder.path}"
         return OutputError(text, is_partly=tally.n_with_pose > 0)

@@ -1,19 +1,34 @@
-"""What a run tells of itself in `summary.json`."""
+"""What a run tells of itself in `summary.json`, and what makes it this run and no other."""
 
 from __future__ import annotations
 
+import hashlib
 import resource
 import sys
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict, fields
+from itertools import islice
+from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
+from gvo.errors import GvoError
+from gvo.geometry.camera import Calibration
+from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.poses.truth import TruthComparison
-from gvo.resuming.beginning import State
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.run_loop import RunLoop
 from gvo.trajectory.evaluation import Evaluation, evaluations_json
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Status
 from gvo.version import __version__
+
+State: TypeAlias = Literal["running", "interrupted", "complete"]
+
+# In which the first images of both streams are looked for.
+_N_FIRST = 20
 
 
 def summarize(
@@ -83,3 +98,102 @@ def peak_memory_mb() -> float:
 
 def _frame_text(frame: OutputFrame) -> str:
     return ", ".join(text for text in (frame.name or "camera", frame.origin) if text)
+
+
+def run_identity(
+    source: Source,
+    frame: OutputFrame,
+    excerpt: Excerpt | None,
+    *,
+    start: Trajectory | None = None,
+) -> dict[str, Any]:
+    """Return what makes a run, beside its configuration, this one and no other.
+
+    Parameters
+    ----------
+    source : Source
+        Of its images the first one of either stream is read.
+    frame : OutputFrame
+        Before the first frame.
+    excerpt : Excerpt or None
+    start : Trajectory, optional
+        The true poses, where the run starts at one of them.
+
+    Returns
+    -------
+    dict
+        Plain values, as `summary.json` gives them back.
+    """
+    return {
+        "version of gvo": __version__,
+        "recording": _describe_recording(source),
+        "excerpt": asdict(excerpt or Excerpt()),
+        "output": {
+            "frame": frame.name,
+            "mount": _digest_of(frame.fixed_mount),
+            "initial pose": _digest_of(frame.T_initial),
+            "true start": "" if start is None else _digest_of(start.T_world_cam),
+        },
+    }
+
+
+def _describe_recording(source: Source) -> dict[str, Any]:
+    info = source.info
+    return {
+        "sensor": info.sensor,
+        "number of images": info.n_images,
+        "frame_id": info.frame_id,
+        "calibration": _digest(_calibration_parts(info)),
+        "first images": dict(_first_images(source)),
+    }
+
+
+def _calibration_parts(info: RecordingInfo) -> Iterator[bytes]:
+    view = info.depth_view
+    calibrations = [*info.calibrations, *([] if view is None else [view.calibration])]
+    for calibration in calibrations:
+        for field in fields(Calibration):
+            value = getattr(calibration, field.name)
+            yield value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+    if view is not None:
+        yield view.T_color_depth.tobytes()
+
+
+def _first_images(source: Source) -> Iterator[tuple[str, str]]:
+    """Yield the stream of the first image of each, its stamp and a digest of its pixels."""
+    streams: set[int] = set()
+    try:
+        with closing(_as_generator(source)) as images:
+            for image in islice(images, _N_FIRST):
+                if image.stream not in streams:
+                    streams.add(image.stream)
+                    yield source.info.stream_names[image.stream], _describe_image(image)
+                if len(streams) == 2:
+                    return
+    except GvoError:
+        return  # whoever reads on is told
+
+
+def _as_generator(source: Source) -> Any:  # noqa: ANN401 - what can be closed before its end
+    yield from source.images()
+
+
+def _describe_image(image: StampedImage) -> str:
+    try:
+        pixels = image.load()
+    except GvoError:
+        return f"{image.stamp_ns} faulty"
+    parts = f"{pixels.dtype}{pixels.shape}".encode(), np.ascontiguousarray(pixels).tobytes()
+    return f"{image.stamp_ns} {_digest(parts)}"
+
+
+def _digest_of(array: np.ndarray[Any, Any] | None) -> str:
+    return "" if array is None else _digest([np.ascontiguousarray(array).tobytes()])
+
+
+def _digest(parts: Any) -> str:  # noqa: ANN401 - bytes, one after another
+    digest = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()

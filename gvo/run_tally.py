@@ -98,7 +98,6 @@ class RunTally:
     rig_offsets: RigOffsets | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
-    n_unknown: int = 0
 
     @property
     def n_frames(self) -> int:
@@ -275,12 +274,6 @@ class RunTally:
 
     def _warnings_of_window(self) -> list[str]:
         warnings = []
-        if self.n_unknown:
-            warnings.append(
-                f"{self.n_unknown} registrations were asked for when the run was resumed that had "
-                "not been made before: this machine computes otherwise; later poses differ a "
-                "little from those of a run without interruption"
-            )
         if self.window.n_restored:
             warnings.append(
                 f"{self.window.n_restored} updates of the window failed and were done again with "

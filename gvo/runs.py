@@ -12,19 +12,24 @@ from typing import Any
 import numpy as np
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError, GvoError, RecordingError
+from gvo.errors import GvoError, RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.poses.inputs import initial_pose, own_truth
 from gvo.io.poses.truth import FramedTruth, TruthComparison
 from gvo.io.recording import Source
-from gvo.io.run_folder.writer import PICTURE, REPORT, SUMMARY, TRAJECTORIES, RunFolder
-from gvo.resuming.beginning import Beginning, Complete, begin, identity
-from gvo.resuming.header import describe_run
-from gvo.run_loop import Output, RunLoop
+from gvo.io.run_folder.writer import (
+    PICTURE,
+    REPORT,
+    SUMMARY,
+    TRAJECTORIES,
+    RunFolder,
+    written_alone,
+)
+from gvo.run_loop import RunLoop
 from gvo.run_outputs import RunOutputs
 from gvo.run_progress import RunningSummary
-from gvo.run_summary import summarize
+from gvo.run_summary import run_identity, summarize
 from gvo.run_tally import Progress
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Evaluation
@@ -52,10 +57,6 @@ class RunResult:
         What was skipped or broke off, a line each.
     report : Path or None
         The page that shows it, where one was written.
-    notes : tuple of str
-        What became of the wish to resume a run, a line each.
-    is_found : bool
-        The folder held this run, complete: nothing was computed.
     """
 
     summary: dict[str, Any]
@@ -63,8 +64,6 @@ class RunResult:
     exit_code: int
     warnings: tuple[str, ...]
     report: Path | None = None
-    notes: tuple[str, ...] = ()
-    is_found: bool = False
 
 
 def run_recording(
@@ -77,7 +76,6 @@ def run_recording(
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
-    resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Run odometry over a recording and write a run folder.
@@ -87,7 +85,8 @@ def run_recording(
     source : Source
         From `open_recording`, or a rendered one.
     out : str or Path
-        Folder for the trajectories, covariances, tables, summary and report.
+        Folder for the trajectories, covariances, tables, summary and report; a run that is there
+        is replaced.
     config : Config, optional
     ground_truth : Trajectory or FramedTruth, optional
         Poses of the frame asked for; the recording's own where omitted.
@@ -100,9 +99,6 @@ def run_recording(
         Which frames are read; all where omitted.
     outputs : RunOutputs, optional
         What is written besides; the report where omitted.
-    resume : bool
-        Go on where a run in the folder was interrupted, see `docs/resume.md`; where there is
-        none, begin, and where it is complete, leave it as it is. Else it is replaced.
     on_progress : callable, optional
         Called after each frame.
 
@@ -116,92 +112,46 @@ def run_recording(
         When no frame is usable.
     OutputError
         When something cannot be written; what was written before stands.
-    ResumeError
-        When the folder holds another run than the one that is to go on.
+    RunBusyError
+        When another process is writing a run into the folder.
     """
     config = config or Config()
     frame = frame or OutputFrame(source.info.frame_id)
     truth = _find_truth(source, ground_truth, frame)
     outputs = outputs or RunOutputs()
-    if resume:
-        _refuse_unresumable(outputs)
     start = truth.trajectory if starts_at_truth and isinstance(truth, FramedTruth) else None
-    header = describe_run(source, config, frame, excerpt, start=start)
+    identity = run_identity(source, frame, excerpt, start=start)
     with ExitStack() as stack, ExitStack() as files:
         is_placed = frame.is_placed or starts_at_truth
         others, notes = outputs.open(source, frame, files, config=config, is_placed=is_placed)
-        begun = begin(Path(out), header, resume=resume)
-        if isinstance(begun, Complete):
-            return _already_complete(begun, Path(out))
-        stack.enter_context(begun.journal)
-        folder = files.enter_context(begun.folder)
+        stack.enter_context(written_alone(Path(out)))
+        folder = files.enter_context(RunFolder(Path(out)))
         loop = RunLoop(
             source,
             config,
             frame,
             excerpt=excerpt,
             first_pose=partial(initial_pose, truth) if starts_at_truth else None,
-            journal=begun.journal,
         )
-        _track(loop, begun, others, files, on_progress)
+        summary = RunningSummary(loop, folder, identity, on_progress)
+        with summary.told():
+            loop.run([folder, *others], summary)
+            files.close()
+        _refuse_nothing(loop, folder)
         estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
         compared = _compare(truth, folder, loop, estimates)
-        result = _conclude(loop, begun, compared, notes, is_asked=ground_truth is not None)
-        begun.journal.remove()
-    if resume:
-        result = replace(result, notes=(_resumed_words(loop),))
+        is_asked = ground_truth is not None
+        result = _conclude(loop, folder, identity, compared, notes, is_asked=is_asked)
     if not outputs.report:
         return result
     return _drawn(result, folder, compared, estimates, plots=outputs.plots)
 
 
-def _track(
-    loop: RunLoop,
-    begun: Beginning,
-    others: list[Output],
-    files: ExitStack,
-    on_progress: Callable[[Progress], None] | None,
-) -> None:
-    """Take all frames and complete the files."""
-    summary = RunningSummary(loop, begun, on_progress)
-    with summary.told():
-        loop.run([begun.folder, *others], summary, on_repeated=begun.folder.settle)
-        files.close()
+def _refuse_nothing(loop: RunLoop, folder: RunFolder) -> None:
+    """Refuse a run without a single pose; no summary is left of it."""
     if loop.tally.n_with_pose == 0:
-        begun.journal.remove()
-        (begun.folder.path / SUMMARY).unlink(missing_ok=True)
-        name = loop.source.info.name
-        raise RecordingError(f"{name}: no usable frame: {loop.tally.reason()}")
-
-
-def _refuse_unresumable(outputs: RunOutputs) -> None:
-    """Refuse what is written as a whole: it cannot go on in the middle."""
-    given = {"--bag": outputs.bag, "--overlay": outputs.overlay, "--rerun": outputs.rerun}
-    names = [name for name, path in given.items() if path is not None]
-    if names:
-        raise ConfigurationError(
-            f"--resume does not go with {', '.join(names)}: a part of the run would be missing; "
-            "resume without, or run anew with it"
-        )
-
-
-def _already_complete(found: Complete, out: Path) -> RunResult:
-    summary, page = found.summary, out / REPORT
-    return RunResult(
-        summary=summary,
-        evaluations=(),
-        exit_code=int(summary.get("exit_code", EXIT_COMPLETE)),
-        warnings=tuple(summary.get("warnings", ())),
-        report=page if page.exists() else None,
-        notes=(f"{out} holds this run, complete: nothing was left to do",),
-        is_found=True,
-    )
-
-
-def _resumed_words(loop: RunLoop) -> str:
-    if loop.n_repeated == 0:
-        return "there was no interrupted run to resume: began with the first frame"
-    return f"resumed after {loop.n_repeated} frames"
+        (folder.path / SUMMARY).unlink(missing_ok=True)
+        raise RecordingError(f"{loop.source.info.name}: no usable frame: {loop.tally.reason()}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,14 +189,14 @@ def _compare(
 
 def _conclude(
     loop: RunLoop,
-    begun: Beginning,
+    folder: RunFolder,
+    identity: dict[str, Any],
     compared: TruthComparison | Failure,
     notes: list[str],
     *,
     is_asked: bool,
 ) -> RunResult:
     """Write truth and summary."""
-    folder = begun.folder
     warnings = loop.tally.warnings() + notes
     found = compared if isinstance(compared, TruthComparison) else None
     if found is not None:
@@ -258,7 +208,7 @@ def _conclude(
         folder.write_truth(found.truth.trajectory)
     is_partly = loop.tally.is_partly or (is_asked and found is None)
     exit_code = EXIT_PARTLY if is_partly else EXIT_COMPLETE
-    summary |= {"exit_code": exit_code, "run": identity(begun.journal.header)}
+    summary |= {"exit_code": exit_code, "run": identity}
     folder.write_summary(summary)
     return RunResult(
         summary=summary,

@@ -25,8 +25,6 @@ def report(result: RunResult, out: Path) -> NoReturn:
     """Print what a run of odometry gave, and end with its exit code."""
     from gvo.trajectory.evaluation import format_evaluations
 
-    for note in result.notes:
-        typer.echo(note)
     for key in ("frame", "ground_truth"):
         typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
@@ -164,14 +162,10 @@ def interruptible() -> Iterator[Callable[[object], None]]:
 
 
 @contextmanager
-def told_how_to_go_on(out: Path) -> Iterator[None]:
-    """Say, where a run is interrupted, what stands and how to go on."""
+def told_where_it_stands(out: Path) -> Iterator[None]:
+    """Say, where a run is interrupted, where its files are."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(
-            f"gvo: interrupted; what was done stands in {out}: the same command with --resume "
-            "goes on (without --bag, --overlay and --rerun)",
-            err=True,
-        )
+        typer.echo(f"gvo: interrupted; what was done stands in {out}", err=True)
         raise

@@ -71,7 +71,7 @@ def run(
 
     Each run writes its folder as `run_recording` does, below `out`: by the name of the recording
     and, where there are several, of the configuration. A run that is complete there, of the same
-    recording, configuration and version, is taken over; an interrupted one goes on.
+    recording, configuration and version, is taken over; any other begins anew.
 
     Parameters
     ----------

@@ -12,12 +12,16 @@ from pathlib import Path
 
 from gvo.batch.rows import BatchRow, RunStatus, Value, figures_of
 from gvo.batch.storage import fetch, fetch_file, is_url, store
+from gvo.bounded_text import read_text
 from gvo.config import Config
-from gvo.errors import ConfigurationError, GvoError, OutputError, ResumeError, RunBusyError
+from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
 from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions, open_recording
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.run_outputs import RunOutputs
+from gvo.run_summary import run_identity
 from gvo.run_tally import Progress
 from gvo.runs import EXIT_COMPLETE, RunResult, run_recording
 from gvo.version import __version__
@@ -108,7 +112,7 @@ def run_task(
 ) -> BatchRow:
     """Run a recording, unless its folder holds the finished run.
 
-    A run that was interrupted goes on; another one is replaced.
+    Another one, and one that was interrupted, is replaced.
 
     Parameters
     ----------
@@ -131,15 +135,15 @@ def run_task(
                 f"the worker has gvo {__version__}, the client {options.gvo_version}: install one"
             )
         with tempfile.TemporaryDirectory(prefix="gvo-", dir=scratch) as copies:
-            result = _run(task, options, Path(copies), on_progress)
+            result, is_found = _run(task, options, Path(copies), on_progress)
     except GvoError as error:
         return task.row("failed", str(error))
     status: RunStatus = "complete" if result.exit_code == EXIT_COMPLETE else "partly"
     return replace(
         task.row(status, "" if status == "complete" else "; ".join(result.warnings)),
         **figures_of(result.summary),
-        run_s=None if result.is_found else time.perf_counter() - start,
-        is_found=result.is_found,
+        run_s=None if is_found else time.perf_counter() - start,
+        is_found=is_found,
         run_hash=digest([result.summary["run"], result.summary["configuration"]]),
     )
 
@@ -155,45 +159,61 @@ def _run(
     options: TaskOptions,
     copies: Path,
     on_progress: Callable[[Progress], None] | None,
-) -> RunResult:
+) -> tuple[RunResult, bool]:
+    """Return the run, and whether its folder held it."""
     path = fetch(task.source, copies) if is_url(task.source) else Path(task.source)
     source = open_recording(path, config=task.config, options=options.recording)
 
-    def run(folder: Path, *, resume: bool) -> RunResult:
-        return run_recording(
+    def run(folder: Path) -> tuple[RunResult, bool]:
+        found = None if options.force else _find_finished(folder, source, task, options)
+        if found is not None:
+            return found, True
+        result = run_recording(
             source,
             folder,
             config=task.config,
             excerpt=options.excerpt,
             outputs=RunOutputs(report=options.report),
-            resume=resume,
             on_progress=on_progress,
         )
-
-    def go_on(folder: Path) -> RunResult:
-        if options.force:
-            return run(folder, resume=False)
-        try:
-            return run(folder, resume=True)
-        except RunBusyError:
-            raise
-        except ResumeError:
-            return run(folder, resume=False)
+        return result, False
 
     if not is_url(options.out):
         out = Path(options.out)
         _refuse_other_disk(out, options.mark)
-        return _when_free(lambda: go_on(out / task.folder))
+        return _when_free(lambda: run(out / task.folder))
     folder, url = copies / "run", f"{options.out.rstrip('/')}/{task.folder}"
     folder.mkdir()
     fetch_file(f"{url}/{SUMMARY}", folder / SUMMARY)
-    result = go_on(folder)
-    if not result.is_found:
+    result, is_found = run(folder)
+    if not is_found:
         store(folder, url)
-    return result
+    return result, is_found
 
 
-def _when_free(run: Callable[[], RunResult]) -> RunResult:
+def _find_finished(
+    folder: Path, source: Source, task: Task, options: TaskOptions
+) -> RunResult | None:
+    """Return the complete run of a task that is in its folder; None where there is none."""
+    try:
+        summary = json.loads(read_text(folder / SUMMARY))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(summary, dict) or summary.get("state") != "complete":
+        return None
+    identity = run_identity(source, OutputFrame(source.info.frame_id), options.excerpt)
+    there = summary.get("run"), summary.get("configuration")
+    if there != (identity, task.config.model_dump(mode="json")):
+        return None
+    return RunResult(
+        summary=summary,
+        evaluations=(),
+        exit_code=int(summary.get("exit_code", EXIT_COMPLETE)),
+        warnings=tuple(summary.get("warnings", ())),
+    )
+
+
+def _when_free(run: Callable[[], tuple[RunResult, bool]]) -> tuple[RunResult, bool]:
     """Run as soon as nobody else writes the folder.
 
     A worker that was given up, or whose batch was stopped, may write for a while yet.

@@ -47,11 +47,6 @@ class DescriptorFrontend:
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
 
-    @property
-    def learners(self) -> tuple[RigOffsets, ...]:
-        """All that is learnt on the way."""
-        return (self.rig_offsets,)
-
     def extract(self, frame: Frame) -> Observations:
         """Return the points of a frame that are seen and measured in 3-D.
 

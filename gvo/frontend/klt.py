@@ -65,11 +65,6 @@ class KltFrontend:
         self._described: dict[int, Observations] = {}
         self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
-    @property
-    def learners(self) -> tuple[RigOffsets, ...]:
-        """All that is learnt on the way: that of the tracks, and of the descriptors beside them."""
-        return self.rig_offsets, *self._descriptors.learners
-
     def extract(self, frame: Frame) -> KltObservations:
         """Return a frame with its corners that are measured in 3-D.
 

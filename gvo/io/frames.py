@@ -122,8 +122,6 @@ def frames(
     source: Source,
     config: Config,
     excerpt: Excerpt | None = None,
-    *,
-    choose: Callable[[Iterator[Pair | FaultyFrame]], Iterator[Pair | FaultyFrame]] | None = None,
 ) -> Iterator[Frame | FaultyFrame]:
     """Read a recording as frames.
 
@@ -137,8 +135,6 @@ def frames(
         number of threads.
     excerpt : Excerpt, optional
         The part that is wanted; the whole where omitted.
-    choose : callable, optional
-        Is given the pairs of that part, not decoded yet, and returns those that are wanted.
 
     Yields
     ------
@@ -153,8 +149,6 @@ def frames(
     pairs = paired(source.images(), source.info.sensor, config.sync)
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)
-    if choose is not None:
-        pairs = choose(pairs)
     preparers = make_preparers(source.info)
     make = _one_by_one if config.runtime.threads == 1 else _ahead
     made = make(pairs, preparers, source.info)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,7 @@ import gvo
 from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
 from gvo.io.excerpt import Excerpt
-from gvo.io.run_folder.writer import JOURNAL
-from gvo.resuming.record_file import RecordFile
+from gvo.io.run_folder.writer import written_alone
 from gvo.run_tally import Progress
 from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of
 
@@ -44,10 +44,10 @@ class StopError(Exception):
     """Ends a run."""
 
 
-def stop_at(n_frames: int) -> Callable[[Progress], None]:
+def stop_at(n_frames: int, error: type[BaseException]) -> Callable[[Progress], None]:
     def check(progress: Progress) -> None:
         if progress.n_done >= n_frames:
-            raise StopError
+            raise error
 
     return check
 
@@ -116,25 +116,17 @@ def test_another_run_in_the_folder_is_replaced(
     assert_same_run(Path(options.out) / "a", tmp_path / "fresh" / "a")
 
 
-def test_an_interrupted_run_goes_on_from_its_journal(
-    bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path], tmp_path: Path
+def test_an_interrupted_run_begins_anew(
+    bag: Path, options: TaskOptions, run_alone: Callable[[Path], Path]
 ) -> None:
-    with pytest.raises(StopError):
-        run_task(task_of(bag), options, on_progress=stop_at(5))
-    out = Path(options.out) / "a"
-    assert (out / JOURNAL).exists()
-    assert run_task(task_of(bag), options).status == "complete"
-    assert not (out / JOURNAL).exists()
-    assert_same_run(out, run_alone(bag))
-
-
-def test_what_was_computed_before_an_interruption_stands(bag: Path, options: TaskOptions) -> None:
-    with pytest.raises(StopError):
-        run_task(task_of(bag), options, on_progress=stop_at(5))
-    timings = Path(options.out) / "a" / "timings.csv"
-    before = timings.read_bytes()
-    run_task(task_of(bag), options)
-    assert timings.read_bytes().startswith(before)
+    for error in (StopError, KeyboardInterrupt):
+        with pytest.raises(error):
+            run_task(task_of(bag), options, on_progress=stop_at(5, error))
+    seen: list[int] = []
+    row = run_task(task_of(bag), options, on_progress=lambda progress: seen.append(progress.n_done))
+    assert (row.status, row.is_found) == ("complete", False)
+    assert seen == list(range(1, N_FRAMES + 1))
+    assert_same_run(Path(options.out) / "a", run_alone(bag))
 
 
 def test_a_recording_that_fails_is_a_row_with_its_reason(
@@ -193,14 +185,14 @@ def test_a_folder_that_another_process_writes_is_waited_for(
     bag: Path, options: TaskOptions, monkeypatch: pytest.MonkeyPatch, force: bool
 ) -> None:
     out = Path(options.out) / "a"
-    out.mkdir()
-    journal = RecordFile(out / JOURNAL, is_new=True)
+    other = ExitStack()
+    other.enter_context(written_alone(out))
     waited: list[float] = []
 
     def wait(seconds: float) -> None:
         waited.append(seconds)
         if len(waited) == 3:
-            journal.close()
+            other.close()
 
     monkeypatch.setattr("gvo.batch.tasks.time.sleep", wait)
     row = run_task(task_of(bag), replace(options, force=force))

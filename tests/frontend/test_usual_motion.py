@@ -18,7 +18,6 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.odometry.chain import RawChain
-from gvo.resuming.frontend import RepeatableFrontend
 from gvo.types import Failure, FloatArray, RelativePose
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
@@ -115,16 +114,11 @@ def test_the_usual_motion_is_heeded_where_the_prediction_is_and_not_in_the_round
     assert handed == [None] * n_rounds
 
 
-def repeatable(camera: StereoCamera, config: Config) -> RepeatableFrontend:
-    return RepeatableFrontend(make_frontend(camera, config))
-
-
-@pytest.mark.parametrize("wrap", [WatchedFrontend, repeatable])
 def test_a_front_end_inside_another_is_handed_the_usual_motion_too(
-    wrap: Any, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
-    frontend = wrap(recording.info.camera, Config())
+    frontend = WatchedFrontend(recording.info.camera, Config())
     first, second = (frontend.extract(frame) for frame in gvo.frames(recording, Config()))
     handed: list[Any] = []
 

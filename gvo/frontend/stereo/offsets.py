@@ -10,7 +10,6 @@ pixel. Where the rows of left and right differ, each match shows it by itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from gvo.config import StereoConfig
 from gvo.types import RelativePose
@@ -25,8 +24,6 @@ _ROW_PRIOR_PX = 0.3
 _DRIFT_PX = 5e-4
 # A measurement that is farther off, in sigmas, counts as this far: something else moved it.
 _MAX_SURPRISE = 3.0
-# Numbers that hold all that was learnt.
-_N_STATE = 9
 
 
 class OffsetFilter:
@@ -52,14 +49,6 @@ class OffsetFilter:
     def sigma_px(self) -> float:
         """Its standard deviation, pixels."""
         return math.sqrt(self._variance)
-
-    def state(self) -> tuple[float, float]:
-        """Return the value and its variance."""
-        return self._value, self._variance
-
-    def restore(self, value: float, variance: float) -> None:
-        """Go on from a value and its variance."""
-        self._value, self._variance = value, variance
 
     def update(self, left_px: float, sigma_px: float) -> None:
         """Take a measurement of what is left when the present value is taken off.
@@ -139,41 +128,6 @@ class RigOffsets:
             self.row.update(self._pending_row, _ROW_SIGMA_PX)
             self._pending_row = None
 
-    def state(self) -> list[float | int | None]:
-        """Return all that was learnt as plain numbers, for `restore`."""
-        pending = self._pending or (None, None)
-        return [
-            *self.disparity.state(),
-            *self.row.state(),
-            *pending,
-            self._pending_row,
-            self._last_ns,
-            self._last_row_ns,
-        ]
-
-    def restore(self, state: Sequence[float | int | None]) -> None:
-        """Go on with what was learnt before, bit for bit.
-
-        Parameters
-        ----------
-        state : sequence of numbers or None
-            What `state` gave.
-
-        Raises
-        ------
-        ValueError
-            When it is none.
-        """
-        check_state(state)
-        numbers = [math.nan if number is None else float(number) for number in state[:7]]
-        self.disparity.restore(*numbers[:2])
-        self.row.restore(*numbers[2:4])
-        self._pending = None if state[4] is None else (numbers[4], numbers[5])
-        self._pending_row = None if state[6] is None else numbers[6]
-        self._last_ns, self._last_row_ns = (
-            None if stamp is None else int(stamp) for stamp in state[7:]
-        )
-
     def as_json(self) -> dict[str, float]:
         """Return values and sigmas as plain numbers."""
         return {
@@ -181,24 +135,3 @@ class RigOffsets:
             "disparity_sigma_px": round(self.disparity.sigma_px, 4),
             "row_px": round(self.row.value_px, 4),
         }
-
-
-def check_state(state: Sequence[float | int | None]) -> None:
-    """Raise `ValueError` where something is not what `RigOffsets.state` gives."""
-    is_state = isinstance(state, Sequence) and len(state) == _N_STATE
-    is_state = is_state and all(map(_is_number_or_none, state))
-    is_state = is_state and all(_is_variance(state[index]) for index in (1, 3))
-    is_state = is_state and state[0] is not None and state[2] is not None
-    is_state = is_state and (state[4] is None) == (state[5] is None)
-    if not is_state or any(isinstance(stamp, float) for stamp in state[7:]):
-        raise ValueError(f"no state of rig offsets: {state!r:.80}")
-
-
-def _is_variance(number: float | None) -> bool:
-    return number is not None and number >= 0
-
-
-def _is_number_or_none(value: object) -> bool:
-    if value is None:
-        return True
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -12,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from gvo.errors import OutputError
-from gvo.io.run_folder.line_file import LineFile, RewrittenFile, replace_text
+from gvo.errors import OutputError, RunBusyError
+from gvo.io.run_folder.line_file import LineFile, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
@@ -24,7 +26,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Status
 
 SUMMARY = "summary.json"
-JOURNAL = "journal.bin"
+LOCK = "run.lock"
 PICTURE = "trajectories.png"
 REPORT = "report.html"
 SHUTTLE_PICTURE = "shuttle.png"
@@ -46,9 +48,7 @@ FRAMES_HEADER = (
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
 TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
 
-# The journal first: what is left of the others without it is no run that could go on.
 _OF_EARLIER_RUNS = (
-    JOURNAL,
     SUMMARY,
     "edges.csv",
     "timings.csv",
@@ -60,12 +60,49 @@ _OF_EARLIER_RUNS = (
 )
 
 
+@contextmanager
+def written_alone(folder: Path) -> Iterator[None]:
+    """Make a run folder where it is missing, and keep it from other processes inside the context.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written.
+    RunBusyError
+        When another process is writing it.
+    """
+    path = folder / LOCK
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = io.FileIO(path, "ab", opener=_open_no_link)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunBusyError(
+                f"{folder}: another process is writing this run; wait for its end, or end it"
+            ) from None
+        except OSError:
+            pass  # a file system without locks
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    # A link there may lead out of the folder.
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
+
+
 class RunFolder(AbstractContextManager["RunFolder"]):
     """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
     Smoothed poses come in the order in which they leave the window; `close` puts them in the
     order of their stamps. At any moment the files hold whole lines, whatever happens to the
-    process; a line that was cut off by the end of the power is cut out where the run goes on.
+    process; only the end of the power can cut one off.
 
     Parameters
     ----------
@@ -74,21 +111,11 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         summary and picture removed.
     columns : sequence of str
         Of the table of frames; the first is `stamp_ns`.
-    goes_on : bool
-        The run in the folder was interrupted and goes on: what it wrote is given once more from
-        its start, and the lines that are there stand. `settle` is to be called after that.
-
-    Attributes
-    ----------
-    is_settled : bool
-        All was given once more that had been written before an interruption.
 
     Raises
     ------
     OutputError
         When the folder cannot be written.
-    ResumeError
-        When its tables are not those of the run that goes on.
     """
 
     def __init__(
@@ -96,16 +123,13 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         path: Path,
         *,
         columns: Sequence[str] = FRAMES_HEADER,
-        goes_on: bool = False,
     ) -> None:
         self.path = path
-        self._goes_on = goes_on
-        self.is_settled = not goes_on
         self._is_writable = True
         self._files: dict[str, LineFile] = {}
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
-            for name in () if goes_on else _OF_EARLIER_RUNS:
+            for name in _OF_EARLIER_RUNS:
                 (path / name).unlink(missing_ok=True)
             stack.callback(self._close_files)
             self._open_all(columns)
@@ -129,24 +153,12 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
     def _open(self, name: str, header: str) -> None:
-        path = self.path / name
-        if self._goes_on and name.startswith("smoothed"):
-            # An interruption wrote preliminary poses too, and all in the order of their stamps.
-            self._files[name] = RewrittenFile(path, header)
-        else:
-            self._files[name] = LineFile(path, header, goes_on=self._goes_on)
+        self._files[name] = LineFile(self.path / name, header)
 
     def _write(self, name: str, lines: str) -> None:
         file = self._files[name]
         with self._refused_on_error(file.path):
             file.write(lines)
-
-    def settle(self) -> None:
-        """Take that all was given once more that had been written before the interruption."""
-        for file in self._files.values() if self._goes_on else ():
-            with self._refused_on_error(file.path):
-                file.settle()
-        self.is_settled = True
 
     def add_frame(self, frame: object, result: FrameResult) -> None:
         """Write what one frame gave; its images are not needed."""
@@ -218,7 +230,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
     def close(self) -> None:
         """Close all files and sort the smoothed poses by stamp."""
         self._close_files()
-        if not (self.is_settled and self._is_writable):
+        if not self._is_writable:
             return
         for name, n_header in (("smoothed.txt", 0), ("smoothed_covariance.csv", 1)):
             with self._refused_on_error(self.path / name):

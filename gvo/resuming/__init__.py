@@ -1,1 +1,0 @@
-"""What lets a run go on where it was interrupted: a journal, and the replay of it."""
