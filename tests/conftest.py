@@ -11,7 +11,6 @@ from hypothesis import settings
 import gvo
 from gvo.cli import main
 from gvo.io.synthetic.recording import SyntheticRecording
-from tests.browser import browser as browser
 from tests.rendered_walk import Walk
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the

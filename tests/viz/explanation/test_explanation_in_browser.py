@@ -9,7 +9,7 @@ from gvo.diagnostics.explain import explain_frame
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.viz.explanation import write_explanation
-from tests.browser import Browser
+from tests.viz.browser import Browser
 
 _PICTURES = "return [...document.images].map(i => [i.alt, i.naturalWidth, i.clientWidth])"
 

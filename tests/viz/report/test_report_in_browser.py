@@ -10,9 +10,9 @@ from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_outputs import RunOutputs
 from gvo.viz.report import write_run_report
-from tests.browser import Browser
-from tests.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
 from tests.outputs.long_run import make_long_run
+from tests.viz.browser import Browser
+from tests.viz.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
 
 if TYPE_CHECKING:
     from selenium.webdriver.remote.webelement import WebElement

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from tests.browser import Browser, Picture
+from tests.viz.browser import Browser, Picture
 
 if TYPE_CHECKING:
     from selenium.webdriver.remote.webelement import WebElement

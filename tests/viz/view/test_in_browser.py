@@ -11,8 +11,8 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_outputs import RunOutputs
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
-from tests.browser import Browser
-from tests.browser_checks import changed_share, n_colours
+from tests.viz.browser import Browser
+from tests.viz.browser_checks import changed_share, n_colours
 from tests.viz.view.page_driver import ViewPage
 
 N_FRAMES = 20

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import browser as browsers
-from tests.browser import Browser, leaves_the_machine
-from tests.browser_checks import (
+from tests.viz import browser as browsers
+from tests.viz.browser import Browser, leaves_the_machine
+from tests.viz.browser_checks import (
     changed_share,
     cut_texts,
     drawn_share,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from tests.browser import Browser, Picture
+from tests.viz.browser import Browser, Picture
 
 if TYPE_CHECKING:
     from selenium.webdriver.remote.webelement import WebElement

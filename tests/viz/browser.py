@@ -248,10 +248,3 @@ def chromium(folder: Path) -> Iterator[Browser]:
             yield Browser(driver, refused, downloads)
         finally:
             driver.quit()
-
-
-@pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Return the one browser of all tests of pages."""
-    with chromium(tmp_path_factory.mktemp("chromium")) as running:
-        yield running
