@@ -148,10 +148,10 @@ def view(task: Task) -> Picture | None:
             driver.execute_script(HIDE_COMPLAINT)
             for title in ("Parameters", "klt"):
                 unfold(driver, title)
-            moment = player.moment
-            if moment is None:
+            view = player.frame_view
+            if view is None:
                 raise RecordingError(f"{task.bag}: {player.fault}")
-            R, t = moment.T_world_cam[:3, :3], moment.T_world_cam[:3, 3]
+            R, t = view.T_world_cam[:3, :3], view.T_world_cam[:3, 3]
             for client in server.viser.get_clients().values():
                 client.camera.position, client.camera.look_at = R @ FROM_CAM + t, R @ TO_CAM + t
             time.sleep(3.0)  # the page draws on its own time

@@ -22,7 +22,7 @@ _JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Moment:
+class FrameView:
     """All that a page shows of one frame.
 
     Parameters
@@ -85,13 +85,13 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Entry:
+class FrameRecord:
     """What is written down of a frame.
 
     Parameters
     ----------
     stamp_ns, result, reason, image, overlay, window_poses, window_covariances
-        As of `Moment`.
+        As of `FrameView`.
     cloud : tuple of points and colours
         In the `cam` frame.
     """
@@ -125,7 +125,7 @@ class History:
         self._lock = RLock()
         # By frame: stamp, result and reason.
         self._told: list[tuple[int, FrameResult | None, str]] = []
-        self._latest: tuple[int, Entry] | None = None
+        self._latest: tuple[int, FrameRecord] | None = None
         # By frame with a pose: index and stamp, and the poses; by smoothed pose: when and of what.
         self._tracked = _Rows(2, np.int64)
         self._raw = _Rows(16, np.float64)
@@ -145,25 +145,25 @@ class History:
         """Index of the frame that is shown, up to which the paths go."""
         return self._shown
 
-    def add(self, entry: Entry) -> None:
+    def add(self, record: FrameRecord) -> None:
         """Write down the next frame; it is not shown yet."""
         index = self.n_done
         with self._lock:
-            self._arrays.append(_arrays_of(entry))
-            result = entry.result
+            self._arrays.append(_arrays_of(record))
+            result = record.result
             if result is not None:
                 result = replace(result, registration=None)
-            self._told.append((entry.stamp_ns, result, entry.reason))
-            self._latest = index, replace(entry, result=result)
+            self._told.append((record.stamp_ns, result, record.reason))
+            self._latest = index, replace(record, result=result)
             if result is None:
                 return
-            self._tracked.append((index, entry.stamp_ns))
+            self._tracked.append((index, record.stamp_ns))
             self._raw.append(result.raw.T_world_cam.ravel())
             self._causal.append(result.causal.T_world_cam.ravel())
             self._note_finished(index, result.finished)
-            if entry.stamp_ns in result.keyframes_ns:
+            if record.stamp_ns in result.keyframes_ns:
                 self._keyframes.append(index)
-                self._clouds.add(index, entry.cloud)
+                self._clouds.add(index, record.cloud)
 
     def finish(self, estimates: Iterable[Estimate]) -> None:
         """Take the smoothed poses that are known with the last frame."""
@@ -191,7 +191,7 @@ class History:
         self._check(index)
         return self._told[index - self.first_index][0]
 
-    def moment(self, index: int | None = None, *, fault: str = "") -> Moment:
+    def frame_view(self, index: int | None = None, *, fault: str = "") -> FrameView:
         """Return all that is known of a frame.
 
         Parameters
@@ -208,21 +208,21 @@ class History:
         """
         with self._lock:
             index = self._shown if index is None else index
-            entry = self._entry(index)
+            record = self._record(index)
             n = self._n_tracked(index)
-            return Moment(
+            return FrameView(
                 index=index,
                 n_done=self.n_done,
-                stamp_ns=entry.stamp_ns,
-                result=entry.result,
-                reason=entry.reason,
-                image=entry.image,
-                overlay=entry.overlay,
-                cloud_cam=entry.cloud[0],
-                colours=entry.cloud[1],
+                stamp_ns=record.stamp_ns,
+                result=record.result,
+                reason=record.reason,
+                image=record.image,
+                overlay=record.overlay,
+                cloud_cam=record.cloud[0],
+                colours=record.cloud[1],
                 T_world_cam=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
-                window_poses=entry.window_poses,
-                window_covariances=entry.window_covariances,
+                window_poses=record.window_poses,
+                window_covariances=record.window_covariances,
                 fault=fault,
             )
 
@@ -262,11 +262,11 @@ class History:
                 f"frame {index} is not among those done: {self.first_index} to {self.n_done - 1}"
             )
 
-    def _entry(self, index: int) -> Entry:
+    def _record(self, index: int) -> FrameRecord:
         self._check(index)
         if self._latest is None or self._latest[0] != index:
             row = index - self.first_index
-            self._latest = index, _entry_of(*self._told[row], self._arrays[row])
+            self._latest = index, _record_of(*self._told[row], self._arrays[row])
         return self._latest[1]
 
     def _n_tracked(self, index: int) -> int:
@@ -289,7 +289,7 @@ class History:
         poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()
         if n == 0:
             return stamps_ns, poses
-        window = self._entry(self._shown).window_poses
+        window = self._record(self._shown).window_poses
         known = [stamp_ns for stamp_ns in window if stamp_ns <= stamps_ns[-1]]
         if known:
             poses[np.searchsorted(stamps_ns, known)] = [window[stamp_ns] for stamp_ns in known]
@@ -318,23 +318,23 @@ class _Rows:
         return self._array[: self._n]
 
 
-def _arrays_of(entry: Entry) -> dict[str, NDArray[Any]]:
+def _arrays_of(record: FrameRecord) -> dict[str, NDArray[Any]]:
     return {
-        "image": _encode(entry.image),
-        "overlay": _encode(entry.overlay),
-        "points": entry.cloud[0],
-        "colours": entry.cloud[1],
-        "window_ns": np.array(list(entry.window_poses), dtype=np.int64),
-        "poses": np.array(list(entry.window_poses.values())),
-        "covariances": np.array(list(entry.window_covariances.values())),
+        "image": _encode(record.image),
+        "overlay": _encode(record.overlay),
+        "points": record.cloud[0],
+        "colours": record.cloud[1],
+        "window_ns": np.array(list(record.window_poses), dtype=np.int64),
+        "poses": np.array(list(record.window_poses.values())),
+        "covariances": np.array(list(record.window_covariances.values())),
     }
 
 
-def _entry_of(
+def _record_of(
     stamp_ns: int, result: FrameResult | None, reason: str, arrays: dict[str, NDArray[Any]]
-) -> Entry:
+) -> FrameRecord:
     window_ns = arrays["window_ns"].tolist()
-    return Entry(
+    return FrameRecord(
         stamp_ns=stamp_ns,
         result=result,
         reason=reason,

@@ -39,7 +39,7 @@ class Path:
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene = scene
         self._name = name
-        self._pieces = Pieces(_PATH_PIECE, n_shared=1)
+        self._pieces = ChunkedArray(_PATH_PIECE, n_shared=1)
         self._nodes: dict[int, Any] = {}
 
     def show(self, positions: FloatArray, *, is_visible: bool) -> None:
@@ -78,7 +78,7 @@ class Cloud:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self._pieces = Pieces(_CLOUD_PIECE)
+        self._pieces = ChunkedArray(_CLOUD_PIECE)
         self._nodes: dict[int, Any] = {}
 
     def show(
@@ -150,7 +150,7 @@ def _dashes(n: int) -> NDArray[np.bool_]:
     return drawn
 
 
-class Pieces:
+class ChunkedArray:
     """Cuts rows into pieces of equal size and tells which of them differ from before.
 
     Parameters

@@ -16,7 +16,7 @@ from gvo.trajectory.alignment import alignment, associate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray, IntArray
 from gvo.viz.view.controls import ParameterControls
-from gvo.viz.view.history import Moment
+from gvo.viz.view.history import FrameView
 from gvo.viz.view.layers import COLOURS
 from gvo.viz.view.panels import (
     UP,
@@ -85,8 +85,8 @@ class Page:
         self._add_frame_panel()
         self._add_main_panel()
         self._painter = Painter(self._draw_newest, rate_hz=RATE_HZ, idle=self._show_state)
-        self._unsubscribe = player.subscribe(lambda moment: self._painter.offer())
-        if player.moment is not None:
+        self._unsubscribe = player.subscribe(lambda frame: self._painter.offer())
+        if player.frame_view is not None:
             self._painter.offer()
 
     def close(self) -> None:
@@ -109,22 +109,22 @@ class Page:
         """Wait until what the player told last is drawn."""
         self._painter.settle()
 
-    def draw(self, moment: Moment) -> None:
+    def draw(self, frame: FrameView) -> None:
         """Show a frame with all that was known when it was done."""
         with self.scene.lock, self._server.atomic():
-            self._place(moment)
-            self.playback.show(moment.index)
-            self._numbers.content = numbers_html(self._rows(moment))
+            self._place(frame)
+            self.playback.show(frame.index)
+            self._numbers.content = numbers_html(self._rows(frame))
             self._show_state()
-            self._draw_images(moment)
+            self._draw_images(frame)
             self._draw_paths()
-            self._draw_window(moment)
-            self._view.show_pose(moment.T_world_cam)
+            self._draw_window(frame)
+            self._view.show_pose(frame.T_world_cam)
 
     def _draw_newest(self) -> None:
-        moment = self._player.moment
-        if moment is not None:
-            self.draw(moment)
+        frame = self._player.frame_view
+        if frame is not None:
+            self.draw(frame)
 
     def _add_frame_panel(self) -> None:
         gui = self._server.gui
@@ -188,30 +188,30 @@ class Page:
         content = describe_configuration(self.controls.config).encode()
         client.send_file_download(FILE_NAME, content, save_immediately=True)
 
-    def _rows(self, moment: Moment) -> dict[str, str]:
-        status = moment.status or "skipped"
-        rows = frame_rows(moment.index, self._player.n_frames, moment.stamp_ns, status)
-        if moment.reason:
-            rows["reason"] = moment.reason
-        return rows if moment.result is None else rows | result_rows(moment.result)
+    def _rows(self, frame: FrameView) -> dict[str, str]:
+        status = frame.status or "skipped"
+        rows = frame_rows(frame.index, self._player.n_frames, frame.stamp_ns, status)
+        if frame.reason:
+            rows["reason"] = frame.reason
+        return rows if frame.result is None else rows | result_rows(frame.result)
 
-    def _place(self, moment: Moment) -> None:
+    def _place(self, frame: FrameView) -> None:
         """Choose sizes and the view by what the first frame sees."""
         if self._placed_for == self._player.first_index:
             return
         self._placed_for = self._player.first_index
         camera = self._player.camera
-        depth = _depth_of(moment, camera)
+        depth = _depth_of(frame, camera)
         self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
-        start = moment.T_world_cam[:3, 3]
+        start = frame.T_world_cam[:3, 3]
         self.scene.show_ground(start - _GROUND_SHARE * depth * UP["-y"], grid_cell(0.1 * depth))
-        self._view.look_along(moment.T_world_cam, _VIEW_SHARE * depth)
+        self._view.look_along(frame.T_world_cam, _VIEW_SHARE * depth)
 
-    def _draw_images(self, moment: Moment) -> None:
-        self._overlay.image = _rgb(moment.overlay)
-        self.scene.show_image(_rgb(moment.image))
-        self.scene.show_points(moment.cloud_cam, moment.colours)
-        self.scene.show_pose(moment.T_world_cam)
+    def _draw_images(self, frame: FrameView) -> None:
+        self._overlay.image = _rgb(frame.overlay)
+        self.scene.show_image(_rgb(frame.image))
+        self.scene.show_points(frame.cloud_cam, frame.colours)
+        self.scene.show_pose(frame.T_world_cam)
 
     def _draw_paths(self) -> None:
         history = self._player.history
@@ -222,22 +222,22 @@ class Page:
         if self._truth is not None:
             self.scene.show_path("truth", self._truth.until(stamps_ns, positions))
 
-    def _draw_window(self, moment: Moment) -> None:
-        poses = moment.window_poses
-        keyframes = [poses[stamp] for stamp in moment.keyframes if stamp in poses]
+    def _draw_window(self, frame: FrameView) -> None:
+        poses = frame.window_poses
+        keyframes = [poses[stamp] for stamp in frame.keyframes if stamp in poses]
         self.scene.show_keyframes(np.array(keyframes).reshape(-1, 4, 4))
-        self.scene.show_links(_link_lines(moment))
-        stamps = [stamp for stamp in moment.window_covariances if stamp in poses]
+        self.scene.show_links(_link_lines(frame))
+        stamps = [stamp for stamp in frame.window_covariances if stamp in poses]
         self.scene.show_ellipsoids(
             np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4),
-            np.array([moment.window_covariances[stamp] for stamp in stamps]).reshape(-1, 6, 6),
+            np.array([frame.window_covariances[stamp] for stamp in stamps]).reshape(-1, 6, 6),
             float(self._sigmas.value),
         )
-        self._draw_cloud(moment)
+        self._draw_cloud(frame)
 
-    def _draw_cloud(self, moment: Moment) -> None:
+    def _draw_cloud(self, frame: FrameView) -> None:
         """Draw the accumulated points; they change with keyframes alone."""
-        newest = moment.keyframes[-1] if moment.keyframes else 0
+        newest = frame.keyframes[-1] if frame.keyframes else 0
         if self._shown_cloud != (newest, self._player.first_index):
             self._shown_cloud = (newest, self._player.first_index)
             self.scene.show_cloud(*self._player.history.accumulated_cloud())
@@ -253,21 +253,21 @@ def player_state(player: Player) -> str:
     return "at the end" if is_last else "paused"
 
 
-def _depth_of(moment: Moment, camera: StereoCamera | PinholeCamera) -> float:
+def _depth_of(frame: FrameView, camera: StereoCamera | PinholeCamera) -> float:
     """Return how far away, metres, most of what is seen is; a guess before anything is."""
-    if len(moment.cloud_cam) > 0:
-        return float(np.median(moment.cloud_cam[:, 2]))
+    if len(frame.cloud_cam) > 0:
+        return float(np.median(frame.cloud_cam[:, 2]))
     return _DEPTH_PER_BASELINE * getattr(camera, "baseline", 0.05)
 
 
-def _link_lines(moment: Moment) -> dict[str, FloatArray]:
+def _link_lines(frame: FrameView) -> dict[str, FloatArray]:
     """Return the frame's links as lines (n, 2, 3), by how they are drawn."""
     lines: dict[str, list[FloatArray]] = {}
-    for link in moment.links:
-        if link.reference_ns in moment.window_poses:
-            start = moment.window_poses[link.reference_ns][:3, 3]
+    for link in frame.links:
+        if link.reference_ns in frame.window_poses:
+            start = frame.window_poses[link.reference_ns][:3, 3]
             name = "keyframe link" if link.kind == "keyframe" else link.kind
-            ends = np.stack([start, moment.T_world_cam[:3, 3]])
+            ends = np.stack([start, frame.T_world_cam[:3, 3]])
             lines.setdefault(name if link.is_accepted else "refused", []).append(ends)
     return {name: np.stack(ends) for name, ends in lines.items()}
 

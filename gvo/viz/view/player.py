@@ -17,10 +17,10 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import RecordingInfo, Source
-from gvo.viz.view.history import History, Moment
+from gvo.viz.view.history import FrameView, History
 from gvo.viz.view.tracking import OpenSource, Tracking
 
-Subscriber: TypeAlias = Callable[[Moment], None]
+Subscriber: TypeAlias = Callable[[FrameView], None]
 _LOGGER = logging.getLogger(__name__)
 
 # A gap of the stamps is not waited for longer, seconds of the recording.
@@ -182,7 +182,7 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def subscribe(self, callback: Subscriber) -> Callable[[], None]:
-        """Have something called with each moment that is shown, on the thread of the player.
+        """Have something called with each view that is shown, on the thread of the player.
 
         Returns
         -------
@@ -294,12 +294,12 @@ class Player(AbstractContextManager["Player"]):
         return self._history
 
     @property
-    def moment(self) -> Moment | None:
+    def frame_view(self) -> FrameView | None:
         """The frame shown; None before there is any."""
         history = self._history
         if history.shown < history.first_index:
             return None
-        return history.moment(fault=self._fault)
+        return history.frame_view(fault=self._fault)
 
     # What the thread does
 
@@ -342,10 +342,10 @@ class Player(AbstractContextManager["Player"]):
         """Tell all subscribers of the frame shown."""
         with self._changed:
             subscribers = tuple(self._subscribers)
-        moment = self.moment if subscribers else None
-        if moment is not None:
+        view = self.frame_view if subscribers else None
+        if view is not None:
             for callback in subscribers:
-                self._guarded(partial(callback, moment))
+                self._guarded(partial(callback, view))
 
     def _turn(self) -> None:
         """Do one thing of those that were asked for: start anew, show or compute one frame."""
@@ -431,15 +431,15 @@ class Player(AbstractContextManager["Player"]):
             return False
         try:
             self._take_configuration()
-            entry = self._tracking.advance(self.n_done)
-            if entry is not None:
-                self._history.add(entry)
+            record = self._tracking.advance(self.n_done)
+            if record is not None:
+                self._history.add(record)
                 self._show(self.n_done - 1)
                 self._tracking.peek()  # is it the last one?
         finally:
             if self._tracking.is_finished:
                 self._finish()
-        return entry is not None
+        return record is not None
 
     def _take_configuration(self) -> None:
         config = self._config

@@ -20,7 +20,7 @@ from gvo.odometry.odometry import Odometry
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, ImageArray, StereoFrame
 from gvo.viz.overlay import compose_overlay, draw_matches
 from gvo.viz.view.clouds import empty_cloud, frame_cloud
-from gvo.viz.view.history import Entry
+from gvo.viz.view.history import FrameRecord
 
 OpenSource: TypeAlias = Callable[[Config], Source]
 # Newest poses of the window that are written down with each frame; it may keep all there are.
@@ -124,7 +124,7 @@ class Tracking:
         self._items, self._next = coming, following
         self.is_finished = following is None
 
-    def advance(self, index: int) -> Entry | None:
+    def advance(self, index: int) -> FrameRecord | None:
         """Track the next frame and return what there is to show of it; None at the end.
 
         Parameters
@@ -141,9 +141,9 @@ class Tracking:
         if item is None:
             return None
         self.is_finished = True  # unless all goes well
-        entry = self._faulty(item) if isinstance(item, FaultyFrame) else self._track(item, index)
+        record = self._faulty(item) if isinstance(item, FaultyFrame) else self._track(item, index)
         self._last_ns, self._next, self.is_finished = item.stamp_ns, None, False
-        return entry
+        return record
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses that the window still holds."""
@@ -154,10 +154,10 @@ class Tracking:
         if isinstance(self._items, Generator):
             self._items.close()
 
-    def _faulty(self, frame: FaultyFrame) -> Entry:
+    def _faulty(self, frame: FaultyFrame) -> FrameRecord:
         picture = draw_fault(self.camera, frame.reason)
         poses, covariances = self._window()
-        return Entry(
+        return FrameRecord(
             stamp_ns=frame.stamp_ns,
             result=None,
             reason=frame.reason,
@@ -168,14 +168,14 @@ class Tracking:
             window_covariances=covariances,
         )
 
-    def _track(self, frame: Frame, index: int) -> Entry:
+    def _track(self, frame: Frame, index: int) -> FrameRecord:
         result = self._odometry.track(frame)
         result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
         self._stamps_ns.append(frame.stamp_ns)
         self._keyframes_ns = result.keyframes_ns
         poses, covariances = self._window()
         image = frame.left if isinstance(frame, StereoFrame) else frame.image
-        return Entry(
+        return FrameRecord(
             stamp_ns=frame.stamp_ns,
             result=result,
             reason=result.reason,

@@ -1,4 +1,4 @@
-"""A player that computes nothing, and moments of a camera that drives ahead."""
+"""A player that computes nothing, and views of a camera that drives ahead."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gvo.config import Config
 from gvo.geometry.camera import PinholeCamera
 from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, IntArray, Status
-from gvo.viz.view.history import Moment
+from gvo.viz.view.history import FrameView
 
 PERIOD_NS = 100_000_000
 CAMERA = PinholeCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0)
@@ -55,12 +55,12 @@ def result_of(index: int) -> FrameResult:
     )
 
 
-def moment_of(index: int, *, fault: str = "", is_faulty: bool = False) -> Moment:
+def frame_view_of(index: int, *, fault: str = "", is_faulty: bool = False) -> FrameView:
     """What the page is given of a frame."""
     picture = np.full((120, 160, 3), index, dtype=np.uint8)
     points = np.random.default_rng(index).uniform(1.0, 9.0, (50, 3)).astype(np.float32)
     known = {int(stamp): pose_of(i) for i, stamp in enumerate(stamps_of(index + 1))}
-    return Moment(
+    return FrameView(
         index=index,
         n_done=index + 1,
         stamp_ns=PERIOD_NS * index,
@@ -88,7 +88,7 @@ class FakeHistory:
         return stamps_of(self.n), self._positions() + np.array([0.1, 0.0, 0.0])
 
     def causal_path(self) -> tuple[IntArray, FloatArray]:
-        """The path of the moments."""
+        """The path of the views."""
         return stamps_of(self.n), self._positions()
 
     def smoothed_path(self) -> tuple[IntArray, FloatArray]:
@@ -115,18 +115,18 @@ class FakePlayer:
         self.config = Config()
         self.info = SimpleNamespace(name="drive")
         self.history = FakeHistory()
-        self.moment: Moment | None = None
+        self.frame_view: FrameView | None = None
         self.is_playing = self.is_busy = self.is_finished = False
         self.fault = ""
-        self.callbacks: list[Callable[[Moment], None]] = []
+        self.callbacks: list[Callable[[FrameView], None]] = []
 
-    def show(self, moment: Moment) -> None:
+    def show(self, view: FrameView) -> None:
         """Be at a frame, and tell."""
-        self.moment = moment
-        self.fault = moment.fault
-        self.history.n = moment.index + 1
+        self.frame_view = view
+        self.fault = view.fault
+        self.history.n = view.index + 1
         for callback in self.callbacks:
-            callback(moment)
+            callback(view)
 
     @property
     def index(self) -> int:
@@ -138,7 +138,7 @@ class FakePlayer:
         """Frames that are done."""
         return self.history.n
 
-    def subscribe(self, callback: Callable[[Moment], None]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[FrameView], None]) -> Callable[[], None]:
         """Tell of every frame, until it is called back."""
         self.callbacks.append(callback)
         return lambda: self.callbacks.remove(callback)

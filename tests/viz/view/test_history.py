@@ -24,7 +24,7 @@ from gvo.types import (
 from gvo.viz.view import clouds
 from gvo.viz.view.clouds import Cloud, KeyframeClouds, frame_cloud, put_together, thin
 from gvo.viz.view.disk_list import DiskList
-from gvo.viz.view.history import Entry, History
+from gvo.viz.view.history import FrameRecord, History
 
 CAMERA = PinholeCamera(fx=100.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 POINT: Cloud = (
@@ -43,7 +43,9 @@ def estimate(frame: int, x_m: float) -> Estimate:
     return Estimate(stamp_ns=frame * 10, T_world_cam=at(x_m), covariance=np.eye(6))
 
 
-def entry(frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...] = ()) -> Entry:
+def record(
+    frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...] = ()
+) -> FrameRecord:
     """Return a frame whose raw, causal, window and final x tell where they come from."""
     result = FrameResult(
         raw=estimate(frame, frame + 0.1),
@@ -58,7 +60,7 @@ def entry(frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...]
         n_links=0,
         keyframes_ns=(10 * (frame - frame % 3),),
     )
-    return Entry(
+    return FrameRecord(
         stamp_ns=10 * frame,
         result=result,
         reason="",
@@ -70,9 +72,9 @@ def entry(frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...]
     )
 
 
-def faulty(frame: int) -> Entry:
+def faulty(frame: int) -> FrameRecord:
     black = np.zeros((6, 8, 3), dtype=np.uint8)
-    return Entry(
+    return FrameRecord(
         stamp_ns=10 * frame,
         result=None,
         reason="dark",
@@ -88,11 +90,11 @@ def faulty(frame: int) -> Entry:
 def history() -> History:
     """Return frames 2 to 6, of which 4 is faulty; 2 is final with 5, 3 with the end."""
     history = History(2)
-    history.add(entry(2, window=(2,)))
-    history.add(entry(3, window=(2, 3)))
+    history.add(record(2, window=(2,)))
+    history.add(record(3, window=(2, 3)))
     history.add(faulty(4))
-    history.add(entry(5, finished=(2,), window=(3, 5)))
-    history.add(entry(6, window=(5, 6)))
+    history.add(record(5, finished=(2,), window=(3, 5)))
+    history.add(record(6, window=(5, 6)))
     history.finish([estimate(done, done + 0.4) for done in (3, 5, 6)])
     return history
 
@@ -118,21 +120,21 @@ def test_paths_go_up_to_the_frame_shown_as_it_was_known_then(history: History) -
         assert history.raw_path()[0].tolist() == [10 * frame for frame in frames]
 
 
-def test_moments_come_back_from_disk_as_they_were(history: History) -> None:
+def test_frames_come_back_from_disk_as_they_were(history: History) -> None:
     for frame in (5, 3, 6, 2):
-        moment = history.moment(frame)
-        assert (moment.index, moment.n_done, moment.stamp_ns) == (frame, 7, 10 * frame)
-        assert moment.image.shape == (6, 8, 3)
-        assert moment.overlay.shape == (12, 16, 3)
-        assert np.abs(moment.image.astype(int) - 20 * frame).max() <= 2
-        assert moment.T_world_cam[0, 3] == frame + 0.2
-        assert moment.result is not None
-        assert moment.result.raw.T_world_cam[0, 3] == frame + 0.1
-        np.testing.assert_array_equal(moment.cloud_cam, POINT[0])
-        assert set(moment.window_poses) == set(moment.window_covariances)
-        assert all(moment.window_poses[ns][0, 3] == ns / 10 + 0.3 for ns in moment.window_poses)
-        assert all(c[0, 0] == ns / 10 for ns, c in moment.window_covariances.items())
-    fault = history.moment(4, fault="told")
+        view = history.frame_view(frame)
+        assert (view.index, view.n_done, view.stamp_ns) == (frame, 7, 10 * frame)
+        assert view.image.shape == (6, 8, 3)
+        assert view.overlay.shape == (12, 16, 3)
+        assert np.abs(view.image.astype(int) - 20 * frame).max() <= 2
+        assert view.T_world_cam[0, 3] == frame + 0.2
+        assert view.result is not None
+        assert view.result.raw.T_world_cam[0, 3] == frame + 0.1
+        np.testing.assert_array_equal(view.cloud_cam, POINT[0])
+        assert set(view.window_poses) == set(view.window_covariances)
+        assert all(view.window_poses[ns][0, 3] == ns / 10 + 0.3 for ns in view.window_poses)
+        assert all(c[0, 0] == ns / 10 for ns, c in view.window_covariances.items())
+    fault = history.frame_view(4, fault="told")
     assert (fault.result, fault.status, fault.reason, fault.fault) == (None, None, "dark", "told")
     assert fault.keyframes == ()
     assert fault.links == ()
@@ -141,7 +143,7 @@ def test_moments_come_back_from_disk_as_they_were(history: History) -> None:
 
 @pytest.mark.parametrize("index", [1, 7])
 def test_frames_that_are_not_there_are_refused(history: History, index: int) -> None:
-    for ask in (history.show, history.moment, history.stamp_ns):
+    for ask in (history.show, history.frame_view, history.stamp_ns):
         with pytest.raises(ValueError, match="2 to 6"):
             ask(index)
 
@@ -166,7 +168,7 @@ def test_the_clouds_of_keyframes_stand_where_their_best_poses_put_them(history: 
 def test_many_frames_grow_the_arrays() -> None:
     history = History()
     for frame in range(200):
-        history.add(entry(frame))
+        history.add(record(frame))
     history.show(199)
     assert xs(history.raw_path()) == [round(frame + 0.1, 6) for frame in range(200)]
 

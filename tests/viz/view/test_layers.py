@@ -1,4 +1,4 @@
-"""Pieces: only what changed, and together the whole."""
+"""ChunkedArray: only what changed, and together the whole."""
 
 from itertools import pairwise
 from typing import Any
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.types import FloatArray
-from gvo.viz.view.layers import Pieces
+from gvo.viz.view.layers import ChunkedArray
 
 rows_of_one_number = st.lists(st.integers(0, 3), max_size=20).map(
     lambda values: np.array(values, dtype=np.float64).reshape(-1, 1)
@@ -19,7 +19,7 @@ rows_of_one_number = st.lists(st.integers(0, 3), max_size=20).map(
 def test_pieces_put_together_are_the_rows(
     states: list[FloatArray], size: int, is_line: bool
 ) -> None:
-    pieces = Pieces(size, n_shared=int(is_line))
+    pieces = ChunkedArray(size, n_shared=int(is_line))
     held: dict[int, FloatArray] = {}
     for rows in states:
         held |= pieces.update(rows)
@@ -30,7 +30,7 @@ def test_pieces_put_together_are_the_rows(
 
 
 def test_growing_by_one_row_changes_the_last_piece_alone() -> None:
-    pieces = Pieces(10, n_shared=1)
+    pieces = ChunkedArray(10, n_shared=1)
     rows = np.arange(60.0).reshape(-1, 2)
     pieces.update(rows[:27])
     assert list(pieces.update(rows[:28])) == [2]
@@ -38,7 +38,7 @@ def test_growing_by_one_row_changes_the_last_piece_alone() -> None:
 
 
 def test_rows_are_compared_with_what_they_were() -> None:
-    pieces = Pieces(10)
+    pieces = ChunkedArray(10)
     rows = np.zeros((5, 2))
     pieces.update(rows)
     rows[3] = 1.0

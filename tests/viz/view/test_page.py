@@ -1,4 +1,4 @@
-"""The page of a recording shows the moment and steers the player."""
+"""The page of a recording shows the view and steers the player."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.view.page import Page
 from gvo.viz.view.server import ViewServer
-from tests.viz.view.fakes import FakePlayer, moment_of, pose_of, stamps_of
+from tests.viz.view.fakes import FakePlayer, frame_view_of, pose_of, stamps_of
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def page(view: ViewServer, player: FakePlayer) -> Iterator[Page]:
 
 def show(page: Page, player: FakePlayer, index: int, **options: Any) -> None:
     """Be at a frame, drawn."""
-    player.show(moment_of(index, **options))
+    player.show(frame_view_of(index, **options))
     page.settle()
 
 
@@ -105,8 +105,8 @@ def test_a_frame_without_points_sends_no_cloud(
         "colours": np.zeros((0, 3), np.uint8),
     }
     for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
-        moment = moment_of(index)
-        player.show(moment if n_clouds else replace(moment, **empty))
+        view = frame_view_of(index)
+        player.show(view if n_clouds else replace(view, **empty))
         page.settle()
         assert len(nodes(view, "/camera/points")) == n_clouds
 
@@ -190,6 +190,6 @@ def test_the_painter_draws_the_last_moment(
     page: Page, player: FakePlayer, view: ViewServer
 ) -> None:
     for index in range(25):
-        player.show(moment_of(index))
+        player.show(frame_view_of(index))
     page.settle()
     assert cells(page)["frame"] == "24 of 40"

@@ -17,7 +17,7 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FrameResult, RgbdFrame
-from gvo.viz.view.history import Moment
+from gvo.viz.view.history import FrameView
 from gvo.viz.view.player import Player
 
 N_FRAMES = 12
@@ -84,18 +84,18 @@ def change(**sections: dict[str, object]) -> Config:
     return Config.model_validate(sections)
 
 
-def follow(player: Player) -> list[Moment]:
-    """Return a list that each moment shown is added to."""
-    moments: list[Moment] = []
-    player.subscribe(moments.append)
-    return moments
+def follow(player: Player) -> list[FrameView]:
+    """Return a list that each view shown is added to."""
+    views: list[FrameView] = []
+    player.subscribe(views.append)
+    return views
 
 
 def test_playing_shows_each_frame_once_with_the_poses_of_a_run() -> None:
     with Player(Recording().open, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         assert player.index == -1
-        assert player.moment is None
+        assert player.frame_view is None
         player.set_speed(None)
         player.play()
         assert player.wait(LIMIT_S)
@@ -103,14 +103,14 @@ def test_playing_shows_each_frame_once_with_the_poses_of_a_run() -> None:
         assert player.is_finished
         assert player.fault == ""
         # Once more at the end, with the smoothed poses of all.
-        assert [moment.index for moment in moments] == [*range(N_FRAMES), N_FRAMES - 1]
-        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+        assert [view.index for view in views] == [*range(N_FRAMES), N_FRAMES - 1]
+        assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
         results, smoothed = computed()
-        for moment, result in zip(moments, results, strict=False):
-            np.testing.assert_array_equal(moment.T_world_cam, result.causal.T_world_cam)
-            assert moment.keyframes == result.keyframes_ns
-            assert set(moment.keyframes) <= set(moment.window_poses)
-            assert set(moment.window_poses) == set(moment.window_covariances)
+        for view, result in zip(views, results, strict=False):
+            np.testing.assert_array_equal(view.T_world_cam, result.causal.T_world_cam)
+            assert view.keyframes == result.keyframes_ns
+            assert set(view.keyframes) <= set(view.window_poses)
+            assert set(view.window_poses) == set(view.window_covariances)
         paths = player.history.raw_path(), player.history.causal_path()
         for (stamps, path), kind in zip(paths, ("raw", "causal"), strict=True):
             assert stamps.tolist() == stamps_ns()
@@ -122,12 +122,12 @@ def test_playing_shows_each_frame_once_with_the_poses_of_a_run() -> None:
 
 def test_a_frame_that_is_done_is_shown_as_it_was() -> None:
     with Player(Recording().open, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         player.seek(7)
         assert player.wait(LIMIT_S)
         player.seek(3)
         assert player.wait(LIMIT_S)
-        then, now = moments[3], moments[-1]
+        then, now = views[3], views[-1]
         assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
         assert now.status == then.status
         np.testing.assert_array_equal(now.T_world_cam, then.T_world_cam)
@@ -144,11 +144,11 @@ def test_steps_go_through_what_is_done_and_on() -> None:
         player.wait(LIMIT_S)
         player.seek(0)
         player.wait(LIMIT_S)
-        moments = follow(player)
+        views = follow(player)
         for _ in range(4):
             player.step()
         assert player.wait(LIMIT_S)
-        assert [(moment.index, moment.n_done) for moment in moments][-2:] == [(3, 4), (4, 5)]
+        assert [(view.index, view.n_done) for view in views][-2:] == [(3, 4), (4, 5)]
         assert not player.is_playing
 
 
@@ -156,8 +156,8 @@ def test_steps_go_through_what_is_done_and_on() -> None:
 def test_the_way_to_a_frame_can_be_interrupted(tell: str) -> None:
     with Player(Recording().open, Config()) as player:
 
-        def interrupt(moment: Moment) -> None:
-            if (moment.index, moment.n_done) == (4, 5):
+        def interrupt(view: FrameView) -> None:
+            if (view.index, view.n_done) == (4, 5):
                 player.pause() if tell == "pause" else player.seek(1)
 
         player.subscribe(interrupt)
@@ -231,8 +231,8 @@ def test_after_a_restart_the_world_begins_at_the_frame_shown() -> None:
         player.seek(0)
         player.wait(LIMIT_S)
         assert player.index == 5
-        assert player.moment is not None
-        np.testing.assert_array_equal(player.moment.T_world_cam, results[0].causal.T_world_cam)
+        assert player.frame_view is not None
+        np.testing.assert_array_equal(player.frame_view.T_world_cam, results[0].causal.T_world_cam)
         player.restart(0)
         assert player.wait(LIMIT_S)
         assert (player.index, player.first_index, player.n_done) == (0, 0, 1)
@@ -243,13 +243,13 @@ def test_after_a_restart_the_world_begins_at_the_frame_shown() -> None:
 def test_another_configuration_counts_from_the_next_frame_on() -> None:
     recording = Recording()
     with Player(recording.open, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         player.seek(3)
         player.wait(LIMIT_S)
         player.reconfigure(change(klt={"n_corners": 50}))
         player.step()
         assert player.wait(LIMIT_S)
-        before, after = moments[-2].result, moments[-1].result
+        before, after = views[-2].result, views[-1].result
         assert before is not None
         assert after is not None
         assert after.n_matches <= 50 < before.n_matches
@@ -265,14 +265,14 @@ def test_another_configuration_counts_from_the_next_frame_on() -> None:
 def test_what_matters_when_reading_opens_the_recording_again_without_a_gap(other: Config) -> None:
     recording = Recording()
     with Player(recording.open, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         player.seek(3)
         player.wait(LIMIT_S)
         player.reconfigure(other)
         player.seek(N_FRAMES - 1)
         assert player.wait(LIMIT_S)
         assert recording.n_opened == 2
-        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+        assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
         expected = positions([result.raw for result in computed()[0]])
         assert player.history.raw_path()[1].tolist() == expected
 
@@ -286,20 +286,20 @@ def test_a_configuration_that_cannot_be_read_with_leaves_the_former_one() -> Non
         return recording.open(config)
 
     with Player(open_source, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         player.seek(3)
         player.wait(LIMIT_S)
         player.reconfigure(change(images={"black": 7}, klt={"n_corners": 50}))
         player.step()
         assert player.wait(LIMIT_S)
-        assert moments[-1].fault == player.fault == "black is not black; take 0"
+        assert views[-1].fault == player.fault == "black is not black; take 0"
         assert player.config == Config()
         player.seek(N_FRAMES - 1)
         assert player.wait(LIMIT_S)
-        assert [moment.stamp_ns for moment in moments[:-1]] == stamps_ns()
+        assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
 
 
-def test_a_faulty_frame_is_a_moment_without_result() -> None:
+def test_a_faulty_frame_is_shown_without_result() -> None:
     def fail() -> np.ndarray:
         raise RecordingError("cut off")
 
@@ -309,14 +309,14 @@ def test_a_faulty_frame_is_a_moment_without_result() -> None:
             yield replace(image, load=fail) if is_bad else image
 
     with Player(Recording(spoil).open, Config()) as player:
-        moments = follow(player)
+        views = follow(player)
         player.seek(N_FRAMES - 1)
         assert player.wait(LIMIT_S)
-        moment = moments[4]
-        assert moment.result is None
-        assert moment.status is None
-        assert "cut off" in moment.reason
-        np.testing.assert_array_equal(moment.T_world_cam, moments[3].T_world_cam)
+        view = views[4]
+        assert view.result is None
+        assert view.status is None
+        assert "cut off" in view.reason
+        np.testing.assert_array_equal(view.T_world_cam, views[3].T_world_cam)
         assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
         player.restart(4)
         player.seek(6)
@@ -364,7 +364,7 @@ def test_a_recording_without_a_frame_is_told() -> None:
         player.step()
         assert player.wait(LIMIT_S)
         assert player.is_finished
-        assert player.moment is None
+        assert player.frame_view is None
 
 
 def test_a_fault_of_the_program_is_told_and_a_restart_goes_on() -> None:
@@ -382,26 +382,26 @@ def test_a_fault_of_the_program_is_told_and_a_restart_goes_on() -> None:
 
 def test_a_subscriber_that_fails_stops_nobody() -> None:
     with Player(Recording().open, Config()) as player:
-        page: dict[str, Moment] = {}
-        player.subscribe(lambda moment: page["page"])  # type: ignore[arg-type]
-        moments = follow(player)
+        page: dict[str, FrameView] = {}
+        player.subscribe(lambda view: page["page"])  # type: ignore[arg-type]
+        views = follow(player)
         player.seek(2)
         assert player.wait(LIMIT_S)
         assert player.fault == "KeyError: 'page'"
-        assert [moment.index for moment in moments] == [0, 1, 2]
+        assert [view.index for view in views] == [0, 1, 2]
 
 
 def test_who_unsubscribes_is_not_called() -> None:
     with Player(Recording().open, Config()) as player:
-        moments: list[Moment] = []
-        end = player.subscribe(moments.append)
+        views: list[FrameView] = []
+        end = player.subscribe(views.append)
         player.step()
         player.wait(LIMIT_S)
         end()
         end()
         player.step()
         player.wait(LIMIT_S)
-        assert [moment.index for moment in moments] == [0]
+        assert [view.index for view in views] == [0]
 
 
 def test_an_excerpt_is_played_and_restarted_within() -> None:
@@ -423,9 +423,9 @@ def test_what_was_done_can_be_read_after_the_end() -> None:
     player.wait(LIMIT_S)
     player.close()
     player.close()
-    assert player.history.moment(1).index == 1
+    assert player.history.frame_view(1).index == 1
     with pytest.raises(ValueError, match="frame 5 is not among those done: 0 to 4"):
-        player.history.moment(5)
+        player.history.frame_view(5)
 
 
 def test_closing_while_it_plays_ends_it() -> None:
