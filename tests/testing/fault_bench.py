@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,11 @@ from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.run_outputs import RunOutputs
 from gvo.runs import run_recording
-from gvo.testing.faults import FaultySource, NamedFault
+from gvo.testing.faults import FaultyImage, FaultySource
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
+from tests.testing.named import NamedFault
 
 _SCALE = 0.4
 
@@ -99,10 +100,10 @@ def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
         rows = list(csv.DictReader(file))
     poses = {name: read_trajectory(out / f"{name}.txt") for name in ("raw", "causal", "smoothed")}
     causal, covariances = poses["causal"], _read_covariances(out / "causal_covariance.csv")
-    given = [shot for shot in _until_error(source) if shot.image.stream == 0]
+    given = [image for image in _until_error(source) if image.given.stream == 0]
     with_pose = {int(row["stamp_ns"]) for row in rows if row["status"] != "skipped"}
     # where a stamp repeats, the first image has the pose
-    of_stamp = {shot.image.stamp_ns: shot.frame for shot in reversed(given)}
+    of_stamp = {image.given.stamp_ns: image.frame for image in reversed(given)}
     frames = np.array([of_stamp[stamp_ns] for stamp_ns in causal.stamps_ns.tolist()])
     assert with_pose == set(causal.stamps_ns.tolist())
     errors_m, deviations = _errors(truth, frames, causal.T_world_cam, covariances)
@@ -129,19 +130,12 @@ def complaints(source: FaultySource) -> set[str]:
 
 
 def faulty(fault: NamedFault, sensor: Sensor, *, is_lasting: bool = False) -> FaultySource:
-    return fault.put_into(sound(sensor, fault.n_frames), is_lasting=is_lasting)
+    return fault.wrap(sound(sensor, fault.n_frames), is_lasting=is_lasting)
 
 
-def _until_error(source: FaultySource) -> Iterator[Any]:
-    shots = source.shots()
-    return takewhile(lambda shot: shot is not None, (_next(shots) for _ in iter(int, 1)))
-
-
-def _next(shots: Iterator[Any]) -> Any:
-    try:
-        return next(shots, None)
-    except (GvoError, OSError):
-        return None
+def _until_error(source: FaultySource) -> Iterator[FaultyImage]:
+    with suppress(GvoError, OSError):
+        yield from source.faulty_images()
 
 
 def _read_covariances(path: Path) -> FloatArray:

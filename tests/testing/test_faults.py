@@ -18,7 +18,6 @@ from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.testing.faults import (
-    FAULTS,
     Banded,
     Black,
     Blurred,
@@ -64,6 +63,7 @@ from gvo.testing.faults import (
     WrongFocalLength,
     WrongPrincipalPoint,
 )
+from tests.testing.catalogue import FAULTS
 
 _N = 8
 _START_NS, _PERIOD_NS = 5_000_000_000, 100_000_000
@@ -121,7 +121,9 @@ def stamps(source: FaultySource, stream: int = 0) -> list[int]:
 
 def load(source: FaultySource, frame: int, stream: int = 0) -> NDArray[Any]:
     """Return the pixels of a frame as the faulty recording gives them."""
-    (found,) = [s.image for s in source.shots() if (s.frame, s.image.stream) == (frame, stream)]
+    (found,) = [
+        i.given for i in source.faulty_images() if (i.frame, i.given.stream) == (frame, stream)
+    ]
     return found.load()
 
 
@@ -171,7 +173,7 @@ def test_one_stream_alone_can_be_struck() -> None:
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_same_seed_gives_the_same_bytes_in_any_order(name: str) -> None:
     sensor = FAULTS[name].sensors[-1]
-    sources = [FAULTS[name].put_into(Small(sensor, n_frames=16)) for _ in range(2)]
+    sources = [FAULTS[name].wrap(Small(sensor, n_frames=16)) for _ in range(2)]
     forth, back = ([*_until_error(source)] for source in sources)
     bytes_forth = [_bytes(image) for image in forth]
     bytes_back = [_bytes(image) for image in reversed(back)]
@@ -302,9 +304,9 @@ def test_stamps_are_those_of_the_faulty_clock(frame: int) -> None:
 
 def test_jitter_is_shared_by_a_pair_or_not() -> None:
     def errors_s(fault: Fault, stream: int) -> NDArray[Any]:
-        found = [s for s in FaultySource(Small(n_frames=400), fault).shots()
-                 if s.image.stream == stream]  # fmt: skip
-        return np.array([(s.image.stamp_ns - s.stamp_ns) / 1e9 for s in found])
+        images = FaultySource(Small(n_frames=400), fault).faulty_images()
+        found = [image for image in images if image.given.stream == stream]
+        return np.array([(image.given.stamp_ns - image.stamp_ns) / 1e9 for image in found])
 
     shared, own = StampJitter(sigma_s=0.01), StampJitter(sigma_s=0.01, is_shared=False)
     assert np.std(errors_s(shared, 0)) == pytest.approx(0.01, rel=0.2)

@@ -10,16 +10,16 @@ import pytest
 
 from gvo.io.recording import Sensor
 from gvo.testing.faults import (
-    FAULTS,
     Elsewhere,
     Exchanged,
     FaultySource,
     Frozen,
     Lagging,
-    NamedFault,
     PixelFault,
 )
+from tests.testing.catalogue import FAULTS
 from tests.testing.fault_bench import Outcome, complaints, faulty, run, sound
+from tests.testing.named import NamedFault
 
 # Of six honest errors, 3 in 10,000 are beyond five sigmas; those of 20 poses are dependent.
 _MAX_DEVIATION = 6.0
@@ -186,11 +186,10 @@ def _wrong_poses_are_told(fault: NamedFault, outcome: Outcome, source: FaultySou
 
 def _untouched(source: FaultySource) -> set[int]:
     """Return the frames both images of which show what they should."""
-    plain = FaultySource(source._source)
     touching = [fault for fault in source.faults if isinstance(fault, _OF_IMAGES)]
-    shots = list(plain.shots())
-    touched = {shot.frame for shot in shots for fault in touching if fault.strikes(shot)}
-    return {shot.frame for shot in shots} - touched
+    images = list(FaultySource(source._source).faulty_images())
+    touched = {image.frame for image in images for fault in touching if fault.applies_to(image)}
+    return {image.frame for image in images} - touched
 
 
 # The check looks at the same things for both kinds; that of depth is quicker.

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from gvo.testing import faults
-from gvo.testing.faults import FAULTS, Fault, describe_faults
+from gvo.testing.faults import Fault
+from tests.testing.catalogue import FAULTS
+from tests.testing.named import describe_faults
 from tests.testing.test_faults_runs import N_SKIPPED, N_UNPAIRED, TOLD
 
 PAGE = Path(__file__).parents[2] / "docs/reliability.md"

@@ -1,12 +1,5 @@
 """Bad recordings on purpose: faults that are put into any recording."""
 
-from gvo.testing.faults.calibrations import (
-    CalibrationFault,
-    WrongBaseline,
-    WrongFocalLength,
-    WrongPrincipalPoint,
-)
-from gvo.testing.faults.catalogue import FAULTS
 from gvo.testing.faults.delivery import (
     BrokenOff,
     Dropped,
@@ -17,32 +10,6 @@ from gvo.testing.faults.delivery import (
     Late,
     Repeated,
     Shuffled,
-    Unloadable,
-)
-from gvo.testing.faults.depths import (
-    DepthConstant,
-    DepthFault,
-    DepthHoles,
-    DepthNoisy,
-    DepthQuantized,
-    DepthSaturated,
-    DepthScaled,
-)
-from gvo.testing.faults.fault import Fault, FaultySource, ImageFault, PixelFault, Shot
-from gvo.testing.faults.images import (
-    Banded,
-    Black,
-    Blurred,
-    Covered,
-    Exposed,
-    Flickering,
-    MotionBlurred,
-    Noisy,
-    SaltAndPepper,
-    White,
-)
-from gvo.testing.faults.named import NamedFault, describe_faults
-from gvo.testing.faults.stamps import (
     StampBackwards,
     StampConstant,
     StampFault,
@@ -51,6 +18,37 @@ from gvo.testing.faults.stamps import (
     StampRate,
     StampShift,
     StampUnit,
+    Unloadable,
+)
+from gvo.testing.faults.fault import (
+    CalibrationFault,
+    Fault,
+    FaultyImage,
+    FaultySource,
+    ImageFault,
+    PixelFault,
+    WrongBaseline,
+    WrongFocalLength,
+    WrongPrincipalPoint,
+)
+from gvo.testing.faults.images import (
+    Banded,
+    Black,
+    Blurred,
+    Covered,
+    DepthConstant,
+    DepthFault,
+    DepthHoles,
+    DepthNoisy,
+    DepthQuantized,
+    DepthSaturated,
+    DepthScaled,
+    Exposed,
+    Flickering,
+    MotionBlurred,
+    Noisy,
+    SaltAndPepper,
+    White,
 )
 from gvo.testing.faults.transfer import (
     HalfWritten,
@@ -62,7 +60,6 @@ from gvo.testing.faults.transfer import (
 )
 
 __all__ = [
-    "FAULTS",
     "Banded",
     "Black",
     "Blurred",
@@ -81,6 +78,7 @@ __all__ = [
     "Exchanged",
     "Exposed",
     "Fault",
+    "FaultyImage",
     "FaultySource",
     "Flickering",
     "Frozen",
@@ -89,7 +87,6 @@ __all__ = [
     "Lagging",
     "Late",
     "MotionBlurred",
-    "NamedFault",
     "Noisy",
     "OfType",
     "PixelFault",
@@ -98,7 +95,6 @@ __all__ = [
     "RowsShifted",
     "SaltAndPepper",
     "Shifted",
-    "Shot",
     "Shuffled",
     "StampBackwards",
     "StampConstant",
@@ -114,5 +110,4 @@ __all__ = [
     "WrongBaseline",
     "WrongFocalLength",
     "WrongPrincipalPoint",
-    "describe_faults",
 ]

@@ -1,58 +1,57 @@
-"""Faults of delivery: images lost, repeated, late, out of step, from elsewhere."""
+"""Faults of delivery and stamps: images lost, repeated, late, out of step; wrong clocks."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
-from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.testing.faults.fault import Fault, ImageFault, Shot
+from gvo.io.recording import RecordingInfo, Source
+from gvo.testing.faults.fault import Fault, FaultyImage, ImageFault, Pixels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dropped(Fault):
-    """Images that are missing: lost on the way, or never taken.
+    """Missing images: lost on the way, or never taken.
 
     Without parameters none is left; with `first`, the recording ends early.
     """
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield the images that are not struck."""
-        return (shot for shot in shots if not self.strikes(shot))
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield the images that are not affected."""
+        return (image for image in images if not self.applies_to(image))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repeated(Fault):
     """Images that are delivered twice, with the same stamp."""
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck twice."""
-        for shot in shots:
-            yield shot
-            if self.strikes(shot):
-                yield shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones twice."""
+        for image in images:
+            yield image
+            if self.applies_to(image):
+                yield image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frozen(Fault):
     """A camera that hangs: the last image before, again and again, with new stamps."""
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images; those that are struck show what the last sound one shows."""
-        last: dict[int, StampedImage] = {}
-        for shot in shots:
-            image = shot.image
-            if self.strikes(shot):
-                shown = last.setdefault(image.stream, image)
-                yield replace(shot, image=replace(image, load=shown.load))
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images; affected ones show the last one before that is not."""
+        last: dict[int, FaultyImage] = {}
+        for image in images:
+            stream = image.given.stream
+            if self.applies_to(image):
+                yield image.with_pixels(last.setdefault(stream, image).given.load)
             else:
-                last[image.stream] = image
-                yield shot
+                last[stream] = image
+                yield image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +61,7 @@ class Late(Fault):
     Parameters
     ----------
     by : int
-        So many images of the same stream come before.
+        Number of images of the same stream that come before.
     """
 
     by: int = 1
@@ -73,21 +72,21 @@ class Late(Fault):
         if self.by < 1:
             raise ValueError(f"by must be 1 or more, got {self.by}")
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck later."""
-        waiting: list[Shot] = []
-        for shot in shots:
-            if self.strikes(shot):
-                waiting.append(shot)
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones later."""
+        waiting: list[FaultyImage] = []
+        for image in images:
+            if self.applies_to(image):
+                waiting.append(image)
                 continue
-            yield shot
-            due = [late for late in waiting if self._is_due(late, shot)]
+            yield image
+            due = [late for late in waiting if self._is_due(late, image)]
             waiting = [late for late in waiting if late not in due]
             yield from due
         yield from waiting
 
-    def _is_due(self, late: Shot, shot: Shot) -> bool:
-        return shot.image.stream == late.image.stream and shot.frame >= late.frame + self.by
+    def _is_due(self, late: FaultyImage, image: FaultyImage) -> bool:
+        return image.given.stream == late.given.stream and image.frame >= late.frame + self.by
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,25 +96,26 @@ class Shuffled(Fault):
     Parameters
     ----------
     within : int
-        So many images of each stream, that are struck and follow one another, change places.
+        Number of consecutive affected images of each stream that change places.
     """
 
     within: int = 4
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck in another order."""
-        held: list[Shot] = []
-        for shot in shots:
-            if self.strikes(shot):
-                held.append(shot)
-            if len(held) >= self.within * len(self.streams) or not self.strikes(shot):
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones in another order."""
+        held: list[FaultyImage] = []
+        for image in images:
+            is_affected = self.applies_to(image)
+            if is_affected:
+                held.append(image)
+            if len(held) >= self.within * len(self.streams) or not is_affected:
                 yield from self._mixed(held)
                 held = []
-            if not self.strikes(shot):
-                yield shot
+            if not is_affected:
+                yield image
         yield from self._mixed(held)
 
-    def _mixed(self, held: list[Shot]) -> Iterator[Shot]:
+    def _mixed(self, held: list[FaultyImage]) -> Iterator[FaultyImage]:
         if held:
             order = np.random.default_rng([self.seed, held[0].frame]).permutation(len(held))
             yield from (held[index] for index in order.tolist())
@@ -123,7 +123,7 @@ class Shuffled(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lagging(Fault):
-    """Images that show what was to be seen some frames before; the first ones all the same.
+    """Images that show what was to be seen some frames before; the first ones the first frame.
 
     Parameters
     ----------
@@ -133,37 +133,33 @@ class Lagging(Fault):
 
     by: int = 1
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images; those that are struck show an earlier one."""
-        earlier: dict[int, list[StampedImage]] = {0: [], 1: []}
-        for shot in shots:
-            past = earlier[shot.image.stream]
-            past.append(shot.image)
-            del past[: -self.by - 1]
-            if self.strikes(shot):
-                yield replace(shot, image=replace(shot.image, load=past[0].load))
-            else:
-                yield shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images; affected ones show an earlier one."""
+        earlier: tuple[deque[FaultyImage], ...] = tuple(deque(maxlen=self.by + 1) for _ in range(2))
+        for image in images:
+            past = earlier[image.given.stream]
+            past.append(image)
+            yield image.with_pixels(past[0].given.load) if self.applies_to(image) else image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exchanged(Fault):
     """Left and right exchanged: each stream shows what the other one sees.
 
-    Both images of a frame must be struck, and follow each other.
+    Both images of a frame must be affected, and follow each other.
     """
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck with the pixels of their partners."""
-        held: Shot | None = None
-        for shot in shots:
-            if not self.strikes(shot):
-                yield shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones with the pixels of their partners."""
+        held: FaultyImage | None = None
+        for image in images:
+            if not self.applies_to(image):
+                yield image
             elif held is None:
-                held = shot
+                held = image
             else:
-                yield replace(held, image=replace(held.image, load=shot.image.load))
-                yield replace(shot, image=replace(shot.image, load=held.image.load))
+                yield held.with_pixels(image.given.load)
+                yield image.with_pixels(held.given.load)
                 held = None
         if held is not None:
             yield held
@@ -182,18 +178,13 @@ class Elsewhere(Fault):
 
     other: Source
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck with the pixels of the other recording."""
-        others: tuple[list[StampedImage], list[StampedImage]] = ([], [])
-        for image in self.other.images():
-            others[image.stream].append(image)
-        for shot in shots:
-            images = others[shot.image.stream]
-            if self.strikes(shot) and shot.frame < len(images):
-                load = images[shot.frame].load
-                yield replace(shot, image=replace(shot.image, load=load))
-            else:
-                yield shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones with the pixels of the other recording."""
+        others = [[image for image in self.other.images() if image.stream == n] for n in (0, 1)]
+        for image in images:
+            shown = others[image.given.stream][image.frame : image.frame + 1]
+            is_affected = shown and self.applies_to(image)
+            yield image.with_pixels(shown[0].load) if is_affected else image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,25 +194,25 @@ class BrokenOff(Fault):
     Parameters
     ----------
     error : type of exception
-        Raised in place of the first image that is struck.
+        Raised in place of the first affected image.
     message : str
     """
 
     error: type[Exception] = RecordingError
     message: str = "the file is cut off"
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield the images before the first one that is struck.
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield the images before the first affected one.
 
         Raises
         ------
         Exception
-            The error that was asked for.
+            Of the type and with the message given.
         """
-        for shot in shots:
-            if self.strikes(shot):
+        for image in images:
+            if self.applies_to(image):
                 raise self.error(self.message)
-            yield shot
+            yield image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,9 +229,135 @@ class Unloadable(ImageFault):
     error: type[Exception] = RecordingError
     message: str = "the image is damaged"
 
-    def change_image(self, shot: Shot) -> StampedImage:
+    def change_image(self, image: FaultyImage) -> FaultyImage:
         """Return the image with a `load` that fails."""
-        return replace(shot.image, load=self._fail)
+        return image.with_pixels(self._fail)
 
-    def _fail(self) -> NDArray[Any]:
+    def _fail(self) -> Pixels:
         raise self.error(self.message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampFault(Fault):
+    """A wrong stamp; a subclass overrides `restamp`. The clock of the recording is right."""
+
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones with another stamp."""
+        start_ns: int | None = None
+        for image in images:
+            start_ns = image.stamp_ns if start_ns is None else start_ns
+            is_affected = self.applies_to(image)
+            yield image.with_stamp(self.restamp(image, start_ns)) if is_affected else image
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp of an image in nanoseconds; that of the first one is `start_ns`."""
+        return image.given.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampShift(StampFault):
+    """A clock that is set to another time, or an offset between two clocks.
+
+    Parameters
+    ----------
+    by_s : float
+        Seconds; negative: back.
+    """
+
+    by_s: float = 3600.0
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp, shifted."""
+        return image.given.stamp_ns + round(self.by_s * 1e9)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampConstant(StampFault):
+    """A driver that does not stamp: each image gets the same.
+
+    Parameters
+    ----------
+    stamp_ns : int or None
+        Nanoseconds; None: that of the first image of the recording.
+    """
+
+    stamp_ns: int | None = 0
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp of all."""
+        return start_ns if self.stamp_ns is None else self.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampFromZero(StampFault):
+    """A clock that starts with the recording: the first stamp is 0."""
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the time since the first image."""
+        return image.given.stamp_ns - start_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampBackwards(StampFault):
+    """A clock that runs backwards."""
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp, mirrored at the start."""
+        return 2 * start_ns - image.given.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampRate(StampFault):
+    """A clock that drifts.
+
+    Parameters
+    ----------
+    rate : float
+        Seconds it shows in a second.
+    """
+
+    rate: float = 1.001
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp of the clock that was right at the start."""
+        return start_ns + round(self.rate * (image.given.stamp_ns - start_ns))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampUnit(StampFault):
+    """Stamps in another unit, taken for nanoseconds.
+
+    Parameters
+    ----------
+    unit_ns : int
+        Nanoseconds of the unit: 10^9 for seconds.
+    """
+
+    unit_ns: int = 1_000_000_000
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the number of whole units."""
+        return image.given.stamp_ns // self.unit_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StampJitter(StampFault):
+    """Stamps of the arrival, not of the exposure.
+
+    Parameters
+    ----------
+    sigma_s : float
+        Standard deviation, seconds; errors end at three of them.
+    is_shared : bool
+        Both images of a frame have the same error.
+    """
+
+    sigma_s: float = 0.01
+    is_shared: bool = True
+
+    def restamp(self, image: FaultyImage, start_ns: int) -> int:
+        """Return the stamp with its error."""
+        given = replace(image.given, stream=0) if self.is_shared else image.given
+        error = float(self.rng(replace(image, given=given)).standard_normal())
+        error = math.copysign(min(abs(error), 3.0), error)
+        return image.given.stamp_ns + round(1e9 * self.sigma_s * error)

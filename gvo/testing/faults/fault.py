@@ -1,65 +1,76 @@
-"""What a fault is, and a recording with faults."""
+"""What a fault is, a recording with faults, and faults of the calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.geometry.camera import Calibration
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FloatArray
 
+Pixels: TypeAlias = NDArray[Any]
 Kind: TypeAlias = Literal["image", "depth"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shot:
-    """An image and its place in the recording that it was taken from.
+class FaultyImage:
+    """An image of a faulty recording, and its place in the original one.
 
     Parameters
     ----------
-    image : StampedImage
-        As it is given now.
+    given : StampedImage
+        The image, with the faults so far.
     frame : int
-        Its number in its stream of the sound recording, from 0.
+        Its number in its stream of the original recording, from 0.
     stamp_ns : int
-        Its stamp there, nanoseconds.
+        Its stamp in the original recording, nanoseconds.
     """
 
-    image: StampedImage
+    given: StampedImage
     frame: int
     stamp_ns: int
+
+    def with_pixels(self, load: Callable[[], Pixels]) -> FaultyImage:
+        """Return the image with the same stamp and other pixels."""
+        return replace(self, given=replace(self.given, load=load))
+
+    def with_stamp(self, stamp_ns: int) -> FaultyImage:
+        """Return the image with the same pixels and another stamp in nanoseconds."""
+        return replace(self, given=replace(self.given, stamp_ns=stamp_ns))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """What goes wrong with some images of a recording; this one: nothing.
+    """A fault of some images of a recording; the base class changes nothing.
 
-    A subclass overrides `inject`, and `change_info` where the calibration is wrong. The same
-    fault on the same recording gives the same bytes, in whatever order images are loaded.
+    A subclass overrides `inject`, and `change_info` if the calibration is wrong. The same fault
+    on the same recording gives the same bytes, in whatever order images are loaded.
 
     Parameters
     ----------
     first, end : int, int or None
-        Frames that it may strike: from `first` to before `end`, numbered within each stream;
+        Frames that may be affected: from `first` to before `end`, numbered within each stream;
         None: to the last one.
     every, burst : int
         Of these the first `burst` of each `every`.
     share : float
-        Of these each one with so much probability. Whether a frame is struck is the same for
-        both streams.
+        Probability with which each of these is affected, the same frames in both streams.
     streams : tuple of int
         0: left or colour; 1: right or depth.
     seed : int
-        Of all that is random, not negative.
+        Seed of all that is random, not negative.
 
     Raises
     ------
     ValueError
-        Where a number is out of its range.
+        For a number out of its range.
     """
 
     first: int = 0
@@ -82,34 +93,34 @@ class Fault:
         if not set(self.streams) <= {0, 1}:
             raise ValueError(f"streams must be of 0 and 1, got {self.streams}")
 
-    def strikes(self, shot: Shot) -> bool:
-        """Tell whether an image is among those that the fault is for."""
-        since = shot.frame - self.first
-        if shot.image.stream not in self.streams or since < 0:
+    def applies_to(self, image: FaultyImage) -> bool:
+        """Tell whether an image is affected."""
+        since = image.frame - self.first
+        if image.given.stream not in self.streams or since < 0:
             return False
-        if self.end is not None and shot.frame >= self.end:
+        if self.end is not None and image.frame >= self.end:
             return False
-        return since % self.every < self.burst and self._is_chosen(shot.frame)
+        return since % self.every < self.burst and self._is_chosen(image.frame)
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
         """Yield the images with the fault.
 
         Parameters
         ----------
-        shots : iterator of Shot
+        images : iterator of FaultyImage
             Both streams in the order of the recording.
         info : RecordingInfo
-            Of the recording.
+            Of the original recording.
         """
-        yield from shots
+        yield from images
 
     def change_info(self, info: RecordingInfo) -> RecordingInfo:
-        """Return what the recording says of itself."""
+        """Return the description of the recording, with the fault."""
         return info
 
-    def rng(self, shot: Shot) -> np.random.Generator:
-        """Return a generator that belongs to one image."""
-        return np.random.default_rng([self.seed, shot.frame, shot.image.stream])
+    def rng(self, image: FaultyImage) -> np.random.Generator:
+        """Return the random generator of one image."""
+        return np.random.default_rng([self.seed, image.frame, image.given.stream])
 
     def _is_chosen(self, frame: int) -> bool:
         if self.share >= 1.0:
@@ -121,77 +132,66 @@ class Fault:
 class ImageFault(Fault):
     """A fault of single images; a subclass overrides `change_image`."""
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images, those that are struck changed."""
-        for shot in shots:
-            yield replace(shot, image=self.change_image(shot)) if self.strikes(shot) else shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images, affected ones changed."""
+        for image in images:
+            yield self.change_image(image) if self.applies_to(image) else image
 
-    def change_image(self, shot: Shot) -> StampedImage:
-        """Return an image that is struck, with the fault."""
-        return shot.image
+    def change_image(self, image: FaultyImage) -> FaultyImage:
+        """Return an affected image, with the fault."""
+        return image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PixelFault(Fault):
-    """A fault of pixels, done when an image is loaded; a subclass overrides `spoil`.
+    """A fault of pixels, applied when an image is loaded; a subclass overrides `spoil`.
 
-    Grey and colour images are struck; depth images by the faults that say so.
+    It affects grey and colour images, and depth images if `kinds` holds "depth".
     """
 
-    def inject(self, shots: Iterator[Shot], info: RecordingInfo) -> Iterator[Shot]:
-        """Yield all images; the pixels of those that are struck change as they are loaded."""
-        for shot in shots:
-            kind: Kind = "depth" if info.sensor == "rgbd" and shot.image.stream == 1 else "image"
-            if self.strikes(shot) and kind in self.kinds():
-                yield replace(shot, image=replace(shot.image, load=_Spoilt(self, shot)))
-            else:
-                yield shot
+    def inject(self, images: Iterator[FaultyImage], info: RecordingInfo) -> Iterator[FaultyImage]:
+        """Yield all images; the pixels of affected ones change as they are loaded."""
+        for image in images:
+            kind: Kind = "depth" if info.sensor == "rgbd" and image.given.stream == 1 else "image"
+            is_affected = self.applies_to(image) and kind in self.kinds()
+            yield image.with_pixels(partial(self._load, image)) if is_affected else image
 
     def kinds(self) -> tuple[Kind, ...]:
-        """Return which images can have this fault."""
+        """Return the kinds of images that can have this fault."""
         return ("image",)
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the pixels with the fault.
 
         Parameters
         ----------
         pixels : ndarray
-            As `StampedImage.load` gives them; is not changed.
+            As `StampedImage.load` gives them; not to be changed.
         rng : numpy.random.Generator
             Of this image.
-        shot : Shot
-            Which image it is.
+        image : FaultyImage
+            The image before the fault.
         """
         return pixels
 
-
-@dataclass(frozen=True, slots=True)
-class _Spoilt:
-    """Loads an image and spoils it."""
-
-    fault: PixelFault
-    shot: Shot
-
-    def __call__(self) -> NDArray[Any]:
-        return self.fault.spoil(self.shot.image.load(), self.fault.rng(self.shot), self.shot)
+    def _load(self, image: FaultyImage) -> Pixels:
+        return self.spoil(image.given.load(), self.rng(image), image)
 
 
 class FaultySource:
-    """A recording in which something went wrong; itself a `Source`.
+    """A recording with faults; itself a `Source`.
 
     Parameters
     ----------
     source : Source
-        The sound recording, or one with other faults.
+        The original recording, or one with other faults.
     faults : Fault
-        Done one after the other, each on what those before it left. All number the frames as in
-        `source`.
+        Applied one after the other. All number the frames as in `source`.
 
     Raises
     ------
     ValueError
-        For what is no fault.
+        For an argument that is no fault.
 
     Examples
     --------
@@ -212,31 +212,120 @@ class FaultySource:
 
     @property
     def info(self) -> RecordingInfo:
-        """What is known before the first image, wrong where a fault makes it so."""
+        """What is known before the first image, with the faults of the calibration."""
         info = self._source.info
         for fault in self.faults:
             info = fault.change_info(info)
         return info
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield the images that are left, as they are left."""
-        return (shot.image for shot in self.shots())
+        """Yield the images with the faults."""
+        return (image.given for image in self.faulty_images())
 
-    def shots(self) -> Iterator[Shot]:
-        """Yield the images with their places in the sound recording."""
+    def faulty_images(self) -> Iterator[FaultyImage]:
+        """Yield the images with the faults and with their places in the original recording."""
         info = self._source.info
-        shots = _numbered(self._source)
+        images = _numbered(self._source)
         for fault in self.faults:
-            shots = fault.inject(shots, info)
-        return shots
+            images = fault.inject(images, info)
+        return images
 
     def ground_truth(self) -> Trajectory | None:
-        """Return what the sound recording holds: stamps of the true poses are right."""
+        """Return the true poses of the original recording, with the right stamps."""
         return self._source.ground_truth()
 
 
-def _numbered(source: Source) -> Iterator[Shot]:
+def _numbered(source: Source) -> Iterator[FaultyImage]:
     counts = [0, 0]
     for image in source.images():
-        yield Shot(image=image, frame=counts[image.stream], stamp_ns=image.stamp_ns)
+        yield FaultyImage(given=image, frame=counts[image.stream], stamp_ns=image.stamp_ns)
         counts[image.stream] += 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationFault(Fault):
+    """A wrong calibration; a subclass overrides `miscalibrate`.
+
+    It holds for the whole recording: `first`, `end`, `every` and `share` are not used.
+    """
+
+    def change_info(self, info: RecordingInfo) -> RecordingInfo:
+        """Return the info with wrong calibrations."""
+        calibrations = tuple(
+            self.miscalibrate(calibration) if stream in self.streams else calibration
+            for stream, calibration in enumerate(info.calibrations)
+        )
+        return replace(info, calibrations=calibrations)
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        """Return a wrong calibration in place of the right one."""
+        return calibration
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongBaseline(CalibrationFault):
+    """A baseline in another unit, or of another rig.
+
+    Parameters
+    ----------
+    factor : float
+        Wrong value over right value.
+    """
+
+    factor: float = 2.0
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with P[0, 3] multiplied."""
+        P = calibration.P.copy()
+        P[:, 3] *= self.factor
+        return replace(calibration, P=P)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongFocalLength(CalibrationFault):
+    """The focal length of another lens, or of another image size; the baseline stays right.
+
+    Parameters
+    ----------
+    factor : float
+        Wrong value over right value.
+    """
+
+    factor: float = 1.3
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with fx, fy and fx * baseline multiplied."""
+        scaling = np.diag([self.factor, self.factor, 1.0])
+        return replace(
+            calibration,
+            K=_with_focal(calibration.K, scaling),
+            P=_with_focal(calibration.P, scaling),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrongPrincipalPoint(CalibrationFault):
+    """The principal point of another camera, or of a cropped image.
+
+    Parameters
+    ----------
+    by : tuple of two float
+        (u, v), as shares of width and height.
+    """
+
+    by: tuple[float, float] = (0.1, 0.1)
+
+    def miscalibrate(self, calibration: Calibration) -> Calibration:
+        """Return the calibration with cx and cy shifted."""
+        K, P = calibration.K.copy(), calibration.P.copy()
+        shift = np.array([self.by[0] * calibration.width, self.by[1] * calibration.height])
+        K[:2, 2] += shift
+        P[:2, 2] += shift
+        return replace(calibration, K=K, P=P)
+
+
+def _with_focal(matrix: FloatArray, scaling: FloatArray) -> FloatArray:
+    """Scale all but the principal point."""
+    scaled = scaling @ matrix
+    scaled[:2, 2] = matrix[:2, 2]
+    return np.asarray(scaled, dtype=np.float64)

@@ -1,15 +1,13 @@
-"""Faults of exposure and optics: black, white, blurred, noisy, flickering, covered."""
+"""Faults of light, lens and depth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from gvo.testing.faults.fault import PixelFault, Shot
+from gvo.testing.faults.fault import FaultyImage, Kind, PixelFault, Pixels
 
 _WHITE = 255
 
@@ -18,7 +16,7 @@ _WHITE = 255
 class Black(PixelFault):
     """Black images: a cap on the lens, no light."""
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return zeros."""
         return np.zeros_like(pixels)
 
@@ -35,7 +33,7 @@ class White(PixelFault):
 
     part: float = 1.0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with white columns."""
         spoilt = pixels.copy()
         spoilt[:, : round(self.part * pixels.shape[1])] = _WHITE
@@ -54,7 +52,7 @@ class Blurred(PixelFault):
 
     sigma_px: float = 4.0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, smoothed."""
         return np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.sigma_px))
 
@@ -71,7 +69,7 @@ class MotionBlurred(PixelFault):
 
     length_px: int = 15
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, smeared along its rows."""
         return np.asarray(cv2.blur(pixels, (self.length_px, 1)))
 
@@ -88,7 +86,7 @@ class Noisy(PixelFault):
 
     sigma: float = 40.0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with noise."""
         return _to_uint8(pixels + self.sigma * rng.standard_normal(pixels.shape))
 
@@ -105,7 +103,7 @@ class SaltAndPepper(PixelFault):
 
     density: float = 0.1
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with some pixels at either end of the range."""
         spoilt = pixels.copy()
         chance = rng.random(pixels.shape[:2])
@@ -126,7 +124,7 @@ class Exposed(PixelFault):
 
     factor: float = 2.0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image at another exposure."""
         return _to_uint8(self.factor * pixels.astype(np.float64))
 
@@ -146,9 +144,9 @@ class Flickering(PixelFault):
     amplitude: float = 0.4
     period: float = 3.3
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, brighter or darker by its number."""
-        swing = np.sin(2.0 * np.pi * shot.frame / self.period)
+        swing = np.sin(2.0 * np.pi * image.frame / self.period)
         return _to_uint8((1.0 + self.amplitude * swing) * pixels.astype(np.float64))
 
 
@@ -170,9 +168,9 @@ class Banded(PixelFault):
     period_rows: float = 40.0
     rows_per_frame: float = 7.0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with bright and dark rows."""
-        rows = np.arange(pixels.shape[0]) + self.rows_per_frame * shot.frame
+        rows = np.arange(pixels.shape[0]) + self.rows_per_frame * image.frame
         gain = 1.0 + self.amplitude * np.sin(2.0 * np.pi * rows / self.period_rows)
         gain = gain.reshape(-1, *[1] * (pixels.ndim - 1))
         return _to_uint8(gain * pixels.astype(np.float64))
@@ -193,10 +191,10 @@ class Covered(PixelFault):
     part: float = 0.25
     n_blobs: int = 3
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with mottled grey blobs."""
         height, width = pixels.shape[:2]
-        fixed = np.random.default_rng([self.seed, shot.image.stream])
+        fixed = np.random.default_rng([self.seed, image.given.stream])
         radius = float(np.sqrt(self.part * height * width / (np.pi * self.n_blobs)))
         dirt = fixed.integers(30, 120, (height, width)).astype(np.uint8)
         dirt = np.asarray(cv2.GaussianBlur(dirt, (0, 0), 1.5))
@@ -209,5 +207,127 @@ class Covered(PixelFault):
         return spoilt
 
 
-def _to_uint8(values: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_uint8(values: Pixels) -> Pixels:
     return np.asarray(np.clip(np.rint(values), 0, _WHITE), dtype=np.uint8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthFault(PixelFault):
+    """A fault of depth images; grey and colour images are left as they are."""
+
+    def kinds(self) -> tuple[Kind, ...]:
+        """Return that of depth."""
+        return ("depth",)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthConstant(DepthFault):
+    """Depth that is one value everywhere.
+
+    Parameters
+    ----------
+    depth_m : float
+        Metres; may be NaN, zero, infinite or negative.
+    """
+
+    depth_m: float = float("nan")
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return an image of one value."""
+        return np.full_like(pixels, self.depth_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthScaled(DepthFault):
+    """Depth in another unit.
+
+    Parameters
+    ----------
+    factor : float
+        1000: millimetres taken for metres.
+    """
+
+    factor: float = 1000.0
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return the depth, multiplied."""
+        return (self.factor * pixels).astype(pixels.dtype)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthQuantized(DepthFault):
+    """Depth in coarse steps.
+
+    Parameters
+    ----------
+    step_m : float
+    """
+
+    step_m: float = 0.25
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return the depth, rounded."""
+        return (self.step_m * np.rint(pixels / self.step_m)).astype(pixels.dtype)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthHoles(DepthFault):
+    """Depth that is unknown in most places: sunlight, dark or shiny surfaces.
+
+    Parameters
+    ----------
+    part : float
+        Share of the pixels.
+    size_px : int
+        Of a hole, about.
+    """
+
+    part: float = 0.9
+    size_px: int = 8
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return the depth with holes, elsewhere in each image."""
+        height, width = pixels.shape[:2]
+        cells = rng.random((height // self.size_px + 1, width // self.size_px + 1))
+        is_hole = cells < self.part
+        spread = np.asarray(
+            cv2.resize(is_hole.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        )
+        spoilt = pixels.copy()
+        spoilt[spread > 0] = np.nan
+        return spoilt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthSaturated(DepthFault):
+    """Depth that ends at the sensor's range, where unknown pixels have that value too.
+
+    Parameters
+    ----------
+    depth_m : float
+        The largest depth, metres.
+    """
+
+    depth_m: float = 2.0
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return the depth, nowhere larger nor unknown."""
+        return np.asarray(np.fmin(pixels, self.depth_m), dtype=pixels.dtype)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthNoisy(DepthFault):
+    """Depth with much noise, growing with its square.
+
+    Parameters
+    ----------
+    sigma_m : float
+        At one metre.
+    """
+
+    sigma_m: float = 0.05
+
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
+        """Return the depth with noise."""
+        noise = self.sigma_m * pixels**2 * rng.standard_normal(pixels.shape)
+        return (pixels + noise).astype(pixels.dtype)

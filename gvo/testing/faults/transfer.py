@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from gvo.testing.faults.fault import Kind, PixelFault, Shot
+from gvo.testing.faults.fault import FaultyImage, Kind, PixelFault, Pixels
 
 Turn: TypeAlias = Literal["upside down", "mirrored", "half turn", "transposed"]
 PixelType: TypeAlias = Literal["float64", "float32", "uint16", "int32", "bool", "colour", "flat"]
@@ -39,7 +38,7 @@ class HalfWritten(PixelFault):
     part: float = 0.5
     fill: Literal["grey", "garbage", "former"] = "grey"
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with other pixels below."""
         n_rows = round(self.part * len(pixels))
         spoilt = pixels.copy()
@@ -65,7 +64,7 @@ class RowsShifted(PixelFault):
 
     most_px: int = 40
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image with bands of rows rolled."""
         bands = np.array_split(pixels, 8)
         shifts = rng.integers(-self.most_px, self.most_px + 1, len(bands)).tolist()
@@ -85,7 +84,7 @@ class Turned(_AnyImageFault):
 
     how: Turn = "upside down"
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, turned."""
         views = {
             "upside down": pixels[::-1],
@@ -107,7 +106,7 @@ class Resized(_AnyImageFault):
 
     factor: float = 0.5
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, smaller or larger."""
         size = [max(round(self.factor * length), 1) for length in pixels.shape[1::-1]]
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST))
@@ -125,7 +124,7 @@ class OfType(_AnyImageFault):
 
     pixel_type: PixelType = "float64"
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the same values in another type."""
         if self.pixel_type == "flat":
             return pixels.reshape(-1)
@@ -149,7 +148,7 @@ class Shifted(_AnyImageFault):
     rows: int = 0
     columns: int = 0
 
-    def spoil(self, pixels: NDArray[Any], rng: np.random.Generator, shot: Shot) -> NDArray[Any]:
+    def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
         """Return the image, moved."""
         pad = [(abs(self.rows),) * 2, (abs(self.columns),) * 2, *[(0, 0)] * (pixels.ndim - 2)]
         if pixels.dtype.kind == "f":

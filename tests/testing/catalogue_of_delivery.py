@@ -5,24 +5,23 @@ from __future__ import annotations
 import cv2
 
 from gvo.io.recording import Source
-from gvo.testing.faults.delivery import (
+from gvo.testing.faults import (
+    Black,
     BrokenOff,
     Dropped,
     Elsewhere,
     Exchanged,
+    Fault,
+    FaultySource,
     Frozen,
     Late,
     Repeated,
     Shuffled,
+    StampShift,
+    Turned,
     Unloadable,
 )
-from gvo.testing.faults.fault import Fault, FaultySource
-from gvo.testing.faults.images import Black
-from gvo.testing.faults.named import NamedFault, fixed
-from gvo.testing.faults.stamps import (
-    StampShift,
-)
-from gvo.testing.faults.transfer import Turned
+from tests.testing.named import NamedFault, fixed
 
 
 def _elsewhere(source: Source) -> tuple[Fault, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 from gvo.io.recording import Sensor, Source
-from gvo.testing.faults.fault import Fault, FaultySource, PixelFault
+from gvo.testing.faults import Fault, FaultySource, PixelFault
 
 Group: TypeAlias = Literal[
     "delivery", "stamps", "light and lens", "transfer", "stereo", "depth", "calibration"
@@ -53,7 +53,7 @@ class NamedFault:
     n_frames: int = 20
     is_silent: bool = False
 
-    def put_into(self, source: Source, *, is_lasting: bool = False) -> FaultySource:
+    def wrap(self, source: Source, *, is_lasting: bool = False) -> FaultySource:
         """Return the recording with the fault.
 
         Parameters

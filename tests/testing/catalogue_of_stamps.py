@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from gvo.testing.faults.named import NamedFault, fixed
-from gvo.testing.faults.stamps import (
+from gvo.testing.faults import (
     StampBackwards,
     StampConstant,
     StampFromZero,
@@ -12,6 +11,7 @@ from gvo.testing.faults.stamps import (
     StampShift,
     StampUnit,
 )
+from tests.testing.named import NamedFault, fixed
 
 STAMPS: tuple[NamedFault, ...] = (
     NamedFault(

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from gvo.testing.faults.calibrations import WrongBaseline, WrongFocalLength, WrongPrincipalPoint
-from gvo.testing.faults.delivery import Dropped, Exchanged, Frozen, Lagging
-from gvo.testing.faults.depths import (
+from gvo.testing.faults import (
+    Black,
     DepthConstant,
     DepthHoles,
     DepthNoisy,
     DepthQuantized,
     DepthSaturated,
     DepthScaled,
+    Dropped,
+    Exchanged,
+    Exposed,
+    Frozen,
+    Lagging,
+    OfType,
+    Resized,
+    Shifted,
+    Turned,
+    WrongBaseline,
+    WrongFocalLength,
+    WrongPrincipalPoint,
 )
-from gvo.testing.faults.images import Black, Exposed
-from gvo.testing.faults.named import NamedFault, fixed
-from gvo.testing.faults.transfer import OfType, Resized, Shifted, Turned
+from tests.testing.named import NamedFault, fixed
 
 STEREO: tuple[NamedFault, ...] = (
     NamedFault(

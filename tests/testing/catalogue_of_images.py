@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from gvo.testing.faults.images import (
+from gvo.testing.faults import (
     Banded,
     Black,
     Blurred,
     Covered,
     Exposed,
     Flickering,
+    HalfWritten,
     MotionBlurred,
     Noisy,
+    OfType,
+    Resized,
+    RowsShifted,
     SaltAndPepper,
+    Turned,
     White,
 )
-from gvo.testing.faults.named import NamedFault, fixed
-from gvo.testing.faults.transfer import HalfWritten, OfType, Resized, RowsShifted, Turned
+from tests.testing.named import NamedFault, fixed
 
 LIGHT_AND_LENS: tuple[NamedFault, ...] = (
     NamedFault(
