@@ -105,8 +105,8 @@ def test_a_frame_without_points_sends_no_cloud(
         "colours": np.zeros((0, 3), np.uint8),
     }
     for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
-        view = frame_view_of(index)
-        player.show(view if n_clouds else replace(view, **empty))
+        frame = frame_view_of(index)
+        player.show(frame if n_clouds else replace(frame, **empty))
         page.settle()
         assert len(nodes(view, "/camera/points")) == n_clouds
 
@@ -186,9 +186,7 @@ def test_a_closed_page_lets_go_of_the_player(view: ViewServer, player: FakePlaye
     assert player.callbacks == []
 
 
-def test_the_painter_draws_the_last_moment(
-    page: Page, player: FakePlayer, view: ViewServer
-) -> None:
+def test_the_painter_draws_the_last_frame(page: Page, player: FakePlayer, view: ViewServer) -> None:
     for index in range(25):
         player.show(frame_view_of(index))
     page.settle()
