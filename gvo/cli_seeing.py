@@ -170,8 +170,8 @@ def shuttle(
 ) -> None:
     """Drive a recording there and back: the drift without a ground truth."""
     from gvo.io.excerpt import make_excerpt
-    from gvo.outputs.shuttle_table import format_closings
     from gvo.shuttle import shuttle as run_shuttle
+    from gvo.trajectory.round_trip import format_closings
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)

@@ -14,9 +14,8 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from gvo.bounded_text import MAX_SHOWN, cut, read_text, shortened
+from gvo._text import MAX_CHARACTERS, MAX_SHOWN, YamlError, cut, load_yaml, read_text, shortened
 from gvo.errors import ConfigurationError
-from gvo.yaml_text import MAX_CHARACTERS, YamlError, load_yaml
 
 
 def _parameter(

@@ -1,6 +1,6 @@
 """Errors that mean a wrong world: a file, a topic, a configuration, a calibration."""
 
-from gvo.bounded_text import cut
+from gvo._text import cut
 
 _MAX_MESSAGE = 4000  # characters
 

@@ -15,10 +15,10 @@ from typing import Any
 import dask
 from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, Security
 
+from gvo._text import cut
 from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import Task, TaskOptions
 from gvo.batch.worker import work
-from gvo.bounded_text import cut
 from gvo.errors import ConfigurationError, GvoError
 
 # Handed out at once, at least: a cluster that grows with its work must see some.

@@ -8,10 +8,10 @@ from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from gvo._text import read_text
 from gvo.batch.results import CSV, PARQUET
 from gvo.batch.storage import Place, is_url
 from gvo.batch.tasks import MARK
-from gvo.bounded_text import read_text
 from gvo.errors import RecordingError
 from gvo.io.opening import BAG_SUFFIXES, FOLDER_MARKERS
 from gvo.io.run_folder.writer import REPORT

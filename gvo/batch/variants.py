@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from gvo._text import YamlError, cut, load_yaml
 from gvo.batch.recordings import free_name, safe_name
 from gvo.batch.rows import Value
-from gvo.bounded_text import cut
 from gvo.config import Config, RuntimeConfig, load_configuration
 from gvo.errors import ConfigurationError
-from gvo.yaml_text import YamlError, load_yaml
 
 DEFAULT = "default"
 _MAX_SHOWN = 100

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvo.bounded_text import exists
+from gvo._text import exists
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.bag.reader import STORAGE_SUFFIXES, is_storage

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gvo._text import format_table
 from gvo.geometry import se3
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
 from gvo.trajectory.trajectory import Trajectory
@@ -300,14 +301,7 @@ def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
         Lines ended by line feeds; "-" where there is no value, as for rotations against
         positions alone.
     """
-    rows = [_HEADER, *(_cells(evaluation) for evaluation in evaluations)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        # names to the left, numbers to the right
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])])
-        for row in rows
-    ]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]]) + "\n"
+    return format_table(_HEADER, [_cells(evaluation) for evaluation in evaluations])
 
 
 def evaluations_json(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo.bounded_text import cut, read_text
+from gvo._text import cut, read_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp

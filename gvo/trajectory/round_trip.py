@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from gvo._text import format_table
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
+
+_HEADER = (
+    "",
+    "closing [m]",
+    "[%]",
+    "[deg]",
+    "[deg/100 m]",
+    "chi2",
+    "mean [m]",
+    "median [m]",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,3 +148,37 @@ def _chi2(error: FloatArray, covariances: FloatArray | None) -> float | None:
     except np.linalg.LinAlgError:
         return None
     return chi2 if np.isfinite(chi2) else None
+
+
+def format_closings(closings: Mapping[str, Closing]) -> str:
+    """Return a table with a row for each trajectory.
+
+    Parameters
+    ----------
+    closings : mapping of str to Closing
+        By the names of the trajectories.
+
+    Returns
+    -------
+    str
+        Lines with line ends; a dash where there is no number.
+    """
+    return format_table(_HEADER, [_row(name, closing) for name, closing in closings.items()])
+
+
+def _row(name: str, closing: Closing) -> tuple[str, ...]:
+    numbers = closing.as_json()
+    return (
+        name,
+        f"{closing.closing_m:.4f}",
+        _optional(closing.closing_pct, ".3f"),
+        f"{closing.closing_deg:.4f}",
+        _optional(closing.closing_deg_per_100m, ".3f"),
+        _optional(closing.chi2, ".2f"),
+        f"{numbers['mean_m']:.4f}",
+        f"{numbers['median_m']:.4f}",
+    )
+
+
+def _optional(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

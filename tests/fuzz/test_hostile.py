@@ -16,7 +16,7 @@ from backports import zstd
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
 
-from gvo.bounded_text import cut, read_text
+from gvo._text import MAX_VALUES, cut, read_text
 from gvo.config import load_configuration
 from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
 from gvo.io.bag.image_encodings import decode_rvl
@@ -33,7 +33,6 @@ from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.types import Failure
-from gvo.yaml_text import MAX_VALUES
 from tests.fuzz.bags import TARGETS as BAG_TARGETS
 
 CAMERA = "image_width: 8\nimage_height: 6\ncamera_matrix: [8, 0, 4, 0, 8, 3, 0, 0, 1]\n"

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from typing import Literal, TypeAlias
 
+from gvo._text import format_table
 from gvo.config import CheckConfig
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
@@ -249,16 +250,14 @@ def format_check(result: CheckResult) -> str:
     """
     head = [finding.value_text for finding in takewhile(_is_told, result.findings)]
     findings = list(_merged(result.findings[len(head) :]))
-    rows = [_HEADER, *map(_row, findings)]
+    rows = [_row(finding) for finding in findings]
     # What is only told, however long, does not push the verdicts aside.
-    judged = [_HEADER, *(_row(finding) for finding in findings if not _is_told(finding))]
-    widths = [max(len(row[column]) for row in judged) for column in range(len(_HEADER))]
-    widths[0] = max(len(row[0]) for row in rows)
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+    measured = [
+        (row[0], "", "", "", "") if _is_told(finding) else row
+        for row, finding in zip(rows, findings, strict=True)
     ]
-    return "\n".join([*head, *lines, _sum_up(result)]) + "\n"
+    table = format_table(_HEADER, rows, is_text=True, measured=measured)
+    return "".join([*(f"{line}\n" for line in head), table, f"{_sum_up(result)}\n"])
 
 
 def _is_told(finding: Finding) -> bool:

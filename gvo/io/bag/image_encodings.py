@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo.bounded_text import shortened
+from gvo._text import shortened
 from gvo.errors import RecordingError
 from gvo.io.images import check_size
 from gvo.types import IntArray

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gvo.bounded_text import cut
+from gvo._text import cut
 from gvo.geometry import se3
 from gvo.io.bag.image_encodings import (
     BAYER,

@@ -15,13 +15,12 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from gvo.bounded_text import read_text
+from gvo._text import YamlError, load_yaml, read_text
 from gvo.errors import RecordingError
 from gvo.io.bag.file import FAULTS, BagFile
 from gvo.io.bag.recovery.inflate import inflate_file
 from gvo.io.bag.recovery.scan import FoundMessage
 from gvo.io.bag.topics import Topic
-from gvo.yaml_text import YamlError, load_yaml
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _COMPRESSED = ".zstd"

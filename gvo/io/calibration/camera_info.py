@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gvo.bounded_text import MAX_SHOWN, cut, shortened
+from gvo._text import MAX_SHOWN, cut, shortened
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration

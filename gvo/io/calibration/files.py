@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import yaml
 
-from gvo.bounded_text import read_text, shortened
+from gvo._text import MAX_CHARACTERS, YamlError, load_yaml, read_text, shortened
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -26,7 +26,6 @@ from gvo.io.calibration.camera_info import (
 from gvo.io.calibration.stereo_pair import pair_of_extrinsics, stereo_baseline
 from gvo.io.recording import Sensor
 from gvo.types import FloatArray
-from gvo.yaml_text import MAX_CHARACTERS, YamlError, load_yaml
 
 _OPENCV_HEADER = "%YAML:"
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"

@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gvo.bounded_text import cut, read_text
+from gvo._text import cut, read_text
 from gvo.errors import RecordingError
 from gvo.io.images import FULL_RANGE, GreyRange, read_image
 from gvo.io.recording import RecordingInfo, StampedImage

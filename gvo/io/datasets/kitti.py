@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo.bounded_text import cut
+from gvo._text import cut
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration

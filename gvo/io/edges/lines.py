@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo.bounded_text import shortened
+from gvo._text import shortened
 from gvo.geometry import se3
 from gvo.io.edges.pose_streams import StepSigma
 from gvo.trajectory.formats import (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo.bounded_text import exists
+from gvo._text import exists
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.io.bag.poses import open_streams
 from gvo.io.edges.events import EdgeSource

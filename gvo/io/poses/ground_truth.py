@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from gvo.bounded_text import exists
+from gvo._text import exists
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.bag.poses import POSE_TYPES, POSITION_TYPES, TopicStream, find_topics, read_positions
 from gvo.io.bag.reader import BagReader

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo.bounded_text import exists
+from gvo._text import exists
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.bag.reader import BagReader
 from gvo.io.bag.source import BagSource

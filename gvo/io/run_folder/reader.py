@@ -12,7 +12,7 @@ from typing import Any, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gvo.bounded_text import read_text
+from gvo._text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import TRAJECTORIES, TRUE_POSITIONS, TRUTH

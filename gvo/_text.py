@@ -1,4 +1,4 @@
-"""YAML of configurations, calibrations and metadata, read within bounds.
+"""Text: files and YAML read within bounds, values shortened for messages, tables aligned.
 
 A few lines of YAML can stand for gigabytes: aliases of aliases, merged keys, numbers of a million
 digits. What is read here is bounded before any value is made of it.
@@ -6,9 +6,18 @@ digits. What is read here is bounded before any value is made of it.
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, cast
 
 import yaml
+
+MAX_TEXT_BYTES = 1 << 28
+"""Of a table: poses of a day at 30 a second."""
+
+MAX_SHOWN = 80
+"""Characters of a value in a message."""
 
 MAX_CHARACTERS = 1 << 18
 """Of a text; a configuration with all its comments has a thirtieth."""
@@ -28,6 +37,109 @@ _VALUE_FAULTS = (
     TypeError,
     ValueError,
 )
+
+
+def shortened(value: object) -> str:
+    """Return a value of a file on one line of a message, cut where it is long."""
+    return cut(repr(value), MAX_SHOWN)
+
+
+def cut(text: str, n_characters: int) -> str:
+    r"""Return a text on one line, cut where it is longer, as it can be written everywhere.
+
+    What is no character to be seen is escaped: a topic's name shall not steer a terminal.
+
+    Examples
+    --------
+    >>> cut("a\nb", 20)
+    'a\\nb'
+    """
+    start = text[: n_characters + 1]
+    if not start.isprintable():
+        start = "".join(
+            character if character.isprintable() else repr(character)[1:-1] for character in start
+        )
+    return start if len(start) <= n_characters else f"{start[:n_characters]}..."
+
+
+def exists(path: Path) -> bool:
+    """Tell whether there is such a file or folder that can be looked at; a name can be none."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
+    """Read a text file that is not larger than it may be.
+
+    Parameters
+    ----------
+    path : Path
+        File; also a pipe, or a device that never ends.
+    max_bytes : int
+        More are not read.
+    encoding : str
+        "utf-8", or "utf-8-sig" where a mark at the start is to be left out.
+
+    Returns
+    -------
+    str
+        With the line ends as Python reads them.
+
+    Raises
+    ------
+    OSError
+        When it cannot be read, or holds more; `strerror` says so.
+    UnicodeDecodeError
+        When it is no text.
+    """
+    with path.open("rb") as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise OSError(errno.EFBIG, f"it holds more than {max_bytes} bytes")
+    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def format_table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    is_text: bool = False,
+    measured: Sequence[Sequence[str]] | None = None,
+) -> str:
+    """Return lines, each with its line end, whose columns are aligned by blanks.
+
+    Parameters
+    ----------
+    header : sequence of str
+        Of k columns.
+    rows : sequence of sequences of str
+        Of k cells each.
+    is_text : bool
+        All columns to the left; else names to the left, numbers to the right, below a rule.
+    measured : sequence of sequences of str, optional
+        Rows that the widths of the columns follow; all of them where omitted.
+
+    Examples
+    --------
+    >>> print(format_table(("name", "m"), [("raw", "1.25"), ("smoothed", "0.5")]), end="")
+    name         m
+    --------------
+    raw       1.25
+    smoothed   0.5
+    """
+    table = [header, *rows]
+    by = table if measured is None else [header, *measured]
+    widths = [max(map(len, column)) for column in zip(*by, strict=True)]
+    justify = str.ljust if is_text else str.rjust
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *map(justify, row[1:], widths[1:])]).rstrip()
+        for row in table
+    ]
+    if not is_text:
+        lines.insert(1, "-" * (sum(widths) + 2 * (len(widths) - 1)))
+    return "\n".join(lines) + "\n"
 
 
 class YamlError(Exception):
