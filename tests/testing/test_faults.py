@@ -63,7 +63,7 @@ from gvo.testing.faults import (
     WrongFocalLength,
     WrongPrincipalPoint,
 )
-from tests.testing.catalogue import FAULTS
+from tests.testing.catalogue import FAULTS, parameters
 
 _N = 8
 _START_NS, _PERIOD_NS = 5_000_000_000, 100_000_000
@@ -170,7 +170,7 @@ def test_one_stream_alone_can_be_struck() -> None:
     assert load(source, 3).any()
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", [parameters(name, fault=FAULTS[name]) for name in FAULTS])
 def test_the_same_seed_gives_the_same_bytes_in_any_order(name: str) -> None:
     sensor = FAULTS[name].sensors[-1]
     sources = [FAULTS[name].wrap(Small(sensor, n_frames=16)) for _ in range(2)]

@@ -17,7 +17,7 @@ from gvo.testing.faults import (
     Lagging,
     PixelFault,
 )
-from tests.testing.catalogue import FAULTS
+from tests.testing.catalogue import FAULTS, parameters
 from tests.testing.fault_bench import Outcome, complaints, faulty, run, sound
 from tests.testing.named import NamedFault
 
@@ -116,7 +116,10 @@ def _rows() -> list[Any]:
     """Return all faults with a sensor each: where both can have it, they take turns."""
     faults = enumerate(FAULTS.values())
     pairs = [(fault, fault.sensors[index % len(fault.sensors)]) for index, fault in faults]
-    return [pytest.param(*pair, id=f"{pair[0].name}-{pair[1]}") for pair in pairs]
+    return [
+        parameters(fault, sensor, fault=fault, id_=f"{fault.name}-{sensor}")
+        for fault, sensor in pairs
+    ]
 
 
 @pytest.mark.parametrize(("fault", "sensor"), _rows())
@@ -193,7 +196,7 @@ def _untouched(source: FaultySource) -> set[int]:
 
 
 # The check looks at the same things for both kinds; that of depth is quicker.
-@pytest.mark.parametrize("fault", FAULTS.values(), ids=list(FAULTS))
+@pytest.mark.parametrize("fault", [parameters(fault, fault=fault) for fault in FAULTS.values()])
 def test_a_check_of_a_bad_recording_finds_what_the_table_says(fault: NamedFault) -> None:
     found = complaints(faulty(fault, fault.sensors[-1], is_lasting=True))
     if fault.found_by:

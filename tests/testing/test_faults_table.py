@@ -6,7 +6,7 @@ import pytest
 
 from gvo.testing import faults
 from gvo.testing.faults import Fault
-from tests.testing.catalogue import FAULTS
+from tests.testing.catalogue import FAULTS, parameters
 from tests.testing.named import describe_faults
 from tests.testing.test_faults_runs import N_SKIPPED, N_UNPAIRED, TOLD
 
@@ -18,6 +18,11 @@ GROUPS = list(dict.fromkeys(fault.group for fault in FAULTS.values()))
 def test_the_page_shows_all_faults_of_a_group(group: str) -> None:
     table = describe_faults(fault for fault in FAULTS.values() if fault.group == group)
     assert f"\n{table}\n" in PAGE.read_text()
+
+
+def test_the_short_run_takes_one_fault_of_each_group() -> None:
+    chosen = [fault.group for fault in FAULTS.values() if not parameters(fault=fault).marks]
+    assert chosen == GROUPS
 
 
 def test_the_page_counts_the_faults() -> None:
