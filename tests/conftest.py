@@ -9,9 +9,6 @@ import pytest
 from hypothesis import settings
 
 import gvo
-from gvo.cli import main
-from gvo.io.synthetic.recording import SyntheticRecording
-from tests.rendered_walk import Walk
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the
 # same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=explore draws others.
@@ -47,6 +44,8 @@ def gvo_data() -> Path:
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Return a function that runs the `gvo` command with its arguments."""
 
+    from gvo.cli import main
+
     def run(*arguments: object) -> Answer:
         monkeypatch.setattr("sys.argv", ["gvo", *map(str, arguments)])
         with pytest.raises(SystemExit) as exit_info:
@@ -61,6 +60,8 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 @pytest.fixture(scope="session")
 def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short rendered drive, a stereo camera at half size."""
+    from gvo.io.synthetic.recording import SyntheticRecording
+
     path = tmp_path_factory.mktemp("bags") / "drive.mcap"
     gvo.convert(SyntheticRecording("driving", "stereo", n_frames=20, scale=0.5), path)
     return path
@@ -69,6 +70,8 @@ def drive_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of a short walk in a rendered room, an RGB-D camera at half size."""
+    from gvo.io.synthetic.recording import SyntheticRecording
+
     path = tmp_path_factory.mktemp("bags") / "room.bag"
     gvo.convert(SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5), path)
     return path
@@ -77,6 +80,8 @@ def room_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def walk_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag of `tests.rendered_walk`: nothing of the robot, no truth."""
+    from tests.rendered_walk import Walk
+
     path = tmp_path_factory.mktemp("walk") / "walk.mcap"
     gvo.convert(Walk(), path)
     return path
