@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from gvo._text import read_text
 from gvo.batch.rows import BatchRow, RunStatus, Value, figures_of
 from gvo.batch.storage import fetch, fetch_file, is_url, store
-from gvo.bounded_text import read_text
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
 from gvo.io.excerpt import Excerpt
