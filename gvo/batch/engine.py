@@ -1,4 +1,4 @@
-"""Tasks on a cluster of Dask: handed out, watched, tried again."""
+"""Tasks on a Dask cluster: submitted, followed, tried again where a worker died."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ from gvo.batch.tasks import Task, TaskOptions
 from gvo.batch.worker import work
 from gvo.errors import ConfigurationError, GvoError
 
-# Handed out at once, at least: a cluster that grows with its work must see some.
+# An adaptive cluster grows with the tasks that it sees.
 _MIN_IN_FLIGHT = 100
 _PER_THREAD = 2
 _TICK_S = 0.2
 _MAX_REASON = 500
 _CONNECT_S = "30s"
-# What a worker did in each hundredth of a second is kept for an hour: megabytes for each run.
-_WORKERS_HERE = {"distributed.worker.profile.enabled": False}
-# How often the workers are counted.
-_COUNT_S = 2.0
-_GONE = "the scheduler is gone; the same command goes on where the batch was"
+# The statistical profiler keeps an hour of samples: megabytes for each run.
+_LOCAL_WORKERS = {"distributed.worker.profile.enabled": False}
+_COUNT_EVERY_S = 2.0
+_LOST = "the scheduler is gone; the same command goes on where the batch was"
 
 
 class ClusterError(GvoError):
-    """The scheduler cannot be reached, or not any more."""
+    """The scheduler cannot be reached, or was lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,16 +46,16 @@ class BatchProgress:
     n_done, n_total : int
         Runs.
     n_found : int
-        Of those done, the ones that an earlier batch had finished.
+        Of those done, finished by an earlier batch.
     n_failed : int
-        Of those done, the ones without a trajectory.
+        Of those done, without a trajectory.
     n_workers : int
     frames_per_s : float
-        Of all workers together, since the start.
+        Of all workers, since the start.
     left_s : float or None
-        Time that is left; None before anything is known.
+        Estimate of the time left; None before the first frame.
     row : BatchRow or None
-        What has just ended.
+        Of the run that has just ended.
     """
 
     n_done: int
@@ -71,33 +70,33 @@ class BatchProgress:
 
 @contextmanager
 def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
-    """Connect to a scheduler, or start workers on this machine: one thread each.
+    """Connect to a scheduler, or start workers of one thread each on this machine.
 
     Parameters
     ----------
     scheduler : str or None
         Its address, such as tcp://host:8786.
     n_workers : int or None
-        How many to start; as many as there are cores where omitted.
+        Workers to start; one a core where omitted.
 
     Raises
     ------
     ClusterError
-        When nobody answers there.
+        When no scheduler answers.
     ConfigurationError
-        When a package is missing that workers here need.
+        When a package is missing that local workers need.
     """
     if scheduler is None:
         with (
-            dask.config.set(_WORKERS_HERE),
+            dask.config.set(_LOCAL_WORKERS),
             LocalCluster(
                 n_workers=n_workers,
                 threads_per_worker=1,
-                # Whoever has none is given port 8787, which another batch may have.
+                # By default it takes port 8787, which another batch may have.
                 scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                 silence_logs=logging.CRITICAL,
                 preload="gvo.batch.worker",
-                # Else whoever has a login here could have the workers run what he likes.
+                # Without keys any user of this machine could run code on the workers.
                 security=_make_security(),
             ) as cluster,
             Client(cluster) as client,
@@ -108,12 +107,12 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
         client = Client(scheduler, timeout=_CONNECT_S)
     except (OSError, ValueError) as error:
         raise ClusterError(f"{scheduler}: no scheduler of Dask answers: {error}") from error
-    with _quiet(), client:
+    with _silenced_client(), client:
         yield client
 
 
 def _make_security() -> Security:
-    """Return keys for this batch alone."""
+    """Return keys and a certificate for this batch alone."""
     try:
         security: Security = Security.temporary()
     except ImportError as error:
@@ -122,8 +121,8 @@ def _make_security() -> Security:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep back what a client logs of a scheduler that it lost: it is said in a line."""
+def _silenced_client() -> Iterator[None]:
+    """Silence what a client logs when it loses its scheduler: `ClusterError` says it."""
     logger = logging.getLogger("distributed.client")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -134,10 +133,11 @@ def _quiet() -> Iterator[None]:
 
 
 class Engine:
-    """Hands tasks to a cluster and takes what comes back.
+    """Submits tasks to a cluster and yields their rows.
 
-    A task whose worker dies is tried elsewhere by Dask, some times. Its neighbours are suspected
-    with it, so whoever is given up is tried once more in the end, alone: then it was its fault.
+    Dask runs a task whose worker dies on another worker, up to `allowed-failures` times. Tasks that
+    wait on the same worker are counted with it, so those given up run once more at the end, one by
+    one: who kills its worker then is to blame.
 
     Parameters
     ----------
@@ -157,10 +157,10 @@ class Engine:
         self._options = options
         self._on_progress = on_progress
         self._id = f"gvo-batch-{uuid.uuid4().hex[:12]}"
-        self._ended: SimpleQueue[Future[BatchRow]] = SimpleQueue()
+        self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
         self._running: dict[Any, tuple[int, Task, Future[BatchRow]]] = {}
         self._frames: dict[int, tuple[int, int]] = {}
-        self._tally = _Tally()
+        self._counts = _Counts()
         self._counted_s: float | None = None
         self._n_threads = 0
         self._n_workers = 0
@@ -173,8 +173,8 @@ class Engine:
         ClusterError
             When the scheduler is lost.
         """
-        self._tally = _Tally(n_total=len(tasks), start_s=time.monotonic())
-        self._client.subscribe_topic(self._id, self._hear)
+        self._counts = _Counts(n_total=len(tasks), start_s=time.monotonic())
+        self._client.subscribe_topic(self._id, self._on_frames)
         suspects: list[Task] = []
         try:
             yield from self._run(deque(enumerate(tasks)), suspects)
@@ -189,74 +189,74 @@ class Engine:
     ) -> Iterator[BatchRow]:
         while waiting or self._running:
             self._count_workers()
-            many = max(_MIN_IN_FLIGHT, _PER_THREAD * self._n_threads)
-            while waiting and len(self._running) < (1 if suspects is None else many):
+            max_running = max(_MIN_IN_FLIGHT, _PER_THREAD * self._n_threads)
+            while waiting and len(self._running) < (1 if suspects is None else max_running):
                 self._submit(*waiting.popleft())
             row = self._next(suspects)
             if row is not None:
-                self._tally.add(row)
+                self._counts.add(row)
                 yield row
             if self._on_progress is not None:
                 self._on_progress(self._progress(row))
 
     def _next(self, suspects: list[Task] | None) -> BatchRow | None:
-        """Return the row of a task that has ended, where one does within a moment."""
+        """Wait a moment for a task to end; return its row."""
         try:
-            future = self._ended.get(timeout=_TICK_S)
+            future = self._done.get(timeout=_TICK_S)
         except Empty:
             return None
         number, task, _ = self._running.pop(future.key)
         self._frames.pop(number, None)
-        return self._take(task, future, suspects)
+        return self._result(task, future, suspects)
 
     def _count_workers(self) -> None:
         now = time.monotonic()
-        if self._counted_s is not None and now - self._counted_s < _COUNT_S:
+        if self._counted_s is not None and now - self._counted_s < _COUNT_EVERY_S:
             return
         self._counted_s = now
         try:
             threads = self._client.nthreads()
         except OSError as error:
-            raise ClusterError(_GONE) from error
+            raise ClusterError(_LOST) from error
         self._n_workers, self._n_threads = len(threads), sum(threads.values())
 
     def _submit(self, number: int, task: Task) -> None:
-        # By such a key the scheduler sees that they belong together, and keeps back what no
-        # worker has a thread for.
+        # Tasks whose keys share a prefix are one group, which the scheduler queues until a worker
+        # has a free thread.
         key = (self._id, number)
         future = self._client.submit(work, task, self._options, self._id, key, key=key, pure=False)
         self._running[key] = number, task, future
-        future.add_done_callback(self._ended.put)
+        future.add_done_callback(self._done.put)
 
-    def _take(
+    def _result(
         self, task: Task, future: Future[BatchRow], suspects: list[Task] | None
     ) -> BatchRow | None:
         try:
             return future.result()
         except CancelledError as error:
-            raise ClusterError(_GONE) from error
+            raise ClusterError(_LOST) from error
         except KilledWorker as error:
             if suspects is not None:
                 suspects.append(task)
                 return None
             return task.row("failed", f"its worker died, each time: killed for memory? ({error})")
-        except Exception as error:  # noqa: BLE001 - nothing in one run may take the others with it
+        except Exception as error:  # noqa: BLE001 - one run must not end the batch
             text = cut(f"{type(error).__name__}: {error}".partition("\n")[0], _MAX_REASON)
             return task.row("failed", text)
         finally:
             future.release()
 
-    async def _hear(self, event: tuple[float, tuple[int, int, int]]) -> None:
+    async def _on_frames(self, event: tuple[float, tuple[int, int, int]]) -> None:
         number, n_done, n_total = event[1]
         self._frames[number] = n_done, n_total
 
     def _progress(self, row: BatchRow | None) -> BatchProgress:
         running = [self._frames[n] for n, _, _ in self._running.values() if n in self._frames]
-        return self._tally.progress(running, self._n_workers, row)
+        return self._counts.progress(running, self._n_workers, row)
 
 
 @dataclass(slots=True, kw_only=True)
-class _Tally:
+class _Counts:
     """Counts of a batch."""
 
     n_total: int = 0
@@ -278,7 +278,7 @@ class _Tally:
         elapsed_s = max(time.monotonic() - self.start_s, 1e-9)
         n_frames = self.n_frames + sum(n_done for n_done, _ in running)
         shares = sum(min(n_done / max(n_total, 1), 1.0) for n_done, n_total in running)
-        # What was found took no time, and tells nothing of what is left.
+        # Runs found finished took no time.
         worked = self.n_done - self.n_found + shares
         left = self.n_total - self.n_done - shares
         return BatchProgress(

@@ -1,4 +1,4 @@
-"""Which recordings a batch is asked for: paths, patterns, folders, lists, URLs."""
+"""The recordings of a batch: paths, patterns, folders, lists and URLs expanded, and named."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
 _MAX_NAME = 150
 _LIST_SUFFIX = ".txt"
 _PATTERN = re.compile(r"[*?\[]")
-# Folders within folders that are looked through: a link to a folder above must have an end.
+# Depth of the search: a link to a parent folder must end somewhere.
 _MAX_DEPTH = 12
 _COMPRESSED = ".zstd"
 _COMMENT = re.compile(r"(^|\s)#.*")
-# Names of the batch's own files, as they are written and as they stay.
+# The batch's own files, also while they are written.
 _TAKEN = {f"{name}{end}" for name in (CSV, PARQUET, REPORT, MARK) for end in ("", ".new")}
 
 
@@ -35,7 +35,7 @@ class NamedRecording:
     Parameters
     ----------
     name : str
-        Unlike those of all others, fit for a folder.
+        Unique, and valid as the name of a folder.
     location : str
         Absolute path, or URL.
     """
@@ -45,22 +45,22 @@ class NamedRecording:
 
 
 def find_recordings(asked: Sequence[str | Path]) -> list[NamedRecording]:
-    """Find the recordings that are asked for, each once, in the order asked.
+    """Find recordings, each once, in the order asked for.
 
     Parameters
     ----------
     asked : sequence of str or Path
         Each a recording, as a path or a URL that fsspec knows; a pattern (`*`, `?`, `[`, `**`);
-        a folder, which is searched where it is no recording itself; or a `.txt` file with any of
-        these, one a line, relative to its folder, `#` before a comment (after a blank, within a
-        line). A path that does not exist is taken for a recording that only the workers see.
+        a folder, which is searched unless it is a recording itself; or a `.txt` file with one of
+        these a line, relative to its folder, `#` before a comment (after a blank, within a line).
+        A path that does not exist is taken for a recording that only the workers see.
 
     Raises
     ------
     RecordingError
-        Where one of them leads to no recording at all.
+        If one of them leads to no recording.
     ValueError
-        Where nothing is asked for.
+        If nothing is asked for.
     """
     if not asked:
         raise ValueError("expected at least one recording")
@@ -103,7 +103,7 @@ def _search(text: str) -> Iterator[str]:
         return
     taken: set[str] = set()
     for match in place.matches():
-        # The files of a recording that is a folder are no recordings of their own.
+        # The files inside a recording that is a folder are not recordings.
         is_inside = not taken.isdisjoint(map(str, PurePosixPath(match.path).parents))
         if not is_inside and (match.is_folder() or _is_bag(match.name)):
             found = list(_search_below(match))
@@ -112,7 +112,7 @@ def _search(text: str) -> Iterator[str]:
 
 
 def _search_below(place: Place, depth: int = 0) -> Iterator[Place]:
-    """Yield a place where it is a recording, else those in the folder."""
+    """Yield a place that is a recording, else the recordings in the folder."""
     if not place.is_folder():
         yield place
         return
@@ -131,7 +131,7 @@ def _is_bag(name: str) -> bool:
 
 
 def _name(locations: Sequence[str]) -> dict[str, str]:
-    """Return each one's name: as much of the end of its path as tells it from others."""
+    """Name each by the shortest end of its path that is unique."""
     ends = {each: list(_ends(each)) for each in locations}
     names = {each: safe_name(ends[each][0]) for each in locations}
     for length in range(1, max(map(len, ends.values()))):
@@ -143,8 +143,8 @@ def _name(locations: Sequence[str]) -> dict[str, str]:
 
 
 def _ends(location: str) -> Iterator[str]:
-    """Yield ends of a path, each longer than the one before."""
-    # What follows in a URL is the archive that the path lies in.
+    """Yield ends of a path, from short to long."""
+    # In a URL the archive that holds the path follows.
     path = location.partition("::")[0] if is_url(location) else location
     *parents, last = [part for part in PurePosixPath(path).parts if part != "/"] or ["root"]
     plain = last.removesuffix(_COMPRESSED)
@@ -155,7 +155,7 @@ def _ends(location: str) -> Iterator[str]:
 
 
 def _number(names: dict[str, str]) -> dict[str, str]:
-    """Tell apart what still has one name, or one of the batch's own files."""
+    """Add numbers to equal names, and to those of the batch's own files."""
     taken = set(_TAKEN)
     numbered = {}
     for each, name in names.items():
@@ -165,7 +165,7 @@ def _number(names: dict[str, str]) -> dict[str, str]:
 
 
 def safe_name(text: str) -> str:
-    """Return a text as the name of a folder.
+    """Return a text as a valid name of a folder.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def safe_name(text: str) -> str:
 
 
 def free_name(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: with a number where it is.
+    """Return a name, numbered if it is taken.
 
     Examples
     --------

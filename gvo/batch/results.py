@@ -1,4 +1,4 @@
-"""The table of a batch: rows, as a DataFrame and in files."""
+"""The table of a batch, as a DataFrame and as files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import get_type_hints
 
 import pandas as pd
 import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
@@ -19,53 +20,34 @@ PARQUET = "results.parquet"
 # Of 64 bits.
 _MAX_INT = 1 << 63
 _FIRST = ("recording", "variant", "status", "reason")
-_COUNTS = ("frames", "tracked", "segments")
-_NUMBERS = (
-    "coverage_percent",
-    "ate_raw_m",
-    "ate_causal_m",
-    "ate_smoothed_m",
-    "rpe_smoothed_m",
-    "rpe_smoothed_deg",
-    "t_smoothed_percent",
-    "r_smoothed_deg_per_100m",
-    "frame_ms",
-    "run_s",
-)
+_DTYPES: dict[object, str] = {int | None: "Int64", float | None: "float64"}
 
 
 def to_frame(rows: Sequence[BatchRow]) -> pd.DataFrame:
     """Return rows as a table.
 
-    Parameters
-    ----------
-    rows : sequence of BatchRow
-
-    Returns
-    -------
-    DataFrame
-        A row each. First name, configuration, status and reason, then the parameters in which
-        configurations differ, by `section.key`, then the rest. Whole numbers are `Int64`; what
-        has no answer is missing.
+    Recording, configuration, status and reason come first, then the parameters in which
+    configurations differ, by `section.key`, then the rest. Integers are `Int64`, None is missing.
     """
     keys = list(dict.fromkeys(key for row in rows for key in row.parameters))
     records = [asdict(row) for row in rows]
     names = [name for name in BatchRow.__slots__ if name not in (*_FIRST, "parameters")]
     columns = {name: [_text(record[name]) for record in records] for name in (*_FIRST, *names)}
     frame = pd.DataFrame(columns, columns=[*_FIRST, *names])
-    frame = frame.astype(dict.fromkeys(_COUNTS, "Int64") | dict.fromkeys(_NUMBERS, "float64"))
+    hints = get_type_hints(BatchRow)
+    frame = frame.astype({name: _DTYPES[hints[name]] for name in names if hints[name] in _DTYPES})
     for place, key in enumerate(keys, start=len(_FIRST)):
         frame.insert(place, key, _column([row.parameters.get(key) for row in rows]))
     return frame
 
 
 def write_results(frame: pd.DataFrame, folder: Path) -> None:
-    """Write a table as `results.csv` and `results.parquet`, each as a whole.
+    """Write `results.csv` and `results.parquet`, each replaced at once.
 
     Raises
     ------
     OutputError
-        When one cannot be written; the one before stands.
+        If one cannot be written; the earlier file stays.
     """
     contents = {
         CSV: frame.to_csv(index=False, lineterminator="\n").encode(),
@@ -79,12 +61,12 @@ def write_results(frame: pd.DataFrame, folder: Path) -> None:
 
 
 def _text(value: Value) -> Value:
-    """Return a text that can be written: names of files may hold what is no character."""
+    """Escape what cannot be encoded: names of files may hold lone surrogates."""
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _column(values: Sequence[Value]) -> pd.Series:
-    """Return the values of a parameter; of more than one kind, as texts."""
+    """Return the values of a parameter; mixed types as JSON texts."""
     kinds = {type(value) for value in values if value is not None}
     is_small = all(abs(value) < _MAX_INT for value in values if type(value) is int)
     if kinds == {int} and is_small:

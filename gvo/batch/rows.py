@@ -1,4 +1,4 @@
-"""What a batch tells of each of its runs: one row of its table."""
+"""A run of a batch: one row of its table."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-# As YAML gives it.
+# A value of a parameter, as YAML gives it.
 Value: TypeAlias = float | int | bool | str | None
 RunStatus: TypeAlias = Literal["complete", "partly", "failed"]
 STAGES = ("extract", "register", "links", "window")
@@ -16,18 +16,18 @@ STAGES = ("extract", "register", "links", "window")
 class BatchRow:
     """One recording, run with one configuration.
 
-    What a run has no answer to is None: errors without ground truth, all figures of a failed run.
+    Missing values are None: errors without ground truth, all measures of a failed run.
 
     Parameters
     ----------
     recording : str
-        Its name, unlike all others of the batch.
+        Its name, unique in the batch.
     variant : str
-        Name of the configuration, unlike all others; `default` where there is but one.
+        Name of the configuration, unique; `default` if there is only one.
     status : {"complete", "partly", "failed"}
-        As the exit code of `gvo run` says: 0, 3, 2.
+        Exit codes 0, 3, 2 of `gvo run`.
     reason : str
-        Why it is not complete; empty where it is.
+        Why the run is not complete.
     source : str
         Path or URL of the recording.
     folder : str
@@ -36,11 +36,11 @@ class BatchRow:
         Those in which the configurations of the batch differ, by `section.key`.
     sensor : str
     frames, tracked : int
-        Number of frames read, and of those registered.
+        Frames read, and frames tracked.
     coverage_percent : float
         Share of the frames with a pose.
     segments : int
-        Number of pieces of the trajectory, one where the camera was never lost.
+        Segments of the trajectory; one if the camera was never lost.
     ate_raw_m, ate_causal_m, ate_smoothed_m : float
         Absolute trajectory errors, metres.
     rpe_smoothed_m, rpe_smoothed_deg : float
@@ -50,12 +50,12 @@ class BatchRow:
     frame_ms : float
         Time from decoded images to the causal pose, the sum of the stages' medians.
     run_s : float
-        Elapsed time of the run; None where a finished one was found.
+        Elapsed time; None if an earlier batch finished the run.
     is_found : bool
-        An earlier batch had finished the run.
+        An earlier batch finished the run.
     gvo_version : str
     configuration_hash, run_hash : str
-        Digests of the configuration; of the recording's head, configuration and version.
+        Digests of the configuration, and of recording, configuration and version.
     """
 
     recording: str
@@ -85,8 +85,8 @@ class BatchRow:
     run_hash: str = ""
 
 
-def figures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the figures of a row from what a run wrote to `summary.json`."""
+def measures_of(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the measures of a row from the `summary.json` of its run."""
     errors = {each["name"]: each for each in summary["errors"]}
     smoothed = errors.get("smoothed", {})
     medians = summary["median_ms"]

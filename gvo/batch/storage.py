@@ -1,4 +1,4 @@
-"""Recordings and run folders that lie behind a URL: found, copied here, copied back."""
+"""Recordings and run folders behind URLs: found, fetched, stored."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Place:
     path : str
         Within it.
     before, after : str
-        What a URL has beside the path: protocol, user and host, the archive that it lies in.
+        The rest of a URL: protocol, user and host; the archive that holds the path.
     """
 
     files: Any
@@ -51,10 +51,10 @@ class Place:
             Where the protocol is unknown, or its package is not installed.
         """
         if not is_url(location):
-            # Links stay as they are: on a worker they may lead elsewhere.
+            # Links are not resolved: on a worker they may lead elsewhere.
             path = os.path.abspath(Path(location).expanduser())  # noqa: PTH100
             return cls(LocalFileSystem(), path)
-        with _told(location):
+        with _naming(location):
             files, path = url_to_fs(str(location))
             return cls(files, str(path), *_around(files, str(path), str(location)))
 
@@ -69,24 +69,24 @@ class Place:
         return f"{self.before}{self.path}{self.after}"
 
     def exists(self) -> bool:
-        """Tell whether there is anything."""
-        with _told(self.location):
+        """Tell whether the path exists."""
+        with _naming(self.location):
             return bool(self.files.exists(self.path))
 
     def is_folder(self) -> bool:
         """Tell whether it is a folder."""
-        with _told(self.location):
+        with _naming(self.location):
             return bool(self.files.isdir(self.path))
 
     def entries(self) -> list[Place]:
-        """Return what a folder holds, sorted."""
-        with _told(self.location):
+        """List a folder, sorted."""
+        with _naming(self.location):
             names = self.files.ls(self.path, detail=False)
         return [replace(self, path=str(name)) for name in sorted(names)]
 
     def matches(self) -> list[Place]:
-        """Return what the path stands for as a pattern, sorted."""
-        with _told(self.location):
+        """Expand the path as a pattern, sorted."""
+        with _naming(self.location):
             names = self.files.glob(self.path)
         return [replace(self, path=str(name)) for name in sorted(names)]
 
@@ -109,15 +109,15 @@ def fetch(url: str, folder: Path) -> Path:
         raise RecordingError(f"{url}: does not exist")
     copy = folder / place.name
     is_folder = place.is_folder()
-    with _told(url):
-        # A folder's contents, where there is a slash at the end; else it would be put inside.
+    with _naming(url):
+        # Without the slash a folder would be copied into the copy.
         source = f"{place.path}/" if is_folder else place.path
         place.files.get(source, str(copy), recursive=is_folder)
     return copy
 
 
 def fetch_file(url: str, target: Path) -> None:
-    """Copy one file, where there is one.
+    """Copy a file, if it exists.
 
     Raises
     ------
@@ -126,21 +126,21 @@ def fetch_file(url: str, target: Path) -> None:
     """
     place = Place.of(url)
     if place.exists():
-        with _told(url):
+        with _naming(url):
             target.write_bytes(place.files.cat_file(place.path))
 
 
 def store(folder: Path, url: str) -> None:
-    """Copy all that a folder holds below a URL.
+    """Copy the contents of a folder below a URL.
 
     Raises
     ------
     OutputError
         When it cannot be written.
     """
-    with _told(url, OutputError):
+    with _naming(url, OutputError):
         place = Place.of(url)
-        # File by file: a folder that is there already would be put into itself.
+        # File by file: a folder that exists already would be copied into itself.
         for file in sorted(each for each in folder.rglob("*") if each.is_file()):
             target = PurePosixPath(place.path) / file.relative_to(folder).as_posix()
             place.files.makedirs(str(target.parent), exist_ok=True)
@@ -148,7 +148,7 @@ def store(folder: Path, url: str) -> None:
 
 
 def _around(files: Any, path: str, url: str) -> tuple[str, str]:  # noqa: ANN401
-    """Return what a URL has before the path and after it."""
+    """Return the parts of a URL before its path and after it."""
     first, mark, others = url.partition("::")
     first = _LAST_SLASHES.sub("", first)
     if not first.endswith(path.rstrip("/")):
@@ -157,13 +157,13 @@ def _around(files: Any, path: str, url: str) -> tuple[str, str]:  # noqa: ANN401
 
 
 @contextmanager
-def _told(location: str | Path, kind: type[GvoError] = RecordingError) -> Iterator[None]:
-    """Give the errors of a file system the name of what they are about."""
+def _naming(location: str | Path, kind: type[GvoError] = RecordingError) -> Iterator[None]:
+    """Name the location in the errors of a file system."""
     try:
         yield
     except GvoError:
         raise
     except Exception as error:
-        # Each file system has errors of its own, of packages that are not even known here.
+        # Each file system raises errors of its own, of packages not known here.
         words = str(error) or type(error).__name__
         raise kind(f"{location}: {words}") from error

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gvo._text import read_text
-from gvo.batch.rows import BatchRow, RunStatus, Value, figures_of
+from gvo.batch.rows import BatchRow, RunStatus, Value, measures_of
 from gvo.batch.storage import fetch, fetch_file, is_url, store
 from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
@@ -141,7 +141,7 @@ def run_task(
     status: RunStatus = "complete" if result.exit_code == EXIT_COMPLETE else "partly"
     return replace(
         task.row(status, "" if status == "complete" else "; ".join(result.warnings)),
-        **figures_of(result.summary),
+        **measures_of(result.summary),
         run_s=None if is_found else time.perf_counter() - start,
         is_found=is_found,
         run_hash=digest([result.summary["run"], result.summary["configuration"]]),

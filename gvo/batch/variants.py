@@ -1,10 +1,10 @@
-"""The configurations of a batch: given ones, and the grid of a sweep."""
+"""The configurations of a batch: given, or the grid of a sweep."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,7 @@ class Variant:
     Parameters
     ----------
     name : str
-        Unlike those of all others, fit for a folder.
+        Unique, and valid as the name of a folder.
     config : Config
     """
 
@@ -38,21 +38,21 @@ class Variant:
 def make_variants(
     files: Sequence[Path] = (), settings: Sequence[str] = (), sweeps: Sequence[str] = ()
 ) -> list[Variant]:
-    """Return each combination of a configuration file and one value of each sweep.
+    """Return the product of configuration files and swept values.
 
     Parameters
     ----------
     files : sequence of Path
-        YAML files; the defaults where there is none.
+        YAML files; the defaults without one.
     settings : sequence of str
-        `section.key=value`, for all of them.
+        `section.key=value`, for all configurations.
     sweeps : sequence of str
         `section.key=a,b,c`, the values in YAML.
 
     Raises
     ------
     ConfigurationError
-        Where one of them cannot be read, or is out of range.
+        If one cannot be read, or a value is out of range.
     """
     grid = [_parse_sweep(sweep) for sweep in sweeps]
     keys = [sweep.partition("=")[0].strip() for sweep in sweeps]
@@ -61,48 +61,47 @@ def make_variants(
     if math.prod(map(len, grid)) * max(len(files), 1) > _MAX_VARIANTS:
         raise ConfigurationError(f"the sweep has more than {_MAX_VARIANTS} configurations")
     bases: list[tuple[str, Path | None]] = [(name, file) for file, name in _names(files).items()]
-    variants: dict[str, Config] = {}
+    named = []
     for (base, file), chosen in product(bases or [("", None)], product(*grid)):
-        values = [f"{key}={json.dumps(value)}" for key, value in zip(keys, chosen, strict=True)]
-        words = ",".join(filter(None, [base, _text_of(dict(zip(keys, chosen, strict=True)))]))
-        name = safe_name(words or DEFAULT)
-        config = load_configuration(file, [*settings, *values])
-        variants[free_name(name, variants)] = _on_one_thread(config)
-    return [Variant(name=name, config=config) for name, config in variants.items()]
+        swept = dict(zip(keys, chosen, strict=True))
+        values = [f"{key}={json.dumps(value)}" for key, value in swept.items()]
+        config = _on_one_thread(load_configuration(file, [*settings, *values]))
+        named.append((",".join(filter(None, [base, _text_of(swept)])), config))
+    return _variants(named)
 
 
 def name_variants(
     configs: Config | Sequence[Config] | Mapping[str, Config] | None,
 ) -> list[Variant]:
-    """Return configurations with names: their own, or the values in which they differ.
+    """Name configurations by their keys, or by the values in which they differ.
 
     Raises
     ------
     ConfigurationError
-        Where there is none.
+        If there is none.
     """
     if configs is None:
         return make_variants()
     if isinstance(configs, Config):
-        return [Variant(name=DEFAULT, config=configs)]
-    if isinstance(configs, Mapping):
-        named = [(safe_name(name), config) for name, config in configs.items()]
-    else:
-        texts = [_text_of(values) for values in differences(configs)]
-        named = [
-            (safe_name(text) if text else DEFAULT, one)
-            for text, one in zip(texts, configs, strict=True)
-        ]
-    if not named:
+        configs = [configs]
+    if not configs:
         raise ConfigurationError("expected at least one configuration")
+    if isinstance(configs, Mapping):
+        return _variants(configs.items())
+    texts = map(_text_of, differences(configs))
+    return _variants(zip(texts, configs, strict=True))
+
+
+def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:
+    """Make the names unique, and valid as names of folders."""
     variants: dict[str, Config] = {}
     for name, config in named:
-        variants[free_name(name, variants)] = config
+        variants[free_name(safe_name(name or DEFAULT), variants)] = config
     return [Variant(name=name, config=config) for name, config in variants.items()]
 
 
 def differences(configs: Sequence[Config]) -> list[dict[str, Value]]:
-    """Return, for each configuration, the values of the keys in which any two of them differ."""
+    """Return the values of each configuration that are not the same in all."""
     flat = [dict(_flatten(config)) for config in configs]
     keys = [
         key for key in (flat[0] if flat else {}) if any(one[key] != flat[0][key] for one in flat)
@@ -125,7 +124,6 @@ def _text_of(values: Mapping[str, Value]) -> str:
 
 
 def _parse_sweep(sweep: str) -> list[Value]:
-    """Return the values of a sweep."""
     key, separator, text = sweep.partition("=")
     shown = f"--sweep {cut(sweep, _MAX_SHOWN)}"
     if not separator or not text.strip() or "." not in key:
@@ -133,7 +131,7 @@ def _parse_sweep(sweep: str) -> list[Value]:
             f"{shown}: expected section.key=a,b,c, for example window.n_links=1,3"
         )
     try:
-        # As the value of a key: what follows a bracket too many would be left out silently.
+        # As the value of a key: YAML would ignore what follows a closing bracket.
         values = load_yaml(f"values: [{text}]")["values"]
     except YamlError as error:
         raise ConfigurationError(f"{shown}: the values are no YAML ({error})") from error
@@ -141,7 +139,7 @@ def _parse_sweep(sweep: str) -> list[Value]:
         raise ConfigurationError(f"{shown}: expected values with commas between them")
     try:
         texts = [json.dumps(value) for value in values]
-    except TypeError as error:  # dates, sets and bytes, which YAML has too
+    except TypeError as error:  # YAML has dates, sets and bytes too
         raise ConfigurationError(f"{shown}: no parameter has such a value ({error})") from error
     if len(set(texts)) < len(texts):
         raise ConfigurationError(f"{shown}: {max(texts, key=texts.count)} is given twice")
@@ -156,7 +154,7 @@ def _names(files: Sequence[Path]) -> dict[Path, str]:
 
 
 def _on_one_thread(config: Config) -> Config:
-    """Read ahead on no thread of its own, unless asked: each core has a run."""
+    """Do not read ahead on a second thread unless asked to: each core has a run."""
     if "runtime" in config.model_fields_set and "threads" in config.runtime.model_fields_set:
         return config
     runtime = RuntimeConfig.model_validate({**config.runtime.model_dump(), "threads": 1})

@@ -1,4 +1,4 @@
-"""What runs on a worker of Dask: a task, with news for the client."""
+"""What a Dask worker runs: a task, reporting its progress to the client."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gvo.batch.tasks import Task, TaskOptions
     from gvo.run_tally import Progress
 
-_NEWS_S = 1.0
+_REPORT_EVERY_S = 1.0
 
 
 class BatchStoppedError(GvoError):
@@ -33,16 +33,16 @@ def dask_setup(worker: object) -> None:
 
 
 def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  # noqa: ANN401
-    """Run a task on the worker that calls this.
+    """Run a task on this worker.
 
     Parameters
     ----------
     task : Task
     options : TaskOptions
     topic : str
-        Under which the scheduler is told how many frames are done.
+        Topic of the events that report how many frames are done.
     key : tuple
-        Of the task, as the scheduler knows it.
+        Key of the task on the scheduler.
     """
     from gvo.batch.tasks import run_task
 
@@ -51,27 +51,27 @@ def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  #
         task,
         options,
         scratch=Path(worker.local_directory),
-        on_progress=_teller(worker, topic, key),
+        on_progress=_reporter(worker, topic, key),
     )
 
 
-def _teller(worker: Any, topic: str, key: Any) -> Callable[[Progress], None]:  # noqa: ANN401
-    told_s = -_NEWS_S
+def _reporter(worker: Any, topic: str, key: Any) -> Callable[[Progress], None]:  # noqa: ANN401
+    reported_s = -_REPORT_EVERY_S
 
-    def tell(progress: Progress) -> None:
-        nonlocal told_s
+    def report(progress: Progress) -> None:
+        nonlocal reported_s
         now = time.monotonic()
-        if now - told_s < _NEWS_S:
+        if now - reported_s < _REPORT_EVERY_S:
             return
-        told_s = now
+        reported_s = now
         if not _is_wanted(worker, key):
             raise BatchStoppedError("the batch was stopped")
         worker.log_event(topic, (key[1], progress.n_done, progress.n_total))
 
-    return tell
+    return report
 
 
 def _is_wanted(worker: Any, key: Any) -> bool:  # noqa: ANN401
-    # Dask has no other word for it: a task that runs is not told that its client went away.
+    # Dask does not interrupt a running task that was cancelled, or whose client is gone.
     known = worker.state.tasks.get(key)
     return known is not None and known.state != "cancelled"

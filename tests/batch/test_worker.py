@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gvo.batch.worker import BatchStoppedError, _teller
+from gvo.batch.worker import BatchStoppedError, _reporter
 from gvo.run_tally import Progress
 
 KEY = ("batch", 7)
@@ -45,7 +45,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def test_news_are_sent_now_and_then(clock: SimpleNamespace) -> None:
     worker = Worker({KEY: "executing"})
-    tell = _teller(worker, "topic", KEY)
+    tell = _reporter(worker, "topic", KEY)
     for n_done in range(1, 31):
         tell(progress(n_done))
         clock.now += 0.125
@@ -57,7 +57,7 @@ def test_a_task_that_nobody_wants_any_more_stops(
     clock: SimpleNamespace, states: dict[Any, str]
 ) -> None:
     worker = Worker({KEY: "executing"})
-    tell = _teller(worker, "topic", KEY)
+    tell = _reporter(worker, "topic", KEY)
     tell(progress(1))
     worker.state = Worker(states).state
     tell(progress(2))
