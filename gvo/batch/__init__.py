@@ -1,6 +1,6 @@
-"""Many recordings at once, on one machine or a cluster of Dask.
+"""Many recordings, many configurations, on one machine or a Dask cluster.
 
-Everything here needs Dask (`pip install 'gvo[batch]'`), which is loaded when a name is asked for.
+Needs `pip install 'gvo[batch]'`; Dask is loaded with the first name.
 
 Examples
 --------

@@ -1,4 +1,4 @@
-"""A batch: recordings times configurations, a table and a report over all."""
+"""Run a batch: recordings times configurations, a table and a report of all runs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gvo.io.run_folder.line_file import replace_text
 from gvo.io.run_folder.writer import REPORT
 from gvo.version import __version__
 
-# How often the table is written while the batch goes.
+# How often the table is written while the batch runs.
 _EVERY_S = 10.0
 
 
@@ -42,11 +42,11 @@ class BatchOptions:
     recording : RecordingOptions
         Topics and calibration.
     excerpt : Excerpt, optional
-        Which frames are read; all where omitted.
+        Which frames are read; all if omitted.
     report : bool
-        Draw the picture and the page of each run; that of the batch is drawn anyway.
+        Draw the picture and the page of each run; those of the batch are always drawn.
     force : bool
-        Run what an earlier batch has finished, too.
+        Run what an earlier batch has finished again.
     plots : Path, optional
         Folder for each plot of the batch's report as PNG and PDF.
     """
@@ -78,15 +78,15 @@ def run(
     recordings : path or URL, or a sequence of them
         Recordings, patterns, folders, lists; see `find_recordings`.
     configs : Config, sequence, or mapping of names, optional
-        The defaults where omitted, but for `runtime.threads`, which is 1: each core has a run.
+        The defaults if omitted, except `runtime.threads`, which is 1: each core has a run.
     out : str or Path
         Folder that all workers see, or a URL.
     client : distributed.Client, optional
-        Of the cluster; as many workers as there are cores, one thread each, where omitted.
+        Of a cluster; a worker of one thread for each core of this machine if omitted.
     options : BatchOptions, optional
     on_progress : callable, optional
-        Called in this thread, some times a second. What it raises ends the batch; what was done
-        stands.
+        Called in this thread, several times a second. What it raises ends the batch; finished runs
+        stay.
 
     Returns
     -------
@@ -97,11 +97,11 @@ def run(
     Raises
     ------
     RecordingError
-        When there is no recording to be found.
+        If no recording is found.
     OutputError
-        When the folder cannot be written.
+        If the folder cannot be written.
     ClusterError
-        When the scheduler is lost.
+        If the scheduler is lost.
     """
     asked = [recordings] if isinstance(recordings, str | Path) else list(recordings)
     variants = name_variants(configs)
@@ -124,7 +124,7 @@ def run_batch(
     options: BatchOptions,
     on_progress: Callable[[BatchProgress], None] | None = None,
 ) -> pd.DataFrame:
-    """Run recordings that are found, with configurations that have names; see `run`."""
+    """Run recordings with named configurations; see `run`."""
     tasks = make_tasks(recordings, variants)
     table = _Table(out, tasks, options.plots)
     shared = TaskOptions(
@@ -138,7 +138,7 @@ def run_batch(
     with ExitStack() as stack:
         stack.enter_context(table.written())
         client = client or stack.enter_context(connected(None, None))
-        # Closed at once where a row cannot be written: what runs then is given up.
+        # Closed at once if a row cannot be written: running tasks are cancelled.
         rows = stack.enter_context(closing(Engine(client, shared, on_progress).run(tasks)))
         for row in rows:
             table.add(row)
@@ -189,7 +189,7 @@ class _Table:
 
     @contextmanager
     def written(self) -> Iterator[None]:
-        """Mark the folder; write table and report in the end, however it comes."""
+        """Mark the folder; write table and report at the end, also after an exception."""
         with self._folder() as folder:
             self._mark(folder)
         try:
@@ -202,7 +202,7 @@ class _Table:
 
     @contextmanager
     def _folder(self) -> Iterator[Path]:
-        """Give the folder, or for a URL one whose files are stored there."""
+        """Yield the folder; for a URL a temporary one, stored there afterwards."""
         if not self._is_remote:
             yield Path(self.location)
             return

@@ -1,4 +1,4 @@
-"""One task of a batch: one recording, run with one configuration, as a worker does it."""
+"""One task of a batch: one recording, run with one configuration on a worker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from gvo.runs import EXIT_COMPLETE, RunResult, run_recording
 from gvo.version import __version__
 
 MARK = "batch.json"
-# How long another process may take to end its run in a folder.
+# How long to wait for another process that writes the folder of the run.
 _BUSY_S = 30.0
 _BUSY_TICK_S = 0.5
 
@@ -41,16 +41,16 @@ class TaskOptions:
     out : str
         Folder of the batch, as an absolute path or a URL.
     mark : str
-        What its `batch.json` holds: a worker that does not find it there has another disk.
+        Token in its `batch.json`: a worker that does not read it there has another disk.
     recording : RecordingOptions
         Topics and calibration.
     excerpt : Excerpt, optional
     report : bool
         Draw the picture and the report of each run.
     force : bool
-        Run what is finished, too.
+        Run finished runs again.
     gvo_version : str
-        Of the client: a worker with another one would give other results.
+        Of the client; a worker with another version refuses the task.
     """
 
     out: str
@@ -68,17 +68,15 @@ class Task:
 
     Parameters
     ----------
-    recording : str
-        Name.
-    variant : str
-        Name of the configuration.
+    recording, variant : str
+        Names of the recording and of the configuration.
     source : str
         Absolute path or URL of the recording.
     folder : str
         Run folder, relative to the batch's.
     config : Config
     parameters : dict of str to value
-        In which the configurations of the batch differ.
+        Those in which the configurations of the batch differ.
     """
 
     recording: str
@@ -89,7 +87,7 @@ class Task:
     parameters: Mapping[str, Value] = field(default_factory=dict)
 
     def row(self, status: RunStatus, reason: str = "") -> BatchRow:
-        """Return the task's row of the table, without figures."""
+        """Return the task's row of the table, without measures."""
         return BatchRow(
             recording=self.recording,
             variant=self.variant,
@@ -110,23 +108,21 @@ def run_task(
     scratch: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> BatchRow:
-    """Run a recording, unless its folder holds the finished run.
-
-    Another one, and one that was interrupted, is replaced.
+    """Run a recording, unless its folder holds the finished run; replace any other there.
 
     Parameters
     ----------
     task : Task
     options : TaskOptions
     scratch : Path, optional
-        Folder for what is copied from or to a URL; the system's where omitted.
+        Folder for copies from and to URLs; the system's temporary folder if omitted.
     on_progress : callable, optional
         Called after each frame.
 
     Returns
     -------
     BatchRow
-        Also where there is nothing but a reason.
+        Failed, with its reason, wherever a `GvoError` was raised.
     """
     start = time.perf_counter()
     try:
@@ -149,7 +145,7 @@ def run_task(
 
 
 def digest(values: object) -> str:
-    """Return a digest of plain values."""
+    """Return a digest of values that JSON can hold."""
     text = json.dumps(values, sort_keys=True, default=str)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
@@ -180,7 +176,7 @@ def _run(
 
     if not is_url(options.out):
         out = Path(options.out)
-        _refuse_other_disk(out, options.mark)
+        _check_same_disk(out, options.mark)
         return _when_free(lambda: run(out / task.folder))
     folder, url = copies / "run", f"{options.out.rstrip('/')}/{task.folder}"
     folder.mkdir()
@@ -194,7 +190,7 @@ def _run(
 def _find_finished(
     folder: Path, source: Source, task: Task, options: TaskOptions
 ) -> RunResult | None:
-    """Return the complete run of a task that is in its folder; None where there is none."""
+    """Return the complete run in the folder of a task, if it is the task's own."""
     try:
         summary = json.loads(read_text(folder / SUMMARY))
     except (OSError, ValueError, RecursionError):
@@ -214,9 +210,9 @@ def _find_finished(
 
 
 def _when_free(run: Callable[[], tuple[RunResult, bool]]) -> tuple[RunResult, bool]:
-    """Run as soon as nobody else writes the folder.
+    """Run as soon as no other process writes the folder.
 
-    A worker that was given up, or whose batch was stopped, may write for a while yet.
+    A worker that was given up, or whose batch was stopped, may still write for a while.
     """
     end_s = time.monotonic() + _BUSY_S
     while True:
@@ -228,7 +224,7 @@ def _when_free(run: Callable[[], tuple[RunResult, bool]]) -> tuple[RunResult, bo
             time.sleep(_BUSY_TICK_S)
 
 
-def _refuse_other_disk(out: Path, mark: str) -> None:
+def _check_same_disk(out: Path, mark: str) -> None:
     try:
         is_there = json.loads((out / MARK).read_text(encoding="utf-8"))["mark"] == mark
     except (OSError, ValueError, KeyError, TypeError):

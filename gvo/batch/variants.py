@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -102,18 +102,20 @@ def _variants(named: Iterable[tuple[str, Config]]) -> list[Variant]:
 
 def differences(configs: Sequence[Config]) -> list[dict[str, Value]]:
     """Return the values of each configuration that are not the same in all."""
-    flat = [dict(_flatten(config)) for config in configs]
+    flat = [flatten(config) for config in configs]
     keys = [
         key for key in (flat[0] if flat else {}) if any(one[key] != flat[0][key] for one in flat)
     ]
     return [{key: one[key] for key in keys} for one in flat]
 
 
-def _flatten(config: Config) -> Iterator[tuple[str, Value]]:
-    for section, values in config.model_dump(mode="json").items():
-        for key, value in values.items():
-            is_plain = value is None or isinstance(value, bool | int | float | str)
-            yield f"{section}.{key}", value if is_plain else json.dumps(value)
+def flatten(config: Config) -> dict[str, Value]:
+    """Return a configuration by `section.key`, lists and mappings as JSON texts."""
+    return {
+        f"{section}.{key}": json.dumps(value) if isinstance(value, list | dict) else value
+        for section, values in config.model_dump(mode="json").items()
+        for key, value in values.items()
+    }
 
 
 def _text_of(values: Mapping[str, Value]) -> str:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_ROWS = 30
-"""With more only the best and the worst are drawn."""
+"""Of more only the best and the worst are drawn."""
 
 _N_EACH_END = 10
 _MAX_POINTS = 40
@@ -30,7 +30,7 @@ _COVERAGE = "coverage [%]"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Row:
-    """A row of the picture: which runs are in it; no name is a gap."""
+    """A row of the picture: the runs in it; none make a gap."""
 
     name: str
     is_in: BoolArray
@@ -39,7 +39,7 @@ class _Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Panel:
-    """A measure of all runs; where it cannot be compared the points are hollow, and not counted."""
+    """A measure of all runs; those not counted are hollow points, in no box."""
 
     label: str
     values: FloatArray
@@ -50,7 +50,7 @@ class _Panel:
 
 
 def box_plot(batch: Batch) -> Plot:
-    """Return the boxes: of the configurations, or of all recordings where there is but one."""
+    """Draw a row per configuration, or per recording if there is only one configuration."""
     title = "Errors, coverage and time"
     panels = _panels(batch)
     if not panels:
@@ -59,14 +59,14 @@ def box_plot(batch: Batch) -> Plot:
     if any(panel.reference is not None for panel in panels):
         words += " The relative ATE is that over the median of all runs of its recording."
     words += (
-        " Boxes hold the middle half of the runs, the line in them is the median; whiskers reach "
-        f"to the farthest run within {_WHISKER} box lengths. Points are runs: all of them up to "
-        f"{_MAX_POINTS} in a row, of more those beyond the whiskers."
+        " Boxes hold the middle half of the runs, the line is the median; whiskers reach to the "
+        f"farthest run within {_WHISKER} box lengths. Points are runs: all of up to {_MAX_POINTS} "
+        "in a row, of more those beyond the whiskers."
     )
     if np.any(~batch.is_comparable() & ~np.isnan(batch.numbers(ERROR))):
         words += (
             " Hollow points are runs with less than 95 % of the poses of the best run of their "
-            "recording: their errors are of the easy part, and in no box."
+            "recording: their errors cover the easy part only, and are in no box."
         )
     return Plot(slug="boxes", title=title, text=words, figure=_figure(rows, panels))
 
@@ -124,7 +124,7 @@ def _variant_rows(batch: Batch) -> tuple[list[_Row], str]:
 
 def _recording_rows(batch: Batch) -> tuple[list[_Row], str]:
     measure = batch.numbers(ERROR) if batch.has_errors else -batch.numbers("coverage_percent")
-    # what failed is the worst
+    # failed runs are the worst
     order = np.argsort(np.where(np.isnan(measure), np.inf, measure), kind="stable")
     is_run = ~batch.is_failed()
     n_run = int(np.sum(is_run))
@@ -145,7 +145,7 @@ def _recording_rows(batch: Batch) -> tuple[list[_Row], str]:
 def _capped(
     rows: list[_Row], is_kept: Sequence[bool], words: str, kind: str
 ) -> tuple[list[_Row], str]:
-    """Return the rows of both ends and the kept ones between, with gaps; say so."""
+    """Keep both ends and some rows between, with gaps; say so."""
     if len(rows) <= MAX_ROWS:
         return rows, words
     chosen = {*range(_N_EACH_END), *range(len(rows) - _N_EACH_END, len(rows))}
@@ -210,31 +210,23 @@ def _draw_row(axes: Axes, y: float, panel: _Panel, row: _Row) -> None:
     axes.plot(hollow, np.full(len(hollow), y), color=REFUSED, **looks)
 
 
-def box_of(values: FloatArray, *, is_logarithmic: bool) -> tuple[float, float, float, float, float]:
-    """Return whisker, quartile, median, quartile and whisker, as Tukey drew them [1]_.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (n,)
-    is_logarithmic : bool
-        The lengths are taken on a logarithmic axis.
+def box_of(values: FloatArray, *, is_logarithmic: bool) -> FloatArray:
+    """Return whisker, quartile, median, quartile and whisker, shape (5,) [1]_.
 
     References
     ----------
     .. [1] R. McGill, J. W. Tukey, W. A. Larsen, "Variations of box plots", The American
        Statistician 32(1), 1978, doi:10.1080/00031305.1978.10479236.
     """
-    scaled = np.log(values) if is_logarithmic else values
-    left, middle, right = np.quantile(scaled, [0.25, 0.5, 0.75])
-    reach = _WHISKER * (right - left)
-    inside = scaled[(scaled >= left - reach) & (scaled <= right + reach)]
-    five = np.array([inside.min(), left, middle, right, inside.max()])
-    low, left, middle, right, high = map(float, np.exp(five) if is_logarithmic else five)
-    return low, left, middle, right, high
+    from matplotlib.cbook import boxplot_stats
+
+    [box] = boxplot_stats(np.log(values) if is_logarithmic else values, whis=_WHISKER)
+    five = np.array([box[name] for name in ("whislo", "q1", "med", "q3", "whishi")])
+    return np.exp(five) if is_logarithmic else five
 
 
 def _thinned(values: FloatArray) -> FloatArray:
-    """Return so many at most, the smallest and the largest among them."""
+    """Return at most `_MAX_POINTS` values, the smallest and the largest among them."""
     if len(values) <= _MAX_POINTS:
         return values
     return np.sort(values)[np.linspace(0, len(values) - 1, _MAX_POINTS).round().astype(np.int64)]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_PARAMETERS = 12
-"""With more only those that change most are drawn."""
+"""Of more only those with the largest ratios of medians are drawn."""
 
 _N_COLUMNS = 4
 _N_TITLE = 30
@@ -43,7 +43,7 @@ _FRONT_HEADER = ("configuration", "number", "error", "time", "recordings")
 
 
 def effect_sheets(batch: Batch) -> list[tuple[Plot, str]]:
-    """Return plots, each with the table below it: errors and times by value of each parameter."""
+    """Return the plots of errors and times by value of each parameter, the table below them."""
     effects = value_medians(batch.table)
     if not effects:
         return []
@@ -58,13 +58,12 @@ def _values_plot(effects: Mapping[str, pd.DataFrame], kind: str) -> Plot:
     if not told:
         return Plot(slug=slug, title=title, text=f"Not drawn: no run has a comparable {kind}.")
     words = (
-        f"Points are medians of the {kind} at each value, each run over the median of its "
-        "recording; bars hold the middle half of the runs. 0.5 is half as much."
+        f"Medians of the {kind} at each value, each run relative to the median of its recording; "
+        "bars hold the middle half of the runs, all other parameters mixed."
     )
     if any(effect["runs", "failed"].any() for effect in told.values()):
         words += (
-            " Red are the runs that failed: they are in no median, and a value with more of them "
-            "is worse than its median."
+            " Failed runs (red) are in no median: a value with more of them is worse than it looks."
         )
     if len(told) > MAX_PARAMETERS:
         words += f" Drawn are the {MAX_PARAMETERS} parameters that change most."
@@ -115,7 +114,7 @@ def _draw_values(axes: Axes, effect: pd.DataFrame, kind: str, n_letters: int) ->
 
 
 def _tick_texts(values: Sequence[object], n_letters: int, is_number: bool) -> tuple[int, list[str]]:
-    """Return the texts below a panel as wide as some letters, and that only each n-th fits."""
+    """Return texts for an axis as wide as `n_letters`, and that every n-th fits."""
     if is_number:
         texts = [f"{each:.3g}" if isinstance(each, float) else value_text(each) for each in values]
         return -(-len(texts) * (max(map(len, texts)) + 1) // n_letters), texts
@@ -180,8 +179,8 @@ def _front_words(batch: Batch, placed: pd.DataFrame) -> str:
     )
     if n_candidates < len(placed):
         words += (
-            " Hollow points lack runs of some: they are placed by the others, and are not on the "
-            "front, as what they failed at would count for them."
+            " Hollow points lack runs of some of them: they are placed by the others, and are not "
+            "on the front, as failing on hard recordings would make them look better."
         )
     return words + batch.label_words
 

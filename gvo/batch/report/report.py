@@ -1,4 +1,4 @@
-"""The report of a batch: many recordings, one configuration or many."""
+"""The page of a batch: head, plots, tables."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _MAX_LISTED = 20
 def write_batch_report(
     path: Path, rows: Sequence[BatchRow], *, title: str, note: str = "", plots: Path | None = None
 ) -> None:
-    """Write a page about a batch; equal input gives equal files.
+    """Write the report of a batch; equal input gives equal files.
 
     Parameters
     ----------
     path : Path
         The page, replaced where it exists. The folders of the rows are relative to its own.
     rows : sequence of BatchRow
-        In any order, at least one.
+        At least one, in any order.
     title : str
     note : str
         A sentence below the title.
@@ -50,7 +50,7 @@ def write_batch_report(
         raise ValueError("expected at least one row")
     batch = Batch.of(rows)
     with settings(), warnings.catch_warnings():
-        # a page has its letters from the reader's machine, whatever the fonts here lack
+        # the page takes its fonts from the reader's machine
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         sheets = _sheets(batch)
         body = [
@@ -84,7 +84,7 @@ def _head(batch: Batch, title: str, note: str) -> list[str]:
 
 
 def _failures(batch: Batch) -> list[str]:
-    """Return the reasons with the number of runs that failed for each, the commonest first."""
+    """Return the reasons of failed runs with their numbers, the commonest first."""
     reasons = Counter(printable(row.reason) for row in batch.rows if row.status == "failed")
     lines = [
         f"{n} {'run' if n == 1 else 'runs'}: {reason or 'no reason was given'}"

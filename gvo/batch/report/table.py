@@ -1,4 +1,4 @@
-"""The table of a batch's runs, the worst first, each with a link to its folder."""
+"""The table of all runs, the worst first, each with a link to its report."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def runs_html(batch: Batch, folder: Path) -> str:
     ----------
     batch : Batch
     folder : Path
-        That of the page: links are relative to it.
+        Of the page, to which links are relative.
     """
     over_best = np.asarray(relative(batch.table, ERROR, to="min"), dtype=np.float64)
     errors = over_best if batch.is_sweep else batch.numbers(ERROR)
@@ -69,14 +69,14 @@ def runs_html(batch: Batch, folder: Path) -> str:
 def _words(batch: Batch) -> str:
     measure = "the ATE over the best one of the recording" if batch.is_sweep else "the smoothed ATE"
     return (
-        "Failed runs first, then those that are partly done, the least covered first, then the "
-        f"others by {measure if batch.has_errors else 'their coverage'}, the worst first. A name "
-        "leads to the report of the run."
+        "Failed runs first, then incomplete ones, the least covered first, then the others by "
+        f"{measure if batch.has_errors else 'their coverage'}, the worst first. A name leads to "
+        "the report of the run."
     )
 
 
 def _rank(row: BatchRow, error: float) -> tuple[float | str, ...]:
-    """Return what sorts the worst to the top."""
+    """Return a key that sorts the worst to the top."""
     coverage = math.inf if row.coverage_percent is None else row.coverage_percent
     by_error = math.inf if math.isnan(error) else -error
     by_status = (coverage, by_error) if row.status == "partly" else (by_error, coverage)
@@ -86,7 +86,7 @@ def _rank(row: BatchRow, error: float) -> tuple[float | str, ...]:
 def _number_columns(
     rows: Sequence[BatchRow], over_best: FloatArray | None
 ) -> Iterator[tuple[str, list[str]]]:
-    """Yield the columns that hold any number."""
+    """Yield the columns that have any number."""
     for name, value, form in _COLUMNS:
         values = [value(row) for row in rows]
         if any(each is not None for each in values):
@@ -96,7 +96,7 @@ def _number_columns(
 
 
 def _outcome(row: BatchRow, numbers: Sequence[str]) -> str:
-    """Return the status and what came of it: the reason, where that is all."""
+    """Return the cells of the status and of the numbers; of a failed run the reason."""
     reason = escape(printable(row.reason))
     if row.status == "failed":
         return f'<td>failed</td><td colspan="{max(1, len(numbers))}">{reason}</td>'
@@ -105,7 +105,7 @@ def _outcome(row: BatchRow, numbers: Sequence[str]) -> str:
 
 
 def _name(text: str) -> str:
-    # a long one may break where a parameter ends
+    # may break where a parameter ends
     return escape(printable(text)).replace(",", ",<wbr>")
 
 
@@ -115,19 +115,19 @@ def _linked(row: BatchRow, folder: Path) -> str:
 
 
 def run_address(run: str, folder: Path) -> str:
-    """Return where a link to a run leads: its report, or its folder where there is none.
+    """Return the address of the report of a run, or of its folder if it has none.
 
     Parameters
     ----------
     run : str
-        Folder of the run, relative to `folder`, or an address in the web.
+        Folder of the run, relative to `folder`, or a URL.
     folder : Path
-        That of the page.
+        Of the page.
 
     Returns
     -------
     str
-        Percent-encoded; empty where there is nothing to lead to.
+        Percent-encoded; empty if neither exists.
     """
     if "://" in run:
         return run if urlsplit(run).scheme in _SCHEMES else ""
@@ -137,9 +137,9 @@ def run_address(run: str, folder: Path) -> str:
     path = Path(found)
     if path.is_absolute():
         return path.as_uri()
-    # a colon would make a scheme of what is before it: it is encoded as well
+    # the colon is encoded too: what is before it would be a scheme
     return quote(path.as_posix(), errors="surrogateescape")
 
 
 def _exists(path: Path) -> bool:
-    return os.path.exists(path)  # noqa: PTH110 - that of Path raises where the name is too long
+    return os.path.exists(path)  # noqa: PTH110 - Path.exists raises if the name is too long

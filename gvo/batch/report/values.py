@@ -1,11 +1,11 @@
-"""The rows of a batch as the report needs them: arrays, order, words."""
+"""The rows of a batch as its report needs them: numbers, names, axes."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from gvo.batch.effects import ERROR, comparable
 from gvo.batch.pareto import variant_means
 from gvo.batch.results import to_frame
 from gvo.batch.rows import BatchRow
-from gvo.batch.variants import DEFAULT
+from gvo.batch.variants import DEFAULT, flatten
 from gvo.config import Config
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.plots import plain
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 N_LABEL = 40
 """Letters of a name in a picture."""
 _LEAST = 1.25
-"""Of end over start: less would make much of nothing."""
+"""Smallest ratio of the ends of an axis."""
 _MARGIN = 0.06
 _SERIES: tuple[tuple[float, ...], ...] = ((1.0,), (1.0, 3.0), (1.0, 2.0, 5.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Batch:
-    """The rows, and what is computed of them once.
+    """The rows of a batch, and what its plots share.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Batch:
     labels : dict of str to str
         Short names of the configurations.
     label_words : str
-        What the short names mean; empty where that is plain.
+        A sentence on what the short names mean, if they need one.
     """
 
     rows: tuple[BatchRow, ...]
@@ -59,7 +59,7 @@ class Batch:
 
     @classmethod
     def of(cls, rows: Sequence[BatchRow]) -> Batch:
-        """Take the numbers out of the rows."""
+        """Compare the rows and name their configurations."""
         table = to_frame(rows)
         labels, label_words = _labels(rows)
         return cls(
@@ -78,7 +78,7 @@ class Batch:
 
     @property
     def has_errors(self) -> bool:
-        """Whether any comparable run has a true trajectory beside it."""
+        """Whether any comparable run has an error."""
         return bool(self.is_comparable(ERROR).any())
 
     def numbers(self, column: str) -> FloatArray:
@@ -95,7 +95,7 @@ class Batch:
 
 
 def _labels(rows: Sequence[BatchRow]) -> tuple[dict[str, str], str]:
-    """Return names of the configurations without sections, or but values where they are long."""
+    """Name configurations without sections; by their values alone if that is too long."""
     own = {row.variant: row.parameters for row in rows}
     parameters = dict.fromkeys(name for row in rows for name in row.parameters)
     keys = {name: name.rpartition(".")[2] for name in parameters}
@@ -117,7 +117,7 @@ def _labels(rows: Sequence[BatchRow]) -> tuple[dict[str, str], str]:
 
 
 def _without_same_ends(labels: Mapping[str, str]) -> dict[str, str]:
-    """Return what tells names apart, where cutting their middles would make equal ones."""
+    """Cut what all names begin and end with, if cutting their middles makes equal ones."""
     texts = [*labels.values()]
     if len({shown(text, N_LABEL) for text in texts}) == len(texts):
         return dict(labels)
@@ -130,33 +130,23 @@ def _without_same_ends(labels: Mapping[str, str]) -> dict[str, str]:
 
 
 def _n_shared(texts: Sequence[str]) -> int:
-    """Return how many letters all texts begin with."""
-    columns = zip(*texts, strict=False)
-    differs = (number for number, letters in enumerate(columns) if len(set(letters)) > 1)
-    return next(differs, min(map(len, texts)))
+    """Return how many characters all texts begin with."""
+    n_distinct = (len(set(column)) for column in zip(*texts, strict=False))
+    return sum(1 for _ in takewhile(lambda n: n == 1, n_distinct))
 
 
 def _default_of(rows: Sequence[BatchRow]) -> str | None:
-    # lists come as text
-    defaults = {
-        f"{section}.{key}": json.dumps(value) if isinstance(value, (list, dict)) else value
-        for section, values in Config().model_dump(mode="json").items()
-        for key, value in values.items()
-    }
-    names = {row.variant for row in rows}
-    if DEFAULT in names:
+    own = {row.variant: row.parameters for row in rows}
+    if DEFAULT in own:
         return DEFAULT
-    for row in rows:
-        known = [
-            name in defaults and defaults[name] == row.parameters[name] for name in row.parameters
-        ]
-        if known and all(known):
-            return row.variant
-    return None
+    defaults = flatten(Config()).items()
+    return next(
+        (name for name, values in own.items() if values and values.items() <= defaults), None
+    )
 
 
 def printable(text: str) -> str:
-    """Return a text without what cannot be printed, or would turn the rest around.
+    """Replace what cannot be printed or would reverse the text; join its lines.
 
     Examples
     --------
@@ -168,7 +158,7 @@ def printable(text: str) -> str:
 
 
 def shown(text: str, n_most: int) -> str:
-    """Return a name as a label of a picture, its middle left out where it is long.
+    """Return a name as a label of a picture, the middle of a long one left out.
 
     Examples
     --------
@@ -183,7 +173,7 @@ def shown(text: str, n_most: int) -> str:
 
 
 def value_text(value: object) -> str:
-    """Return a value as YAML has it."""
+    """Return a value as YAML writes it."""
     if value is None or value is pd.NA or value != value:
         return "null"
     if isinstance(value, bool | np.bool_):
@@ -192,14 +182,14 @@ def value_text(value: object) -> str:
 
 
 def number_text(value: float | None, form: str = ".4g") -> str:
-    """Return a number, a dash where there is none."""
+    """Return a number as text, a dash for a missing one."""
     return "-" if value is None or math.isnan(value) else f"{value:{form}}"
 
 
 def logarithmic_axis(
     axes: Axes, which: Literal["x", "y"], *, ends: tuple[float, float], n_ticks: int = 6
 ) -> None:
-    """Make an axis logarithmic, with some labelled ticks.
+    """Make an axis logarithmic, with a few plain numbers at its ticks.
 
     Parameters
     ----------
@@ -208,7 +198,7 @@ def logarithmic_axis(
     ends : tuple of float
         Least and largest of what is drawn.
     n_ticks : int
-        At most so many.
+        At most.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
@@ -226,7 +216,7 @@ def logarithmic_axis(
 
 
 def log_limits(low: float, high: float) -> tuple[float, float]:
-    """Return ends of an axis around positive numbers, with margins."""
+    """Return the ends of an axis that holds two positive numbers, with margins."""
     if not 0.0 < low <= high < np.inf:
         return 0.1, 10.0
     widening = max(0.0, 0.5 * float(np.log(_LEAST * low / high)))
@@ -235,7 +225,7 @@ def log_limits(low: float, high: float) -> tuple[float, float]:
 
 
 def log_ticks(low: float, high: float, n_most: int) -> list[float]:
-    """Return round numbers between the ends of a logarithmic axis, two at least.
+    """Return round numbers between the ends of a logarithmic axis, at least two.
 
     Examples
     --------
