@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from threading import RLock
 from typing import Any, TypeAlias
 
@@ -22,78 +22,25 @@ _JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameView:
-    """All that a page shows of one frame.
+class FrameRecord:
+    """What is kept of a frame.
 
     Parameters
     ----------
-    index : int
-        Of the frame in the recording, from 0; faulty ones count.
-    n_done : int
-        Frames that are done: the index of the last one, and 1.
     stamp_ns : int
-        Of the frame, nanoseconds.
+        Nanoseconds.
     result : FrameResult or None
-        None for a faulty frame; without `registration`, whose pictures and points are here.
+        None for a faulty frame. Kept without `registration`.
     reason : str
         Why there is no pose, or no registration; empty where there are.
     image, overlay : ndarray of uint8, shape (height, width, 3)
-        The current image, small, and with what was matched in it, BGR.
-    cloud_cam : ndarray of float32, shape (n, 3)
-        What the frame measured, in the `cam` frame, metres.
-    colours : ndarray of uint8, shape (n, 3)
-        Of these points, RGB.
-    T_world_cam : ndarray of float64, shape (4, 4)
-        Causal pose; for a faulty frame that of the frame before, the identity before any.
+        The image, small, and the image with its matches, BGR.
+    cloud : tuple of ndarray
+        Points that the frame measured, in the `cam` frame, and their colours.
     window_poses : dict of int to ndarray of float64, shape (4, 4)
-        T_world_cam of the poses in the window by their stamps; of a window that keeps all, the
-        newest ones and the keyframes.
+        T_world_cam of the newest poses in the window and of its keyframes, by stamp.
     window_covariances : dict of int to ndarray of float64, shape (6, 6)
         Of the same, in the poses' own frames.
-    fault : str
-        What the player has to tell; empty while all is well.
-    """
-
-    index: int
-    n_done: int
-    stamp_ns: int
-    result: FrameResult | None
-    reason: str
-    image: ImageArray
-    overlay: ImageArray
-    cloud_cam: NDArray[np.float32]
-    colours: NDArray[np.uint8]
-    T_world_cam: FloatArray
-    window_poses: dict[int, FloatArray]
-    window_covariances: dict[int, FloatArray]
-    fault: str = ""
-
-    @property
-    def status(self) -> Status | None:
-        """What ties the frame to earlier ones; None for a faulty frame."""
-        return None if self.result is None else self.result.status
-
-    @property
-    def keyframes(self) -> tuple[int, ...]:
-        """Stamps of the kept frames, oldest first."""
-        return () if self.result is None else self.result.keyframes_ns
-
-    @property
-    def links(self) -> tuple[FrameLink, ...]:
-        """The edges that were offered to the window with the frame."""
-        return () if self.result is None else self.result.links
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameRecord:
-    """What is written down of a frame.
-
-    Parameters
-    ----------
-    stamp_ns, result, reason, image, overlay, window_poses, window_covariances
-        As of `FrameView`.
-    cloud : tuple of points and colours
-        In the `cam` frame.
     """
 
     stamp_ns: int
@@ -106,8 +53,45 @@ class FrameRecord:
     window_covariances: dict[int, FloatArray]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameView(FrameRecord):
+    """All that a page shows of a frame.
+
+    Parameters
+    ----------
+    index : int
+        Of the frame in the recording, from 0; faulty ones count.
+    n_done : int
+        Frames that are done: the index of the last one, and 1.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Causal pose; for a faulty frame that of the frame before, the identity before any.
+    fault : str
+        What the player has to tell; empty while all is well.
+    """
+
+    index: int
+    n_done: int
+    T_world_cam: FloatArray
+    fault: str = ""
+
+    @property
+    def status(self) -> Status | None:
+        """What ties the frame to earlier ones; None for a faulty frame."""
+        return None if self.result is None else self.result.status
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Stamps of the keyframes, oldest first."""
+        return () if self.result is None else self.result.keyframes_ns
+
+    @property
+    def links(self) -> tuple[FrameLink, ...]:
+        """The edges that were offered to the window with the frame."""
+        return () if self.result is None else self.result.links
+
+
 class History:
-    """The frames that were done, and the paths up to the one that is shown.
+    """The frames that are done, and the paths up to the one that is shown.
 
     Poses and counts lie in memory, pictures, points and the poses of the window in a temporary
     file. It may be asked from any thread.
@@ -123,10 +107,11 @@ class History:
         self._shown = first_index - 1
         self._arrays = DiskList()
         self._lock = RLock()
-        # By frame: stamp, result and reason.
+        # Of each frame: stamp, result without registration, reason.
         self._told: list[tuple[int, FrameResult | None, str]] = []
         self._latest: tuple[int, FrameRecord] | None = None
-        # By frame with a pose: index and stamp, and the poses; by smoothed pose: when and of what.
+        # Of each frame with a pose: its index and stamp, and its raw and causal pose. Of each final
+        # smoothed pose: the index of the frame with which it became final, its stamp, and the pose.
         self._tracked = _Rows(2, np.int64)
         self._raw = _Rows(16, np.float64)
         self._causal = _Rows(16, np.float64)
@@ -146,7 +131,7 @@ class History:
         return self._shown
 
     def add(self, record: FrameRecord) -> None:
-        """Write down the next frame; it is not shown yet."""
+        """Keep the next frame; it is not shown yet."""
         index = self.n_done
         with self._lock:
             self._arrays.append(_arrays_of(record))
@@ -211,18 +196,10 @@ class History:
             record = self._record(index)
             n = self._n_tracked(index)
             return FrameView(
+                **{field.name: getattr(record, field.name) for field in fields(record)},
                 index=index,
                 n_done=self.n_done,
-                stamp_ns=record.stamp_ns,
-                result=record.result,
-                reason=record.reason,
-                image=record.image,
-                overlay=record.overlay,
-                cloud_cam=record.cloud[0],
-                colours=record.cloud[1],
                 T_world_cam=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
-                window_poses=record.window_poses,
-                window_covariances=record.window_covariances,
                 fault=fault,
             )
 
@@ -248,12 +225,9 @@ class History:
         """
         with self._lock:
             _, T_world_cam = self._smoothed()
-            n = len(T_world_cam)
-            indices = self._tracked.rows[:n, 0]
             keyframes = self._keyframes[: bisect_right(self._keyframes, self._shown)]
-            rows = np.searchsorted(indices, keyframes)
-            wanted = dict(zip(keyframes, T_world_cam[rows], strict=True))
-            clouds = self._clouds.select(wanted)
+            rows = np.searchsorted(self._tracked.rows[: len(T_world_cam), 0], keyframes)
+            clouds = self._clouds.select(dict(zip(keyframes, T_world_cam[rows], strict=True)))
         return put_together(clouds)
 
     def _check(self, index: int) -> None:

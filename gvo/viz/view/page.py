@@ -210,7 +210,7 @@ class Page:
     def _draw_images(self, frame: FrameView) -> None:
         self._overlay.image = _rgb(frame.overlay)
         self.scene.show_image(_rgb(frame.image))
-        self.scene.show_points(frame.cloud_cam, frame.colours)
+        self.scene.show_points(*frame.cloud)
         self.scene.show_pose(frame.T_world_cam)
 
     def _draw_paths(self) -> None:
@@ -255,8 +255,9 @@ def player_state(player: Player) -> str:
 
 def _depth_of(frame: FrameView, camera: StereoCamera | PinholeCamera) -> float:
     """Return how far away, metres, most of what is seen is; a guess before anything is."""
-    if len(frame.cloud_cam) > 0:
-        return float(np.median(frame.cloud_cam[:, 2]))
+    points_cam, _ = frame.cloud
+    if len(points_cam) > 0:
+        return float(np.median(points_cam[:, 2]))
     return _DEPTH_PER_BASELINE * getattr(camera, "baseline", 0.05)
 
 

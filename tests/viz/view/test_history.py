@@ -130,7 +130,7 @@ def test_frames_come_back_from_disk_as_they_were(history: History) -> None:
         assert view.T_world_cam[0, 3] == frame + 0.2
         assert view.result is not None
         assert view.result.raw.T_world_cam[0, 3] == frame + 0.1
-        np.testing.assert_array_equal(view.cloud_cam, POINT[0])
+        np.testing.assert_array_equal(view.cloud[0], POINT[0])
         assert set(view.window_poses) == set(view.window_covariances)
         assert all(view.window_poses[ns][0, 3] == ns / 10 + 0.3 for ns in view.window_poses)
         assert all(c[0, 0] == ns / 10 for ns, c in view.window_covariances.items())

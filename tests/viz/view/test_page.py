@@ -12,6 +12,7 @@ import pytest
 from gvo.config import Config, load_configuration
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.view.clouds import empty_cloud
 from gvo.viz.view.page import Page
 from gvo.viz.view.server import ViewServer
 from tests.viz.view.fakes import FakePlayer, frame_view_of, pose_of, stamps_of
@@ -100,13 +101,9 @@ def test_a_frame_without_points_sends_no_cloud(
     page: Page, player: FakePlayer, view: ViewServer
 ) -> None:
     """Browsers complain of an empty one."""
-    empty: dict[str, Any] = {
-        "cloud_cam": np.zeros((0, 3), np.float32),
-        "colours": np.zeros((0, 3), np.uint8),
-    }
     for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
         frame = frame_view_of(index)
-        player.show(frame if n_clouds else replace(frame, **empty))
+        player.show(frame if n_clouds else replace(frame, cloud=empty_cloud()))
         page.settle()
         assert len(nodes(view, "/camera/points")) == n_clouds
 
