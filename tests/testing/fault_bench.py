@@ -24,7 +24,7 @@ from gvo.testing.faults import FaultyImage, FaultySource
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
-from tests.testing.named import NamedFault
+from tests.testing.catalogue import NamedFault
 
 _SCALE = 0.4
 

@@ -17,9 +17,8 @@ from gvo.testing.faults import (
     Lagging,
     PixelFault,
 )
-from tests.testing.catalogue import FAULTS, parameters
+from tests.testing.catalogue import FAULTS, NamedFault, parameters
 from tests.testing.fault_bench import Outcome, complaints, faulty, run, sound
-from tests.testing.named import NamedFault
 
 # Of six honest errors, 3 in 10,000 are beyond five sigmas; those of 20 poses are dependent.
 _MAX_DEVIATION = 6.0
