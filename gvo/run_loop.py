@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError
 from gvo.io.excerpt import Excerpt
-from gvo.io.frames import frames, one_opencv_thread
+from gvo.io.frames import frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
@@ -163,9 +163,7 @@ class RunLoop:
             output.add_frame(item, placed)
 
     def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
-        # Colour and depth of a free-running sensor need not pair; the images of a stereo
-        # camera are taken together, and one without the other is a loss.
-        is_loss = not item.is_unpaired or self.source.info.sensor == "stereo"
+        is_loss = is_lost(item, self.source.info.sensor)
         self.tally.add_duration("read", self._read_ms)
         self.tally.add_faulty(item, is_loss=is_loss)
         for output in outputs if is_loss else ():

@@ -122,6 +122,8 @@ def frames(
     source: Source,
     config: Config,
     excerpt: Excerpt | None = None,
+    *,
+    with_unpaired: bool = True,
 ) -> Iterator[Frame | FaultyFrame]:
     """Read a recording as frames.
 
@@ -135,6 +137,8 @@ def frames(
         number of threads.
     excerpt : Excerpt, optional
         The part that is wanted; the whole where omitted.
+    with_unpaired : bool
+        False leaves out what is no frame of a run, see `is_lost`.
 
     Yields
     ------
@@ -154,7 +158,18 @@ def frames(
     made = make(pairs, preparers, source.info)
     if config.sync.repeated_images == "skip":
         made = refuse_repeats(made, source.info.stream_names)
-    yield from made
+    for item in made:
+        if with_unpaired or not isinstance(item, FaultyFrame) or is_lost(item, source.info.sensor):
+            yield item
+
+
+def is_lost(frame: FaultyFrame, sensor: Sensor) -> bool:
+    """Tell whether a faulty frame is a loss, and so a frame of a run without a pose.
+
+    Colour and depth of a free-running RGB-D sensor need not pair; the images of a stereo camera
+    are taken together, and one without the other is a loss.
+    """
+    return not frame.is_unpaired or sensor == "stereo"
 
 
 def paired(

@@ -114,6 +114,18 @@ def test_raw_images_are_rectified(tiny: Any) -> None:
     assert not np.array_equal(frame.left, ramp)
 
 
+def test_only_images_of_a_free_running_sensor_may_be_left_out(tiny: Any) -> None:
+    good, depth = tiny.texture(1), tiny.depth(1)
+    stereo = tiny.stereo([(0, 0, good), (1, 0, good), (0, 9_000_000_000, good)])
+    rgbd = tiny.rgbd([(0, 0, good), (1, 0, depth), (0, 9_000_000_000, good)])
+    broken = tiny.rgbd([(0, 0, good), (1, 0, RecordingError("damaged"))])
+    for source, n_kept in ((stereo, 2), (rgbd, 1), (broken, 1)):
+        read = list(frames(source, Config()))
+        kept = list(frames(source, Config(), with_unpaired=False))
+        assert len(kept) == n_kept
+        assert [item.stamp_ns for item in kept] == [item.stamp_ns for item in read[:n_kept]]
+
+
 def _seen_from_beside() -> DepthView:
     """Return a depth camera of half the size, two centimetres left of the colour camera."""
     camera = PinholeCamera(fx=25.0, fy=25.0, cx=11.5, cy=7.5, width=24, height=16)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from gvo.config import Config
@@ -66,7 +66,7 @@ def explain_frame(
     config = config or Config()
     drive = _Drive(source, config)
     n = n_tracked = 0
-    for item in _counted(source, config, excerpt):
+    for item in frames(source, config, excerpt, with_unpaired=False):
         if isinstance(item, FaultyFrame):
             if n == index:
                 raise RecordingError(
@@ -83,16 +83,6 @@ def explain_frame(
         f"{source.info.name}: there is no frame {index}: "
         + (f"there are {n}, counted from 0; choose one up to {n - 1}" if n else "no frame was read")
     )
-
-
-def _counted(
-    source: Source, config: Config, excerpt: Excerpt | None
-) -> Iterator[Frame | FaultyFrame]:
-    """Yield what has a row in `frames.csv`."""
-    for item in frames(source, config, excerpt):
-        is_unpaired = isinstance(item, FaultyFrame) and item.is_unpaired
-        if not is_unpaired or source.info.sensor == "stereo":
-            yield item
 
 
 class _Drive:

@@ -229,8 +229,6 @@ def read_frames(
     Yields
     ------
     StereoFrame, RgbdFrame or FaultyFrame
-        Colour images without depth, and the reverse, are left out: those of a free-running
-        sensor need not pair.
 
     Raises
     ------
@@ -239,10 +237,7 @@ def read_frames(
     """
     if from_ns is not None:
         excerpt = _excerpt_from(from_ns, source, config, excerpt)
-    is_stereo = source.info.sensor == "stereo"
-    for item in frames(source, config, excerpt):
-        if is_stereo or not isinstance(item, FaultyFrame) or not item.is_unpaired:
-            yield item
+    yield from frames(source, config, excerpt, with_unpaired=False)
 
 
 def _excerpt_from(from_ns: int, source: Source, config: Config, excerpt: Excerpt) -> Excerpt:
