@@ -64,7 +64,7 @@ class Keyframes(Generic[ObservationsT]):
         """Keep a frame; of one that is kept already, other observations of it."""
         self._kept[observations.stamp_ns] = observations
         points = getattr(observations, "points_cam", None)
-        self._samples[observations.stamp_ns] = None if points is None else sample_points(points)
+        self._samples[observations.stamp_ns] = None if points is None else _sample_points(points)
 
     def drop(self, stamp_ns: int) -> None:
         """Forget a kept frame."""
@@ -87,7 +87,7 @@ class Keyframes(Generic[ObservationsT]):
         return _overlap(points, T_current_keyframe, self._camera)
 
 
-def sample_points(points_cam: FloatArray) -> FloatArray:
+def _sample_points(points_cam: FloatArray) -> FloatArray:
     """Return so many of n points, shape (n, 3), as tell the share in view; of these, all."""
     n = len(points_cam)
     chosen = np.linspace(0, n - 1, min(_N_SAMPLES, n))

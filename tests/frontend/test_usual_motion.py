@@ -118,7 +118,7 @@ def test_a_front_end_inside_another_is_handed_the_usual_motion_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
-    frontend = WatchedFrontend(recording.info.camera, Config())
+    frontend: Any = WatchedFrontend(recording.info.camera, Config())
     first, second = (frontend.extract(frame) for frame in gvo.frames(recording, Config()))
     handed: list[Any] = []
 

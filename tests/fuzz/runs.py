@@ -5,10 +5,13 @@ import random
 from functools import cache
 
 from gvo.io.run_folder.reader import read_run
+from gvo.trajectory.formats import COVARIANCE_HEADER
 from tests.fuzz.mutations import mutate_text
 from tests.fuzz.target import Folder, Target
 
-_COVARIANCE = "h\n1500000000," + ",".join(["1", *["0"] * 5, "1", *["0"] * 14]) + "\n"
+_COVARIANCE = (
+    f"{COVARIANCE_HEADER}\n1500000000," + ",".join(["1", *["0"] * 5, "1", *["0"] * 14]) + "\n"
+)
 _FILES = {
     "frames.csv": "stamp_ns,status,n_inliers,reason\n1500000000,ok,40,\n1600000000,lost,0,dark\n",
     "edges.csv": "stamp_ns,reference_ns,kind,is_accepted,chi2\n1600000000,1500000000,step,1,2.5\n",
