@@ -116,6 +116,19 @@ class Trajectory:
         """Return the number of poses."""
         return len(self.stamps_ns)
 
+    def __repr__(self) -> str:
+        """Return one line: how many poses, over what time and path, and what is known of them."""
+        if len(self) == 0:
+            return "Trajectory(no poses)"
+        seconds = 1e-9 * float(self.stamps_ns[-1] - self.stamps_ns[0])
+        path_m = float(self.distances()[-1])
+        rotations = "" if self.has_rotations else ", positions alone"
+        covariances = "" if self.covariances is None else ", with covariances"
+        return (
+            f"Trajectory({len(self)} poses, {seconds:.1f} s from {format_stamp(self.stamps_ns[0])}, "
+            f"{path_m:.2f} m{rotations}{covariances})"
+        )
+
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""
         return trajectory_html(

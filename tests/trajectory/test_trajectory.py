@@ -243,3 +243,16 @@ def test_another_world_changes_neither_steps_nor_covariances(seed: int) -> None:
     assert moved.covariances is not None
     assert trajectory.covariances is not None
     np.testing.assert_array_equal(moved.covariances, trajectory.covariances)
+
+
+def test_a_trajectory_prints_as_one_line() -> None:
+    stamps_ns = np.array([1, 3]) * 500_000_000
+    positions = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])
+    known = Trajectory.of_positions(stamps_ns, positions)
+    assert str(known) == "Trajectory(2 poses, 1.0 s from 0.500000000, 5.00 m, positions alone)"
+    T = se3.make_transform(np.tile(np.eye(3), (2, 1, 1)), positions)
+    whole = Trajectory(
+        stamps_ns=stamps_ns, T_world_cam=T, covariances=np.tile(np.eye(6), (2, 1, 1))
+    )
+    assert repr(whole).endswith("5.00 m, with covariances)")
+    assert str(known.select([])) == "Trajectory(no poses)"
