@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo.backend.batch import Polish
+from gvo.backend.batch import BatchResult
 from gvo.backend.gating import WindowCounts
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, SegmentJoin, Status
@@ -94,7 +94,7 @@ class RunTally:
     n_guessed: int = 0
     mount_travel_m: float = 0.0
     window: WindowCounts = field(default_factory=WindowCounts)
-    polish: Polish | None = None
+    polish: BatchResult | None = None
     rig_offsets: RigOffsets | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Batch optimization of a whole graph, where the window keeps everything."""
+"""Batch optimization of a whole graph by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Polish:
-    """What a batch optimization gained.
+class BatchResult:
+    """Errors before and after a batch optimization.
 
     Parameters
     ----------
@@ -36,15 +36,15 @@ class Polish:
         }
 
 
-def polish(
+def optimize_batch(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> tuple[gtsam.Values, Polish]:
-    """Optimize by Levenberg-Marquardt until the error stands still.
+) -> tuple[gtsam.Values, BatchResult]:
+    """Optimize by Levenberg-Marquardt until the error converges.
 
     Returns
     -------
     values : gtsam.Values
-    polish : Polish
+    result : BatchResult
 
     References
     ----------
@@ -54,13 +54,13 @@ def polish(
     try:
         return _optimize(factors, values, "MULTIFRONTAL_CHOLESKY")
     except RuntimeError:
-        # Sigmas too many orders apart; five times slower, and it goes through.
+        # Sigmas too many orders of magnitude apart for Cholesky; QR takes five times as long.
         return _optimize(factors, values, "MULTIFRONTAL_QR")
 
 
 def _optimize(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, solver: str
-) -> tuple[gtsam.Values, Polish]:
+) -> tuple[gtsam.Values, BatchResult]:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
     parameters.setAbsoluteErrorTol(0.0)
@@ -69,7 +69,7 @@ def _optimize(
     optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters)
     before = optimizer.error()
     optimized = optimizer.optimize()
-    return optimized, Polish(
+    return optimized, BatchResult(
         error_before=before,
         error_after=optimizer.error(),
         n_iterations=int(optimizer.iterations()),

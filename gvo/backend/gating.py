@@ -7,9 +7,9 @@ where the optimization starts, and is better not let in at all.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import compress
 
 import gtsam
@@ -17,9 +17,9 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from gvo.backend.factors import Measurement
-from gvo.backend.motion_model import Motion
+from gvo.backend.motion_model import ConstantVelocity
 from gvo.backend.validation import find_faults, prior_fault
-from gvo.backend.window_graph import ORIGIN, Arrival, WindowGraph
+from gvo.backend.window_graph import ORIGIN, NewPose, WindowGraph
 from gvo.geometry import se3
 from gvo.types import (
     BoolArray,
@@ -28,7 +28,6 @@ from gvo.types import (
     FrameId,
     IntArray,
     PosePrior,
-    PositionPrior,
     Prior,
     Rejected,
 )
@@ -38,12 +37,12 @@ _AGREEMENT = 5.0
 _TRACE = 1e-9 * np.eye(6)
 _ZERO = np.zeros(6)
 _NOTHING = np.zeros((6, 6))
-# Of a first pose of which the position alone is known: radians, and metres beside its prior.
-_UNKNOWN_SIGMAS = np.repeat([1.0, 1e4], 3)
+# Of a first pose of which only the position is known: radians, and metres beside its prior.
+_UNKNOWN_COVARIANCE = np.diag(np.repeat([1.0, 1e4], 3) ** 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Verdict:
+class GateResult:
     """What the edges of one pose say together.
 
     Parameters
@@ -58,14 +57,14 @@ class Verdict:
     reasons: list[str]
 
 
-def judge(
+def gate_edges(
     measurements: Sequence[Measurement],
     *,
     pose_of: Callable[[FrameId], gtsam.Pose3],
     relative_covariance: Callable[[FrameId, FrameId], FloatArray],
     motion: Callable[[], Edge | None],
     gate: float | None,
-) -> Verdict:
+) -> GateResult:
     """Find where the edges of a new pose agree, and which of them do not.
 
     An edge is refused when it disagrees with the medoid by more than the gate, and more of the
@@ -90,13 +89,13 @@ def judge(
     """
     predictions = [_predict(measurement, pose_of) for measurement in measurements]
     if len(measurements) == 1:
-        return Verdict(T_world_start=predictions[0], reasons=[""])
+        return GateResult(T_world_start=predictions[0], reasons=[""])
     informations = [measurement.gaussian.information() for measurement in measurements]
     twists = _twists(predictions)
     reasons = [""] * len(measurements)
     mean, spread = _mean(twists, informations)
     if spread <= min(_AGREEMENT, gate or _AGREEMENT) ** 2:
-        return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
+        return GateResult(T_world_start=predictions[0].retract(mean), reasons=reasons)
     covariances = [measurement.edge.covariance for measurement in measurements]
     distances = _distances(twists, covariances)
     if gate is not None and distances.max() > gate:
@@ -112,7 +111,7 @@ def judge(
         distances = _distances(twists, covariances)
     is_near = _are_near_medoid(distances).tolist()
     mean, _ = _mean(list(compress(twists, is_near)), list(compress(informations, is_near)))
-    return Verdict(T_world_start=predictions[0].retract(mean), reasons=reasons)
+    return GateResult(T_world_start=predictions[0].retract(mean), reasons=reasons)
 
 
 def disagreement(
@@ -239,24 +238,24 @@ def _mahalanobis(differences: FloatArray, covariances: FloatArray) -> FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowCounts:
-    """What a window has taken and refused so far.
+    """Counts of what a window accepted and refused so far.
 
     Parameters
     ----------
     n_poses, n_edges, n_priors : int
-        Taken in.
+        Accepted.
     n_rejected : int
-        Edges and priors refused, those below among them.
+        Refused edges and priors, the gated ones among them.
     n_gated : int
-        Edges refused because the others disagree with them.
+        Edges refused because others contradict them.
     n_coasting : int
         Poses without a usable edge, which continue the last velocity.
     n_restored : int
-        Updates that GTSAM gave up; the window went back to where it was before.
+        Updates in which GTSAM failed; the window was restored.
     n_rebuilt : int
         Times that the graph was made anew from its poses and their covariances.
     first_rejected : str
-        The first refusal; empty where there was none.
+        The first refusal; empty before it.
     """
 
     n_poses: int = 0
@@ -270,8 +269,8 @@ class WindowCounts:
     first_rejected: str = ""
 
 
-class Ledger:
-    """Counts what happens in a window."""
+class WindowCounter:
+    """Counts what a window accepts and refuses."""
 
     def __init__(self) -> None:
         self._numbers: Counter[str] = Counter()
@@ -279,51 +278,48 @@ class Ledger:
 
     @property
     def counts(self) -> WindowCounts:
-        """What happened so far."""
+        """The counts so far."""
         return WindowCounts(**self._numbers, first_rejected=self._first_rejected)
 
     def add(self, **numbers: int) -> None:
-        """Add to counts by their names."""
+        """Add numbers to counts of the same names."""
         for name, number in numbers.items():
             self._numbers[name] += number
 
-    def reject(
-        self,
-        frame_id: FrameId,
-        stamp_ns: int | None,
-        reason: str,
-        *,
-        reference_id: FrameId = None,
-        is_gated: bool = False,
-    ) -> Rejected:
-        """Count a refusal and return it."""
-        rejected = Rejected(
-            frame_id=frame_id, stamp_ns=stamp_ns, reason=reason, reference_id=reference_id
+    def add_pose(self, pose: NewPose) -> None:
+        """Count a new pose and its measurements."""
+        self.add(
+            n_poses=1,
+            n_edges=len(pose.measurements),
+            n_priors=int(pose.prior is not None),
+            n_coasting=int(not pose.is_measured),
+            n_gated=pose.n_gated,
         )
+        for rejected in pose.rejected:
+            self.add_rejected(rejected)
+
+    def add_rejected(self, rejected: Rejected, *, is_gated: bool = False) -> None:
+        """Count a refusal."""
         self.add(n_rejected=1, n_gated=int(is_gated))
         self._first_rejected = self._first_rejected or str(rejected)
-        return rejected
 
 
-class Reception:
-    """Sorts the measurements of new poses out; what it refuses is counted.
+class Admission:
+    """Chooses the usable measurements of a new pose, and its start value.
 
     Parameters
     ----------
     graph : WindowGraph
-        The poses that edges refer to.
-    motion : Motion
-        Of the poses so far; leads where measurements do not.
-    ledger : Ledger
+        Of the poses that edges refer to.
+    motion : ConstantVelocity
+        Predicts a pose without usable measurements.
     """
 
-    def __init__(self, graph: WindowGraph, motion: Motion, ledger: Ledger) -> None:
+    def __init__(self, graph: WindowGraph, motion: ConstantVelocity) -> None:
         self._graph = graph
         self._motion = motion
-        self._ledger = ledger
-        self._n_keys = 0
 
-    def receive(
+    def admit(
         self,
         frame_id: FrameId,
         stamp_ns: int,
@@ -331,8 +327,8 @@ class Reception:
         prior: Prior | None,
         *,
         gate: float | None,
-    ) -> Arrival:
-        """Sort out what is usable, and find where to start.
+    ) -> NewPose:
+        """Return the pose with its valid measurements that the others do not contradict.
 
         Parameters
         ----------
@@ -344,84 +340,103 @@ class Reception:
         gate : float or None
             In sigmas of the difference of two edges.
         """
-        arrival = Arrival(frame_id=frame_id, key=self._n_keys, stamp_ns=stamp_ns)
-        self._n_keys += 1
-        if prior is not None:
-            self._receive_prior(arrival, prior)
-        valid, members = [], self._graph.members
+        refuse = partial(_refuse, frame_id, stamp_ns)
+        rejected, valid = [], []
+        if prior is not None and (fault := prior_fault(prior)):
+            rejected.append(refuse(None, fault))
+            prior = None
         for edge, fault in zip(edges, find_faults(edges), strict=True):
-            reason = members.tie_fault(frame_id, edge, is_new=True) or fault
-            if reason:
-                self.refuse(arrival, edge, reason)
+            if reason := self._graph.poses.edge_fault(frame_id, edge, is_new=True) or fault:
+                rejected.append(refuse(edge, reason))
             else:
-                valid.append(edge)
-        if valid:
-            self._receive_edges(arrival, valid, gate)
-        else:
-            self._start_without_edges(arrival)
-        return arrival
-
-    def drop_measurements(self, arrival: Arrival, reason: str) -> None:
-        """Refuse all measurements of a pose; it continues the last velocity."""
-        edges = [measurement.edge for measurement in arrival.measurements]
-        for edge in [*edges, *(None for _ in arrival.priors)]:
-            self.refuse(arrival, edge, reason)
-        arrival.measurements, arrival.priors = [], []
-        arrival.anchor, arrival.is_origin = None, False
-        self._start_without_edges(arrival)
-
-    def refuse(
-        self, arrival: Arrival, edge: Edge | None, reason: str, *, is_gated: bool = False
-    ) -> None:
-        """Refuse an edge of a new pose, or its prior."""
-        arrival.rejected.append(
-            self._ledger.reject(
-                arrival.frame_id,
-                arrival.stamp_ns,
-                reason,
-                reference_id=None if edge is None else edge.reference_id,
-                is_gated=is_gated,
-            )
+                valid.append(Measurement.of(edge))
+        if not valid:
+            return self._unmeasured(frame_id, stamp_ns, prior, rejected)
+        T_world_references = {
+            measurement.edge.reference_id: self._graph.pose3(measurement.edge.reference_id)
+            for measurement in valid
+        }
+        result = self._gate(valid, T_world_references, stamp_ns, gate)
+        accepted = []
+        for measurement, reason in zip(valid, result.reasons, strict=True):
+            if reason:
+                rejected.append(refuse(measurement.edge, reason))
+            else:
+                accepted.append(measurement)
+        return NewPose(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            T_world_start=result.T_world_start,
+            measurements=accepted,
+            T_world_references=T_world_references,
+            prior=prior,
+            rejected=tuple(rejected),
+            n_gated=len(valid) - len(accepted),
         )
 
-    def _receive_prior(self, arrival: Arrival, prior: Prior) -> None:
-        if fault := prior_fault(prior):
-            self.refuse(arrival, None, fault)
-        else:
-            arrival.priors.append(prior)
-
-    def _receive_edges(self, arrival: Arrival, edges: list[Edge], gate: float | None) -> None:
-        measurements = [Measurement.of(edge) for edge in edges]
-        verdict = self._judge(arrival, measurements, gate)
-        arrival.T_world_start = verdict.T_world_start
-        for measurement, reason in zip(measurements, verdict.reasons, strict=True):
-            if reason:
-                self.refuse(arrival, measurement.edge, reason, is_gated=True)
-            else:
-                arrival.measurements.append(measurement)
-
-    def _judge(
-        self, arrival: Arrival, measurements: list[Measurement], gate: float | None
-    ) -> Verdict:
-        known = arrival.T_world_references
-
+    def _gate(
+        self,
+        measurements: Sequence[Measurement],
+        T_world_references: Mapping[FrameId, gtsam.Pose3],
+        stamp_ns: int,
+        gate: float | None,
+    ) -> GateResult:
         def pose_of(frame_id: FrameId) -> gtsam.Pose3:
-            if frame_id not in known:
-                known[frame_id] = self._graph.pose3(frame_id)
-            return known[frame_id]
+            known = T_world_references.get(frame_id)
+            return self._graph.pose3(frame_id) if known is None else known
 
-        return judge(
+        return gate_edges(
             measurements,
             pose_of=pose_of,
             relative_covariance=self._graph.relative_covariance,
-            motion=lambda: self._coasting_edge(arrival.stamp_ns),
+            motion=lambda: self._coasting_edge(stamp_ns),
             gate=gate,
         )
 
+    def refuse_all(self, pose: NewPose, reason: str) -> NewPose:
+        """Return the pose without measurements; it continues the last velocity."""
+        edges: list[Edge | None] = [measurement.edge for measurement in pose.measurements]
+        edges += [] if pose.prior is None else [None]
+        refused = [_refuse(pose.frame_id, pose.stamp_ns, edge, reason) for edge in edges]
+        alone = self._unmeasured(pose.frame_id, pose.stamp_ns, None, [*pose.rejected, *refused])
+        return replace(alone, n_gated=pose.n_gated)
+
+    def _unmeasured(
+        self, frame_id: FrameId, stamp_ns: int, prior: Prior | None, rejected: Sequence[Rejected]
+    ) -> NewPose:
+        """Return a pose without edges."""
+        T_world_start, support = self._start(stamp_ns, prior)
+        return NewPose(
+            frame_id=frame_id,
+            stamp_ns=stamp_ns,
+            T_world_start=T_world_start,
+            prior=prior,
+            support=support,
+            rejected=tuple(rejected),
+        )
+
+    def _start(
+        self, stamp_ns: int, prior: Prior | None
+    ) -> tuple[gtsam.Pose3, Edge | PosePrior | None]:
+        """Return the start value of a pose without edges, and what constrains it there."""
+        if isinstance(prior, PosePrior):
+            return gtsam.Pose3(prior.T_world_frame), None
+        if (edge := self._coasting_edge(stamp_ns)) is not None:
+            T_world_last = self._graph.pose3(edge.reference_id)
+            return T_world_last.compose(gtsam.Pose3(edge.T_reference_frame)), edge
+        if (prediction := self._motion.predict_pose(stamp_ns)) is not None:
+            support = PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
+        elif prior is not None:
+            T_world_start = se3.make_transform(np.eye(3), prior.position_world)
+            support = PosePrior(T_world_frame=T_world_start, covariance=_UNKNOWN_COVARIANCE)
+        else:
+            support = ORIGIN
+        return gtsam.Pose3(support.T_world_frame), support
+
     def _coasting_edge(self, stamp_ns: int) -> Edge | None:
-        """Return the edge from the last pose, where it is in the window, by the velocity so far."""
+        """Return the edge that the last velocity predicts; None if the last pose has left."""
         last = self._motion.last
-        if last is None or last.frame_id not in self._graph.members:
+        if last is None or last.frame_id not in self._graph.poses:
             return None
         T_last_frame, covariance = self._motion.predict_step(stamp_ns)
         return Edge(
@@ -431,28 +446,8 @@ class Reception:
             kernel="none",
         )
 
-    def _start_without_edges(self, arrival: Arrival) -> None:
-        """Start at the prior, else at the origin, else where the last velocity leads."""
-        prior = arrival.priors[0] if arrival.priors else None
-        if isinstance(prior, PosePrior):
-            arrival.T_world_start = gtsam.Pose3(prior.T_world_frame)
-        elif self._motion.last is not None:
-            self._coast(arrival)
-        elif isinstance(prior, PositionPrior):
-            arrival.T_world_start = gtsam.Pose3(gtsam.Rot3(), prior.position_world)
-            arrival.anchor = PosePrior(
-                T_world_frame=arrival.T_world_start.matrix(), covariance=np.diag(_UNKNOWN_SIGMAS**2)
-            )
-        else:
-            arrival.anchor, arrival.is_origin = ORIGIN, True
 
-    def _coast(self, arrival: Arrival) -> None:
-        """Tie the pose to the last one by the velocity so far."""
-        arrival.coasting = self._coasting_edge(arrival.stamp_ns)
-        if arrival.coasting is not None:
-            T_last_frame = gtsam.Pose3(arrival.coasting.T_reference_frame)
-            T_world_last = self._graph.pose3(arrival.coasting.reference_id)
-            arrival.T_world_start = T_world_last.compose(T_last_frame)
-        elif (prediction := self._motion.predict_pose(arrival.stamp_ns)) is not None:
-            arrival.T_world_start = gtsam.Pose3(prediction[0])
-            arrival.anchor = PosePrior(T_world_frame=prediction[0], covariance=prediction[1])
+def _refuse(frame_id: FrameId, stamp_ns: int, edge: Edge | None, reason: str) -> Rejected:
+    """Return the refusal of an edge of a pose, or of its prior."""
+    reference_id = None if edge is None else edge.reference_id
+    return Rejected(frame_id=frame_id, stamp_ns=stamp_ns, reason=reason, reference_id=reference_id)

@@ -180,44 +180,41 @@ class PoseGraph:
             reeliminate.push_back(key)
         return [], constrained, None, reeliminate, False
 
-    def settle(
+    def iterate(
         self,
         before: Mapping[int, gtsam.Pose3],
         *,
         alive: Collection[int] = (),
         leaving: Sequence[int] = (),
-    ) -> tuple[dict[int, gtsam.Pose3], bool]:
-        """Go on until poses stand still, where the update just done moved them far.
+    ) -> bool:
+        """Repeat the last update until poses converge, if it moved them far.
 
-        One step of Gauss-Newton is exact for what moves by a fraction of a radian only; after a
-        loop closes it takes a few. A whole graph is left to the polish at its end.
+        One step of Gauss-Newton is exact only for motions by a fraction of a radian; closing a
+        loop takes a few. A whole graph is left to the batch optimization at its end.
 
         Parameters
         ----------
         before : mapping of int to gtsam.Pose3
-            Where the poses that the update was about were, or started, by their keys.
+            Poses before the update, or start values, of the keys concerned.
         alive, leaving
             As for the update.
 
         Returns
         -------
-        dict of int to gtsam.Pose3
-            Where they are now.
         bool
-            Whether they may have moved far.
+            Whether the poses may have moved far.
         """
-        after = {key: self.pose3(key) for key in before}
         if self._is_whole:
-            return after, True
+            return True
         limit = _FAR
         for _ in range(_MAX_STEPS):
-            if _stand_still(before, after, limit):
-                return after, limit == _STILL
+            after = {key: self.pose3(key) for key in before}
+            if _converged(before, after, limit):
+                return limit == _STILL
             before, limit = after, _STILL
             nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
             self.update(*nothing, alive=alive, leaving=leaving)
-            after = {key: self.pose3(key) for key in before}
-        return after, True
+        return True
 
     def marginalize(self, keys: Sequence[int]) -> None:
         """Take out poses that the last update made ready; what they knew stays."""
@@ -267,10 +264,10 @@ class PoseGraph:
         return self._isam.calculateEstimate()
 
 
-def _stand_still(
+def _converged(
     before: Mapping[int, gtsam.Pose3], after: Mapping[int, gtsam.Pose3], limit: float
 ) -> bool:
-    """Tell whether no element of the twists between two places of poses reaches a limit."""
+    """Tell whether each element of the twists between poses before and after is below a limit."""
     # Where no element of two transforms differs by more than 0.4 of it, no twist can: an angle is
     # at most 3 / sqrt(2), a distance sqrt(3) times the largest difference. GTSAM tells so quickly.
     if all(before[key].equals(after[key], 0.4 * limit) for key in before):

@@ -85,7 +85,7 @@ class StatusClock:
         return Status.LOST if coasting_s > self._lost_after_s else Status.COASTING
 
 
-class Motion:
+class ConstantVelocity:
     """The last pose, and the velocity between the last two that were measured.
 
     Parameters

@@ -9,13 +9,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gvo.backend.batch import Polish
-from gvo.backend.gating import Ledger, Reception, WindowCounts, disagreement
+from gvo.backend.batch import BatchResult
+from gvo.backend.gating import Admission, WindowCounter, WindowCounts, disagreement
 from gvo.backend.isam2 import first_line
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
-from gvo.backend.motion_model import Motion, StatusClock
+from gvo.backend.motion_model import ConstantVelocity, StatusClock
 from gvo.backend.validation import find_faults, prior_fault
-from gvo.backend.window_graph import ORIGIN, Arrival, WindowGraph, absence
+from gvo.backend.window_graph import ORIGIN, NewPose, WindowGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
@@ -79,33 +79,42 @@ class SlidingWindow:
         self._config = config or WindowConfig()
         self._keeps_by_distance = keyframes == "distance"
         self._graph = WindowGraph(self._config)
-        self._members = self._graph.members
-        self._ledger = Ledger()
+        self._poses = self._graph.poses
+        self._counter = WindowCounter()
         self._clock = StatusClock(self._config.lost_after_s)
-        self._motion = Motion(self._config)
-        self._reception = Reception(self._graph, self._motion, self._ledger)
-        self._polish: Polish | None = None
+        self._motion = ConstantVelocity(self._config)
+        self._admission = Admission(self._graph, self._motion)
+        self._polish: BatchResult | None = None
+
+    def __repr__(self) -> str:
+        """Return the number of poses, the newest, and the counts in one line."""
+        counts = self.counts
+        newest = "" if not self else f" (newest {self.newest!r}, {len(self.kept())} kept)"
+        return (
+            f"SlidingWindow: {len(self)} of {counts.n_poses} poses{newest}, {counts.n_edges} edges "
+            f"accepted, {counts.n_rejected} rejected"
+        )
 
     def __contains__(self, frame_id: object) -> bool:
         """Tell whether a frame is in the window."""
-        return frame_id in self._members
+        return frame_id in self._poses
 
     def __len__(self) -> int:
         """Return the number of poses in the window."""
-        return len(self._members)
+        return len(self._poses)
 
     @property
     def newest(self) -> FrameId:
         """The newest frame of the window; None while it is empty."""
-        return self._members.newest
+        return self._poses.newest
 
     @property
     def counts(self) -> WindowCounts:
         """What was taken and refused so far."""
-        return self._ledger.counts
+        return self._counter.counts
 
     @property
-    def polish(self) -> Polish | None:
+    def polish(self) -> BatchResult | None:
         """What `finish` gained by Levenberg-Marquardt, where the window kept everything."""
         return self._polish
 
@@ -171,13 +180,22 @@ class SlidingWindow:
             very first pose. The window stands as before.
         """
         edges = _as_edges(frame_id, edges)
-        self._check_arrival(frame_id, stamp_ns, edges, prior)
-        arrival = self._reception.receive(
-            frame_id, int(stamp_ns), edges, prior, gate=self._config.gate
+        self._check_new(frame_id, stamp_ns, edges, prior)
+        pose = self._admission.admit(frame_id, int(stamp_ns), edges, prior, gate=self._config.gate)
+        pose, T_world_frame, covariance = self._insert(pose)
+        found = self._clock.next(pose.stamp_ns, is_tied=pose.is_measured)
+        estimate = Estimate(
+            frame_id=frame_id,
+            stamp_ns=pose.stamp_ns,
+            T_world_cam=T_world_frame,
+            covariance=covariance,
+            status=status if status and pose.is_measured else found,
+            rejected=pose.rejected,
         )
-        estimate = self._enter(arrival, status)
-        self._note_motion(arrival, estimate)
-        if self._keeps_by_distance and frame_id in self._members:
+        self._graph.keep_causal(estimate)
+        self._counter.add_pose(pose)
+        self._update_motion(pose, estimate)
+        if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)
         return estimate
 
@@ -195,14 +213,14 @@ class SlidingWindow:
         Estimate or Rejected
             The frame's pose with the edge; falsy where the edge was refused.
         """
-        self._members.find(frame_id)
+        self._poses.find(frame_id)
         _as_edges(frame_id, [edge])
-        fault = self._members.tie_fault(frame_id, edge) or find_faults([edge])[0]
+        fault = self._poses.edge_fault(frame_id, edge) or find_faults([edge])[0]
         gated = "" if fault else self._gate_loop(frame_id, edge)
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
         answer = self._try(lambda: self._graph.add_edge(frame_id, edge), frame_id, edge=edge)
-        self._ledger.add(n_edges=int(isinstance(answer, Estimate)))
+        self._counter.add(n_edges=int(isinstance(answer, Estimate)))
         return answer
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
@@ -219,52 +237,52 @@ class SlidingWindow:
             The frame's pose with the prior; falsy where the prior was refused.
         """
         _check_prior(frame_id, prior)
-        is_there = self._members.find(frame_id) is not None
+        is_there = self._poses.find(frame_id) is not None
         fault = prior_fault(prior) if is_there else absence(frame_id)
         if fault:
             return self._reject(frame_id, fault)
         answer = self._try(lambda: self._graph.add_prior(frame_id, prior), frame_id)
-        self._ledger.add(n_priors=int(isinstance(answer, Estimate)))
+        self._counter.add(n_priors=int(isinstance(answer, Estimate)))
         return answer
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose of the window as a keyframe until it is released."""
-        self._members.member(frame_id).is_kept = True
+        self._poses.require(frame_id).is_kept = True
 
     def release(self, frame_id: FrameId) -> None:
         """Let a kept pose leave, with the next update after it is no longer recent."""
-        self._members.member(frame_id).is_kept = False
+        self._poses.require(frame_id).is_kept = False
 
     def kept(self) -> list[FrameId]:
         """Return the kept frames, oldest first."""
-        return self._members.kept
+        return self._poses.kept
 
     def pose(self, frame_id: FrameId) -> FloatArray:
         """Return T_world_frame, shape (4, 4), of a pose of the window."""
-        self._members.member(frame_id)
+        self._poses.require(frame_id)
         return self._graph.pose(frame_id)
 
     def poses(self) -> dict[FrameId, FloatArray]:
         """Return T_world_frame of all poses of the window, oldest first."""
-        return {frame_id: self._graph.pose(frame_id) for frame_id in self._members}
+        return {frame_id: self._graph.pose(frame_id) for frame_id in self._poses}
 
     def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
         """Return the edges from earlier frames that were accepted for a frame.
 
         Empty where it is not in the window.
         """
-        member = self._members.get(frame_id)
-        if member is None:
+        pose = self._poses.get(frame_id)
+        if pose is None:
             return ()
-        return tuple(tie.edge for tie in self._members.standing_ties(member))
+        return tuple(accepted.edge for accepted in self._poses.current_edges(pose))
 
     def stamp_ns(self, frame_id: FrameId) -> int:
         """Return the stamp of a pose of the window, nanoseconds."""
-        return self._members.member(frame_id).stamp_ns
+        return self._poses.require(frame_id).stamp_ns
 
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return what is known now of a pose of the window."""
-        self._members.member(frame_id)
+        self._poses.require(frame_id)
         return self._graph.estimate(frame_id)
 
     def covariance(self, frame_id: FrameId) -> FloatArray:
@@ -335,10 +353,10 @@ class SlidingWindow:
 
     # What comes in
 
-    def _check_arrival(
+    def _check_new(
         self, frame_id: FrameId, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
     ) -> None:
-        is_known = self._members.find(frame_id) is not None
+        is_known = self._poses.find(frame_id) is not None
         if frame_id is None or is_known:
             raise ValueError(
                 f"{frame_id!r} is in the window already" if is_known else "no frame_id"
@@ -365,64 +383,52 @@ class SlidingWindow:
     def _reject(
         self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False
     ) -> Rejected:
-        member = self._members.get(frame_id)
-        return self._ledger.reject(
-            frame_id,
-            None if member is None else member.stamp_ns,
-            reason,
+        pose = self._poses.get(frame_id)
+        rejected = Rejected(
+            frame_id=frame_id,
+            stamp_ns=None if pose is None else pose.stamp_ns,
+            reason=reason,
             reference_id=None if edge is None else edge.reference_id,
-            is_gated=is_gated,
         )
+        self._counter.add_rejected(rejected, is_gated=is_gated)
+        return rejected
 
     # What goes into the graph
 
-    def _enter(self, arrival: Arrival, status: Status | None) -> Estimate:
-        """Put the pose into the graph; where GTSAM gives up, with ever less beside it."""
-        T_world_frame, covariance = self._insert(arrival)
-        found = self._clock.next(arrival.stamp_ns, is_tied=arrival.is_measured)
-        estimate = Estimate(
-            frame_id=arrival.frame_id,
-            stamp_ns=arrival.stamp_ns,
-            T_world_cam=T_world_frame,
-            covariance=covariance,
-            status=status if status and arrival.is_measured else found,
-            rejected=tuple(arrival.rejected),
-        )
-        if arrival.frame_id in self._members:
-            member = self._members[arrival.frame_id]
-            member.status, member.causal = estimate.status, estimate
-        else:
-            self._graph.finish_one(estimate)
-        self._ledger.add(
-            n_poses=1,
-            n_edges=len(arrival.measurements),
-            n_priors=len(arrival.priors),
-            n_coasting=int(not arrival.is_measured),
-        )
-        return estimate
+    def _insert(self, pose: NewPose) -> tuple[NewPose, FloatArray, FloatArray]:
+        """Put a pose into the graph; if GTSAM fails, retry with ever less.
 
-    def _insert(self, arrival: Arrival) -> tuple[FloatArray, FloatArray]:
-        """Return the pose of the new frame and its covariance, whatever GTSAM does."""
-        harden = [lambda _: self._graph.harden()] if self._graph.can_be_hardened else []
-        for simplify in (None, *harden, self._drop_measurements, self._rebuild):
+        Returns
+        -------
+        pose : NewPose
+            As it went in.
+        T_world_frame : ndarray of float64, shape (4, 4)
+        covariance : ndarray of float64, shape (6, 6)
+        """
+        harden = [self._harden_for] if self._graph.can_be_hardened else []
+        for simplify in (None, *harden, self._refuse_all, self._rebuild_for):
             try:
-                if simplify is not None:
-                    simplify(arrival)
-                return self._graph.insert(arrival)
+                pose = pose if simplify is None else simplify(pose)
+                return pose, *self._graph.insert(pose)
             except SmoothingError as error:
-                self._ledger.add(n_restored=1)
-                place = f"{arrival.frame_id!r} at {arrival.stamp_ns} ns"
+                self._counter.add(n_restored=1)
+                place = f"{pose.frame_id!r} at {pose.stamp_ns} ns"
                 _LOGGER.warning("%s: %s; the window stands as before", place, error)
-        # Not even alone: the pose is handed over as it is reckoned, and never in the window.
-        prediction = self._motion.predict_pose(arrival.stamp_ns)
-        return prediction or (ORIGIN.T_world_frame, ORIGIN.covariance)
+        # Not even alone: it is handed over as predicted, and never in the window.
+        prediction = self._motion.predict_pose(pose.stamp_ns)
+        return pose, *(prediction or (ORIGIN.T_world_frame, ORIGIN.covariance))
 
-    def _drop_measurements(self, arrival: Arrival) -> None:
-        self._reception.drop_measurements(arrival, "GTSAM gave up on the update")
+    def _harden_for(self, pose: NewPose) -> NewPose:
+        self._graph.harden()
+        return pose
 
-    def _rebuild(self, _: Arrival) -> None:
+    def _refuse_all(self, pose: NewPose) -> NewPose:
+        return self._admission.refuse_all(pose, "GTSAM gave up on the update")
+
+    def _rebuild_for(self, pose: NewPose) -> NewPose:
         self._graph.rebuild()
-        self._ledger.add(n_rebuilt=1)
+        self._counter.add(n_rebuilt=1)
+        return pose
 
     def _try(
         self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
@@ -432,7 +438,7 @@ class SlidingWindow:
             try:
                 return extend()
             except SmoothingError as error:
-                self._ledger.add(n_restored=1)
+                self._counter.add(n_restored=1)
                 _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
                 if not self._harden():
                     reason = f"GTSAM gave up on the update: {error}"
@@ -449,16 +455,14 @@ class SlidingWindow:
             return False
         return True
 
-    def _note_motion(self, arrival: Arrival, estimate: Estimate) -> None:
-        """Remember how the camera moved, if the graph says so and not a prior alone."""
+    def _update_motion(self, pose: NewPose, estimate: Estimate) -> None:
+        """Update the velocity if edges, and not a prior alone, say how the camera moved."""
         measured_id = self._motion.measured_id
-        measured = self._members.get(measured_id) if arrival.measurements else None
-        T_world_measured = None
-        if measured is not None:
-            T = arrival.T_world_after.get(measured.key)
-            T_world_measured = self._graph.pose(measured_id) if T is None else T.matrix()
+        is_known = bool(pose.measurements) and measured_id in self._poses
         self._motion.append(
-            estimate, is_measured=arrival.is_measured, T_world_measured=T_world_measured
+            estimate,
+            is_measured=pose.is_measured,
+            T_world_measured=self._graph.pose(measured_id) if is_known else None,
         )
 
     def _keep_by_distance(self, frame_id: FrameId) -> None:
@@ -469,7 +473,7 @@ class SlidingWindow:
         }
         if self._config.n_keyframes > 0 and is_needed(scores, self._config):
             self.keep(frame_id)
-        n_kept = len(scores) + int(self._members[frame_id].is_kept)
+        n_kept = len(scores) + int(self._poses[frame_id].is_kept)
         for kept_id in choose_released(scores, self._config, n_kept=n_kept):
             self.release(kept_id)
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.backend.factors import Measurement
-from gvo.backend.gating import Verdict, disagreement, judge
+from gvo.backend.gating import GateResult, disagreement, gate_edges
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
@@ -171,8 +171,8 @@ def optimum(edges: list[Edge], references: dict[FrameId, FloatArray], T: FloatAr
 
 def verdict_of(
     edges: list[Edge], references: dict[FrameId, FloatArray], *, gate: float | None
-) -> Verdict:
-    return judge(
+) -> GateResult:
+    return gate_edges(
         [*map(Measurement.of, edges)],
         pose_of=lambda frame_id: gtsam.Pose3(references[frame_id]),
         relative_covariance=lambda *_: np.zeros((6, 6)),
@@ -234,7 +234,7 @@ def test_what_the_references_have_in_common_is_no_disagreement_of_theirs() -> No
     for offset, n_refused in ((shifted(2.0, 0.0, 0.0), 0), (shifted(0.0, 2.0, 0.0), 1)):
         edges = [edge(0, shifted(0.0, 0.0, 2.0), 1e-4 * np.eye(6)) for _ in range(2)]
         edges.append(edge(1, shifted(0.0, 0.0, 1.0) @ offset, 1e-4 * np.eye(6)))
-        verdict = judge(
+        verdict = gate_edges(
             [*map(Measurement.of, edges)],
             pose_of=lambda frame_id: gtsam.Pose3(here[frame_id]),
             relative_covariance=lambda a, b: np.zeros((6, 6)) if a == b else unknown,
@@ -318,7 +318,7 @@ def test_the_motion_is_asked_only_where_edges_disagree_and_votes_as_one() -> Non
 
     for places, refused in (((0.0, 9.9), []), ((0.0, 20.1), [0]), ((20.1, 0.0), [1])):
         asked.clear()
-        verdict = judge(
+        verdict = gate_edges(
             [*map(Measurement.of, on_a_line(*places))],
             pose_of=lambda _: gtsam.Pose3(),
             relative_covariance=lambda *_: np.zeros((6, 6)),

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gvo.backend.motion_model import Motion
+from gvo.backend.motion_model import ConstantVelocity
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray
@@ -24,7 +24,9 @@ def generator(twist: FloatArray) -> FloatArray:
     return np.array([[0, -rz, ry, tx], [rz, 0, -rx, ty], [-ry, rx, 0, tz], [0, 0, 0, 0]])
 
 
-def moving(motion: Motion, start: FloatArray, velocity: FloatArray, n: int) -> list[Estimate]:
+def moving(
+    motion: ConstantVelocity, start: FloatArray, velocity: FloatArray, n: int
+) -> list[Estimate]:
     """Let a camera move on with a velocity (rad/s, m/s) and be measured n times."""
     poses = [start @ expm(0.05 * frame * generator(velocity)) for frame in range(n)]
     given = [estimate(k, k * STEP_NS, T, 1e-4 * np.eye(6)) for k, T in enumerate(poses)]
@@ -39,7 +41,7 @@ def moving(motion: Motion, start: FloatArray, velocity: FloatArray, n: int) -> l
 def test_a_constant_velocity_goes_on(seed: int) -> None:
     rng = np.random.default_rng(seed)
     velocity, start = rng.normal(size=6), se3.exp(rng.normal(size=6))
-    motion = Motion(WindowConfig())
+    motion = ConstantVelocity(WindowConfig())
     last = moving(motion, start, velocity, 3)[-1]
     assert motion.last is last
     assert motion.measured_id == 2
@@ -61,7 +63,7 @@ def test_poses_without_a_measurement_follow_the_velocity_before_them(seed: int) 
     rng = np.random.default_rng(seed)
     velocity, jump = rng.normal(size=6), se3.exp(rng.normal(size=6))
     config = WindowConfig()
-    motion = Motion(config)
+    motion = ConstantVelocity(config)
     last = moving(motion, np.eye(4), velocity, 3)[-1]
     total = motion.predict_step(last.stamp_ns + 4 * STEP_NS)[1]
     coasted = estimate(3, last.stamp_ns + 3 * STEP_NS, jump, np.eye(6))
@@ -71,7 +73,7 @@ def test_poses_without_a_measurement_follow_the_velocity_before_them(seed: int) 
     T, covariance = motion.predict_step(coasted.stamp_ns + STEP_NS)
     np.testing.assert_allclose(T, expm(0.05 * generator(velocity)), atol=1e-9)
     # Two parts of the way add up to the whole, and the sigmas are those of the configuration.
-    first = Motion(config)
+    first = ConstantVelocity(config)
     moving(first, np.eye(4), velocity, 3)
     before = first.predict_step(coasted.stamp_ns)[1]
     np.testing.assert_allclose(covariance + before, total, rtol=1e-9)
@@ -80,7 +82,7 @@ def test_poses_without_a_measurement_follow_the_velocity_before_them(seed: int) 
 
 
 def test_the_configuration_can_change_on_the_way() -> None:
-    motion = Motion(WindowConfig())
+    motion = ConstantVelocity(WindowConfig())
     last = moving(motion, np.eye(4), np.ones(6), 2)[-1]
     T, before = motion.predict_step(last.stamp_ns + STEP_NS)
     wider = WindowConfig(coasting_sigma_m_per_s=3.0 * WindowConfig().coasting_sigma_m_per_s)
@@ -91,7 +93,7 @@ def test_the_configuration_can_change_on_the_way() -> None:
 
 
 def test_where_nothing_is_known_of_the_motion_the_camera_stands() -> None:
-    motion = Motion(WindowConfig())
+    motion = ConstantVelocity(WindowConfig())
     assert motion.last is None
     assert motion.measured_id is None
     assert motion.predict_pose(0) is None

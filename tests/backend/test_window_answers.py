@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from gvo.backend.gating import Ledger
+from gvo.backend.gating import WindowCounter
 from gvo.backend.isam2 import PoseGraph
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
@@ -77,14 +77,9 @@ def test_a_name_that_cannot_be_one_is_told_as_such(ask: Any) -> None:
 def test_others_are_looked_at_where_a_new_pose_moved_them(is_moved: bool) -> None:
     window = walk(WindowConfig(size=9, kernel="none"), 5)
     before = window.poses()
-    settle = PoseGraph.settle
-
-    def settle_so(self: Any, *arguments: Any, **options: Any) -> tuple[Any, bool]:
-        return settle(self, *arguments, **options)[0], is_moved
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PoseGraph, "positions", lambda _: FAR)
-        patch.setattr(PoseGraph, "settle", settle_so)
+        patch.setattr(PoseGraph, "iterate", lambda *_, **__: is_moved)
         estimate = window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
     np.testing.assert_allclose(estimate.T_world_cam, power(5), atol=1e-6)
     assert (window.counts.n_restored > 0) is is_moved
@@ -185,13 +180,27 @@ def test_late_measurements_are_listed_with_the_others() -> None:
 
 
 def test_a_refusal_is_gated_only_where_it_is_called_so() -> None:
-    ledger = Ledger()
-    first = ledger.reject("a", 7, "one", reference_id="b")
-    second = ledger.reject("c", None, "two", is_gated=True)
+    counter = WindowCounter()
+    first = Rejected(frame_id="a", stamp_ns=7, reason="one", reference_id="b")
+    second = Rejected(frame_id="c", stamp_ns=None, reason="two")
     assert (str(first), str(second)) == ("edge 'b' -> 'a' at 7 ns: one", "prior 'c': two")
-    ledger.add(n_poses=2, n_edges=3)
-    ledger.add(n_poses=1)
-    counts = ledger.counts
+    counter.add_rejected(first)
+    counter.add_rejected(second, is_gated=True)
+    counter.add(n_poses=2, n_edges=3)
+    counter.add(n_poses=1)
+    counts = counter.counts
     assert (counts.n_poses, counts.n_edges, counts.n_rejected, counts.n_gated) == (3, 3, 2, 1)
     assert counts.first_rejected == str(first)
     assert (counts.n_priors, counts.n_coasting, counts.n_restored, counts.n_rebuilt) == (0,) * 4
+
+
+def test_a_window_is_printed_in_one_line() -> None:
+    window = SlidingWindow(WindowConfig(size=3))
+    assert str(window) == "SlidingWindow: 0 of 0 poses, 0 edges accepted, 0 rejected"
+    for frame in range(5):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)] if frame else [])
+    window.keep(3)
+    assert isinstance(window.add_edge(4, edge("nobody", STEP)), Rejected)
+    assert str(window) == (
+        "SlidingWindow: 3 of 5 poses (newest 4, 1 kept), 4 edges accepted, 1 rejected"
+    )
