@@ -120,12 +120,12 @@ class Trajectory:
         """Return one line: how many poses, over what time and path, and what is known of them."""
         if len(self) == 0:
             return "Trajectory(no poses)"
-        seconds = 1e-9 * float(self.stamps_ns[-1] - self.stamps_ns[0])
-        path_m = float(self.distances()[-1])
+        start_ns, end_ns = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
+        seconds, path_m = 1e-9 * (end_ns - start_ns), float(self.distances()[-1])
         rotations = "" if self.has_rotations else ", positions alone"
         covariances = "" if self.covariances is None else ", with covariances"
         return (
-            f"Trajectory({len(self)} poses, {seconds:.1f} s from {format_stamp(self.stamps_ns[0])}, "
+            f"Trajectory({len(self)} poses, {seconds:.1f} s from {format_stamp(start_ns)}, "
             f"{path_m:.2f} m{rotations}{covariances})"
         )
 
