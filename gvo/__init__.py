@@ -6,7 +6,7 @@ The public names are loaded when they are first used, so that the command line a
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from gvo.version import __version__
+from gvo._version import __version__
 
 if TYPE_CHECKING:
     from gvo.backend.window import SlidingWindow
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from gvo.io.poses.inputs import asked_truth, choose_frame, read_ground_truth
     from gvo.io.synthetic.recording import SyntheticRecording
     from gvo.odometry.odometry import Odometry
-    from gvo.run_outputs import RunOutputs
-    from gvo.runs import RunResult, run_recording
+    from gvo.runs.outputs.options import RunOutputs
+    from gvo.runs.run import RunResult, run_recording
     from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
     from gvo.trajectory.formats import read_trajectory
     from gvo.trajectory.trajectory import Trajectory
@@ -53,8 +53,8 @@ _MODULES = {
     "gvo.io.convert.convert": ("convert",),
     "gvo.viz.plots": ("plot_trajectories",),
     "gvo.io.poses.inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
-    "gvo.run_outputs": ("RunOutputs",),
-    "gvo.runs": ("RunResult", "run_recording"),
+    "gvo.runs.outputs.options": ("RunOutputs",),
+    "gvo.runs.run": ("RunResult", "run_recording"),
     "gvo.io.excerpt": ("Excerpt",),
     "gvo.io.frames": ("frames",),
     "gvo.io.opening": ("RecordingOptions", "open_recording"),

@@ -19,8 +19,8 @@ from gvo.io.frames import one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.outputs.run_overlay import RunOverlay, film_width
-from gvo.run_loop import RunLoop
+from gvo.runs.loop import RunLoop
+from gvo.runs.outputs.video import RunOverlay, film_width
 from gvo.types import FaultyFrame, Frame, FrameResult
 from gvo.viz.overlay import compose_overlay
 from gvo.viz.video import open_sink

@@ -35,7 +35,7 @@ from gvo.backend.factors import Factors, Measurement
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.io.recording import Source
-from gvo.run_summary import peak_memory_mb
+from gvo.runs.summary import peak_memory_mb
 from gvo.types import Edge, FaultyFrame, FloatArray, PosePrior, PositionPrior, Prior
 
 STEP_NS = 100_000_000

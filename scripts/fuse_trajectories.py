@@ -14,7 +14,7 @@ from pathlib import Path
 
 import gvo
 from gvo.io.edges.opening import open_edges, parse_sigma
-from gvo.smoothing import smooth_edges
+from gvo.runs.smooth import smooth_edges
 
 
 def main() -> int:

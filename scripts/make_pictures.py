@@ -23,12 +23,12 @@ from PIL import Image
 
 import gvo
 from gvo.config import Config
-from gvo.demo import write_demo_bag
 from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
 from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
-from gvo.run_outputs import RunOutputs
+from gvo.runs.demo import write_demo_bag
+from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.explanation.extraction import draw_stereo
 from gvo.viz.overlay import compose_overlay
 from gvo.viz.report import write_run_report

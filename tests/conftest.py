@@ -44,7 +44,7 @@ def gvo_data() -> Path:
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Return a function that runs the `gvo` command with its arguments."""
 
-    from gvo.cli import main
+    from gvo.cli.main import main
 
     def run(*arguments: object) -> Answer:
         monkeypatch.setattr("sys.argv", ["gvo", *map(str, arguments)])

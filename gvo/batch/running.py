@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 from distributed import Client
 
+from gvo._version import __version__
 from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.results import to_frame, write_results
@@ -27,7 +28,6 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions
 from gvo.io.run_folder.line_file import replace_text
 from gvo.io.run_folder.writer import REPORT
-from gvo.version import __version__
 
 # How often the table is written while the batch runs.
 _EVERY_S = 10.0

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gvo._text import read_text
+from gvo._version import __version__
 from gvo.batch.rows import BatchRow, RunStatus, Value, measures_of
 from gvo.batch.storage import fetch, fetch_file, is_url, store
 from gvo.config import Config
@@ -20,11 +21,10 @@ from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.writer import SUMMARY
-from gvo.run_outputs import RunOutputs
-from gvo.run_summary import run_identity
-from gvo.run_tally import Progress
-from gvo.runs import EXIT_COMPLETE, RunResult, run_recording
-from gvo.version import __version__
+from gvo.runs.outputs.options import RunOutputs
+from gvo.runs.run import EXIT_COMPLETE, RunResult, run_recording
+from gvo.runs.statistics import Progress
+from gvo.runs.summary import run_identity
 
 MARK = "batch.json"
 # How long to wait for another process that writes the folder of the run.

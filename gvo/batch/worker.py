@@ -15,7 +15,7 @@ from gvo.errors import GvoError
 if TYPE_CHECKING:
     from gvo.batch.rows import BatchRow
     from gvo.batch.tasks import Task, TaskOptions
-    from gvo.run_tally import Progress
+    from gvo.runs.statistics import Progress
 
 _REPORT_EVERY_S = 1.0
 

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from gvo.batch import BatchProgress
-from gvo.cli_batch import _clock, _words
+from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import (
     GVO,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gvo.batch.worker import BatchStoppedError, _reporter
-from gvo.run_tally import Progress
+from gvo.runs.statistics import Progress
 
 KEY = ("batch", 7)
 _PROGRAM = """

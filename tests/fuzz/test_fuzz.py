@@ -12,7 +12,7 @@ from tests.fuzz.mutations import mutate_bytes
 from tests.fuzz.target import Target
 from tests.fuzz.targets import TARGETS
 
-SCRIPT = Path(__file__).parent.parent.parent / "scripts" / "fuzz.py"
+SCRIPT = Path(__file__).parents[1] / "quality" / "fuzz.py"
 # What opens files, or smooths, takes milliseconds an execution.
 _N_SLOW = 40
 _N_QUICK = 400

@@ -18,8 +18,8 @@ from gvo.io.poses.base_frame import parse_initial_pose
 from gvo.io.poses.ground_truth import parse_bag_truth, parse_truth
 from gvo.io.recording import StampedImage
 from gvo.io.run_folder.writer import RunFolder
-from gvo.smoothing import POSES_HEADER, Smoother
-from gvo.smoothing_lines import _answer_all as answer_lines
+from gvo.runs.smooth import POSES_HEADER, Smoother
+from gvo.runs.smooth import _answer_all as answer_lines
 from gvo.trajectory.formats import COVARIANCE_HEADER, read_covariances, read_trajectory
 from gvo.trajectory.g2o import convert_line
 from gvo.trajectory.g2o import parse_line as parse_g2o_line

@@ -12,7 +12,7 @@ from gvo.geometry import se3
 from gvo.io.edges.events import PoseEvent
 from gvo.io.run_folder.writer import RunFolder
 from gvo.odometry.chain import EdgeChain
-from gvo.smoothing import POSES_HEADER, Smoother
+from gvo.runs.smooth import POSES_HEADER, Smoother
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, Status
 
 SECOND = 1_000_000_000

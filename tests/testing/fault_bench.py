@@ -18,8 +18,8 @@ from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.run_outputs import RunOutputs
-from gvo.runs import run_recording
+from gvo.runs.outputs.options import RunOutputs
+from gvo.runs.run import run_recording
 from gvo.testing.faults import FaultyImage, FaultySource
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory

@@ -11,7 +11,7 @@ import pytest
 from gvo.errors import GvoError, RecordingError, TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs import run_recording
+from gvo.runs.run import run_recording
 from gvo.trajectory.formats import read_covariances, read_trajectory
 
 N = 6

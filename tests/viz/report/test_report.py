@@ -15,7 +15,7 @@ from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs import run_recording
+from gvo.runs.run import run_recording
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import write_covariances, write_tum
 from gvo.trajectory.trajectory import Trajectory

@@ -8,9 +8,9 @@ import pytest
 import gvo
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.run_outputs import RunOutputs
+from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.report import write_run_report
-from tests.outputs.long_run import make_long_run
+from tests.runs.outputs.long_run import make_long_run
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
 

@@ -8,7 +8,7 @@ import pytest
 import gvo
 from gvo.config import Config, load_configuration
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.run_outputs import RunOutputs
+from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
 from tests.viz.browser import Browser

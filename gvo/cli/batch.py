@@ -1,0 +1,206 @@
+"""The command for many recordings: a batch, a sweep of parameters."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
+
+import typer
+
+from gvo.cli.options import (
+    CalibrationFiles,
+    Color,
+    Depth,
+    Duration,
+    Every,
+    Left,
+    Right,
+    Settings,
+    Start,
+)
+from gvo.cli.terminal import both, interruptible, warn
+from gvo.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from gvo.batch import BatchProgress
+
+_CONFIGURATIONS = (".yaml", ".yml")
+_MAX_WARNINGS = 20
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the command to the `gvo` command."""
+    app.command()(batch)
+
+
+def batch(
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RECORDING...", help="Paths, URLs, patterns, folders, lists (.txt)."
+        ),
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="Folder to write, or a URL.")],
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SECTION.KEY=A,B,C", help="Run each value; several: each pair."),
+    ] = None,
+    configs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--configs", "--config", metavar="FILE...", help="YAML; each is a configuration."
+        ),
+    ] = None,
+    set_: Settings = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Processes here; one a core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="URL", help="Of a cluster, such as tcp://host:8786.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Run what is finished, too.")] = False,
+    start: Start = 0.0,
+    duration: Duration = None,
+    every: Every = 1,
+    with_report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Draw the picture and page of each run.")
+    ] = True,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
+    ] = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Run many recordings, or many parameters: one table, one report."""
+    from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
+    from gvo.io.excerpt import make_excerpt
+    from gvo.io.opening import RecordingOptions
+
+    if scheduler is not None and workers is not None:
+        raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
+    excerpt = make_excerpt(start, duration, every)
+    asked, files = _sort_arguments(recordings, configs)
+    variants = make_variants(files, set_ or [], sweep or [])
+    found = find_recordings(asked)
+    options = BatchOptions(
+        recording=RecordingOptions(
+            calibration=tuple(path.absolute() for path in calibration or ()),
+            left=left,
+            right=right,
+            color=color,
+            depth=depth,
+        ),
+        excerpt=excerpt,
+        report=with_report,
+        force=force,
+        plots=plots,
+    )
+    counts = _count(len(found), "recording"), _count(len(variants), "configuration")
+    typer.echo(", ".join(counts))
+    with (
+        interruptible() as check,
+        _told_how_to_go_on(out),
+        connected(scheduler, workers) as client,
+        _progress() as show,
+    ):
+        told = both(show, check)
+        table = run_batch(
+            found, variants, out=out, client=client, options=options, on_progress=told
+        )
+    _report(table, out)
+
+
+def _sort_arguments(
+    recordings: list[str], configs: list[str] | None
+) -> tuple[list[str], list[Path]]:
+    """Return recordings and configurations: of `--configs *.yaml` the shell makes arguments."""
+    given = [*(configs or []), *(one for one in recordings if one.endswith(_CONFIGURATIONS))]
+    rest = [one for one in recordings if not one.endswith(_CONFIGURATIONS)]
+    if not rest:
+        raise ConfigurationError("expected a recording beside the configurations")
+    files: list[Path] = []
+    for pattern in given:
+        path = Path(pattern)
+        matches = [path] if path.exists() else sorted(path.parent.glob(path.name))
+        if not matches:
+            raise ConfigurationError(f"{pattern}: no such configuration")
+        files += matches
+    return rest, files
+
+
+@contextmanager
+def _told_how_to_go_on(out: str) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(
+            f"gvo: interrupted; what was done stands in {out}: the same command goes on", err=True
+        )
+        raise
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[BatchProgress], None]]:
+    """Give a callback that draws a line on a terminal, and writes one for each run elsewhere."""
+    if not sys.stderr.isatty():
+        yield _print_row
+        return
+    from rich.console import Console
+    from rich.status import Status
+
+    with Status("waiting for workers", console=Console(stderr=True)) as status:
+        yield lambda progress: status.update(_words(progress))
+
+
+def _print_row(progress: BatchProgress) -> None:
+    row = progress.row
+    if row is not None:
+        what = f"{row.status}, found" if row.is_found else row.status
+        reason = f": {row.reason}" if row.reason else ""
+        typer.echo(f"[{progress.n_done}/{progress.n_total}] {row.folder}: {what}{reason}", err=True)
+
+
+def _words(progress: BatchProgress) -> str:
+    left = "" if progress.left_s is None else f", {_clock(progress.left_s)} left"
+    return (
+        f"{progress.n_done} of {progress.n_total} runs, {progress.n_failed} failed, "
+        f"{progress.frames_per_s:.0f} frames/s on {progress.n_workers} workers{left}"
+    )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _clock(seconds: float) -> str:
+    return time.strftime("%H:%M:%S" if seconds >= 3600 else "%M:%S", time.gmtime(seconds))
+
+
+def _report(table: pd.DataFrame, out: str) -> NoReturn:
+    """Print what a batch gave, and end with its exit code."""
+    from gvo.batch.rows import RunStatus
+    from gvo.io.run_folder.writer import REPORT
+    from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
+
+    counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}
+    unfinished = table[table["status"] != "complete"]
+    lines = [f"{row.folder}: {row.status}: {row.reason}" for row in unfinished.itertuples()]
+    warn(lines[:_MAX_WARNINGS])
+    if len(lines) > _MAX_WARNINGS:
+        warn([f"{len(lines) - _MAX_WARNINGS} more runs are not complete, see the table"])
+    words = ", ".join(f"{n} {status}" for status, n in counts.items() if n)
+    typer.echo(f"{_count(len(table), 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
+    if counts["complete"] == len(table):
+        raise typer.Exit(EXIT_COMPLETE)
+    if counts["failed"] == len(table):
+        raise ConfigurationError("all runs failed")
+    raise typer.Exit(EXIT_PARTLY)

@@ -1,0 +1,189 @@
+"""The commands that show: one frame explained, the page in the browser, there and back."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gvo.cli.options import (
+    CalibrationFiles,
+    Color,
+    ConfigFile,
+    Depth,
+    Duration,
+    Every,
+    Left,
+    Out,
+    Recordings,
+    Right,
+    Settings,
+    Start,
+    load,
+    open_source,
+)
+from gvo.cli.terminal import both, interruptible, progress, warn
+from gvo.errors import ConfigurationError, GvoError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from gvo.config import Config
+    from gvo.io.recording import Source
+    from gvo.trajectory.trajectory import Trajectory
+
+_DEFAULT_PORT = 8080
+# How often the page looks for signals.
+_SIGNALS_S = 0.1
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add the commands to the `gvo` command."""
+    for command in (explain, view, shuttle):
+        app.command()(command)
+
+
+def explain(
+    recordings: Recordings,
+    out: Out,
+    frame: Annotated[
+        int, typer.Option("--frame", min=0, metavar="N", help="Which frame; 0 is the first.")
+    ],
+    start: Start = 0.0,
+    every: Every = 1,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Show one frame from image to pose, step by step, as pictures."""
+    from gvo.diagnostics.explain import explain_frame
+    from gvo.io.excerpt import make_excerpt
+    from gvo.runs.statistics import Progress
+    from gvo.viz.explanation import open_folder, write_explanation
+
+    parameters = load(config, set_)
+    excerpt = make_excerpt(start, None, every)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    open_folder(out)
+    with interruptible() as check, progress(source.info.name) as show:
+        told = both(show, check)
+        explanation = explain_frame(
+            source,
+            frame,
+            config=parameters,
+            excerpt=excerpt,
+            on_progress=lambda n_done, n_to_do, n_tracked: told(
+                Progress(n_done=n_done, n_total=n_to_do, n_tracked=n_tracked)
+            ),
+        )
+        written = write_explanation(explanation, out)
+    for path in written:
+        typer.echo(path)
+
+
+def view(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
+    ],
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = (
+        _DEFAULT_PORT
+    ),
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Watch odometry in the browser, with its parameters as controls."""
+    from gvo.viz.view import serve
+    from gvo.viz.view.player import Player
+
+    with interruptible() as check, ExitStack() as stack:
+        shown: Player | Path = recordings[0]
+        truth: Trajectory | None = None
+        topics = {"left": left, "right": right, "color": color, "depth": depth}
+        if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
+            given = {"config": config, "set": set_, "calibration": calibration, **topics}
+            _refuse_for_a_run(recordings[0], given)
+        else:
+
+            def open_again(config: Config) -> Source:
+                return open_source(recordings, config, calibration, topics)
+
+            player = stack.enter_context(Player(open_again, load(config, set_)))
+            shown, truth = player, _find_truth(player.source)
+        server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
+        warn([server.note] if server.note else [])
+        typer.echo(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
+        while not server.wait(_SIGNALS_S):
+            check(None)
+
+
+def _refuse_for_a_run(folder: Path, given: Mapping[str, object]) -> None:
+    for name, value in given.items():
+        if value:
+            raise ConfigurationError(
+                f"--{name}: {folder} is a finished run, which is shown as it was made; "
+                "give the recording itself"
+            )
+
+
+def _find_truth(source: Source) -> Trajectory | None:
+    """Return what the recording itself names its ground truth; it is not needed to watch."""
+    from gvo.io.poses.inputs import own_truth
+    from gvo.types import Failure
+
+    try:
+        truth = own_truth(source)
+    except GvoError as error:
+        warn([f"no ground truth: {error}"])
+        return None
+    return None if isinstance(truth, Failure) else truth.trajectory
+
+
+def shuttle(
+    recordings: Recordings,
+    out: Out,
+    start: Start = 0.0,
+    duration: Duration = None,
+    every: Every = 1,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Drive a recording there and back: the drift without a ground truth."""
+    from gvo.io.excerpt import make_excerpt
+    from gvo.runs.round_trip import shuttle as run_shuttle
+    from gvo.trajectory.round_trip import format_closings
+
+    parameters = load(config, set_)
+    excerpt = make_excerpt(start, duration, every)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    for line in source.info.decisions:
+        typer.echo(line)
+    with interruptible() as check, progress(source.info.name) as show:
+        result = run_shuttle(
+            source, out, config=parameters, excerpt=excerpt, on_progress=both(show, check)
+        )
+    typer.echo(format_closings(result.closings), nl=False)
+    typer.echo(out / "shuttle.png")
+    warn(result.warnings)
+    raise typer.Exit(result.exit_code)

@@ -1,0 +1,455 @@
+"""The `gvo` command: parses, calls, prints; computes nothing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from gvo._version import __version__
+from gvo.cli import batch as cli_batch
+from gvo.cli import inspect as cli_seeing
+from gvo.cli.options import (
+    CalibrationFiles,
+    Color,
+    ConfigFile,
+    Depth,
+    Duration,
+    Every,
+    Left,
+    Out,
+    Recordings,
+    Right,
+    Settings,
+    Start,
+    load,
+    open_source,
+)
+from gvo.cli.terminal import (
+    both,
+    interruptible,
+    progress,
+    report,
+    report_smoothed,
+    told_where_it_stands,
+    warn,
+)
+from gvo.errors import ConfigurationError, GvoError, OutputError
+
+if TYPE_CHECKING:
+    from gvo.config import Config
+    from gvo.trajectory.trajectory import Trajectory
+
+app = typer.Typer(
+    name="gvo",
+    help="Visual odometry: a stereo or RGB-D recording in, trajectories with covariances out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+EXIT_FAULTS = 1
+EXIT_UNUSABLE = 2
+
+
+class _KeyframePolicy(StrEnum):
+    DISTANCE = "distance"
+    MANUAL = "manual"
+
+
+class _Layout(StrEnum):
+    BAG = "bag"
+    KITTI = "kitti"
+    EUROC = "euroc"
+    TUM = "tum"
+
+
+class _Align(StrEnum):
+    NONE = "none"
+    ORIGIN = "origin"
+    SE3 = "se3"
+    SIM3 = "sim3"
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"gvo {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+    ] = False,
+) -> None:
+    """Take the options that stand before a command."""
+
+
+@app.command()
+def demo(
+    out: Out = Path("gvo-demo"),
+) -> None:
+    """Render a drive as a bag, run on it, compare with the truth."""
+    from gvo.runs.demo import BAG_NAME, run_demo
+
+    typer.echo(f"rendering a drive into {out / BAG_NAME}")
+    with interruptible() as check, progress("demo") as show:
+        result = run_demo(out, on_rendered=check, on_progress=both(show, check))
+    report(result, out)
+
+
+@app.command()
+def run(
+    recordings: Recordings,
+    out: Out,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    start: Start = 0.0,
+    duration: Duration = None,
+    every: Every = 1,
+    frame: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Write poses of this frame of tf, not the camera's."),
+    ] = None,
+    initial_pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POSE", help="Of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        str | None,
+        typer.Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too."),
+    ] = None,
+    world: Annotated[
+        str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
+    ] = "world",
+    overlay: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Film the matches: .webm, .mp4, or a folder of PNG."),
+    ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
+    ] = None,
+    with_report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
+    ] = True,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
+    ] = None,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+) -> None:
+    """Estimate the trajectory of a recording, with covariances."""
+    from gvo.io.excerpt import make_excerpt
+    from gvo.io.poses.base_frame import parse_initial_pose
+    from gvo.io.poses.inputs import asked_truth, choose_frame
+    from gvo.runs.outputs.options import RunOutputs
+    from gvo.runs.run import run_recording
+
+    parameters = load(config, set_)
+    excerpt = make_excerpt(start, duration, every)
+    pose = None if initial_pose is None else parse_initial_pose(initial_pose)
+    outputs = RunOutputs(
+        bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
+    )
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    placed = choose_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
+    truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
+    for line in source.info.decisions:
+        typer.echo(line)
+    with (
+        interruptible() as check,
+        told_where_it_stands(out),
+        progress(source.info.name) as show,
+    ):
+        result = run_recording(
+            source,
+            out,
+            config=parameters,
+            ground_truth=truth,
+            frame=placed,
+            starts_at_truth=isinstance(pose, str),
+            excerpt=excerpt,
+            outputs=outputs,
+            on_progress=both(show, check),
+        )
+    report(result, out)
+
+
+@app.command("check")
+def check_(
+    recordings: Recordings,
+    config: ConfigFile = None,
+    set_: Settings = None,
+    frame: Annotated[
+        str, typer.Option(metavar="NAME", help="The robot's own frame in tf.")
+    ] = "base_link",
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+    as_json: _AsJson = False,
+) -> None:
+    """Look for what would make odometry fail, before it runs."""
+    from gvo.diagnostics.check import check_recording, format_check
+    from gvo.io.poses.inputs import count_calibration_changes, read_transforms
+
+    parameters = load(config, set_)
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    source = open_source(recordings, parameters, calibration, topics)
+    with interruptible():
+        result = check_recording(
+            source,
+            parameters,
+            transforms=read_transforms(source, (source.info.frame_id, frame)),
+            base_frame=frame,
+            calibration_changes=count_calibration_changes(source),
+        )
+    if as_json:
+        typer.echo(json.dumps(result.as_json(), allow_nan=False))
+    else:
+        typer.echo(format_check(result), nl=False)
+    raise typer.Exit(0 if result.is_healthy else EXIT_FAULTS)
+
+
+@app.command()
+def smooth(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
+        ),
+    ],
+    out: Out,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
+    ] = None,
+    sigma: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sigma", metavar="DEG,M", help="Of a step, for all inputs or one after another."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
+    ] = None,
+    keyframes: Annotated[
+        _KeyframePolicy, typer.Option(help="What keeps poses in the window.")
+    ] = _KeyframePolicy.DISTANCE,
+    config: ConfigFile = None,
+    set_: Settings = None,
+) -> None:
+    """Smooth the edges or poses of any front-end."""
+    from gvo.io.edges.opening import open_edges, parse_sigma
+    from gvo.io.poses.inputs import read_ground_truth
+    from gvo.runs.smooth import configuration_for, smooth_edges
+
+    parameters = load(config, set_)
+    truth = None if ground_truth is None else read_ground_truth(ground_truth)
+    if "-" in inputs:
+        _refuse_with_lines(inputs, topic=topic, sigma=sigma)
+        _smooth_lines(out, config=parameters, keyframes=keyframes, ground_truth=truth)
+    sigmas = [parse_sigma(text) for text in sigma or []]
+    source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
+    for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
+        typer.echo(decision)
+    with interruptible() as check, progress(source.name, "poses") as show:
+        result = smooth_edges(
+            source,
+            out,
+            config=parameters,
+            keyframes=keyframes.value,
+            ground_truth=truth,
+            on_progress=both(show, check),
+        )
+    report_smoothed(result, out)
+
+
+def _refuse_with_lines(inputs: list[str], **options: object) -> None:
+    if len(inputs) > 1:
+        raise ConfigurationError("-: standard input does not go with another input")
+    for name, given in options.items():
+        if given:
+            raise ConfigurationError(f"-: standard input does not go with --{name}")
+
+
+def _smooth_lines(
+    out: Path, *, config: Config, keyframes: _KeyframePolicy, ground_truth: Trajectory | None
+) -> NoReturn:
+    """Answer standard input line by line; nothing else goes to standard output."""
+    from gvo.io.edges.lines import read_lines
+    from gvo.runs.smooth import smooth_lines
+
+    def answer(line: str) -> None:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+
+    with interruptible() as check:
+        result = smooth_lines(
+            read_lines(sys.stdin.fileno(), lambda: check(None)),
+            answer,
+            out,
+            config=config,
+            keyframes=keyframes.value,
+            ground_truth=ground_truth,
+        )
+    report_smoothed(result, out, is_stdout_taken=True)
+
+
+@app.command()
+def compare(
+    reference: Annotated[
+        str,
+        typer.Argument(
+            help="File (TUM, KITTI, EuRoC), recording, or BAG#tf:PARENT:CHILD, BAG#TOPIC."
+        ),
+    ],
+    estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
+    align: Annotated[_Align, typer.Option(help="What moves each estimate.")] = _Align.SE3,
+    segments: Annotated[
+        str | None, typer.Option(metavar="L,...", help="Lengths in m; 100,...,800 or 20,50.")
+    ] = None,
+    segment_step: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Every Nth pose a start; 10 or 1.")
+    ] = None,
+    as_json: _AsJson = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw a .png, .pdf or .svg.")
+    ] = None,
+    report_file: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE", help="Write a page, .html.")
+    ] = None,
+    plots: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
+    ] = None,
+) -> None:
+    """Measure trajectories against a reference: ATE, RPE, segments."""
+    from gvo.io.poses.inputs import read_compared
+    from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
+
+    truth, trajectories, notes = read_compared(reference, estimates)
+    warn(notes)
+    lengths = None if segments is None else _parse_lengths(segments)
+    evaluations = [
+        evaluate(
+            truth,
+            trajectory,
+            name=name,
+            align=align.value,
+            segments=lengths,
+            segment_step=segment_step,
+        )
+        for name, trajectory in trajectories.items()
+    ]
+    if as_json:
+        typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
+    else:
+        typer.echo(format_evaluations(evaluations), nl=False)
+    if plot is not None:
+        from gvo.viz.plots import plot_trajectories
+
+        plot_trajectories(plot, truth, trajectories, align=align.value)
+    if report_file is not None or plots is not None:
+        from gvo.viz.report import write_comparison_report
+
+        write_comparison_report(
+            report_file, truth, trajectories, evaluations, align=align.value, plots=plots
+        )
+
+
+@app.command("convert")
+def convert_(
+    recordings: Recordings,
+    target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
+    layout: Annotated[
+        _Layout | None, typer.Option(help="Of the folder; a data set's for a bag, else a bag's.")
+    ] = None,
+    rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
+    png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
+    calibration: CalibrationFiles = None,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+    config: ConfigFile = None,
+    set_: Settings = None,
+) -> None:
+    """Write a data-set folder as a bag, or a bag as such a folder."""
+    from gvo.io.convert.convert import convert
+    from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
+
+    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    settings = load(config, set_)
+    source = open_source(recordings, settings, calibration, topics)
+    with interruptible() as check:
+        written = convert(
+            source,
+            target,
+            layout=None if layout is None else layout.value,
+            rectify=rectify,
+            compress=png,
+            config=settings,
+            progress=check,
+        )
+    typer.echo(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
+    warn(written.skipped)
+    raise typer.Exit(EXIT_PARTLY if written.skipped else EXIT_COMPLETE)
+
+
+@app.command("config")
+def config_(config: ConfigFile = None, set_: Settings = None) -> None:
+    """Print all parameters with units, ranges and meaning."""
+    from gvo.config import describe_configuration
+
+    typer.echo(describe_configuration(load(config, set_)), nl=False)
+
+
+def _parse_lengths(text: str) -> list[float]:
+    try:
+        lengths = [float(part) for part in text.split(",")]
+    except ValueError:
+        lengths = []
+    if not lengths or not all(0 < length < float("inf") for length in lengths):
+        raise ConfigurationError(
+            f"--segments {text}: expected positive lengths in metres, such as 100,200"
+        )
+    return lengths
+
+
+cli_batch.add_commands(app)
+cli_seeing.add_commands(app)
+
+
+def main() -> None:
+    """Run the command; one line and exit code 2 for bad input."""
+    try:
+        app()
+    except GvoError as error:
+        typer.echo(f"gvo: error: {error}", err=True)
+        raise SystemExit(_exit_code(error)) from None
+
+
+def _exit_code(error: GvoError) -> int:
+    if not (isinstance(error, OutputError) and error.is_partly):
+        return EXIT_UNUSABLE
+    from gvo.runs.run import EXIT_PARTLY
+
+    return EXIT_PARTLY

@@ -1,0 +1,171 @@
+"""What the commands share: signals, progress bars, and what is printed at the end."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from gvo.runs.run import RunResult
+    from gvo.runs.statistics import Progress
+
+ProgressT = TypeVar("ProgressT")
+# By how much the total of a progress bar may be off.
+_MAX_OFF = 0.02
+_EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+def report(result: RunResult, out: Path) -> NoReturn:
+    """Print what a run of odometry gave, and end with its exit code."""
+    from gvo.trajectory.evaluation import format_evaluations
+
+    for key in ("frame", "ground_truth"):
+        typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
+    if result.evaluations:
+        typer.echo(format_evaluations(result.evaluations), nl=False)
+    frames, tracked = result.summary["frames"], result.summary["tracked"]
+    offsets = result.summary["rig_offsets"]
+    if offsets is not None:
+        typer.echo(
+            f"learnt of the rig: disparities too large by {offsets['disparity_px']:.3f} px, "
+            f"sigma {offsets['disparity_sigma_px']:.3f}; rows of the right image too large by "
+            f"{offsets['row_px']:.3f} px"
+        )
+    where = out if result.report is None else result.report
+    covered = f"coverage {result.summary['coverage_percent']:.1f} %"
+    segments = _segment_words(result.summary["segments"])
+    typer.echo(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
+    warn(result.warnings)
+    raise typer.Exit(result.exit_code)
+
+
+def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
+    """Print what smoothing gave, and end with its exit code.
+
+    Parameters
+    ----------
+    result : RunResult
+    out : Path
+        The run folder.
+    is_stdout_taken : bool
+        Print to standard error: the answers went to standard output.
+    """
+    from gvo.trajectory.evaluation import format_evaluations
+
+    if result.evaluations:
+        typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
+    summary = result.summary
+    if summary["polish"] is not None:
+        errors = summary["polish"]
+        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} polished"
+        typer.echo(text, err=is_stdout_taken)
+    counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
+    typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
+    warn(result.warnings)
+    raise typer.Exit(result.exit_code)
+
+
+def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
+    """Tell how many segments there are, where there is more than one."""
+    if len(segments) < 2:
+        return ""
+    n_joined = sum(segment["joined_to"] is not None for segment in segments)
+    return f", {len(segments)} segments, {n_joined} of them joined to another"
+
+
+def warn(warnings: Sequence[str]) -> None:
+    """Print warnings, a line each, to standard error."""
+    for warning in warnings:
+        typer.echo(f"gvo: warning: {warning}", err=True)
+
+
+@contextmanager
+def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], None]]:
+    """Give a callback that draws a bar on a terminal, and nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda progress: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]:.1f} " + unit + "/s, {task.fields[tracked]:.0%} tracked,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, start=False, rate=0.0, tracked=1.0)
+
+        def update(progress: Progress) -> None:
+            bar.start_task(task)
+            shown = bar.tasks[0]
+            # Another total makes rich forget the rate, and with it the time left.
+            if abs(progress.n_total - (shown.total or 0)) > _MAX_OFF * progress.n_total:
+                bar.update(task, total=progress.n_total)
+            bar.update(
+                task,
+                completed=progress.n_done,
+                rate=shown.speed or 0.0,
+                tracked=progress.n_tracked / max(progress.n_done, 1),
+            )
+
+        yield update
+
+
+def both(
+    show: Callable[[ProgressT], None], check: Callable[[object], None]
+) -> Callable[[ProgressT], None]:
+    """Return a callback that draws, then looks for signals."""
+
+    def on_progress(progress: ProgressT) -> None:
+        show(progress)
+        check(progress)
+
+    return on_progress
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[object], None]]:
+    """Give a function that ends the work where a signal has come; call it between frames.
+
+    So a frame is either in all files or in none. A second signal ends at once.
+    """
+    received: list[int] = []
+
+    def receive(number: int, frame: object) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+
+    def check(_: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, receive) for number in _EXIT_CODES}
+    try:
+        yield check
+    except KeyboardInterrupt:
+        raise SystemExit(_EXIT_CODES[received[0]] if received else 130) from None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def told_where_it_stands(out: Path) -> Iterator[None]:
+    """Say, where a run is interrupted, where its files are."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"gvo: interrupted; what was done stands in {out}", err=True)
+        raise

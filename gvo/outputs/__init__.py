@@ -1,1 +1,0 @@
-"""Files, tables and pictures that a run leaves."""

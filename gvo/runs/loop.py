@@ -1,0 +1,173 @@
+"""The loop of a run: frames in, poses out to all that writes them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from typing import Any, Protocol
+
+from gvo.config import Config
+from gvo.errors import OutputError, RecordingError
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames, is_lost, one_opencv_thread
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
+from gvo.odometry.odometry import Odometry
+from gvo.runs.statistics import Progress, RunTally
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
+
+
+class Output(Protocol):
+    """What writes a run as it goes; all poses are of the frame that was asked for."""
+
+    def add_frame(self, frame: Any, result: FrameResult) -> None:  # noqa: ANN401
+        """Write what one frame gave, and the smoothed poses that are final with it."""
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write that a frame has no pose."""
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses that are final."""
+
+
+class RunLoop:
+    """Odometry over a recording, or a part of it.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    config : Config
+    frame : OutputFrame
+        Whose poses are written.
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    first_pose : callable, optional
+        Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
+    items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
+        The frames in another order than that of the recording.
+
+    Attributes
+    ----------
+    tally : RunTally
+        What was counted.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        frame: OutputFrame,
+        *,
+        excerpt: Excerpt | None = None,
+        first_pose: Callable[[int], FloatArray] | None = None,
+        items: Iterable[Frame | FaultyFrame] | None = None,
+    ) -> None:
+        self.source = source
+        self.config = config
+        self.frame = frame
+        self.tally = RunTally()
+        self._excerpt = excerpt or Excerpt()
+        self._first_pose = first_pose
+        self._items = items
+        self._read_ms = 0.0
+        self._first_ns: int | None = None
+        self._odometry = Odometry(source.info.camera, config)
+
+    @property
+    def is_excerpt(self) -> bool:
+        """Tell whether a part of the recording is read."""
+        return not self._excerpt.is_everything
+
+    def run(
+        self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
+    ) -> None:
+        """Take all frames; where the recording breaks off, note it and end.
+
+        Parameters
+        ----------
+        outputs : iterable of Output
+            Are given the poses, also those that the window still holds where it is interrupted.
+        on_progress : callable, optional
+            Called after each frame.
+        """
+        outputs = tuple(outputs)
+        with one_opencv_thread():
+            is_writable = True
+            try:
+                for item in self._read():
+                    self._take(item, outputs)
+                    if on_progress is not None:
+                        on_progress(self.tally.progress(self._n_expected(item.stamp_ns)))
+            except OutputError:
+                is_writable = False
+                raise
+            finally:
+                finished = self._placed(self._odometry.finish())
+                for output in outputs if is_writable else ():
+                    output.add_smoothed(finished)
+                self.count()
+
+    def count(self) -> None:
+        """Take into the tally what others have counted so far."""
+        window = self._odometry.window
+        self.tally.window, self.tally.polish = window.counts, window.polish
+        self.tally.rig_offsets = self._odometry.rig_offsets
+        self.tally.n_guessed = self.frame.n_guessed
+        self.tally.mount_travel_m = self.frame.mount_travel_m
+
+    def _n_expected(self, stamp_ns: int) -> int:
+        """Estimate how many images are to come in all, from the stamps so far."""
+        n_images, n_done = self.source.info.n_images, self.tally.n_frames + self.tally.n_unpaired
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        if n_done < 2:
+            return self._excerpt.n_expected(n_images)
+        period_s = 1e-9 * (stamp_ns - self._first_ns) / (n_done - 1) / self._excerpt.every
+        length_s = max(period_s, 0.0) * n_images
+        return self._excerpt.n_expected(n_images, length_s=length_s or None)
+
+    def _read(self) -> Iterator[Frame | FaultyFrame]:
+        items = self._items
+        iterator = frames(self.source, self.config, self._excerpt) if items is None else iter(items)
+        while True:
+            start = time.perf_counter()
+            try:
+                item = next(iterator)
+            except StopIteration:
+                return
+            except RecordingError as error:
+                self.tally.broken_off = str(error)
+                return
+            self._read_ms = 1e3 * (time.perf_counter() - start)
+            yield item
+
+    def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
+        """Count a frame, and give the outputs its poses as those of the frame asked for."""
+        if isinstance(item, FaultyFrame):
+            self._take_faulty(item, outputs)
+            return
+        if self._first_pose is not None and self.frame.first_stamp_ns is None:
+            self.frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
+        result = self._odometry.track(item)
+        placed = replace(
+            result,
+            raw=self.frame.apply(result.raw),
+            causal=self.frame.apply(result.causal),
+            finished=self._placed(result.finished),
+            stage_ms={"read": self._read_ms, **result.stage_ms},
+        )
+        self.tally.add_result(placed)
+        for output in outputs:
+            output.add_frame(item, placed)
+
+    def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
+        is_loss = is_lost(item, self.source.info.sensor)
+        self.tally.add_duration("read", self._read_ms)
+        self.tally.add_faulty(item, is_loss=is_loss)
+        for output in outputs if is_loss else ():
+            output.add_faulty(item)
+
+    def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+        return tuple(self.frame.apply(estimate) for estimate in estimates)

@@ -1,0 +1,316 @@
+"""A run as a bag for RViz and Foxglove, written while the run goes.
+
+Topics (frames: see `RunFrames`)
+
+===========================  ==============================  ======================================
+`/tf`, `/tf_static`          `tf2_msgs/TFMessage`            the frames and their poses
+`/gvo/NAME/odometry`         `nav_msgs/Odometry`             NAME: raw, causal, smoothed
+`/gvo/NAME/path`             `nav_msgs/Path`                 NAME: raw, smoothed
+`/gvo/points`                `sensor_msgs/PointCloud2`       matched points in `gvo/causal/CAMERA`
+`/gvo/matches/compressed`    `sensor_msgs/CompressedImage`   matches drawn over the image
+`/diagnostics`               `diagnostic_msgs/...Array`      status, counts, milliseconds
+===========================  ==============================  ======================================
+
+All stamps are those of the frames. The log time is the stamp of the newest frame at the time: a
+smoothed pose appears when it was known, with its own, earlier stamp. Raw and causal poses,
+points, pictures and diagnostics come once a frame; a frame without a registration has an empty
+cloud and a picture without lines.
+
+The velocity of an `Odometry` is that from the pose before, as far as it was known, to this one; 0
+where none was. Its covariance is known for the raw poses alone, from the registration between the
+two; elsewhere, and where the chain coasts, its diagonal is -1.
+
+Smoothed poses of keyframes come late, when all that sees them has left the window. A tf buffer
+drops what is more than its cache time (10 s by default) behind; `Odometry` and the paths hold
+them all.
+
+Paths are written at each full second of the recording and at the end. The ones in between hold
+every pose, every second, every fourth ... so that there are at most 500 and the file grows with
+the length of the run, not with its square; those at the end hold all poses.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rosbags.rosbag1 import WriterError as WriterError1
+from rosbags.rosbag2 import WriterError as WriterError2
+
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_transforms
+from gvo.runs.outputs.bag_messages import (
+    write_diagnostics,
+    write_odometry,
+    write_path,
+    write_points,
+)
+from gvo.runs.outputs.frames import RunFrames, StampedPose, Track, twist_between
+from gvo.types import (
+    BoolArray,
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    FrameResult,
+    ImageArray,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
+from gvo.viz.overlay import draw_matches
+
+SUFFIXES: Final = (".mcap", ".bag")
+N_SHOWN_POSES: Final = 500
+"""Most poses of a path while the run goes."""
+
+_SECOND_NS: Final = 10**9
+_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
+
+
+class RunBag(AbstractContextManager["RunBag"]):
+    """A bag of what a run computes, open inside a `with` block.
+
+    It is written under another name in the same folder and takes its own when it is closed, also
+    where the run is interrupted. Without a single frame no file is left.
+
+    Parameters
+    ----------
+    path : Path
+        `.mcap`: one file of ROS 2; `.bag`: of ROS 1. Its folder is made where it is missing.
+    frames : RunFrames, optional
+
+    Raises
+    ------
+    RecordingError
+        When the path exists, ends otherwise or cannot be written.
+    """
+
+    def __init__(self, path: str | Path, frames: RunFrames | None = None) -> None:
+        self.path = Path(path)
+        self._frames = frames or RunFrames()
+        self._tracks = {"raw": Track(), "smoothed": Track()}
+        self._last: dict[str, Estimate] = {}
+        self._first_ns: int | None = None
+        self._newest_ns = 0
+        self._n_seconds = 0
+        self._is_open = True
+        _check_target(self.path)
+        with self._refused_on_error():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".gvo-bag-")
+            self._bag = BagWriter(Path(self._folder.name) / self.path.name).__enter__()
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Write what one frame gave.
+
+        Parameters
+        ----------
+        frame : StereoFrame or RgbdFrame
+            Whose image the matches are drawn over.
+        result : FrameResult
+            Its poses are those of the tracked frame.
+
+        Raises
+        ------
+        RecordingError
+            When the file cannot be written.
+        """
+        raw, causal = result.raw, result.causal
+        with self._refused_on_error():
+            self._begin(frame.stamp_ns)
+            self._write_tf([("raw", raw), ("causal", causal)])
+            covariance = self._step_covariance(result, raw)
+            self._write_odometry("raw", raw, self._previous("raw"), covariance)
+            self._write_odometry("causal", causal, self._previous("causal"))
+            self._tracks["raw"].add(raw)
+            self._last.update(raw=raw, causal=causal)
+            self._write_matches(frame, result)
+            self._write_paths_of_second(frame.stamp_ns)
+        self.add_smoothed(result.finished)
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses of the tracked frame that are final, in any order.
+
+        Raises
+        ------
+        RecordingError
+            When the file cannot be written.
+        """
+        estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
+        track = self._tracks["smoothed"]
+        with self._refused_on_error():
+            self._write_tf([("smoothed", estimate) for estimate in estimates])
+            for estimate in estimates:
+                self._write_odometry("smoothed", estimate, track.before(estimate.stamp_ns))
+                track.add(estimate)
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Tell of a frame without a pose, in the diagnostics alone."""
+        if self._first_ns is None:
+            return
+        with self._refused_on_error():
+            header = Header(frame.stamp_ns, self._frames.camera)
+            write_diagnostics(self._bag, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
+
+    def close(self) -> None:
+        """Write the whole paths and give the file its name; again: nothing.
+
+        Raises
+        ------
+        RecordingError
+            When the file cannot be written.
+        """
+        if not self._is_open:
+            return
+        self._is_open = False
+        with self._folder, self._refused_on_error():
+            try:
+                if self._first_ns is not None:
+                    self._write_paths()
+            finally:
+                self._bag.__exit__(None, None, None)
+            if self._first_ns is not None:
+                self._bag.result.rename(self.path)
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
+
+    @contextmanager
+    def _refused_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, WriterError1, WriterError2) as error:
+            detail = getattr(error, "strerror", None) or error
+            raise RecordingError(f"{self.path}: cannot be written: {detail}") from error
+
+    def _begin(self, stamp_ns: int) -> None:
+        """Note the stamp of a frame; before the first, write what never changes."""
+        self._newest_ns = stamp_ns
+        if self._first_ns is not None:
+            return
+        self._first_ns = stamp_ns
+        write_transforms(self._bag, "/tf_static", self._frames.fixed(stamp_ns), is_latched=True)
+
+    def _write_tf(self, named: Iterable[tuple[str, Estimate]]) -> None:
+        poses = [self._frames.moving(name, estimate) for name, estimate in named]
+        write_transforms(self._bag, "/tf", chain.from_iterable(poses))
+
+    def _previous(self, name: str) -> StampedPose | None:
+        last = self._last.get(name)
+        return None if last is None else StampedPose(last.stamp_ns, last.T_world_cam)
+
+    def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
+        """Return the covariance (6, 6) of the last step of the raw chain, where it is known.
+
+        After coasting, the registration is against an older frame than the pose before.
+        """
+        last = self._last.get("raw")
+        is_tied = last is not None and last.status == raw.status == Status.OK
+        if not is_tied or result.registration is None:
+            return None
+        Ad = se3.adjoint(self._frames.mount(raw.stamp_ns))
+        return np.asarray(Ad @ result.registration.covariance @ Ad.T)
+
+    def _write_odometry(
+        self,
+        name: str,
+        estimate: Estimate,
+        previous: StampedPose | None,
+        step_covariance: FloatArray | None = None,
+    ) -> None:
+        write_odometry(
+            self._bag,
+            f"/gvo/{name}/odometry",
+            estimate,
+            (self._frames.world, self._frames.tracked_by(name)),
+            twist_between(estimate, previous, step_covariance),
+        )
+
+    def _write_matches(self, frame: Frame, result: FrameResult) -> None:
+        """Write points, picture and diagnostics of a frame."""
+        image = frame.left if isinstance(frame, StereoFrame) else frame.image
+        found = result.registration or _NOTHING
+        n_told = min(len(found.pixels_current), len(found.points_current))
+        inliers = found.inliers[:n_told]
+        header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
+        write_points(
+            self._bag,
+            "/gvo/points",
+            header,
+            found.points_current[:n_told],
+            intensities=_grey_values(image, found.pixels_current[:n_told]),
+            inliers=inliers,
+        )
+        picture = draw_matches(
+            image,
+            found.pixels_reference[:n_told],
+            found.pixels_current[:n_told],
+            inliers,
+            lines=_caption(result),
+        )
+        write_picture(self._bag, "/gvo/matches/compressed", header, picture)
+        hardware = Header(frame.stamp_ns, self._frames.camera)
+        text = " ".join(_caption(result))
+        write_diagnostics(self._bag, hardware, result.status, text, _numbers(result))
+
+    def _write_paths_of_second(self, stamp_ns: int) -> None:
+        """Write the paths where a new second of the recording has begun."""
+        n_seconds = (stamp_ns - (self._first_ns or 0)) // _SECOND_NS
+        if n_seconds > self._n_seconds:
+            self._n_seconds = n_seconds
+            self._write_paths(N_SHOWN_POSES)
+
+    def _write_paths(self, n_most: int | None = None) -> None:
+        header = Header(self._newest_ns, self._frames.world)
+        for name, track in self._tracks.items():
+            if len(track) > 0:
+                write_path(self._bag, f"/gvo/{name}/path", header, *track.poses(n_most))
+
+
+def _check_target(path: Path) -> None:
+    if path.exists():
+        raise RecordingError(f"{path}: exists already; give another path or remove it")
+    if path.suffix not in SUFFIXES:
+        raise RecordingError(
+            f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got {path.name}"
+        )
+
+
+def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:
+    """Return the grey values (n,) of the nearest pixels; 0 outside the image."""
+    height, width = image.shape
+    u, v = np.rint(np.nan_to_num(pixels, nan=-1.0)).T
+    is_inside: BoolArray = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    values = np.zeros(len(pixels))
+    values[is_inside] = image[v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)]
+    return values
+
+
+def _caption(result: FrameResult) -> list[str]:
+    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers, {result.n_links} links"
+    lines = [f"{result.status}: {counts}"]
+    return [*lines, result.reason] if result.reason else lines
+
+
+def _numbers(result: FrameResult) -> dict[str, object]:
+    """Return what the diagnostics list."""
+    numbers: dict[str, object] = {
+        "status": result.status,
+        "status of the raw chain": result.raw.status,
+        "keypoints": result.n_keypoints,
+        "points": result.n_points,
+        "matches": result.n_matches,
+        "inliers": result.n_inliers,
+        "links": result.n_links,
+        "refused edges": len(result.causal.rejected),
+    }
+    stages = {f"{stage} [ms]": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
+    return {**numbers, **stages}

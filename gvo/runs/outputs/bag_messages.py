@@ -1,0 +1,242 @@
+"""Messages of what odometry computes: poses, paths, points, pictures, diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from gvo.geometry import se3
+from gvo.io.convert.bag_messages import BagWriter, Header, pose_numbers
+from gvo.runs.outputs.frames import Twist
+from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
+
+ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
+PATH_TYPE: Final = "nav_msgs/msg/Path"
+CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
+DIAGNOSTICS_TYPE: Final = "diagnostic_msgs/msg/DiagnosticArray"
+
+# Three bytes of padding: four-byte fields that start at multiples of four are read anywhere.
+_POINT: Final = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "inlier"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "u1"],
+        "itemsize": 20,
+    }
+)
+_UINT8, _FLOAT32 = 2, 7  # of sensor_msgs/PointField
+_LEVELS: Final = {
+    Status.OK: 0,
+    Status.RESUMED: 1,
+    Status.COASTING: 1,
+    Status.LOST: 2,
+    Status.SKIPPED: 2,
+}
+
+
+def covariance_to_ros(covariance: FloatArray, R_parent_frame: FloatArray) -> FloatArray:
+    """Return the covariance of a pose as messages of ROS state it.
+
+    Parameters
+    ----------
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
+    R_parent_frame : ndarray of float64, shape (3, 3)
+        Rotation of the pose.
+
+    Returns
+    -------
+    ndarray of float64, shape (6, 6)
+        Of (x, y, z, rx, ry, rz): the position in the parent frame, and the rotation about the
+        fixed axes of the parent frame.
+    """
+    # Exchange the halves and turn both: with the inverse rotation, that is the way back.
+    return se3.covariance_from_ros(covariance, R_parent_frame.T)
+
+
+def write_odometry(
+    bag: BagWriter, topic: str, estimate: Estimate, frames: tuple[str, str], twist: Twist
+) -> None:
+    """Write a pose and a velocity with their covariances as `nav_msgs/Odometry`.
+
+    A covariance of the velocity that is not known has -1 on its diagonal.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    estimate : Estimate
+        Pose of the child frame in the parent frame.
+    frames : (str, str)
+        Parent and child.
+    twist : Twist
+        Of the child frame, in its own axes.
+    """
+    parent, child = frames
+    R = estimate.T_world_cam[:3, :3]
+    message = bag.make(
+        ODOMETRY_TYPE,
+        header=bag.header(Header(estimate.stamp_ns, parent)),
+        child_frame_id=child,
+        pose=bag.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=_pose(bag, pose_numbers(estimate.T_world_cam).tolist()),
+            covariance=covariance_to_ros(estimate.covariance, R).ravel(),
+        ),
+        twist=_twist(bag, twist),
+    )
+    bag.write(topic, ODOMETRY_TYPE, message, estimate.stamp_ns)
+
+
+def write_path(
+    bag: BagWriter, topic: str, header: Header, stamps_ns: IntArray, poses: FloatArray
+) -> None:
+    """Write poses as `nav_msgs/Path`.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    header : Header
+        Stamp of the message, and the frame of the poses.
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the poses.
+    poses : ndarray of float64, shape (n, 7)
+        Position in metres and quaternion (x, y, z, w).
+    """
+    stamped = [
+        bag.make(
+            "geometry_msgs/msg/PoseStamped",
+            header=bag.header(Header(stamp_ns, header.frame_id)),
+            pose=_pose(bag, numbers),
+        )
+        for stamp_ns, numbers in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
+    ]
+    message = bag.make(PATH_TYPE, header=bag.header(header), poses=stamped)
+    bag.write(topic, PATH_TYPE, message, header.stamp_ns)
+
+
+def write_points(
+    bag: BagWriter,
+    topic: str,
+    header: Header,
+    points: FloatArray,
+    *,
+    intensities: FloatArray,
+    inliers: BoolArray,
+) -> None:
+    """Write points as an unorganised `sensor_msgs/PointCloud2`.
+
+    Its fields are x, y, z and intensity (FLOAT32), and inlier (UINT8, 0 or 1); points that are
+    not finite are left out.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    header : Header
+        Stamp, and the frame of the points.
+    points : ndarray of float64, shape (n, 3)
+        Metres.
+    intensities : ndarray of float64, shape (n,)
+    inliers : ndarray of bool, shape (n,)
+    """
+    is_finite = np.isfinite(points).all(axis=1)
+    cloud = np.zeros(int(np.count_nonzero(is_finite)), dtype=_POINT)
+    for name, values in zip("xyz", points[is_finite].T, strict=True):
+        cloud[name] = values
+    cloud["intensity"], cloud["inlier"] = intensities[is_finite], inliers[is_finite]
+    message = bag.make(
+        CLOUD_TYPE,
+        header=bag.header(header),
+        height=1,
+        width=len(cloud),
+        fields=_point_fields(bag),
+        is_bigendian=False,
+        point_step=_POINT.itemsize,
+        row_step=cloud.nbytes,
+        data=cloud.view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+    bag.write(topic, CLOUD_TYPE, message, header.stamp_ns)
+
+
+def write_diagnostics(
+    bag: BagWriter, header: Header, status: Status, text: str, values: Mapping[str, object]
+) -> None:
+    """Write the state of a frame to `/diagnostics`.
+
+    Its level is OK for a frame tied to its predecessors, WARN where it coasts or has resumed,
+    ERROR where it is lost or was skipped.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    header : Header
+        Stamp of the frame, and what it was seen by: the hardware.
+    status : Status
+        Of the frame.
+    text : str
+        One line.
+    values : mapping of str to object
+        Numbers to show.
+    """
+    message = bag.make(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=_LEVELS[status],
+        name="gvo: odometry",
+        message=text,
+        hardware_id=header.frame_id,
+        values=[
+            bag.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+            for key, value in values.items()
+        ],
+    )
+    array = bag.make(
+        DIAGNOSTICS_TYPE, header=bag.header(Header(header.stamp_ns, "")), status=[message]
+    )
+    bag.write("/diagnostics", DIAGNOSTICS_TYPE, array, header.stamp_ns)
+
+
+def _pose(bag: BagWriter, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - made at run time
+    x, y, z, *q = numbers
+    return bag.make(
+        "geometry_msgs/msg/Pose",
+        position=bag.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+    )
+
+
+def _twist(bag: BagWriter, twist: Twist) -> Any:  # noqa: ANN401 - made at run time
+    covariance = -np.eye(6) if twist.covariance is None else twist.covariance
+    angular, linear = (
+        bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        for x, y, z in twist.velocity.reshape(2, 3).tolist()
+    )
+    return bag.make(
+        "geometry_msgs/msg/TwistWithCovariance",
+        twist=bag.make("geometry_msgs/msg/Twist", linear=linear, angular=angular),
+        # In the child's own axes: nothing is turned, rotation and translation change places.
+        covariance=covariance_to_ros(covariance, np.eye(3)).ravel(),
+    )
+
+
+def _point_fields(bag: BagWriter) -> list[Any]:
+    return [
+        bag.make(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=offset,
+            datatype=_UINT8 if dtype == np.uint8 else _FLOAT32,
+            count=1,
+        )
+        for name, (dtype, offset, *_) in (_POINT.fields or {}).items()
+    ]

@@ -1,0 +1,200 @@
+"""Names of frames, and the poses so far."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry import se3
+from gvo.io.convert.bag_messages import FramePose, pose_numbers
+from gvo.io.poses.tf_paths import bare
+from gvo.types import Estimate, FloatArray, IntArray
+
+ESTIMATES: Final = ("raw", "causal", "smoothed")
+
+# x forward, y left, z up, from the optical x right, y down, z forward (REP 103).
+_T_FLU_OPTICAL: Final = se3.make_transform(
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunFrames:
+    """The names of a run's frames, and how the camera sits in the frame of the trajectory.
+
+    Parameters
+    ----------
+    world : str
+        The fixed frame that the poses are stated in.
+    camera : str
+        The optical frame of the rectified left or colour camera; `camera_optical` where empty.
+    tracked : str
+        The frame whose poses they are; where empty, the camera's.
+    T_tracked_cam : ndarray of float64, shape (4, 4), or callable
+        Maps camera coordinates to the tracked frame, metres. A function of stamp_ns where the
+        camera moves in that frame.
+    is_world_optical : bool
+        Whether `world` has the axes of a camera: z forward.
+
+    Raises
+    ------
+    ValueError
+        For a world without a name, or a transform between a frame and itself.
+    """
+
+    world: str = "world"
+    camera: str = ""
+    tracked: str = ""
+    T_tracked_cam: FloatArray | Callable[[int], FloatArray] = field(
+        default_factory=lambda: np.eye(4)
+    )
+    is_world_optical: bool = False
+
+    def __post_init__(self) -> None:
+        """Choose names where none are given; tf refuses a leading slash."""
+        camera = bare(self.camera) or "camera_optical"
+        names = {
+            "world": bare(self.world),
+            "camera": camera,
+            "tracked": bare(self.tracked) or camera,
+        }
+        for key, name in names.items():
+            object.__setattr__(self, key, name)
+        if not self.world:
+            raise ValueError("the world needs a name")
+        if not callable(self.T_tracked_cam):
+            T = np.array(self.T_tracked_cam, dtype=np.float64)
+            T.setflags(write=False)
+            object.__setattr__(self, "T_tracked_cam", T)
+            if self.is_camera and not np.array_equal(T, np.eye(4)):
+                raise ValueError(f"{camera}: its transform to itself must be the identity")
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether the trajectory is the camera's own."""
+        return self.tracked == self.camera
+
+    def mount(self, stamp_ns: int) -> FloatArray:
+        """Return T_tracked_cam, shape (4, 4), at a stamp."""
+        if self.is_camera:
+            return np.eye(4)
+        return self.T_tracked_cam(stamp_ns) if callable(self.T_tracked_cam) else self.T_tracked_cam
+
+    def tracked_by(self, name: str) -> str:
+        """Return the tracked frame as one of `ESTIMATES` places it."""
+        return f"gvo/{name}/{self.tracked}"
+
+    def camera_by(self, name: str) -> str:
+        """Return the camera's optical frame as one of `ESTIMATES` places it."""
+        return f"gvo/{name}/{self.camera}"
+
+    def moving(self, name: str, estimate: Estimate) -> Iterator[FramePose]:
+        """Yield what a pose says of the frames."""
+        stamp_ns = estimate.stamp_ns
+        yield FramePose(stamp_ns, self.world, self.tracked_by(name), estimate.T_world_cam)
+        if callable(self.T_tracked_cam) and not self.is_camera:
+            yield self._mounted(stamp_ns, name)
+
+    def fixed(self, stamp_ns: int) -> Iterator[FramePose]:
+        """Yield what never moves."""
+        if self.is_world_optical:
+            yield FramePose(stamp_ns, f"{self.world}_flu", self.world, _T_FLU_OPTICAL)
+        if not callable(self.T_tracked_cam) and not self.is_camera:
+            for name in ESTIMATES:
+                yield self._mounted(stamp_ns, name)
+
+    def _mounted(self, stamp_ns: int, name: str) -> FramePose:
+        parent, child = self.tracked_by(name), self.camera_by(name)
+        return FramePose(stamp_ns, parent, child, self.mount(stamp_ns))
+
+
+_N_NUMBERS = 7
+
+
+class StampedPose(NamedTuple):
+    """Stamp in nanoseconds and pose (4, 4) of a frame."""
+
+    stamp_ns: int
+    T_world_frame: FloatArray
+
+
+class Twist(NamedTuple):
+    """A velocity of a moving frame, in its own axes.
+
+    (rx, ry, rz, tx, ty, tz) per second, shape (6,), radians and metres; its covariance (6, 6) in
+    the same order, None where it is not known.
+    """
+
+    velocity: FloatArray
+    covariance: FloatArray | None
+
+
+class Track:
+    """The poses of one estimate so far, 64 bytes each, in the order of their stamps."""
+
+    def __init__(self) -> None:
+        self._stamps_ns = array("q")
+        self._poses = array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def add(self, estimate: Estimate) -> None:
+        """Take the next pose, in any order of stamps."""
+        index = bisect_right(self._stamps_ns, estimate.stamp_ns)
+        self._stamps_ns.insert(index, estimate.stamp_ns)
+        numbers = pose_numbers(estimate.T_world_cam).tolist()
+        self._poses[_N_NUMBERS * index : _N_NUMBERS * index] = array("d", numbers)
+
+    def before(self, stamp_ns: int) -> StampedPose | None:
+        """Return stamp and pose (4, 4) of the latest pose before a stamp."""
+        index = bisect_left(self._stamps_ns, stamp_ns) - 1
+        if index < 0:
+            return None
+        numbers = np.array(self._poses[_N_NUMBERS * index : _N_NUMBERS * (index + 1)])
+        R = np.asarray(Rotation.from_quat(numbers[3:]).as_matrix())
+        return StampedPose(self._stamps_ns[index], se3.make_transform(R, numbers[:3]))
+
+    def poses(self, n_most: int | None = None) -> tuple[IntArray, FloatArray]:
+        """Return stamps (n,) and positions with quaternions (n, 7).
+
+        Of more than `n_most`, every second, fourth, ... and the last are taken: those shown stay
+        the same while the track grows.
+        """
+        stride = 1
+        while n_most is not None and stride * (n_most - 1) < len(self) > n_most:
+            stride *= 2
+        is_shown = np.arange(len(self)) % stride == 0
+        is_shown[-1:] = True
+        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
+        return stamps_ns[is_shown], np.array(self._poses).reshape(-1, _N_NUMBERS)[is_shown]
+
+
+def twist_between(
+    estimate: Estimate,
+    previous: StampedPose | None,
+    step_covariance: FloatArray | None,
+) -> Twist:
+    """Return the velocity that leads from the pose before to this one.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The later pose.
+    previous : StampedPose or None
+        The earlier one; without it the velocity is 0, of unknown covariance.
+    step_covariance : ndarray of float64, shape (6, 6), or None
+        Of the step between the two, (rx, ry, rz, tx, ty, tz), in the later frame.
+    """
+    if previous is None:
+        return Twist(velocity=np.zeros(6), covariance=None)
+    elapsed_s = 1e-9 * (estimate.stamp_ns - previous.stamp_ns)
+    step = se3.log(se3.invert(previous.T_world_frame) @ estimate.T_world_cam)
+    covariance = None if step_covariance is None else step_covariance / elapsed_s**2
+    return Twist(velocity=step / elapsed_s, covariance=covariance)

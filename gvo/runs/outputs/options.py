@@ -1,0 +1,148 @@
+"""What a run writes beside the tables of its folder."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from gvo.config import Config
+from gvo.errors import ConfigurationError, RecordingError
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import Source
+from gvo.runs.loop import Output
+from gvo.runs.outputs.frames import RunFrames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOutputs:
+    """What a run writes beside the tables of its folder.
+
+    Parameters
+    ----------
+    bag : Path, optional
+        A `.mcap` or `.bag` with transforms, odometry, paths, points, overlays.
+    world : str
+        The fixed frame in that bag, and in the file for Rerun.
+    overlay : Path, optional
+        A film of the matches: `.webm`, `.mp4`, or a folder of PNG files.
+    rerun : Path, optional
+        A `.rrd` for the Rerun viewer.
+    report : bool
+        Draw `trajectories.png` and write `report.html` into the run folder.
+    plots : Path, optional
+        Folder for each plot of the report as PNG and PDF.
+    """
+
+    bag: Path | None = None
+    world: str = "world"
+    overlay: Path | None = None
+    rerun: Path | None = None
+    report: bool = True
+    plots: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        if self.plots is not None and not self.report:
+            raise ConfigurationError("--plots are those of the report: not with --no-report")
+
+    def open(
+        self,
+        source: Source,
+        frame: OutputFrame,
+        stack: ExitStack,
+        *,
+        config: Config,
+        is_placed: bool,
+    ) -> tuple[list[Output], list[str]]:
+        """Open what is written as the run goes.
+
+        Parameters
+        ----------
+        source : Source
+            The recording.
+        frame : OutputFrame
+            Whose poses are written.
+        stack : ExitStack
+            Closes what is opened.
+        config : Config
+            Of the run.
+        is_placed : bool
+            The first pose was asked for: the world is not that of the first frame.
+
+        Returns
+        -------
+        outputs : list of Output
+        warnings : list of str
+            What is written otherwise than asked for, a line each.
+
+        Raises
+        ------
+        ConfigurationError
+            When a name cannot be one, or what a file needs is not installed.
+        RecordingError
+            When a file cannot be written.
+        """
+        outputs: list[Output] = []
+        warnings: list[str] = []
+        if self.plots is not None:
+            _make_folder(self.plots)
+        if self.bag is not None or self.rerun is not None:
+            names = name_frames(source, frame, is_placed=is_placed, world=self.world)
+        if self.bag is not None:
+            from gvo.runs.outputs.bag import RunBag
+
+            outputs.append(stack.enter_context(RunBag(self.bag, names)))
+        if self.overlay is not None:
+            from gvo.runs.outputs.video import RunOverlay
+
+            film = RunOverlay(self.overlay, source.info.camera)
+            warnings += film.decisions
+            outputs.append(stack.enter_context(film))
+        if self.rerun is not None:
+            from gvo.runs.outputs.rerun import RunRerun
+
+            rerun = RunRerun(self.rerun, source.info.camera, names, config=config)
+            outputs.append(stack.enter_context(rerun))
+        return outputs, warnings
+
+
+def _make_folder(path: Path) -> None:
+    """Make a folder before the work that is to fill it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
+    """Name the frames of a run for a bag.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    frame : OutputFrame
+        Whose poses are written.
+    is_placed : bool
+        The first pose was asked for: the world is not that of the first frame.
+    world : str
+        The fixed frame.
+
+    Raises
+    ------
+    ConfigurationError
+        When a name cannot be one.
+    """
+    try:
+        return _named(source, frame, is_placed=is_placed, world=world)
+    except ValueError as error:
+        raise ConfigurationError(f"--world {world}: {error}") from error
+
+
+def _named(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
+    camera = source.info.frame_id
+    if frame.is_camera:
+        return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
+    mount = frame.T_frame_cam if frame.fixed_mount is None else frame.fixed_mount
+    return RunFrames(world=world, camera=camera, tracked=frame.name, T_tracked_cam=mount)

@@ -1,0 +1,421 @@
+"""What of a run goes into a Rerun file."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, TypeAlias
+
+import cv2
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry.camera import PinholeCamera
+from gvo.io.convert.bag_messages import pose_numbers
+from gvo.io.images import encode_jpeg
+from gvo.runs.outputs import rerun_stream as place
+from gvo.runs.outputs.frames import ESTIMATES, RunFrames, Track
+from gvo.runs.outputs.rerun_stream import RerunStream
+from gvo.types import (
+    Estimate,
+    FloatArray,
+    Frame,
+    FrameLink,
+    FrameResult,
+    ImageArray,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
+from gvo.viz import palette
+from gvo.viz.overlay import compose_overlay
+
+N_SHOWN_POSES: Final = 500
+"""Most poses of a path while the run goes."""
+
+_SECOND_NS: Final = 10**9
+_TRACKED: Final = "world/causal/frame"
+_CAMERA: Final = f"{_TRACKED}/camera"
+_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
+
+
+class RerunWriter:
+    """Logs frame by frame.
+
+    Parameters
+    ----------
+    stream : RerunStream
+        Open.
+    camera : PinholeCamera or StereoCamera
+        Of the rectified frames.
+    frames : RunFrames
+        Whose poses they are, and how the camera sits there.
+    text : str
+        The configuration; none is shown where it is empty.
+    """
+
+    def __init__(
+        self, stream: RerunStream, camera: PinholeCamera, frames: RunFrames, text: str
+    ) -> None:
+        self.stream = stream
+        self._camera, self._frames = camera, frames
+        self._n_seen = 0
+        self._stamps_ns, self._indices = array("q"), array("q")  # of the frames with a pose
+        self._first_ns: int | None = None
+        self._n_seconds = 0
+        self._tracks = {name: Track() for name in ESTIMATES}
+        self._recent: dict[str, list[FloatArray]] = {"raw": [], "causal": []}
+        self._keyframes: dict[int, Estimate] = {}
+        self._series: set[str] = set()
+        stream.log(f"{_CAMERA}/image", make_pinhole(camera), is_static=True)
+        for name in ESTIMATES:
+            stream.log(f"world/{name}/frame", make_marker(name), is_static=True)
+        if text:
+            document = rr.TextDocument(text)
+            stream.log(place.CONFIGURATION, document, is_static=True)
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Log what one frame gave."""
+        image = frame.left if isinstance(frame, StereoFrame) else frame.image
+        self._begin(result)
+        self._stamps_ns.append(frame.stamp_ns)
+        self._indices.append(self._n_seen)
+        self.add_status(frame.stamp_ns, result.status, _caption(result))
+        self._add_poses(result)
+        self._add_picture(frame, image, result)
+        self._add_points(image, result)
+        self._add_links(result)
+        self._add_numbers(result)
+        self.add_smoothed(result.finished)
+        self._add_lines(frame.stamp_ns)
+
+    def add_status(self, stamp_ns: int, status: Status, text: str) -> None:
+        """Log a line that tells of a new frame."""
+        self.stream.set_frame(stamp_ns, self._n_seen)
+        self._n_seen += 1
+        self.stream.log(place.STATUS, make_status(status, text))
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Log poses at their own stamps."""
+        for estimate in estimates:
+            self._set_frame(estimate.stamp_ns)
+            transform = make_transform(estimate.T_world_cam)
+            self.stream.log("world/smoothed/frame", transform)
+            self._tracks["smoothed"].add(estimate)
+
+    def add_paths(self, n_most: int | None = None) -> None:
+        """Log the paths up to now, of at most `n_most` poses, at the newest frame."""
+        self._set_frame(self._stamps_ns[-1])
+        for name, track in self._tracks.items():
+            positions = track.poses(n_most)[1][:, :3]
+            self.stream.log(f"world/{name}/path", make_path(name, positions))
+        for recent in self._recent.values():
+            del recent[:-1]
+        self._add_recent()
+
+    def _begin(self, result: FrameResult) -> None:
+        """Log, before the first pose, what never changes."""
+        if self._first_ns is not None:
+            return
+        self._first_ns = result.stamp_ns
+        is_optical = self._frames.is_world_optical or (
+            # A camera in a world of its recording: one with y down, or one with z up.
+            self._frames.is_camera and result.causal.T_world_cam[1, 1] > np.cos(np.pi / 4)
+        )
+        self.stream.log("world", make_axes(is_optical=is_optical), is_static=True)
+        if not callable(self._frames.T_tracked_cam):
+            mount = make_transform(self._frames.mount(result.stamp_ns))
+            self.stream.log(_CAMERA, mount, is_static=True)
+
+    def _set_frame(self, stamp_ns: int) -> None:
+        # A smoothed pose comes late: its frame is looked up.
+        index = bisect_left(self._stamps_ns, stamp_ns)
+        self.stream.set_frame(stamp_ns, self._indices[index])
+
+    def _add_poses(self, result: FrameResult) -> None:
+        for name, estimate in (("raw", result.raw), ("causal", result.causal)):
+            path = f"world/{name}"
+            self.stream.log(f"{path}/frame", make_transform(estimate.T_world_cam))
+            self.stream.log(f"{path}/covariance", make_ellipsoids(name, [estimate]))
+            self._tracks[name].add(estimate)
+            self._recent[name].append(estimate.T_world_cam[:3, 3])
+        if callable(self._frames.T_tracked_cam):
+            self.stream.log(_CAMERA, make_transform(self._frames.mount(result.stamp_ns)))
+
+    def _add_picture(self, frame: Frame, image: ImageArray, result: FrameResult) -> None:
+        overlay = compose_overlay(frame, result, self._camera, index=self._n_seen - 1)
+        self.stream.log(place.OVERLAY, make_image(overlay))
+        self.stream.log(f"{_CAMERA}/image", make_image(halve(image)))
+
+    def _add_points(self, image: ImageArray, result: FrameResult) -> None:
+        found = result.registration or _NOTHING
+        self.stream.log(f"{_CAMERA}/points", make_matches(found))
+        if result.stamp_ns in result.keyframes_ns and len(found.points_current) > 0:
+            T_world_cam = result.causal.T_world_cam @ self._frames.mount(result.stamp_ns)
+            self.stream.log(place.CLOUD, make_cloud(found, image, T_world_cam))
+
+    def _add_links(self, result: FrameResult) -> None:
+        """Log the window's keyframes and the edges that came with the frame."""
+        known = {**self._keyframes, result.stamp_ns: result.causal}
+        self._keyframes = {ns: known[ns] for ns in result.keyframes_ns if ns in known}
+        kept = list(self._keyframes.values())
+        self.stream.log("world/keyframes", make_keyframes(kept))
+        ellipsoids = make_ellipsoids(KEYFRAMES, kept)
+        self.stream.log("world/keyframes/covariance", ellipsoids)
+        here = result.causal.T_world_cam[:3, 3]
+        ends = [(link, self._position(link.reference_ns)) for link in result.links]
+        placed = [(link, np.stack([end, here])) for link, end in ends if end is not None]
+        segments = np.array([segment for _, segment in placed]).reshape(-1, 2, 3)
+        self.stream.log("world/links", make_links([link for link, _ in placed], segments))
+
+    def _position(self, stamp_ns: int) -> FloatArray | None:
+        """Return where a frame was placed when it came, shape (3,)."""
+        pose = self._tracks["causal"].before(stamp_ns + 1)
+        if pose is None or pose.stamp_ns != stamp_ns:
+            return None
+        return np.asarray(pose.T_world_frame[:3, 3])
+
+    def _add_numbers(self, result: FrameResult) -> None:
+        counts = (result.n_matches, result.n_inliers, result.n_points)
+        for name, count in zip(COUNT_COLOURS, counts, strict=True):
+            self._add_number(f"{place.COUNTS}/{name}", name, count, COUNT_COLOURS[name])
+        for stage, ms in result.stage_ms.items():
+            colour = STAGE_COLOURS.get(stage)
+            self._add_number(f"{place.MILLISECONDS}/{stage}", f"{stage} [ms]", ms, colour)
+        chi2: dict[str, list[float]] = {}
+        for link in result.links:
+            if link.is_accepted and link.chi2 is not None:
+                chi2.setdefault(link.kind, []).append(link.chi2)
+        for kind, values in chi2.items():
+            colour = LINK_COLOURS.get(kind)
+            self._add_number(f"{place.CHI2}/{kind}", kind, float(np.mean(values)), colour)
+
+    def _add_number(self, path: str, name: str, value: float, colour: Colour | None = None) -> None:
+        if path not in self._series:
+            self._series.add(path)
+            self.stream.log(path, make_series(name, colour), is_static=True)
+        self.stream.log(path, rr.Scalars([value]))
+
+    def _add_lines(self, stamp_ns: int) -> None:
+        """Log where it was: the paths where a new second of the recording has begun."""
+        n_seconds = (stamp_ns - (self._first_ns or 0)) // _SECOND_NS
+        if n_seconds > self._n_seconds:
+            self._n_seconds = n_seconds
+            self.add_paths(N_SHOWN_POSES)
+        else:
+            self._set_frame(stamp_ns)
+            self._add_recent()
+
+    def _add_recent(self) -> None:
+        for name, recent in self._recent.items():
+            positions = np.array(recent).reshape(-1, 3)
+            self.stream.log(f"world/{name}/recent", make_path(name, positions))
+
+
+def _caption(result: FrameResult) -> str:
+    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers"
+    text = f"{result.status}: {counts}, {result.n_links} links"
+    return f"{text}; {result.reason}" if result.reason else text
+
+
+Colour: TypeAlias = tuple[int, int, int]
+
+KEYFRAMES: Final = "keyframes"
+N_SIGMAS: Final = 3.0
+"""Half-axes of an ellipsoid, in standard deviations."""
+SHOWN_WIDTH_PX: Final = 640
+"""Images in the scene are halved until they are no wider."""
+
+_LEVELS: Final = {
+    Status.OK: rr.TextLogLevel.INFO,
+    Status.RESUMED: rr.TextLogLevel.WARN,
+    Status.COASTING: rr.TextLogLevel.WARN,
+    Status.LOST: rr.TextLogLevel.ERROR,
+    Status.SKIPPED: rr.TextLogLevel.ERROR,
+}
+# Of the viewer, so that they are seen from any distance.
+_LINE: Final = rr.Radius.ui_points(1.5)
+_THIN_LINE: Final = rr.Radius.ui_points(0.75)
+_DOT: Final = rr.Radius.ui_points(4.0)
+_SMALL_DOT: Final = rr.Radius.ui_points(1.5)
+
+
+def colour_of(code: str) -> Colour:
+    """Return `#RRGGBB` as three numbers."""
+    red, green, blue = bytes.fromhex(code.removeprefix("#"))
+    return red, green, blue
+
+
+COLOURS: Final[Mapping[str, Colour]] = {
+    **{name: colour_of(code) for name, code in palette.ESTIMATES.items()},
+    KEYFRAMES: colour_of(palette.LINKS["keyframe"]),
+}
+COUNT_COLOURS: Final = {
+    name: colour_of(palette.COUNTS[name]) for name in ("matches", "inliers", "points")
+}
+STAGE_COLOURS: Final = {name: colour_of(code) for name, code in palette.STAGES.items()}
+LINK_COLOURS: Final = {kind: colour_of(code) for kind, code in palette.LINKS.items()}
+_INLIER, _OUTLIER = colour_of(palette.INLIERS), colour_of(palette.OUTLIERS)
+
+
+def make_transform(T_parent_child: FloatArray) -> rr.Transform3D:
+    """Return a pose (4, 4) as a transform of an entity."""
+    numbers = pose_numbers(T_parent_child)
+    return rr.Transform3D(translation=numbers[:3], quaternion=rr.Quaternion(xyzw=numbers[3:]))
+
+
+def make_marker(name: str) -> rr.Points3D:
+    """Return a dot at the origin of a frame, in the colour of its estimate."""
+    return rr.Points3D([np.zeros(3)], colors=COLOURS[name], radii=_DOT)
+
+
+def make_path(name: str, positions: FloatArray) -> rr.LineStrips3D:
+    """Return positions (n, 3) as one line in the colour of its estimate."""
+    strips = [positions] if len(positions) > 1 else []
+    return rr.LineStrips3D(strips, colors=COLOURS[name], radii=_LINE)
+
+
+def make_keyframes(keyframes: Sequence[Estimate]) -> rr.Points3D:
+    """Return poses as dots."""
+    return rr.Points3D(_positions(keyframes), colors=COLOURS[KEYFRAMES], radii=_DOT)
+
+
+def make_links(links: Sequence[FrameLink], segments: FloatArray) -> rr.LineStrips3D:
+    """Return edges as lines.
+
+    Parameters
+    ----------
+    links : sequence of FrameLink
+        Those that the window refused have a colour of their own.
+    segments : ndarray of float64, shape (n, 2, 3)
+        Where each of them begins and ends, in the world, metres.
+    """
+    codes = [palette.LINKS[link.kind] if link.is_accepted else palette.REFUSED for link in links]
+    colours = [colour_of(code) for code in codes]
+    return rr.LineStrips3D(list(segments), colors=colours or None, radii=_THIN_LINE)
+
+
+def make_ellipsoids(name: str, estimates: Sequence[Estimate]) -> rr.Ellipsoids3D:
+    """Return the 3-sigma ellipsoids of positions, in the world.
+
+    Those that are not known to be finite are left out.
+
+    Parameters
+    ----------
+    name : str
+        A key of `COLOURS`.
+    estimates : sequence of Estimate
+    """
+    known = [e for e in estimates if np.isfinite(e.covariance).all()]
+    axes = [_axes(estimate) for estimate in known]
+    return rr.Ellipsoids3D(
+        centers=_positions(known),
+        half_sizes=np.array([half_sizes for half_sizes, _ in axes]).reshape(-1, 3),
+        quaternions=np.array([quaternion for _, quaternion in axes]).reshape(-1, 4),
+        colors=COLOURS[name],
+        line_radii=_THIN_LINE,
+    )
+
+
+def _axes(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return half-axes (3,) in metres and the quaternion (x, y, z, w) that turns them."""
+    # The covariance is stated along the axes of the frame: the pose turns it into the world.
+    variances, directions = np.linalg.eigh(estimate.covariance[3:, 3:])
+    if np.linalg.det(directions) < 0:
+        directions = -directions
+    R = estimate.T_world_cam[:3, :3] @ directions
+    half_sizes = N_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    return half_sizes, np.asarray(Rotation.from_matrix(R).as_quat())
+
+
+def _positions(estimates: Sequence[Estimate]) -> FloatArray:
+    return np.array([e.T_world_cam[:3, 3] for e in estimates]).reshape(-1, 3)
+
+
+def make_matches(found: RelativePose) -> rr.Points3D:
+    """Return the matched points in the camera's frame, inliers and outliers coloured."""
+    points = found.points_current
+    is_finite = np.isfinite(points).all(axis=1)
+    is_inlier = found.inliers[: len(points)]
+    colours = np.where(is_inlier[:, np.newaxis], _INLIER, _OUTLIER)
+    return _points(points[is_finite], colours[is_finite])
+
+
+def make_cloud(found: RelativePose, image: ImageArray, T_world_cam: FloatArray) -> rr.Points3D:
+    """Return the inliers' points in the world, as grey as the image is there.
+
+    Parameters
+    ----------
+    found : RelativePose
+    image : ndarray of uint8, shape (height, width)
+        The current one.
+    T_world_cam : ndarray of float64, shape (4, 4)
+        Maps camera coordinates to the world, metres.
+    """
+    points, pixels = found.points_current, found.pixels_current
+    n = min(len(points), len(pixels))
+    is_shown = found.inliers[:n] & np.isfinite(points[:n]).all(axis=1)
+    is_shown &= np.isfinite(pixels[:n]).all(axis=1)
+    height, width = image.shape
+    u, v = np.rint(pixels[:n][is_shown]).astype(np.int64).T
+    greys = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
+    points_world = points[:n][is_shown] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    return _points(points_world, np.repeat(greys[:, np.newaxis], 3, axis=1))
+
+
+def _points(points: FloatArray, colours: FloatArray | ImageArray) -> rr.Points3D:
+    # No colour for no point: an empty array would be taken for one of a shape it has not.
+    kept = colours.astype(np.uint8) if len(points) > 0 else None
+    return rr.Points3D(points.reshape(-1, 3), colors=kept, radii=_SMALL_DOT)
+
+
+def make_image(image: ImageArray) -> rr.EncodedImage:
+    """Return an image, grey or BGR, as a JPEG file."""
+    return rr.EncodedImage(contents=encode_jpeg(image), media_type="image/jpeg")
+
+
+def halve(image: ImageArray) -> ImageArray:
+    """Return an image (height, width) for the scene, at most `SHOWN_WIDTH_PX` wide."""
+    n = shrinkage(image.shape[1])
+    if n == 1:
+        return image
+    height, width = (size // n for size in image.shape)
+    cropped = image[: height * n, : width * n]
+    return np.asarray(cv2.resize(cropped, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def make_pinhole(camera: PinholeCamera) -> rr.Pinhole:
+    """Return the camera of what `halve` returns."""
+    n = shrinkage(camera.width)
+    # Pixel (0, 0) is the centre of the first pixel: its corner is where sizes are scaled about.
+    return rr.Pinhole(
+        focal_length=[camera.fx / n, camera.fy / n],
+        principal_point=[(camera.cx + 0.5) / n - 0.5, (camera.cy + 0.5) / n - 0.5],
+        resolution=[camera.width // n, camera.height // n],
+        camera_xyz=rr.ViewCoordinates.RDF,
+    )
+
+
+def shrinkage(width: int) -> int:
+    """Return by what an image of this width is divided for the scene: 1, 2, 4, ..."""
+    n = 1
+    while width // n > SHOWN_WIDTH_PX:
+        n *= 2
+    return n
+
+
+def make_series(name: str, colour: Colour | None = None) -> rr.SeriesLines:
+    """Return how a number is drawn over time."""
+    return rr.SeriesLines(names=name, colors=None if colour is None else colour, widths=1.5)
+
+
+def make_status(status: Status, text: str) -> rr.TextLog:
+    """Return a line of the log."""
+    return rr.TextLog(text, level=_LEVELS[status])
+
+
+def make_axes(*, is_optical: bool) -> rr.AsComponents:
+    """Return the axes of the world: a camera's, or x forward, y left, z up."""
+    return rr.ViewCoordinates.RDF if is_optical else rr.ViewCoordinates.FLU

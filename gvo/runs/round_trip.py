@@ -1,0 +1,339 @@
+"""A drive there and back: the drift without a ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.io.excerpt import Excerpt
+from gvo.io.frames import frames, pair_limit_key
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.run_folder.writer import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
+from gvo.runs.loop import RunLoop
+from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
+from gvo.runs.statistics import Progress
+from gvo.runs.summary import summarize
+from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, FaultyFrame, Frame, StereoFrame
+from gvo.viz.plots import plot_shuttle
+
+MAX_PIECE_BYTES = 256_000_000
+
+
+class ThereAndBack:
+    """The frames of a recording in their order, then in the opposite one with mirrored stamps.
+
+    The frame at the turn, the last sound one, is given once. What is faulty on the way there is
+    faulty on the way back.
+
+    Parameters
+    ----------
+    source : Source
+        The recording; is read again, piece by piece from its end, where it is long.
+    config : Config
+        As of `frames`.
+    excerpt : Excerpt, optional
+        The part that is wanted; the whole where omitted.
+    max_bytes : int
+        Of images that are held at a time; at least one frame is.
+
+    Attributes
+    ----------
+    turn_ns : int or None
+        Stamp of the frame at the turn, known when that is passed; None where no frame is sound.
+
+    Notes
+    -----
+    The last piece is kept while the recording is read, so a short recording is read once. Each
+    of the others is one more reading from the start to the end of the piece, in which images
+    outside of the piece are paired but not decoded.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        excerpt: Excerpt | None = None,
+        *,
+        max_bytes: int = MAX_PIECE_BYTES,
+    ) -> None:
+        self._source = source
+        self._config = config
+        self._excerpt = excerpt
+        self._max_bytes = max_bytes
+        self.turn_ns: int | None = None
+
+    def __iter__(self) -> Iterator[Frame | FaultyFrame]:
+        """Yield the frames.
+
+        Yields
+        ------
+        StereoFrame, RgbdFrame or FaultyFrame
+            On the way back with stamp' = 2 * turn - stamp, nanoseconds.
+
+        Raises
+        ------
+        RecordingError
+            When the recording cannot be read on; what was read before is yielded first, there
+            and back.
+        """
+        log = _Log(self._max_bytes)
+        fault: RecordingError | None = None
+        try:
+            for item in frames(self._source, self._config, self._excerpt):
+                log.add(item)
+                yield item
+        except RecordingError as error:
+            fault = error  # what was read before it counts
+        self.turn_ns = log.turn_ns
+        if log.turn_ns is not None:
+            for item in self._backwards(log):
+                yield replace(item, stamp_ns=2 * log.turn_ns - item.stamp_ns)
+        if fault is not None:
+            raise fault
+
+    def _backwards(self, log: _Log) -> Iterator[Frame | FaultyFrame]:
+        """Yield what lies before the turn, from there to the start."""
+        while log.pieces:
+            piece = log.pieces.pop()
+            n_wanted = log.n_to_turn - 1 - piece.first
+            if n_wanted <= 0:
+                log.held.clear()
+                continue
+            held = log.held or self._read(piece)
+            log.held = []
+            del held[n_wanted:]
+            while held:
+                yield held.pop()
+
+    def _read(self, piece: _Piece) -> list[Frame | FaultyFrame]:
+        key = pair_limit_key(self._source.info.sensor)
+        margin_ns = round(float(getattr(self._config.sync, key)) * 1e6)
+        least_ns, greatest_ns = piece.stamps_ns
+        source = _Windowed(self._source, (least_ns - margin_ns, greatest_ns + margin_ns))
+        items = frames(source, self._config, self._excerpt)
+        return list(islice(items, piece.first, piece.end))
+
+
+@dataclass(slots=True, kw_only=True)
+class _Piece:
+    """Frames that follow one another: those of the indices [first, end)."""
+
+    first: int
+    end: int
+    n_bytes: int = 0
+    stamps_ns: tuple[int, int] = (0, 0)  # least and greatest
+
+
+@dataclass(slots=True)
+class _Log:
+    """What was read on the way there, in pieces; the frames of the last one are held."""
+
+    max_bytes: int
+    pieces: list[_Piece] = field(default_factory=lambda: [_Piece(first=0, end=0)])
+    held: list[Frame | FaultyFrame] = field(default_factory=list)
+    turn_ns: int | None = None
+    n_to_turn: int = 0  # items up to the frame at the turn
+
+    def add(self, item: Frame | FaultyFrame) -> None:
+        piece, n_bytes = self.pieces[-1], _size(item)
+        if piece.n_bytes and piece.n_bytes + n_bytes > self.max_bytes:
+            piece = _Piece(first=piece.end, end=piece.end)
+            self.pieces.append(piece)
+            self.held = []
+        self.held.append(item)
+        known = piece.stamps_ns if piece.end > piece.first else ()
+        piece.stamps_ns = min((item.stamp_ns, *known)), max((item.stamp_ns, *known))
+        piece.end += 1
+        piece.n_bytes += n_bytes
+        if not isinstance(item, FaultyFrame):
+            self.turn_ns = item.stamp_ns
+            self.n_to_turn = piece.end
+
+
+class _Windowed:
+    """A recording whose images can be loaded between two stamps only: so they cost nothing."""
+
+    def __init__(self, source: Source, window_ns: tuple[int, int]) -> None:
+        self._source = source
+        self._window_ns = window_ns
+
+    @property
+    def info(self) -> RecordingInfo:
+        """What is known before the first image."""
+        return self._source.info
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield all images; those outside of the window are faulty."""
+        for image in self._source.images():
+            yield image if self._holds(image.stamp_ns) else replace(image, load=_not_loaded)
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return what the recording holds."""
+        return self._source.ground_truth()
+
+    def _holds(self, stamp_ns: int) -> bool:
+        return self._window_ns[0] <= stamp_ns <= self._window_ns[1]
+
+
+def _not_loaded() -> NDArray[Any]:
+    raise RecordingError("outside of the piece that is read")
+
+
+def _size(item: Frame | FaultyFrame) -> int:
+    if isinstance(item, FaultyFrame):
+        return 0
+    images = (item.left, item.right) if isinstance(item, StereoFrame) else (item.image, item.depth)
+    return sum(image.nbytes for image in images)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShuttleResult:
+    """What a drive there and back left.
+
+    Parameters
+    ----------
+    summary : dict
+        As written to `summary.json`; `shuttle` holds the closing errors.
+    closings : dict of str to Closing
+        Of raw, causal and smoothed.
+    turn_ns : int
+        Stamp of the frame at the turn, nanoseconds.
+    exit_code : int
+        0 complete, 3 partly.
+    warnings : tuple of str
+        What was skipped or broke off, a line each.
+    """
+
+    summary: dict[str, Any]
+    closings: dict[str, Closing]
+    turn_ns: int
+    exit_code: int
+    warnings: tuple[str, ...]
+
+
+def shuttle(
+    source: Source,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    excerpt: Excerpt | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> ShuttleResult:
+    """Drive a recording forward, then backward, and tell how far it ends from its start.
+
+    The sequence of frames is given to odometry as one recording of twice the length, and a run
+    folder is written as `run_recording` does, with `shuttle.png` beside it.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_recording`, or a rendered one; is read again for the way back.
+    out : str or Path
+        Folder for the trajectories, covariances, tables, summary and picture.
+    config : Config, optional
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    on_progress : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    ShuttleResult
+
+    Raises
+    ------
+    RecordingError
+        When fewer than two frames are usable, the recording cannot be read on the way back, or
+        what is to be written cannot be.
+
+    Notes
+    -----
+    A closing error is a lower bound of the drift. Both ways rest on the same images: noise of
+    the images, and whatever reverses with the motion (a wrong baseline, depths that are all too
+    large, a tilted rectification), gives opposite errors there and back, and cancels. So a large
+    closing error shows that something is wrong, and a small one does not show that all is well.
+    What it measures is what depends on the direction of the drive: bias of the estimator, lost
+    tracks, chance.
+
+    The raw chain has no memory, its closing error is that of the registrations. The window has:
+    near the turn it still holds keyframes of the way there, and where the camera never loses sight
+    of its start, the way back is tied to the way there directly. Then the closing error of causal
+    and smoothed says how well keyframes are found again, nothing of their drift.
+
+    References
+    ----------
+    Z. Kalal, K. Mikolajczyk, J. Matas, "Forward-Backward Error: Automatic Detection of Tracking
+    Failures", ICPR 2010, doi:10.1109/ICPR.2010.675.
+    """
+    config = config or Config()
+    way = ThereAndBack(source, config, excerpt)
+    frame = OutputFrame(source.info.frame_id)
+    loop = RunLoop(source, config, frame, excerpt=excerpt, items=way)
+    with RunFolder(Path(out)) as folder:
+        loop.run([folder], None if on_progress is None else _doubled(on_progress))
+    turn_ns = way.turn_ns
+    if turn_ns is None:
+        raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
+    closings = _close(folder.path, turn_ns, source.info.name)
+    warnings = loop.tally.warnings()
+    summary = _summary(loop, warnings, turn_ns, closings)
+    folder.write_summary(summary)
+    plot_shuttle(folder.path / SHUTTLE_PICTURE, closings)
+    return ShuttleResult(
+        summary=summary,
+        closings=closings,
+        turn_ns=turn_ns,
+        exit_code=EXIT_PARTLY if loop.tally.is_partly else EXIT_COMPLETE,
+        warnings=tuple(warnings),
+    )
+
+
+def _doubled(on_progress: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """Return a callback that is told of the way back as well; the turn is there once."""
+
+    def tell(progress: Progress) -> None:
+        on_progress(replace(progress, n_total=max(2 * progress.n_total - 1, 0)))
+
+    return tell
+
+
+def _close(folder: Path, turn_ns: int, name: str) -> dict[str, Closing]:
+    trajectories = {name: _read(folder, name) for name in TRAJECTORIES}
+    path_m = float(trajectories["smoothed"].distances()[-1])
+    closings: dict[str, Closing] = {}
+    for label, trajectory in trajectories.items():
+        closing = close(trajectory, turn_ns, path_m=path_m)
+        if isinstance(closing, Failure):
+            raise RecordingError(f"{name}: cannot be driven there and back: {closing.reason}")
+        closings[label] = closing
+    return closings
+
+
+def _read(folder: Path, name: str) -> Trajectory:
+    trajectory = read_trajectory(folder / f"{name}.txt")
+    _, covariances = read_covariances(folder / f"{name}_covariance.csv")
+    return replace(trajectory, covariances=covariances)
+
+
+def _summary(
+    loop: RunLoop, warnings: list[str], turn_ns: int, closings: dict[str, Closing]
+) -> dict[str, Any]:
+    summary = summarize(loop, Failure(reason="driven there and back"), warnings)
+    summary["recording"] = f"{loop.source.info.name}, there and back"
+    summary["shuttle"] = {
+        "turn_ns": turn_ns,
+        "path_m": closings["smoothed"].path_m,
+        "estimates": {name: closing.as_json() for name, closing in closings.items()},
+    }
+    return summary

@@ -1,0 +1,267 @@
+"""One recording, one run folder: what `gvo run`, the scripts and batches call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.errors import GvoError, RecordingError
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.inputs import initial_pose, own_truth
+from gvo.io.poses.truth import FramedTruth, TruthComparison
+from gvo.io.recording import Source
+from gvo.io.run_folder.writer import (
+    PICTURE,
+    REPORT,
+    SUMMARY,
+    TRAJECTORIES,
+    RunFolder,
+    written_alone,
+)
+from gvo.runs.loop import RunLoop
+from gvo.runs.outputs.options import RunOutputs
+from gvo.runs.statistics import Progress
+from gvo.runs.summary import RunningSummary, run_identity, summarize
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
+from gvo.trajectory.evaluation import Evaluation
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure
+
+EXIT_COMPLETE = 0
+EXIT_PARTLY = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunResult:
+    """What a run left.
+
+    Parameters
+    ----------
+    summary : dict
+        As written to `summary.json`.
+    evaluations : tuple of Evaluation
+        Of raw, causal and smoothed; empty without ground truth.
+    exit_code : int
+        0 complete, 3 partly.
+    warnings : tuple of str
+        What was skipped or broke off, a line each.
+    report : Path or None
+        The page that shows it, where one was written.
+    """
+
+    summary: dict[str, Any]
+    evaluations: tuple[Evaluation, ...]
+    exit_code: int
+    warnings: tuple[str, ...]
+    report: Path | None = None
+
+
+def run_recording(
+    source: Source,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    ground_truth: Trajectory | FramedTruth | None = None,
+    frame: OutputFrame | None = None,
+    starts_at_truth: bool = False,
+    excerpt: Excerpt | None = None,
+    outputs: RunOutputs | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> RunResult:
+    """Run odometry over a recording and write a run folder.
+
+    Parameters
+    ----------
+    source : Source
+        From `open_recording`, or a rendered one.
+    out : str or Path
+        Folder for the trajectories, covariances, tables, summary and report; a run that is there
+        is replaced.
+    config : Config, optional
+    ground_truth : Trajectory or FramedTruth, optional
+        Poses of the frame asked for; the recording's own where omitted.
+    frame : OutputFrame, optional
+        Whose poses are written, and where they start; the camera's, from the identity, where
+        omitted.
+    starts_at_truth : bool
+        Take the first true pose for the initial one.
+    excerpt : Excerpt, optional
+        Which frames are read; all where omitted.
+    outputs : RunOutputs, optional
+        What is written besides; the report where omitted.
+    on_progress : callable, optional
+        Called after each frame.
+
+    Returns
+    -------
+    RunResult
+
+    Raises
+    ------
+    RecordingError
+        When no frame is usable.
+    OutputError
+        When something cannot be written; what was written before stands.
+    RunBusyError
+        When another process is writing a run into the folder.
+    """
+    config = config or Config()
+    frame = frame or OutputFrame(source.info.frame_id)
+    truth = _find_truth(source, ground_truth, frame)
+    outputs = outputs or RunOutputs()
+    start = truth.trajectory if starts_at_truth and isinstance(truth, FramedTruth) else None
+    identity = run_identity(source, frame, excerpt, start=start)
+    with ExitStack() as stack, ExitStack() as files:
+        is_placed = frame.is_placed or starts_at_truth
+        others, notes = outputs.open(source, frame, files, config=config, is_placed=is_placed)
+        stack.enter_context(written_alone(Path(out)))
+        folder = files.enter_context(RunFolder(Path(out)))
+        loop = RunLoop(
+            source,
+            config,
+            frame,
+            excerpt=excerpt,
+            first_pose=partial(initial_pose, truth) if starts_at_truth else None,
+        )
+        summary = RunningSummary(loop, folder, identity, on_progress)
+        with summary.told():
+            loop.run([folder, *others], summary)
+            files.close()
+        _refuse_nothing(loop, folder)
+        estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+        compared = _compare(truth, folder, loop, estimates)
+        is_asked = ground_truth is not None
+        result = _conclude(loop, folder, identity, compared, notes, is_asked=is_asked)
+    if not outputs.report:
+        return result
+    return _drawn(result, folder, compared, estimates, plots=outputs.plots)
+
+
+def _refuse_nothing(loop: RunLoop, folder: RunFolder) -> None:
+    """Refuse a run without a single pose; no summary is left of it."""
+    if loop.tally.n_with_pose == 0:
+        (folder.path / SUMMARY).unlink(missing_ok=True)
+        raise RecordingError(f"{loop.source.info.name}: no usable frame: {loop.tally.reason()}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Fault(Failure):
+    """Why there is no truth to compare with, though there should be one."""
+
+
+def _find_truth(
+    source: Source, given: Trajectory | FramedTruth | None, frame: OutputFrame
+) -> FramedTruth | Failure:
+    if isinstance(given, Trajectory):
+        return FramedTruth(trajectory=given, decision="given")
+    if given is not None:
+        return given
+    try:
+        return own_truth(source, frame=frame)
+    except GvoError as error:
+        # What was not asked for must not keep the run from being made.
+        return _Fault(reason=str(error))
+
+
+def _compare(
+    truth: FramedTruth | Failure,
+    folder: RunFolder,
+    loop: RunLoop,
+    estimates: dict[str, Trajectory],
+) -> TruthComparison | Failure:
+    if isinstance(truth, Failure):
+        return truth
+    try:
+        return TruthComparison.of(_within(truth, folder, loop), estimates)
+    except GvoError as error:
+        return _Fault(reason=str(error))
+
+
+def _conclude(
+    loop: RunLoop,
+    folder: RunFolder,
+    identity: dict[str, Any],
+    compared: TruthComparison | Failure,
+    notes: list[str],
+    *,
+    is_asked: bool,
+) -> RunResult:
+    """Write truth and summary."""
+    warnings = loop.tally.warnings() + notes
+    found = compared if isinstance(compared, TruthComparison) else None
+    if found is not None:
+        warnings += [f"ground truth: {text}" for text in found.warnings()]
+    elif isinstance(compared, _Fault):
+        warnings.append(f"not compared with the ground truth: {compared.reason}")
+    summary = summarize(loop, compared, warnings)
+    if found is not None:
+        folder.write_truth(found.truth.trajectory)
+    is_partly = loop.tally.is_partly or (is_asked and found is None)
+    exit_code = EXIT_PARTLY if is_partly else EXIT_COMPLETE
+    summary |= {"exit_code": exit_code, "run": identity}
+    folder.write_summary(summary)
+    return RunResult(
+        summary=summary,
+        evaluations=() if found is None else found.evaluations,
+        exit_code=exit_code,
+        warnings=tuple(warnings),
+    )
+
+
+def _drawn(
+    result: RunResult,
+    folder: RunFolder,
+    compared: TruthComparison | Failure,
+    estimates: dict[str, Trajectory],
+    *,
+    plots: Path | None,
+) -> RunResult:
+    """Draw; what cannot be drawn takes nothing from what was computed and written."""
+    try:
+        _draw(folder, compared, estimates, plots=plots)
+    except (GvoError, OSError) as error:
+        warnings = (*result.warnings, f"not all was drawn: {error}")
+        result = replace(result, exit_code=EXIT_PARTLY, warnings=warnings)
+    page = folder.path / REPORT
+    return replace(result, report=page if page.exists() else None)
+
+
+def _draw(
+    folder: RunFolder,
+    compared: TruthComparison | Failure,
+    estimates: dict[str, Trajectory],
+    *,
+    plots: Path | None,
+) -> None:
+    """Draw the picture and write the report."""
+    from gvo.io.run_folder.reader import read_run
+    from gvo.viz.plots import plot_trajectories
+    from gvo.viz.report import write_run_report
+
+    if isinstance(compared, TruthComparison):
+        plot_trajectories(folder.path / PICTURE, compared.truth.trajectory, compared.estimates)
+    else:
+        plot_trajectories(folder.path / PICTURE, None, estimates)
+    write_run_report(folder.path / REPORT, read_run(folder.path), plots=plots)
+
+
+def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth:
+    """Give poses without stamps, one for each frame, their stamps; cut the truth to an excerpt."""
+    stamps_ns = folder.frame_stamps_ns()
+    trajectory = truth.trajectory
+    if trajectory.stamps_from == "rows" and len(trajectory) == len(stamps_ns):
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_cam=trajectory.T_world_cam)
+    if loop.is_excerpt and trajectory.stamps_from != "rows":
+        first, last = stamps_ns.min() - MAX_DIFFERENCE_NS, stamps_ns.max() + MAX_DIFFERENCE_NS
+        start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
+        trajectory = trajectory.select(slice(int(start), int(end)))
+    return replace(truth, trajectory=trajectory)

@@ -1,0 +1,442 @@
+"""Edges of any front-end, smoothed: from a file, or line by line."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gvo._version import __version__
+from gvo.backend.window import Keeping, SlidingWindow
+from gvo.config import Config
+from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.io.edges.events import EdgeEvent, EdgeSource, Event, InputFaults, PoseEvent
+from gvo.io.edges.lines import (
+    CSV_HEADER,
+    LineFormat,
+    Request,
+    detect_format,
+    format_error,
+    format_estimate,
+    is_header,
+    parse_line,
+)
+from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
+from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder
+from gvo.odometry.chain import EdgeChain
+from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY, RunResult
+from gvo.runs.statistics import Progress
+from gvo.runs.summary import peak_memory_mb
+from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Estimate, Rejected, Status
+from gvo.viz.plots import plot_trajectories
+
+POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
+"""Columns of `frames.csv` in the folder of smoothed edges."""
+
+# What a pose graph's file says: its noise is stated, its loops reach far back.
+_GRAPH_DEFAULTS: dict[str, tuple[object, str]] = {
+    "size": (None, "loops refer to poses of any age"),
+    "kernel": ("none", "edges are taken at the noise that the file states; 1 where it does not"),
+    "gate": (None, "edges are taken at the noise that the file states; 1 where it does not"),
+}
+
+
+def configuration_for(source: EdgeSource, config: Config) -> tuple[Config, list[str]]:
+    """Return the configuration that fits an input, where the user left it open.
+
+    Parameters
+    ----------
+    source : EdgeSource
+        A pose graph is smoothed as a whole and taken at its word: `window.size: null`,
+        `window.kernel: none` and `window.gate: null`.
+    config : Config
+        Values that were set stay.
+
+    Returns
+    -------
+    config : Config
+    decisions : list of str
+        What was changed, a line each.
+    """
+    if not isinstance(source, PoseGraphSource):
+        return config, []
+    changes = {
+        key: value
+        for key, (value, _) in _GRAPH_DEFAULTS.items()
+        if key not in config.window.model_fields_set
+    }
+    window = config.window.model_copy(update=changes)
+    decisions = [
+        f"window.{key}: {'null' if value is None else value} ({_GRAPH_DEFAULTS[key][1]})"
+        for key, value in changes.items()
+    ]
+    return config.model_copy(update={"window": window}), decisions
+
+
+@dataclass(slots=True, kw_only=True)
+class SmoothingNotes:
+    """What is told of a run beside its poses."""
+
+    decisions: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    broken_off: str = ""
+
+
+class Smoother:
+    """Drives a window and writes a run folder as it goes.
+
+    Parameters
+    ----------
+    folder : RunFolder
+        Open.
+    config : Config
+    keyframes : {"manual", "distance"}
+        As of `SlidingWindow`.
+    graph_file : GraphFile, optional
+        Gets the smoothed poses too.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        config: Config,
+        *,
+        keyframes: Keeping = "distance",
+        graph_file: GraphFile | None = None,
+    ) -> None:
+        self.window = SlidingWindow(config.window, keyframes=keyframes)
+        self.statuses: Counter[Status] = Counter()
+        self._folder = folder
+        self._graph_file = graph_file
+        self.chain = EdgeChain(config.window)
+
+    @property
+    def n_poses(self) -> int:
+        """Poses taken in."""
+        return sum(self.statuses.values())
+
+    def take(self, event: Event) -> Estimate | Rejected:
+        """Add a pose or an edge."""
+        if isinstance(event, PoseEvent):
+            return self.add_pose(event)
+        return self.add_edge(event)
+
+    def add_edge(self, event: EdgeEvent) -> Estimate | Rejected:
+        """Add an edge between two poses of the window."""
+        return self.window.add_edge(event.frame_id, event.edge)
+
+    def add_pose(self, event: PoseEvent) -> Estimate:
+        """Add a pose, and write what it gave.
+
+        Raises
+        ------
+        ValueError
+            As of `SlidingWindow.add_pose`; nothing is changed.
+        """
+        causal = self.window.add_pose(event.frame_id, event.stamp_ns, event.edges, event.prior)
+        raw = self.chain.advance(causal, event.edges, event.prior)
+        self.statuses[causal.status] += 1
+        reason = str(causal.rejected[0]) if causal.rejected else ""
+        row = (causal.stamp_ns, causal.frame_id, causal.status, len(event.edges))
+        self._folder.add_poses(raw, causal, (*row, len(causal.rejected), reason))
+        self._add_finished(self.window.pop_finished())
+        return causal
+
+    def finish(self) -> None:
+        """Write the poses that are still in the window."""
+        self._add_finished(self.window.finish())
+
+    def _add_finished(self, finished: list[Estimate]) -> None:
+        self._folder.add_smoothed(finished)
+        if self._graph_file is not None:
+            self._graph_file.add(finished)
+        self.chain.forget(estimate.frame_id for estimate in finished)
+
+
+def smooth_edges(
+    source: EdgeSource,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    keyframes: Keeping = "distance",
+    ground_truth: Trajectory | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> RunResult:
+    """Smooth the edges of an input and write a run folder.
+
+    Parameters
+    ----------
+    source : EdgeSource
+        From `open_edges`.
+    out : str or Path
+        Folder for the trajectories, covariances, table of poses, summary and picture; of a pose
+        graph also `smoothed.g2o`.
+    config : Config, optional
+        Of which `window` matters; see `configuration_for`.
+    keyframes : {"manual", "distance"}
+        Which poses stay in the window when they are no longer recent: none, or by distance.
+    ground_truth : Trajectory, optional
+        True poses of the same frame.
+    on_progress : callable, optional
+        Called after each pose and each edge.
+
+    Returns
+    -------
+    RunResult
+
+    Raises
+    ------
+    RecordingError
+        When the input holds no pose, or the folder cannot be written.
+    """
+    config, decisions = configuration_for(source, config or Config())
+    notes = SmoothingNotes(decisions=[*source.decisions, *decisions])
+    with _opened(Path(out), source) as (folder, graph_file):
+        smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
+        try:
+            for event in _events(source, notes):
+                smoother.take(event)
+                if on_progress is not None:
+                    on_progress(_progress(smoother, source.n_poses))
+        finally:
+            # Also where the run is interrupted: what the window holds was computed.
+            smoother.finish()
+    notes.warnings += source.faults.warnings()
+    truth = _with_stamps(ground_truth, source, folder)
+    return conclude(source.name, folder, smoother, config=config, notes=notes, truth=truth)
+
+
+@contextmanager
+def _opened(out: Path, source: EdgeSource) -> Iterator[tuple[RunFolder, GraphFile | None]]:
+    """Open the files of a run, and complete them also where it is interrupted."""
+    with RunFolder(out, columns=POSES_HEADER) as folder:
+        if not isinstance(source, PoseGraphSource):
+            yield folder, None
+            return
+        graph_file = GraphFile(out)
+        try:
+            yield folder, graph_file
+        finally:
+            graph_file.close(source.measurement_lines())
+
+
+def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
+    """Yield events; where the input breaks off, note it and end."""
+    try:
+        yield from source.events()
+    except (RecordingError, TrajectoryError) as error:
+        notes.broken_off = str(error)
+
+
+def _progress(smoother: Smoother, n_total: int) -> Progress:
+    n_tied = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
+    n_done = smoother.n_poses
+    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=n_tied)
+
+
+def _with_stamps(
+    truth: Trajectory | None, source: EdgeSource, folder: RunFolder
+) -> Trajectory | None:
+    """Give true poses without stamps those of the poses: both are the order in a file."""
+    if truth is None or truth.stamps_from != "rows":
+        return truth
+    stamps_ns = truth.stamps_ns
+    if not source.has_made_up_stamps:
+        stamps_ns = folder.frame_stamps_ns()
+        if len(stamps_ns) != len(truth):
+            return truth
+    return Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.T_world_cam)
+
+
+def conclude(
+    name: str,
+    folder: RunFolder,
+    smoother: Smoother,
+    *,
+    config: Config,
+    notes: SmoothingNotes,
+    truth: Trajectory | None = None,
+) -> RunResult:
+    """Write summary and picture of a finished run, and compare with the truth."""
+    if smoother.n_poses == 0:
+        reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
+        raise RecordingError(f"{name}: nothing to smooth: {reason}")
+    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+    warnings = [*_warnings(smoother, notes), *notes.warnings]
+    counts = smoother.window.counts
+    is_partly = bool(notes.warnings or notes.broken_off or counts.n_coasting or counts.n_rejected)
+    evaluations: tuple[Evaluation, ...] = ()
+    if truth is not None:
+        try:
+            evaluations = tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
+        except GvoError as error:
+            warnings.append(f"not compared with the ground truth: {error}")
+            is_partly = True
+    summary = _summary(name, smoother, notes)
+    summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
+    folder.write_summary(summary | {"configuration": config.model_dump()})
+    plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
+    return RunResult(
+        summary=summary | {"configuration": config.model_dump()},
+        evaluations=evaluations,
+        exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
+        warnings=tuple(warnings),
+    )
+
+
+def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
+    counts = smoother.window.counts
+    warnings = []
+    if notes.broken_off:
+        warnings.append(f"the input broke off after {smoother.n_poses} poses: {notes.broken_off}")
+    if counts.n_rejected:
+        warnings.append(
+            f"{counts.n_rejected} edges or priors were refused, {counts.n_gated} of them because "
+            f"others contradict them; the first: {counts.first_rejected}"
+        )
+    if counts.n_coasting:
+        warnings.append(
+            f"{counts.n_coasting} of {smoother.n_poses} poses have no usable edge and continue "
+            "the last velocity (frames.csv: coasting, lost)"
+        )
+    if counts.n_restored:
+        warnings.append(f"{counts.n_restored} updates failed and were done again with less")
+    return warnings
+
+
+def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, Any]:
+    n_tied = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
+    polish = smoother.window.polish
+    return {
+        "gvo_version": __version__,
+        "recording": name,
+        "decisions": notes.decisions,
+        "frames": smoother.n_poses,
+        "tracked": n_tied,
+        "status_counts": {status.value: smoother.statuses[status] for status in Status},
+        "window": asdict(smoother.window.counts),
+        "polish": None if polish is None else polish.as_json(),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+    }
+
+
+def smooth_lines(
+    lines: Iterable[str],
+    answer: Callable[[str], None],
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    keyframes: Keeping = "distance",
+    ground_truth: Trajectory | None = None,
+) -> RunResult:
+    """Smooth a stream of poses and edges, answering each line at once.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        CSV or JSON, told by the first one; see `gvo.io.edges.lines`.
+    answer : callable
+        Gets the answer to each line that holds anything, without its line end: the estimate of
+        the line's pose, or `{"error": ...}`.
+    out : str or Path
+        Folder, as of `smooth_edges`.
+    config : Config, optional
+    keyframes : {"manual", "distance"}
+        Who keeps poses beside the stream's own `keep`.
+    ground_truth : Trajectory, optional
+        True poses of the same frame.
+
+    Returns
+    -------
+    RunResult
+        Exit code 3 where a line was malformed.
+
+    Raises
+    ------
+    RecordingError
+        When no line held a pose, or the folder cannot be written.
+    """
+    config = config or Config()
+    faults = InputFaults()
+    with RunFolder(Path(out), columns=POSES_HEADER) as folder:
+        smoother = Smoother(folder, config, keyframes=keyframes)
+        try:
+            _answer_all(lines, answer, smoother, faults)
+        except OSError as error:
+            faults.add("answers could not be written", f"the stream ends there: {error.strerror}")
+        finally:
+            smoother.finish()
+    notes = SmoothingNotes(warnings=faults.warnings())
+    return conclude(
+        "standard input", folder, smoother, config=config, notes=notes, truth=ground_truth
+    )
+
+
+def _answer_all(
+    lines: Iterable[str],
+    answer: Callable[[str], None],
+    smoother: Smoother,
+    faults: InputFaults,
+) -> None:
+    line_format: LineFormat | None = None
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        if line_format is None:
+            line_format = detect_format(line)
+            if line_format == "csv" and is_header(line):
+                answer(CSV_HEADER)
+                continue
+        try:
+            reply = _reply(parse_line(line, line_format), smoother, line_format)
+        except ValueError as error:
+            faults.add("lines were not understood", f"line {number}: {error}")
+            reply = format_error(f"line {number}: {error}")
+        answer(reply)
+
+
+def _reply(request: Request, smoother: Smoother, line_format: LineFormat) -> str:
+    frame_id = request.frame_id
+    if frame_id not in smoother.window:
+        estimate, rejected = _add(request, smoother), list[Rejected]()
+    else:
+        estimate, rejected = _extend(request, smoother)
+    if request.keep is not None and frame_id in smoother.window:
+        (smoother.window.keep if request.keep else smoother.window.release)(frame_id)
+    return format_estimate(estimate, line_format, rejected)
+
+
+def _add(request: Request, smoother: Smoother) -> Estimate:
+    if request.stamp_ns is None:
+        raise ValueError(f"{request.frame_id!r} is not in the window; a new pose needs a stamp")
+    return smoother.add_pose(
+        PoseEvent(
+            frame_id=request.frame_id,
+            stamp_ns=request.stamp_ns,
+            edges=request.edges,
+            prior=request.prior,
+        )
+    )
+
+
+def _extend(request: Request, smoother: Smoother) -> tuple[Estimate, list[Rejected]]:
+    """Add edges and prior to a pose of the window; return its estimate and what was refused."""
+    frame_id, window = request.frame_id, smoother.window
+    if request.stamp_ns not in (None, window.stamp_ns(frame_id)):
+        raise ValueError(
+            f"{frame_id!r} is in the window with the stamp {window.stamp_ns(frame_id)}, got "
+            f"{request.stamp_ns}"
+        )
+    answers: list[Estimate | Rejected] = [
+        smoother.add_edge(EdgeEvent(frame_id=frame_id, edge=edge)) for edge in request.edges
+    ]
+    if request.prior is not None:
+        answers.append(window.add_prior(frame_id, request.prior))
+    rejected = [reply for reply in answers if isinstance(reply, Rejected)]
+    return window.estimate(frame_id), rejected

@@ -1,0 +1,281 @@
+"""The summary of a run, while it runs and at its end."""
+
+from __future__ import annotations
+
+import hashlib
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, fields
+from itertools import islice
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from gvo._version import __version__
+from gvo.errors import GvoError, OutputError
+from gvo.geometry.camera import Calibration
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.truth import TruthComparison
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.run_folder.writer import RunFolder
+from gvo.runs.loop import RunLoop
+from gvo.runs.statistics import Progress
+from gvo.trajectory.evaluation import Evaluation, evaluations_json
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, Status
+
+State: TypeAlias = Literal["running", "interrupted", "complete"]
+
+# In which the first images of both streams are looked for.
+_N_FIRST = 20
+
+
+def summarize(
+    loop: RunLoop,
+    compared: TruthComparison | Failure,
+    warnings: list[str],
+    *,
+    state: State = "complete",
+) -> dict[str, Any]:
+    """Return what `summary.json` holds of a run.
+
+    Parameters
+    ----------
+    loop : RunLoop
+        After its run, or in the middle of it.
+    compared : TruthComparison or Failure
+        The errors, or why there are none.
+    warnings : list of str
+        A line each.
+    state : {"running", "interrupted", "complete"}
+        How far the run is.
+    """
+    info, tally = loop.source.info, loop.tally
+    evaluations: tuple[Evaluation, ...] = ()
+    point: list[list[float]] | None = None
+    stamps_from: str | None = None
+    if isinstance(compared, Failure):
+        truth = f"none: {compared.reason}"
+    else:
+        truth, evaluations = compared.truth.decision, compared.evaluations
+        point = compared.truth.T_frame_point.tolist()
+        stamps_from = compared.truth.trajectory.stamps_from
+    medians = {stage: durations.median() for stage, durations in tally.stages.items()}
+    return {
+        "gvo_version": __version__,
+        "state": state,
+        "recording": info.name,
+        "sensor": info.sensor,
+        "decisions": list(info.decisions),
+        "frame": _frame_text(loop.frame),
+        "ground_truth": truth,
+        "T_frame_truth": point,
+        "ground_truth_stamps_from": stamps_from,
+        "frames": tally.n_frames,
+        "tracked": tally.n_tracked,
+        "coverage_percent": tally.coverage_percent,
+        "segments": tally.segments_json(),
+        "status_counts": {status.value: tally.statuses[status] for status in Status},
+        "unpaired_images": tally.n_unpaired,
+        "window": asdict(tally.window),
+        "polish": None if tally.polish is None else tally.polish.as_json(),
+        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
+        "median_ms": medians,
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "errors": evaluations_json(evaluations)["estimates"],
+        "warnings": warnings,
+        "configuration": loop.config.model_dump(),
+    }
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident memory of this process so far, in 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = 1 if sys.platform == "darwin" else 1024
+    return peak * unit / 1e6
+
+
+def _frame_text(frame: OutputFrame) -> str:
+    return ", ".join(text for text in (frame.name or "camera", frame.origin) if text)
+
+
+def run_identity(
+    source: Source,
+    frame: OutputFrame,
+    excerpt: Excerpt | None,
+    *,
+    start: Trajectory | None = None,
+) -> dict[str, Any]:
+    """Return what makes a run, beside its configuration, this one and no other.
+
+    Parameters
+    ----------
+    source : Source
+        Of its images the first one of either stream is read.
+    frame : OutputFrame
+        Before the first frame.
+    excerpt : Excerpt or None
+    start : Trajectory, optional
+        The true poses, where the run starts at one of them.
+
+    Returns
+    -------
+    dict
+        Plain values, as `summary.json` gives them back.
+    """
+    return {
+        "version of gvo": __version__,
+        "recording": _describe_recording(source),
+        "excerpt": asdict(excerpt or Excerpt()),
+        "output": {
+            "frame": frame.name,
+            "mount": _digest_of(frame.fixed_mount),
+            "initial pose": _digest_of(frame.T_initial),
+            "true start": "" if start is None else _digest_of(start.T_world_cam),
+        },
+    }
+
+
+def _describe_recording(source: Source) -> dict[str, Any]:
+    info = source.info
+    return {
+        "sensor": info.sensor,
+        "number of images": info.n_images,
+        "frame_id": info.frame_id,
+        "calibration": _digest(_calibration_parts(info)),
+        "first images": dict(_first_images(source)),
+    }
+
+
+def _calibration_parts(info: RecordingInfo) -> Iterator[bytes]:
+    view = info.depth_view
+    calibrations = [*info.calibrations, *([] if view is None else [view.calibration])]
+    for calibration in calibrations:
+        for field in fields(Calibration):
+            value = getattr(calibration, field.name)
+            yield value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+    if view is not None:
+        yield view.T_color_depth.tobytes()
+
+
+def _first_images(source: Source) -> Iterator[tuple[str, str]]:
+    """Yield the stream of the first image of each, its stamp and a digest of its pixels."""
+    streams: set[int] = set()
+    try:
+        with closing(_as_generator(source)) as images:
+            for image in islice(images, _N_FIRST):
+                if image.stream not in streams:
+                    streams.add(image.stream)
+                    yield source.info.stream_names[image.stream], _describe_image(image)
+                if len(streams) == 2:
+                    return
+    except GvoError:
+        return  # whoever reads on is told
+
+
+def _as_generator(source: Source) -> Any:  # noqa: ANN401 - what can be closed before its end
+    yield from source.images()
+
+
+def _describe_image(image: StampedImage) -> str:
+    try:
+        pixels = image.load()
+    except GvoError:
+        return f"{image.stamp_ns} faulty"
+    parts = f"{pixels.dtype}{pixels.shape}".encode(), np.ascontiguousarray(pixels).tobytes()
+    return f"{image.stamp_ns} {_digest(parts)}"
+
+
+def _digest_of(array: np.ndarray[Any, Any] | None) -> str:
+    return "" if array is None else _digest([np.ascontiguousarray(array).tobytes()])
+
+
+def _digest(parts: Any) -> str:  # noqa: ANN401 - bytes, one after another
+    digest = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+_EVERY_S = 3.0
+_NOT_YET = Failure(reason="the run has not ended")
+
+
+class RunningSummary:
+    """Replaces `summary.json` every few seconds.
+
+    Parameters
+    ----------
+    loop : RunLoop
+    folder : RunFolder
+    identity : dict
+        See `run_identity`.
+    on_progress : callable, optional
+        Called before, after each frame.
+    """
+
+    def __init__(
+        self,
+        loop: RunLoop,
+        folder: RunFolder,
+        identity: dict[str, Any],
+        on_progress: Callable[[Progress], None] | None = None,
+    ) -> None:
+        self._loop = loop
+        self._folder = folder
+        self._identity = identity
+        self._on_progress = on_progress
+        self._written_s: float | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Take that a frame is done."""
+        if self._on_progress is not None:
+            self._on_progress(progress)
+        if self._written_s is None or time.monotonic() - self._written_s > _EVERY_S:
+            self._loop.count()
+            self.write("running")
+
+    def write(self, state: State, *warnings: str) -> None:
+        """Write what was done so far.
+
+        Raises
+        ------
+        OutputError
+            When it cannot be written.
+        """
+        lines = [*warnings, *self._loop.tally.warnings()]
+        summary = summarize(self._loop, _NOT_YET, lines, state=state)
+        self._folder.write_summary(summary | {"run": self._identity})
+        self._written_s = time.monotonic()
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """Say in the summary, and in an error of writing, what stands.
+
+        Raises
+        ------
+        OutputError
+            The same, with the number of frames that stand.
+        """
+        try:
+            yield
+        except OutputError as error:
+            self._write_interrupted(str(error))
+            raise self._explained(error) from error
+        except (GvoError, KeyboardInterrupt):
+            self._write_interrupted("interrupted")
+            raise
+
+    def _write_interrupted(self, what: str) -> None:
+        with suppress(OutputError):
+            self.write("interrupted", what)
+
+    def _explained(self, error: OutputError) -> OutputError:
+        tally = self._loop.tally
+        text = f"{error}; {tally.n_frames} frames stand whole in {self._folder.path}"
+        return OutputError(text, is_partly=tally.n_with_pose > 0)

@@ -1,0 +1,183 @@
+"""Films of runs, decoded again."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import gvo
+from gvo.config import Config
+from gvo.errors import ConfigurationError, RecordingError
+from gvo.io.frames import frames
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SyntheticRecording, WorldName
+from gvo.odometry.odometry import Odometry
+from gvo.runs.outputs.video import RunOverlay, film_width
+from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
+from gvo.viz.overlay import compose_faulty, compose_overlay
+
+_N_FRAMES = 11
+_Run = tuple[SyntheticRecording, list[tuple[Frame, FrameResult]]]
+
+
+def _track(world: WorldName, sensor: Sensor) -> _Run:
+    recording = SyntheticRecording(world, sensor, n_frames=_N_FRAMES, scale=0.5)
+    odometry = Odometry(recording.info.camera, Config())
+    seen = [f for f in frames(recording, Config()) if not isinstance(f, FaultyFrame)]
+    return recording, [(frame, odometry.track(frame)) for frame in seen]
+
+
+@pytest.fixture(scope="module")
+def drive() -> _Run:
+    return _track("driving", "stereo")
+
+
+@pytest.fixture(scope="module")
+def room() -> _Run:
+    return _track("handheld", "rgbd")
+
+
+def _decoded(path: Path) -> Iterator[ImageArray]:
+    capture = cv2.VideoCapture(str(path))
+    while (answer := capture.read())[0]:
+        yield np.asarray(answer[1], dtype=np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+@pytest.mark.parametrize("name", ["drive", "room"])
+def test_a_film_shows_the_picture_of_each_frame(
+    name: str, suffix: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    recording, pairs = request.getfixturevalue(name)
+    camera = recording.info.camera
+    path = tmp_path / f"film{suffix}"
+    with RunOverlay(path, camera) as output:
+        for frame, result in pairs:
+            output.add_frame(frame, result)
+        output.add_smoothed([])
+    pictures = list(_decoded(path))
+    assert len(pictures) == _N_FRAMES
+    for index, ((frame, result), picture) in enumerate(zip(pairs, pictures, strict=True)):
+        width = film_width(camera)
+        expected = compose_overlay(frame, result, camera, index=index, max_width=width)
+        assert picture.shape == expected.shape
+        assert np.abs(picture.astype(int) - expected).mean() < 8.0
+    period_ns = np.median(np.diff([frame.stamp_ns for frame, _ in pairs]))
+    rate_hz = cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS)
+    assert rate_hz == pytest.approx(1e9 / period_ns, rel=2e-3)
+
+
+def test_faulty_frames_have_dark_pictures_in_their_place(drive: _Run, tmp_path: Path) -> None:
+    recording, pairs = drive
+    camera = recording.info.camera
+    faulty = FaultyFrame(stamp_ns=pairs[4][0].stamp_ns, reason="image_0/000004.png: is cut off")
+    with RunOverlay(tmp_path / "film.mp4", camera, rate_hz=5.0) as output:
+        for n, (frame, result) in enumerate(pairs):
+            if n == 4:
+                output.add_faulty(faulty)
+            else:
+                output.add_frame(frame, result)
+    pictures = list(_decoded(tmp_path / "film.mp4"))
+    assert len(pictures) == _N_FRAMES
+    expected = compose_faulty(faulty, camera, index=4, max_width=film_width(camera))
+    assert np.abs(pictures[4].astype(int) - expected).mean() < 4.0
+    assert pictures[4].mean() < 0.3 * pictures[5].mean()
+    assert cv2.VideoCapture(str(tmp_path / "film.mp4")).get(cv2.CAP_PROP_FPS) == 5.0
+
+
+@pytest.mark.parametrize("n_done", [1, 7, 10])
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+def test_an_interrupted_run_leaves_a_film_of_what_was_done(
+    drive: _Run, tmp_path: Path, suffix: str, n_done: int
+) -> None:
+    recording, pairs = drive
+    path = tmp_path / "new" / f"film{suffix}"
+    output = RunOverlay(path, recording.info.camera)
+
+    def run() -> None:
+        with output:
+            for frame, result in pairs[:n_done]:
+                output.add_frame(frame, result)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert len(list(_decoded(path))) == n_done
+    output.close()
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
+def test_without_a_frame_no_file_is_left(drive: _Run, tmp_path: Path) -> None:
+    for name in ("film.webm", "frames"):
+        with RunOverlay(tmp_path / name, drive[0].info.camera):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_become_numbered_files_where_a_folder_is_named(room: _Run, tmp_path: Path) -> None:
+    recording, pairs = room
+    camera = recording.info.camera
+    with RunOverlay(tmp_path / "frames", camera) as output:
+        for frame, result in pairs:
+            output.add_frame(frame, result)
+    assert output.decisions == ()
+    files = sorted((tmp_path / "frames").iterdir())
+    assert len(files) == _N_FRAMES
+    frame, result = pairs[-1]
+    width = film_width(camera)
+    expected = compose_overlay(frame, result, camera, index=_N_FRAMES - 1, max_width=width)
+    np.testing.assert_array_equal(cv2.imread(str(files[-1])), expected)
+
+
+def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) -> None:
+    recording, pairs = drive
+    folder = tmp_path / "frames"
+
+    def run() -> None:
+        with RunOverlay(folder, recording.info.camera) as output:
+            folder.rmdir()
+            for frame, result in pairs:
+                output.add_frame(frame, result)
+
+    with pytest.raises(RecordingError, match="frames: cannot be written"):
+        run()
+
+
+def test_other_names_are_refused_before_anything_is_read(drive: _Run, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"\.webm"):
+        RunOverlay(tmp_path / "film.gif", drive[0].info.camera)
+    (tmp_path / "film.webm").touch()
+    with pytest.raises(RecordingError, match="exists already"):
+        RunOverlay(tmp_path / "film.webm", drive[0].info.camera)
+
+
+@pytest.mark.slow
+def test_the_overlay_benchmark_prints_a_table(drive_bag: Path, tmp_path: Path) -> None:
+    package = Path(gvo.__file__).parent.parent
+    script = Path(__file__).parents[3] / "scripts" / "benchmark_overlay.py"
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(script), *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(package)},
+            check=False,
+        )
+
+    answer = run(drive_bag, "--rounds", 1, "--duration", 1)
+    assert answer.returncode == 0, answer.stderr
+    cells = re.split(r" *\| *", answer.stdout.splitlines()[-1].strip("| "))
+    assert cells[0] in ("drive.mcap", "drive")
+    assert all(float(cell) > 0.0 for cell in cells[3:7])
+    for wrong in ([tmp_path / "missing.bag"], ["x.bag", "--rounds", 0], ["x.bag", "--duration", 0]):
+        refused = run(*wrong)
+        assert refused.returncode == 2
+        assert "error" in refused.stderr
+        assert "Traceback" not in refused.stderr

@@ -1,0 +1,630 @@
+"""Runs as files of the Rerun viewer, read back by rerun's own reader."""
+
+import csv
+import os
+import resource
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pyarrow as pa  # type: ignore[import-untyped]
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+if os.environ.get("CI") != "true":
+    pytest.importorskip("rerun")
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from gvo.config import Config
+from gvo.errors import ConfigurationError, GvoError, RecordingError
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.se3 import exp, make_transform
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.run_folder.writer import RunFolder
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.runs.loop import RunLoop
+from gvo.runs.outputs import rerun_writer as rerun_run
+from gvo.runs.outputs.frames import RunFrames
+from gvo.runs.outputs.rerun import RunRerun
+from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    FrameLink,
+    FrameResult,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
+from gvo.viz.palette import COUNTS, LINKS, STAGES
+
+_N_FRAMES = 12
+_ESTIMATES = ("raw", "causal", "smoothed")
+_CAMERA_ENTITY = "/world/causal/frame/camera"
+_SECOND_NS = 10**9
+_UNIX_NS = 1_403_636_584_763_555_584
+# A camera that looks ahead and 20 degrees down, on a robot whose x points ahead and z up.
+_T_BASE_CAM = make_transform(
+    np.asarray(Rotation.from_euler("ZYX", [-90, 0, -110], degrees=True).as_matrix()),
+    np.array([0.3, -0.1, 0.5]),
+)
+_MOUNTED = RunFrames(tracked="base_link", camera="left_optical", T_tracked_cam=_T_BASE_CAM)
+# Up 1, down 2, right 3, left 4, forward 5, back 6.
+_RIGHT_DOWN_FORWARD, _FORWARD_LEFT_UP = [3, 2, 5], [5, 4, 1]
+_CAMERA = StereoCamera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48, baseline=0.1)
+
+
+class _Row(NamedTuple):
+    frame: int
+    stamp_ns: int
+    values: dict[str, Any]
+
+
+class _Read:
+    """What a file holds, by entity."""
+
+    def __init__(self, path: Path) -> None:
+        self.stamp_types: set[pa.DataType] = set()
+        self.fixed: dict[str, dict[str, Any]] = {}
+        self.rows: dict[str, list[_Row]] = {}
+        reader = RrdReader(path)
+        (entry,) = reader.recordings()
+        self.application = entry.application_id
+        self.n_blueprints = len(reader.blueprints())
+        for chunk in reader.stream():
+            self._take(chunk.entity_path, chunk.to_record_batch())
+        for rows in self.rows.values():
+            rows.sort(key=lambda row: row.frame)  # keeps the order of those of one frame
+
+    def _take(self, entity: str, batch: pa.RecordBatch) -> None:
+        columns = {name: batch.column(name) for name in batch.schema.names}
+        columns.pop("rerun.controls.RowId")
+        if "frame" not in columns:
+            values = {name: column[0].as_py() for name, column in columns.items()}
+            self.fixed.setdefault(entity, {}).update(values)
+            return
+        indices = columns.pop("frame").to_pylist()
+        stamps = columns.pop("stamp")
+        self.stamp_types.add(stamps.type)
+        stamps_ns = stamps.cast(pa.int64()).to_pylist()
+        for k, (index, stamp_ns) in enumerate(zip(indices, stamps_ns, strict=True)):
+            values = {name: column[k].as_py() for name, column in columns.items()}
+            self.rows.setdefault(entity, []).append(_Row(index, stamp_ns, values))
+
+    def poses(self, entity: str) -> dict[int, FloatArray]:
+        """Return T_parent_entity by stamp."""
+        return {row.stamp_ns: _matrix(row.values) for row in self.rows[entity]}
+
+    def latest(self, entity: str, frame: int) -> dict[str, Any]:
+        """Return what the viewer shows of an entity at a frame."""
+        return [row for row in self.rows[entity] if row.frame <= frame][-1].values
+
+    def numbers(self, entity: str) -> dict[int, float]:
+        """Return scalars by stamp."""
+        return {row.stamp_ns: row.values["Scalars:scalars"][0] for row in self.rows[entity]}
+
+
+def _matrix(values: dict[str, Any]) -> FloatArray:
+    R = Rotation.from_quat(values["Transform3D:quaternion"][0]).as_matrix()
+    return make_transform(np.asarray(R), np.array(values["Transform3D:translation"][0]))
+
+
+def _strip(values: dict[str, Any]) -> list[list[float]]:
+    strips = values["LineStrips3D:strips"]
+    return strips[0] if strips else []
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run folder, and the Rerun file of the same run."""
+
+    folder: Path
+    read: _Read
+    results: list[FrameResult]
+    frames: RunFrames
+
+    def trajectory(self, name: str) -> Trajectory:
+        return read_trajectory(self.folder / f"{name}.txt")
+
+    def table(self, name: str) -> list[dict[str, str]]:
+        with (self.folder / name).open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+
+    def causal(self) -> dict[int, FloatArray]:
+        trajectory = self.trajectory("causal")
+        return dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_cam, strict=True))
+
+
+class _Kept:
+    """Keeps the results of a run."""
+
+    def __init__(self) -> None:
+        self.results: list[FrameResult] = []
+
+    def add_frame(self, frame: object, result: FrameResult) -> None:
+        self.results.append(result)
+
+    def add_faulty(self, frame: object) -> None:
+        """Nothing is kept."""
+
+    def add_smoothed(self, estimates: object) -> None:
+        """Nothing is kept."""
+
+
+def _run(folder: Path, source: SyntheticRecording, names: RunFrames) -> _Run:
+    frame = OutputFrame() if names.is_camera else OutputFrame("base_link", names.mount(0))
+    loop, kept = RunLoop(source, Config(), frame), _Kept()
+    path = folder / "run.rrd"
+    with (
+        RunFolder(folder) as tables,
+        RunRerun(path, source.info.camera, names, config=Config()) as file,
+    ):
+        loop.run([tables, file, kept], None)
+    return _Run(folder=folder, read=_Read(path), results=kept.results, frames=names)
+
+
+@pytest.fixture(scope="module")
+def room_run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
+    """Return a run with an RGB-D camera, whose own poses are asked for."""
+    source = SyntheticRecording("handheld", "rgbd", n_frames=_N_FRAMES, scale=0.5)
+    return _run(tmp_path_factory.mktemp("room"), source, RunFrames(is_world_optical=True))
+
+
+@pytest.fixture(scope="module")
+def robot_run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
+    """Return a run with a stereo camera on a robot, whose poses are asked for."""
+    source = SyntheticRecording("handheld", "stereo", n_frames=_N_FRAMES, scale=0.5)
+    return _run(tmp_path_factory.mktemp("robot"), source, _MOUNTED)
+
+
+@pytest.fixture(scope="module", params=["room_run", "robot_run"])
+def any_run(request: pytest.FixtureRequest) -> _Run:
+    run = request.getfixturevalue(request.param)
+    assert isinstance(run, _Run)
+    return run
+
+
+@pytest.mark.parametrize("name", _ESTIMATES)
+def test_all_poses_are_those_of_the_run_folder_at_their_stamps(any_run: _Run, name: str) -> None:
+    trajectory = any_run.trajectory(name)
+    poses = any_run.read.poses(f"/world/{name}/frame")
+    assert sorted(poses) == trajectory.stamps_ns.tolist()
+    assert len(poses) == _N_FRAMES
+    placed = np.stack([poses[stamp_ns] for stamp_ns in trajectory.stamps_ns.tolist()])
+    np.testing.assert_allclose(placed, trajectory.T_world_cam, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", _ESTIMATES)
+def test_both_timelines_name_the_same_frames(any_run: _Run, name: str) -> None:
+    stamps_ns = any_run.trajectory("raw").stamps_ns.tolist()
+    rows = any_run.read.rows[f"/world/{name}/frame"]
+    assert [(row.frame, row.stamp_ns) for row in rows] == list(enumerate(stamps_ns))
+
+
+@pytest.mark.parametrize("name", _ESTIMATES)
+def test_the_last_paths_are_whole(any_run: _Run, name: str) -> None:
+    drawn = _strip(any_run.read.latest(f"/world/{name}/path", _N_FRAMES))
+    positions = any_run.trajectory(name).T_world_cam[:, :3, 3]
+    np.testing.assert_allclose(drawn, positions, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", ["raw", "causal"])
+def test_ellipsoids_are_three_sigma_of_the_position_in_the_world(any_run: _Run, name: str) -> None:
+    rows = any_run.read.rows[f"/world/{name}/covariance"]
+    assert len(rows) == _N_FRAMES
+    for row, result in zip(rows, any_run.results, strict=True):
+        estimate = getattr(result, name)
+        _check_ellipsoid(row.values, 0, estimate)
+
+
+def _check_ellipsoid(values: dict[str, Any], k: int, estimate: Estimate) -> None:
+    """Put the matrix of the ellipsoid together again and compare it with the covariance."""
+    R = estimate.T_world_cam[:3, :3]
+    covariance = R @ estimate.covariance[3:, 3:] @ R.T
+    directions = Rotation.from_quat(values["Ellipsoids3D:quaternions"][k]).as_matrix()
+    sigmas = np.array(values["Ellipsoids3D:half_sizes"][k]) / 3.0
+    scale = max(float(np.abs(covariance).max()), 1e-12)
+    drawn = directions @ np.diag(sigmas**2) @ directions.T
+    np.testing.assert_allclose(drawn, covariance, atol=1e-5 * scale)
+    centre = values["Ellipsoids3D:centers"][k]
+    np.testing.assert_allclose(centre, estimate.T_world_cam[:3, 3], atol=2e-6)
+
+
+def test_keyframes_stand_where_their_causal_poses_put_them(any_run: _Run) -> None:
+    causal = {result.stamp_ns: result.causal for result in any_run.results}
+    pairs = zip(any_run.read.rows["/world/keyframes"], any_run.results, strict=True)
+    for row, result in pairs:
+        expected = [causal[ns].T_world_cam[:3, 3] for ns in result.keyframes_ns]
+        np.testing.assert_allclose(row.values["Points3D:positions"], expected, atol=2e-6)
+        ellipsoids = any_run.read.latest("/world/keyframes/covariance", row.frame)
+        for k, stamp_ns in enumerate(result.keyframes_ns):
+            _check_ellipsoid(ellipsoids, k, causal[stamp_ns])
+    assert max(len(result.keyframes_ns) for result in any_run.results) > 1
+
+
+def test_links_run_from_the_earlier_frame_to_the_newest(any_run: _Run) -> None:
+    causal = any_run.causal()
+    expected: dict[int, list[FloatArray]] = {stamp_ns: [] for stamp_ns in causal}
+    for edge in any_run.table("edges.csv"):
+        stamps_ns = [int(edge["reference_ns"]), int(edge["stamp_ns"])]
+        expected[stamps_ns[1]].append(np.stack([causal[ns][:3, 3] for ns in stamps_ns]))
+    drawn = {row.stamp_ns: row.values for row in any_run.read.rows["/world/links"]}
+    assert drawn.keys() == expected.keys()
+    for stamp_ns, segments in expected.items():
+        strips = drawn[stamp_ns]["LineStrips3D:strips"] or []
+        assert len(strips) == len(segments)
+        drawn_ends, ends = np.reshape(strips, (-1, 3)), np.reshape(segments, (-1, 3))
+        np.testing.assert_allclose(drawn_ends, ends, atol=2e-6)
+    assert sum(map(len, expected.values())) > _N_FRAMES
+
+
+def test_there_are_an_image_and_an_overlay_of_each_frame(any_run: _Run) -> None:
+    shapes = {}
+    for entity in ("/overlay", f"{_CAMERA_ENTITY}/image"):
+        rows = any_run.read.rows[entity]
+        assert [row.frame for row in rows] == list(range(_N_FRAMES))
+        pictures = [_decode(row.values) for row in rows]
+        assert len({picture.shape for picture in pictures}) == 1
+        assert all(float(picture.std()) > 5.0 for picture in pictures)
+        shapes[entity] = pictures[0].shape[:2]
+    width, height = any_run.read.fixed[f"{_CAMERA_ENTITY}/image"]["Pinhole:resolution"][0]
+    assert shapes[f"{_CAMERA_ENTITY}/image"] == (height, width)
+
+
+def _decode(values: dict[str, Any]) -> Any:
+    (blob,) = values["EncodedImage:blob"]
+    assert values["EncodedImage:media_type"] == ["image/jpeg"]
+    return cv2.imdecode(np.array(blob, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_matched_points_project_to_where_they_were_seen(any_run: _Run) -> None:
+    K = np.array(any_run.read.fixed[f"{_CAMERA_ENTITY}/image"]["Pinhole:image_from_camera"][0])
+    rows = any_run.read.rows[f"{_CAMERA_ENTITY}/points"]
+    for row, result in zip(rows, any_run.results, strict=True):
+        if result.registration is None:
+            assert row.values["Points3D:positions"] == []
+            continue
+        points = np.array(row.values["Points3D:positions"])
+        pixels = (points @ K.reshape(3, 3, order="F").T)[:, :2] / points[:, 2:]
+        np.testing.assert_allclose(pixels, result.registration.pixels_current, atol=0.05)
+        colours = set(row.values["Points3D:colors"])
+        assert len(colours) == len(set(result.registration.inliers.tolist()))
+
+
+def test_the_camera_hangs_below_the_frame_as_it_is_mounted(any_run: _Run) -> None:
+    mount = _matrix(any_run.read.fixed[_CAMERA_ENTITY])
+    np.testing.assert_allclose(mount, any_run.frames.mount(0), atol=1e-6)
+
+
+def test_the_cloud_has_the_inliers_of_each_keyframe_in_the_world(any_run: _Run) -> None:
+    causal = any_run.causal()
+    clouds = {row.stamp_ns: row.values for row in any_run.read.rows["/world/cloud"]}
+    n_checked = 0
+    for result in any_run.results:
+        is_keyframe = result.stamp_ns in result.keyframes_ns
+        assert (result.stamp_ns in clouds) == (is_keyframe and result.registration is not None)
+        if result.stamp_ns not in clouds or result.registration is None:
+            continue
+        T_world_cam = causal[result.stamp_ns] @ any_run.frames.mount(0)
+        points = result.registration.points_current[result.registration.inliers]
+        expected = np.column_stack([points, np.ones(len(points))]) @ T_world_cam.T
+        drawn = clouds[result.stamp_ns]["Points3D:positions"]
+        np.testing.assert_allclose(drawn, expected[:, :3], atol=1e-4)
+        n_checked += 1
+    assert n_checked > 0
+
+
+def test_numbers_are_those_of_the_tables(any_run: _Run) -> None:
+    counted, timed = any_run.table("frames.csv"), any_run.table("timings.csv")
+    for name in ("matches", "inliers", "points"):
+        expected = {int(row["stamp_ns"]): float(row[f"n_{name}"]) for row in counted}
+        assert any_run.read.numbers(f"/counts/{name}") == expected
+    for stage in ("read", "extract", "register", "links", "window"):
+        drawn = any_run.read.numbers(f"/milliseconds/{stage}")
+        values = [float(row[f"{stage}_ms"]) for row in timed]
+        np.testing.assert_allclose(list(drawn.values()), values, atol=1e-3)
+
+
+def test_lines_have_the_colours_that_the_report_gives_them(any_run: _Run) -> None:
+    expected = {
+        **{f"/counts/{name}": COUNTS[name] for name in ("matches", "inliers", "points")},
+        **{f"/milliseconds/{stage}": code for stage, code in STAGES.items()},
+        "/chi2/keyframe": LINKS["keyframe"],
+    }
+    for entity, code in expected.items():
+        (drawn,) = any_run.read.fixed[entity]["SeriesLines:colors"]
+        assert f"{drawn:08x}" == f"{code[1:].lower()}ff", entity
+
+
+def test_chi2_is_the_mean_of_the_accepted_edges_of_a_kind(any_run: _Run) -> None:
+    expected: dict[int, list[float]] = {}
+    for edge in any_run.table("edges.csv"):
+        if edge["kind"] == "keyframe" and edge["is_accepted"] == "1" and edge["chi2"]:
+            expected.setdefault(int(edge["stamp_ns"]), []).append(float(edge["chi2"]))
+    means = {stamp_ns: np.mean(values) for stamp_ns, values in expected.items()}
+    drawn = any_run.read.numbers("/chi2/keyframe")
+    assert drawn == pytest.approx(means, rel=1e-3)
+    assert means
+
+
+def test_the_log_has_the_status_of_each_frame_and_the_configuration(any_run: _Run) -> None:
+    texts = [row.values["TextLog:text"][0] for row in any_run.read.rows["/status"]]
+    statuses = [row["status"] for row in any_run.table("frames.csv")]
+    assert [text.split(":")[0] for text in texts] == statuses
+    assert "n_keyframes" in any_run.read.fixed["/configuration"]["TextDocument:text"][0]
+
+
+def test_up_is_where_the_frame_has_it(room_run: _Run, robot_run: _Run) -> None:
+    axes = [run.read.fixed["/world"]["ViewCoordinates:xyz"][0] for run in (room_run, robot_run)]
+    assert axes == [_RIGHT_DOWN_FORWARD, _FORWARD_LEFT_UP]
+
+
+@pytest.mark.parametrize(("down", "axes"), [("y", _RIGHT_DOWN_FORWARD), ("z", _FORWARD_LEFT_UP)])
+def test_a_placed_camera_tells_by_its_pose_where_up_is(
+    tmp_path: Path, down: str, axes: list[int]
+) -> None:
+    turn = [-100.0, 0.0, 0.0] if down == "z" else [10.0, 5.0, 0.0]
+    R = np.asarray(Rotation.from_euler("xyz", turn, degrees=True).as_matrix())
+    start = make_transform(R, np.array([4.0, 5.0, 6.0]))
+    read = _write_made(tmp_path, [_made(0, start)], RunFrames())
+    assert read.fixed["/world"]["ViewCoordinates:xyz"][0] == axes
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    numbers=st.lists(st.floats(-1.0, 1.0), min_size=36, max_size=36),
+    twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6),
+)
+def test_any_covariance_gives_its_ellipsoid(numbers: list[float], twist: list[float]) -> None:
+    from gvo.runs.outputs.rerun_writer import make_ellipsoids
+
+    A = np.array(numbers).reshape(6, 6)
+    estimate = Estimate(stamp_ns=0, T_world_cam=exp(np.array(twist)), covariance=A @ A.T)
+    batches = make_ellipsoids("raw", [estimate]).as_component_batches()
+    values = {b.component_descriptor().component: b.as_arrow_array().to_pylist() for b in batches}
+    _check_ellipsoid(values, 0, estimate)
+
+
+def test_a_covariance_that_is_not_finite_has_no_ellipsoid(tmp_path: Path) -> None:
+    result = _made(0)
+    unknown = replace(result.raw, covariance=np.full((6, 6), np.inf))
+    read = _write_made(tmp_path, [replace(result, raw=unknown)])
+    sizes = {
+        name: len(read.latest(f"/world/{name}/covariance", 0)["Ellipsoids3D:half_sizes"])
+        for name in ("raw", "causal")
+    }
+    assert sizes == {"raw": 0, "causal": 1}
+
+
+def _made(
+    stamp_ns: int, T_world_cam: FloatArray | None = None, *, links: tuple[FrameLink, ...] = ()
+) -> FrameResult:
+    """Make the result of a frame that was not tracked."""
+    T = np.eye(4) if T_world_cam is None else T_world_cam
+    estimate = Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=np.eye(6))
+    return FrameResult(
+        raw=estimate,
+        causal=estimate,
+        finished=(),
+        status=Status.OK,
+        reason="",
+        n_keypoints=0,
+        n_points=0,
+        n_matches=0,
+        n_inliers=0,
+        n_links=0,
+        links=links,
+    )
+
+
+def _frame(stamp_ns: int) -> StereoFrame:
+    grey = np.full((_CAMERA.height, _CAMERA.width), 90, dtype=np.uint8)
+    return StereoFrame(stamp_ns=stamp_ns, left=grey, right=grey)
+
+
+def _write_made(folder: Path, results: list[FrameResult], names: RunFrames | None = None) -> _Read:
+    path = folder / "made.rrd"
+    with RunRerun(path, _CAMERA, names) as file:
+        for result in results:
+            file.add_frame(_frame(result.stamp_ns), result)
+    return _Read(path)
+
+
+@pytest.mark.parametrize(
+    ("start_ns", "kind"), [(0, pa.duration("ns")), (_UNIX_NS, pa.timestamp("ns"))]
+)
+def test_stamps_are_dates_where_they_can_be(
+    tmp_path: Path, start_ns: int, kind: pa.DataType
+) -> None:
+    read = _write_made(tmp_path, [_made(start_ns), _made(start_ns + 1)])
+    assert read.stamp_types == {kind}
+    assert [row.stamp_ns for row in read.rows["/status"]] == [start_ns, start_ns + 1]
+
+
+def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path) -> None:
+    def mount(stamp_ns: int) -> FloatArray:
+        return make_transform(np.eye(3), np.array([0.0, 1e-3 * stamp_ns, 1.0]))
+
+    names = RunFrames(tracked="base_link", camera="pan", T_tracked_cam=mount)
+    read = _write_made(tmp_path, [_made(5), _made(9)], names)
+    poses = read.poses(_CAMERA_ENTITY)
+    assert {ns: pytest.approx(mount(ns)[1, 3]) for ns in (5, 9)} == {
+        ns: pose[1, 3] for ns, pose in poses.items()
+    }
+
+
+def test_a_pose_that_cannot_be_tied_to_a_known_frame_has_no_link(tmp_path: Path) -> None:
+    def link(reference_ns: int, *, is_accepted: bool) -> FrameLink:
+        return FrameLink(reference_ns=reference_ns, kind="step", chi2=1.0, is_accepted=is_accepted)
+
+    links = (link(10, is_accepted=True), link(11, is_accepted=True), link(10, is_accepted=False))
+    read = _write_made(tmp_path, [_made(10), _made(20, links=links)])
+    drawn = read.latest("/world/links", 1)
+    assert len(drawn["LineStrips3D:strips"]) == 2
+    assert len(set(drawn["LineStrips3D:colors"])) == 2  # refused ones stand out
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    points = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 1.0], [0.0, 0.0, np.inf], [4.0, 5.0, 6.0]])
+    found = RelativePose(
+        T_reference_current=np.eye(4),
+        covariance=np.eye(6),
+        matches=np.zeros((4, 2), dtype=np.int64),
+        inliers=np.array([True, True, True, False]),
+        pixels_reference=np.full((4, 2), 7.0),
+        pixels_current=np.full((4, 2), 9.0),
+        points_current=points,
+    )
+    result = replace(_made(3), registration=found, keyframes_ns=(3,))
+    read = _write_made(tmp_path, [result])
+    drawn = read.latest(f"{_CAMERA_ENTITY}/points", 0)["Points3D:positions"]
+    np.testing.assert_allclose(drawn, points[[0, 3]])
+    np.testing.assert_allclose(read.latest("/world/cloud", 0)["Points3D:positions"], points[:1])
+
+
+def test_faulty_frames_are_told_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "made.rrd"
+    with RunRerun(path, _CAMERA) as file:
+        file.add_faulty(FaultyFrame(stamp_ns=1, reason="black"))
+        file.add_frame(_frame(2), _made(2))
+        file.add_faulty(FaultyFrame(stamp_ns=3, reason="torn"))
+        file.add_frame(_frame(4), _made(4))
+        file.add_smoothed([_made(2).causal])
+    read = _Read(path)
+    rows = [
+        (row.frame, row.stamp_ns, row.values["TextLog:text"][0]) for row in read.rows["/status"]
+    ]
+    assert [row[:2] for row in rows] == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert [row[2] for row in rows][::2] == ["skipped: black", "skipped: torn"]
+    assert [row.frame for row in read.rows["/world/causal/frame"]] == [1, 3]
+    assert [(r.frame, r.stamp_ns) for r in read.rows["/world/smoothed/frame"]] == [(1, 2)]
+
+
+def test_path_and_recent_poses_are_all_there_were_at_each_frame(tmp_path: Path) -> None:
+    places = np.cumsum(np.random.default_rng(0).normal(size=(14, 3)), axis=0)
+    poses = [make_transform(np.eye(3), place) for place in places]
+    read = _write_made(tmp_path, [_made(k * 300_000_000, T) for k, T in enumerate(poses)])
+    for frame in range(1, 13):
+        drawn = _strip(read.latest("/world/raw/recent", frame))
+        if frame >= 4:  # after the first second
+            drawn = _strip(read.latest("/world/raw/path", frame)) + drawn[1:]
+        np.testing.assert_allclose(drawn, places[: frame + 1], atol=2e-6)
+
+
+def test_paths_on_the_way_are_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_run, "N_SHOWN_POSES", 10)
+    places = [make_transform(np.eye(3), np.array([float(k), 0.0, 0.0])) for k in range(60)]
+    results = [_made(k * _SECOND_NS, T) for k, T in enumerate(places)]
+    read = _write_made(tmp_path, results)
+    rows = read.rows["/world/causal/path"]
+    assert max(len(_strip(row.values)) for row in rows[:-1]) <= 11
+    assert [_strip(row.values)[-1][0] for row in rows[:-1]] == list(range(1, 60))
+    assert len(_strip(rows[-1].values)) == 60
+
+
+def test_each_frame_may_come_from_another_thread(tmp_path: Path) -> None:
+    path = tmp_path / "made.rrd"
+    with RunRerun(path, _CAMERA) as file:
+        for k in range(6):
+            with ThreadPoolExecutor(1) as pool:
+                pool.submit(file.add_frame, _frame(k), _made(k)).result()
+    rows = _Read(path).rows
+    for entity in ("/overlay", "/world/causal/frame", "/world/links", "/counts/matches"):
+        assert [(row.frame, row.stamp_ns) for row in rows[entity]] == [(k, k) for k in range(6)]
+
+
+def test_an_interrupted_run_leaves_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "made.rrd"
+    with suppress(KeyboardInterrupt), RunRerun(path, _CAMERA) as file:
+        file.add_frame(_frame(0), _made(0))
+        raise KeyboardInterrupt
+    assert len(_Read(path).rows["/overlay"]) == 1
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_file_has_its_name_only_when_it_is_closed_and_is_closed_once(tmp_path: Path) -> None:
+    path = tmp_path / "made.rrd"
+    with RunRerun(path, _CAMERA) as file:
+        file.add_frame(_frame(0), _made(0))
+        assert not path.exists()
+        file.close()
+        size = path.stat().st_size
+    assert path.stat().st_size == size
+    read = _Read(path)
+    assert (read.application, read.n_blueprints) == ("gvo", 1)
+    assert rr.get_global_data_recording() is None
+
+
+@pytest.mark.parametrize("is_faulty", [True, False])
+def test_without_a_frame_no_file_is_left(tmp_path: Path, is_faulty: bool) -> None:
+    with RunRerun(tmp_path / "made.rrd", _CAMERA) as file:
+        if is_faulty:
+            file.add_faulty(FaultyFrame(stamp_ns=1, reason="black"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def small_disk() -> Iterator[None]:
+    """Let no file grow beyond 100 kB, as a full disk would."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.usefixtures("small_disk")
+def test_a_full_disk_is_told_and_no_file_taken_for_whole(tmp_path: Path) -> None:
+    path = tmp_path / "made.rrd"
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
+    file = RunRerun(path, replace(_CAMERA, width=640, height=480))
+    for k in range(3):
+        file.add_frame(StereoFrame(stamp_ns=k, left=noise, right=noise), _made(k))
+    with pytest.raises(RecordingError, match="cannot be written"):
+        file.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_exists_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "made.rrd"
+    path.write_bytes(b"mine")
+    with pytest.raises(RecordingError, match="exists already"):
+        RunRerun(path, _CAMERA)
+    assert path.read_bytes() == b"mine"
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"ending in \.rrd"):
+        RunRerun(tmp_path / "made.mcap", _CAMERA)
+
+
+def test_a_folder_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="cannot be written"):
+        RunRerun(tmp_path / "file" / "made.rrd", _CAMERA)
+
+
+def test_without_rerun_the_run_does_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'gvo\[rerun\]'"):
+        RunRerun(tmp_path / "made.rrd", _CAMERA)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rerun_switched_off_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(GvoError, match="RERUN"):
+        RunRerun(tmp_path / "made.rrd", _CAMERA)
+    assert list(tmp_path.iterdir()) == []

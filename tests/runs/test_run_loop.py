@@ -1,0 +1,193 @@
+"""The loop of a run: which frames reach the outputs, as poses of what, and how it ends."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.runs.loop import RunLoop
+from gvo.runs.statistics import Progress
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
+from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
+
+_N_FRAMES = 7
+
+
+@dataclass
+class Kept:
+    """An output that keeps what it is given."""
+
+    frames: list[FrameResult] = field(default_factory=list)
+    faulty: list[FaultyFrame] = field(default_factory=list)
+    smoothed: list[Estimate] = field(default_factory=list)
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        assert frame.stamp_ns == result.stamp_ns
+        self.frames.append(result)
+        self.smoothed += result.finished
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        self.faulty.append(frame)
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        self.smoothed += estimates
+
+    def poses(self) -> dict[str, FloatArray]:
+        smoothed = sorted(self.smoothed, key=lambda estimate: estimate.stamp_ns)
+        return {
+            "raw": np.array([result.raw.T_world_cam for result in self.frames]),
+            "causal": np.array([result.causal.T_world_cam for result in self.frames]),
+            "smoothed": np.array([estimate.T_world_cam for estimate in smoothed]),
+        }
+
+
+class Rendered:
+    """A rendered recording, rendered once, without some of its images or with an end too early."""
+
+    def __init__(self, sensor: Sensor = "stereo") -> None:
+        source = SyntheticRecording("handheld", sensor, n_frames=_N_FRAMES, scale=0.25)
+        self.info: RecordingInfo = replace(source.info, frame_id=CAMERA)
+        self.items = [_loaded(image) for image in source.images()]
+        self.damage = ""
+
+    def images(self) -> Iterator[StampedImage]:
+        yield from self.items
+        if self.damage:
+            raise RecordingError(self.damage)
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+def _loaded(image: StampedImage) -> StampedImage:
+    pixels = image.load()
+
+    def load() -> NDArray[Any]:
+        return pixels
+
+    return replace(image, load=load)
+
+
+@pytest.fixture
+def walk() -> Rendered:
+    return Rendered()
+
+
+def loop_over(source: Rendered, frame: OutputFrame | None = None, **options: Any) -> RunLoop:
+    return RunLoop(source, Config(), frame or OutputFrame(CAMERA), **options)
+
+
+def run(source: Rendered, frame: OutputFrame | None = None, **options: Any) -> tuple[Kept, RunLoop]:
+    kept, loop = Kept(), loop_over(source, frame, **options)
+    loop.run([kept], None)
+    return kept, loop
+
+
+def test_all_outputs_are_given_all_frames_and_each_smoothed_pose_once(walk: Rendered) -> None:
+    first, second = Kept(), Kept()
+    loop_over(walk).run([first, second], None)
+    stamps = [image.stamp_ns for image in walk.items[::2]]
+    for kept in (first, second):
+        assert [result.stamp_ns for result in kept.frames] == stamps
+        assert sorted(estimate.stamp_ns for estimate in kept.smoothed) == stamps
+        assert kept.faulty == []
+    assert first == second
+
+
+def test_all_poses_are_of_the_frame_asked_for(walk: Rendered) -> None:
+    camera = run(walk)[0].poses()
+    base = run(walk, OutputFrame("base_link", T_BASE_CAM))[0].poses()
+    T_initial = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
+    placed = run(walk, OutputFrame("base_link", T_BASE_CAM, T_initial=T_initial))[0].poses()
+    for name, poses in camera.items():
+        expected = moved_by_hand(poses, T_BASE_CAM)
+        np.testing.assert_allclose(base[name], expected, atol=1e-12)
+        np.testing.assert_allclose(placed[name], T_initial @ expected, atol=1e-12)
+
+
+def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(
+    walk: Rendered,
+) -> None:
+    asked: list[int] = []
+    T_first = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
+
+    def first_pose(stamp_ns: int) -> FloatArray:
+        asked.append(stamp_ns)
+        return T_first
+
+    kept, _ = run(walk, excerpt=Excerpt(start_s=0.05), first_pose=first_pose)
+    assert asked == [kept.frames[0].stamp_ns]
+    assert asked[0] == walk.items[4].stamp_ns
+    np.testing.assert_allclose(kept.frames[0].raw.T_world_cam, T_first, atol=1e-12)
+
+
+def test_only_the_excerpt_is_tracked_and_announced(walk: Rendered) -> None:
+    told: list[Progress] = []
+    kept, loop = Kept(), loop_over(walk, excerpt=Excerpt(every=3))
+    loop.run([kept], told.append)
+    stamps = [image.stamp_ns for image in walk.items[::2]]
+    assert [result.stamp_ns for result in kept.frames] == stamps[::3]
+    assert [(progress.n_done, progress.n_total) for progress in told] == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(
+    walk: Rendered,
+) -> None:
+    walk.items, walk.damage = walk.items[:8], "the last 3 frames are missing"
+    kept, loop = run(walk)
+    assert len(kept.frames) == len(kept.smoothed) == 4
+    assert loop.tally.broken_off == "the last 3 frames are missing"
+    assert loop.tally.is_partly
+
+
+@pytest.mark.parametrize(("sensor", "n_lost"), [("stereo", 1), ("rgbd", 0)])
+def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lost: int) -> None:
+    source = Rendered(sensor)
+    del source.items[7]
+    kept, loop = run(source)
+    assert len(kept.frames) == _N_FRAMES - 1
+    assert [frame.stamp_ns for frame in kept.faulty] == [source.items[6].stamp_ns] * n_lost
+    assert loop.tally.n_faulty == n_lost
+    assert loop.tally.is_partly == bool(n_lost)
+
+
+def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Rendered) -> None:
+    kept = Kept()
+
+    def interrupt(progress: Progress) -> None:
+        if progress.n_done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        loop_over(walk).run([kept], interrupt)
+    assert len(kept.frames) == len(kept.smoothed) == 5
+
+
+def test_opencv_gets_its_threads_back(walk: Rendered) -> None:
+    n_before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    n_inside = 0
+
+    def fail(*_: object) -> None:
+        nonlocal n_inside
+        n_inside = cv2.getNumThreads()
+        raise KeyboardInterrupt
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            loop_over(walk).run([], fail)
+        assert (n_inside, cv2.getNumThreads()) == (1, 2)
+    finally:
+        cv2.setNumThreads(n_before)

@@ -1,0 +1,212 @@
+"""Whatever stops a run: the lines on disk are whole, and the summary says how far it came."""
+
+import json
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gvo
+from gvo.errors import OutputError, RunBusyError
+from gvo.io.run_folder.reader import read_run
+from gvo.runs.statistics import Progress
+
+N = 12
+NO_REPORT = gvo.RunOutputs(report=False)
+# All but the times that things took.
+TABLES = (
+    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
+    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+    "frames.csv",
+    "edges.csv",
+)
+
+
+@dataclass
+class Reference:
+    """A run that was never stopped, and what was on disk after each of its frames."""
+
+    bag: Path
+    folder: Path
+    killed: Path
+    """Folders named by numbers of frames: what kill -9 would have left."""
+
+    def run(self, out: Path, **options: Any) -> gvo.RunResult:
+        asked: dict[str, Any] = {"outputs": NO_REPORT} | options
+        return gvo.run_recording(gvo.open_recording(self.bag), out, **asked)
+
+    def assert_same(self, out: Path) -> None:
+        for name in TABLES:
+            assert (out / name).read_bytes() == (self.folder / name).read_bytes(), name
+        assert {path.name for path in out.iterdir()} == {
+            path.name for path in self.folder.iterdir()
+        }
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Reference:
+    path = tmp_path_factory.mktemp("drive")
+    recording = gvo.SyntheticRecording("driving", "stereo", n_frames=N, scale=0.25)
+    gvo.convert(recording, path / "drive.mcap")
+    found = Reference(bag=path / "drive.mcap", folder=path / "whole", killed=path / "killed")
+
+    def keep(progress: Progress) -> None:
+        shutil.copytree(found.folder, found.killed / str(progress.n_done))
+
+    found.run(found.folder, on_progress=keep)
+    return found
+
+
+def interrupt_at(n_frames: int) -> Callable[[Progress], None]:
+    def check(progress: Progress) -> None:
+        if progress.n_done >= n_frames:
+            raise KeyboardInterrupt
+
+    return check
+
+
+def summary_of(out: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+def assert_whole_lines(out: Path) -> None:
+    for name in TABLES:
+        content = (out / name).read_bytes()
+        assert content.endswith(b"\n") or not content
+
+
+def test_what_a_killed_run_leaves_is_the_beginning_of_the_whole_one(drive: Reference) -> None:
+    for n_frames in range(1, N + 1):
+        left = drive.killed / str(n_frames)
+        for name in TABLES:
+            lines = (left / name).read_bytes().splitlines(keepends=True)
+            whole = (drive.folder / name).read_bytes().splitlines(keepends=True)
+            if name.startswith("smoothed"):
+                assert set(lines) <= set(whole)
+            else:
+                assert lines == whole[: len(lines)]
+        assert len((left / "raw.txt").read_bytes().splitlines()) == n_frames
+
+
+def test_the_summary_says_how_far_the_run_is(drive: Reference, tmp_path: Path) -> None:
+    running = summary_of(drive.killed / "4")
+    assert running["state"] == "running"
+    assert not read_run(drive.killed / "4").is_finished
+    assert summary_of(drive.folder)["state"] == "complete"
+    assert read_run(drive.folder).is_finished
+    with pytest.raises(KeyboardInterrupt):
+        drive.run(tmp_path, on_progress=interrupt_at(6))
+    interrupted = summary_of(tmp_path)
+    assert (interrupted["state"], interrupted["frames"]) == ("interrupted", 6)
+    assert interrupted["warnings"][0] == "interrupted"
+    assert interrupted["run"] == running["run"] == summary_of(drive.folder)["run"]
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 6
+
+
+@pytest.mark.parametrize("n_frames", [None, 5])
+def test_a_run_that_was_stopped_is_replaced(
+    drive: Reference, tmp_path: Path, n_frames: int | None
+) -> None:
+    out = tmp_path / "out"
+    if n_frames is None:
+        with pytest.raises(KeyboardInterrupt):
+            drive.run(out, on_progress=interrupt_at(7))
+    else:
+        shutil.copytree(drive.killed / str(n_frames), out)
+    assert drive.run(out).exit_code == 0
+    drive.assert_same(out)
+
+
+def test_a_folder_that_is_written_is_refused_and_the_first_run_goes_on(
+    drive: Reference, tmp_path: Path
+) -> None:
+    refused: list[str] = []
+
+    def start_another(progress: Progress) -> None:
+        if progress.n_done in (1, 4):
+            with pytest.raises(RunBusyError, match="another process is writing") as error:
+                drive.run(tmp_path)
+            refused.append(str(error.value))
+
+    assert drive.run(tmp_path, on_progress=start_another).exit_code == 0
+    assert len(refused) == 2
+    drive.assert_same(tmp_path)
+
+
+def test_a_picture_that_cannot_be_drawn_takes_nothing_from_the_run(
+    drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gvo.viz.plots.plot_trajectories", fail)
+    result = drive.run(tmp_path, outputs=gvo.RunOutputs())
+    assert result.exit_code == 3
+    assert "No space left" in result.warnings[-1]
+    drive.assert_same(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["raw.txt", "edges.csv", "smoothed.txt"])
+def test_a_full_disk_leaves_whole_lines(
+    drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    full = _FullDisk(name, (drive.killed / "7" / name).stat().st_size - 40)
+    with monkeypatch.context() as patch:
+        patch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
+        said = rf"{name}.*No space left.*; \d+ frames stand whole in {tmp_path}$"
+        with pytest.raises(OutputError, match=said) as caught:
+            drive.run(tmp_path)
+    assert caught.value.is_partly
+    summary = summary_of(tmp_path)
+    assert summary["state"] == "interrupted"
+    assert "No space left" in summary["warnings"][0]
+    assert_whole_lines(tmp_path)
+
+
+class _FullDisk:
+    """Files of a disk on which one of them cannot grow beyond a size."""
+
+    def __init__(self, name: str, limit: int) -> None:
+        self._name, self._limit = name, limit
+
+    def make(self, path: Path, mode: str, **options: Any) -> Any:
+        full = self
+
+        class File(FileIO):
+            def write(self, data: Any) -> int:
+                room = full._limit - self.tell()
+                if not Path(str(self.name)).name.startswith(full._name) or room >= len(data):
+                    return super().write(data) or 0
+                if room <= 0:
+                    raise OSError(28, "No space left on device")
+                return super().write(bytes(data)[:room]) or 0
+
+        return File(path, mode, **options)
+
+
+def test_a_file_that_may_not_grow_ends_the_command_partly(drive: Reference, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))
+
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-c", "import gvo.cli.main; gvo.cli.main()"),
+            *("run", str(drive.bag), "--out", str(tmp_path), "--no-report"),
+        ],
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 3, ended.stderr
+    assert f"frames stand whole in {tmp_path}\n" in ended.stderr
+    assert ended.stderr.count("\n") == 1
+    assert_whole_lines(tmp_path)

@@ -1,0 +1,93 @@
+"""What makes a run this run and no other."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import gvo
+from gvo.errors import RecordingError
+from gvo.geometry.se3 import make_transform
+from gvo.io.excerpt import Excerpt
+from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.recording import StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.runs.summary import run_identity
+from gvo.trajectory.trajectory import Trajectory
+
+MOVED = make_transform(np.eye(3), np.array([0.1, 0.2, 0.3]))
+
+
+class Recording:
+    """A recording of three pairs of grey images."""
+
+    def __init__(self, *, grey: int = 7) -> None:
+        rendered = SyntheticRecording("driving", "stereo", n_frames=3, scale=0.25)
+        self.info = rendered.info
+        self._grey = grey
+
+    def images(self) -> Iterator[StampedImage]:
+        for n in range(3):
+            for stream in (0, 1):
+                yield StampedImage(stream=stream, stamp_ns=n, load=partial(self._load, stream))
+
+    def _load(self, stream: int) -> NDArray[Any]:
+        if self._grey < 0:
+            raise RecordingError("the image is cut off")
+        return np.full((4, 6), self._grey + stream, dtype=np.uint8)
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+def identity(recording: Recording | None = None, **options: Any) -> dict[str, Any]:
+    asked: dict[str, Any] = {"frame": OutputFrame("camera"), "excerpt": None}
+    return run_identity(recording or Recording(), **(asked | options))
+
+
+def more_images(recording: Recording) -> Recording:
+    recording.info = replace(recording.info, n_images=99)
+    return recording
+
+
+def other_calibration(recording: Recording) -> Recording:
+    first, second = recording.info.calibrations
+    moved = replace(first, K=first.K + np.array([[0.0, 0.0, 1e-9], [0, 0, 0], [0, 0, 0]]))
+    recording.info = replace(recording.info, calibrations=(moved, second))
+    return recording
+
+
+def test_the_same_run_is_the_same_as_a_file_gives_it_back() -> None:
+    found = json.loads(json.dumps(identity(excerpt=Excerpt())))
+    assert found == identity()
+    assert found["version of gvo"] == gvo.__version__
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"recording": Recording(grey=8)},
+        {"recording": Recording(grey=-1)},
+        {"recording": more_images(Recording())},
+        {"recording": other_calibration(Recording())},
+        {"excerpt": Excerpt(every=2)},
+        {"excerpt": Excerpt(duration_s=5.0)},
+        {"frame": OutputFrame("base_link")},
+        {"frame": OutputFrame("camera", MOVED)},
+        {"frame": OutputFrame("camera", T_initial=MOVED)},
+        {"start": Trajectory(stamps_ns=np.array([1]), T_world_cam=np.eye(4)[np.newaxis])},
+    ],
+)
+def test_another_run_is_told_apart(options: dict[str, Any]) -> None:
+    assert identity(**options) != identity()
+
+
+def test_another_version_is_another_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = identity()
+    monkeypatch.setattr("gvo.runs.summary.__version__", "99.0")
+    assert identity() != before

@@ -1,0 +1,281 @@
+"""Edges in, a run folder out: against GTSAM's own optimizer, and never half of it."""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+import gvo
+from gvo.config import Config, WindowConfig
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
+from gvo.io.edges.opening import open_edges
+from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY, RunResult
+from gvo.runs.smooth import configuration_for, smooth_edges
+from gvo.runs.statistics import Progress
+from gvo.trajectory.formats import read_covariances, write_tum
+from gvo.trajectory.g2o import format_edge, format_vertex
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Edge, FloatArray
+
+TRAJECTORIES = ("raw", "causal", "smoothed")
+SECOND = 1_000_000_000
+
+
+class ListSource:
+    """Events in memory; ends in an error where one is given."""
+
+    name = "list"
+    has_made_up_stamps = False
+
+    def __init__(self, events: list[Event], error: BaseException | None = None) -> None:
+        self._events = events
+        self._error = error
+        self.decisions: list[str] = []
+        self.faults = InputFaults()
+        self.n_poses = len(events)
+
+    def events(self) -> Iterator[Event]:
+        yield from self._events
+        if self._error is not None:
+            raise self._error
+
+
+def example(name: str) -> Path:
+    return Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]
+
+
+def step(seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return se3.exp(np.concatenate([0.1 * rng.normal(size=3), [0.0, 0.0, 1.0]]))
+
+
+def edge(reference: int, T: FloatArray) -> Edge:
+    return Edge(reference_id=reference, T_reference_frame=T, covariance=1e-4 * np.eye(6))
+
+
+def chain(n: int) -> list[Event]:
+    """Return poses tied to their predecessors only."""
+    events: list[Event] = [PoseEvent(frame_id=0, stamp_ns=5)]
+    events += [
+        PoseEvent(frame_id=i, stamp_ns=5 + i * SECOND, edges=(edge(i - 1, step(i)),))
+        for i in range(1, n)
+    ]
+    return events
+
+
+def errors_by_gtsam(path: Path, graph_of: Path) -> float:
+    """Return the error of the poses of one file in the graph of another, both read by GTSAM."""
+    _, values = gtsam.readG2o(str(path), True)
+    graph, _ = gtsam.readG2o(str(graph_of), True)
+    return float(graph.error(values))
+
+
+def least_error(path: Path) -> float:
+    """Return the error of GTSAM's batch Levenberg-Marquardt, from the file's own vertices."""
+    graph, values = gtsam.readG2o(str(path), True)
+    first = min(values.keys())
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+    graph.add(gtsam.PriorFactorPose3(first, values.atPose3(first), noise))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-12)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    optimizer.optimize()
+    return float(optimizer.error())
+
+
+def smooth_file(path: str | Path, out: Path, config: Config | None = None) -> RunResult:
+    return smooth_edges(open_edges([path]), out, config=config)
+
+
+def test_a_chain_without_redundant_edges_stays_as_it_is(tmp_path: Path) -> None:
+    result = smooth_edges(ListSource(chain(30)), tmp_path)
+    assert result.exit_code == EXIT_COMPLETE
+    raw, causal, smoothed = (gvo.read_trajectory(tmp_path / f"{n}.txt") for n in TRAJECTORIES)
+    T = np.eye(4)
+    for i in range(1, 30):
+        T = T @ step(i)
+    np.testing.assert_allclose(raw.T_world_cam[-1], T, atol=1e-8)
+    np.testing.assert_allclose(causal.T_world_cam, raw.T_world_cam, atol=1e-6)
+    np.testing.assert_allclose(smoothed.T_world_cam, raw.T_world_cam, atol=1e-6)
+    raw_C, smoothed_C = (
+        read_covariances(tmp_path / f"{n}_covariance.csv")[1] for n in ("raw", "smoothed")
+    )
+    scale = np.sqrt(np.einsum("nii,njj->nij", raw_C, raw_C))
+    assert np.abs((raw_C - smoothed_C) / scale).max() < 1e-3
+
+
+def test_poses_lie_in_the_folder_under_their_own_names(tmp_path: Path) -> None:
+    smooth_edges(ListSource(chain(12)), tmp_path)
+    with (tmp_path / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame_id"] for row in rows] == [str(i) for i in range(12)]
+    assert [row["n_edges"] for row in rows] == ["0"] + ["1"] * 11
+    assert (tmp_path / "trajectories.png").stat().st_size > 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] == summary["tracked"] == 12
+    assert summary["window"]["n_edges"] == 11
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["pose3example-grid.txt", "pose3example.txt"])
+def test_a_pose_graph_reaches_the_error_of_batch_optimization(tmp_path: Path, name: str) -> None:
+    path = example(name)
+    result = smooth_file(path, tmp_path)
+    assert result.exit_code == EXIT_COMPLETE
+    expected = least_error(path)
+    reread = errors_by_gtsam(tmp_path / "smoothed.g2o", tmp_path / "smoothed.g2o")
+    assert reread == pytest.approx(expected, rel=1e-6)
+    assert errors_by_gtsam(tmp_path / "smoothed.g2o", path) == pytest.approx(expected, rel=1e-6)
+    assert result.summary["polish"]["error"] == pytest.approx(expected, rel=1e-6)
+    assert result.summary["polish"]["error_isam2"] >= expected * (1 - 1e-9)
+
+
+def test_the_smoothed_graph_keeps_ids_order_and_edges(tmp_path: Path) -> None:
+    lines = [format_vertex(n, se3.exp(np.full(6, 0.1 * n))) for n in (12, 3, 40)]
+    edges = [format_edge(a, b, step(a), 1e-3 * np.eye(6)) for a, b in [(3, 12), (40, 3), (12, 40)]]
+    path = tmp_path / "graph.g2o"
+    path.write_text("\n".join([*lines, "FIX 3", *edges]) + "\n")
+    smooth_file(path, tmp_path / "out")
+    written = (tmp_path / "out/smoothed.g2o").read_text().splitlines()
+    assert [line.split()[1] for line in written[:3]] == ["3", "12", "40"]
+    assert written[3:] == ["FIX 3", *edges]
+    _, values = gtsam.readG2o(str(tmp_path / "out/smoothed.g2o"), True)
+    np.testing.assert_allclose(values.atPose3(3).matrix(), se3.exp(np.full(6, 0.3)), atol=1e-9)
+
+
+def test_a_graph_changes_the_windows_defaults_and_settings_win() -> None:
+    source = open_edges([example("pose3example.txt")])
+    config, decisions = configuration_for(source, Config())
+    assert (config.window.size, config.window.kernel, config.window.gate) == (None, "none", None)
+    assert len(decisions) == 3
+    config, decisions = configuration_for(source, Config(window=WindowConfig(size=5, gate=10.0)))
+    assert (config.window.size, config.window.kernel, config.window.gate) == (5, "none", 10.0)
+    assert [line.split(":")[0] for line in decisions] == ["window.kernel"]
+    unchanged, decisions = configuration_for(ListSource([]), Config())
+    assert unchanged == Config()
+    assert decisions == []
+
+
+def test_a_graph_may_be_smoothed_by_a_small_window(tmp_path: Path) -> None:
+    path = example("pose3example-grid.txt")
+    config = Config(window=WindowConfig(size=3))
+    result = smooth_file(path, tmp_path, config)
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 27
+    assert result.summary["polish"] is None
+
+
+def test_a_pose_without_a_usable_edge_is_in_all_trajectories(tmp_path: Path) -> None:
+    events = chain(10)
+    assert isinstance(events[5], PoseEvent)
+    bad = Edge(reference_id=4, T_reference_frame=np.full((4, 4), np.nan), covariance=np.eye(6))
+    events[5] = replace(events[5], edges=(bad,))
+    result = smooth_edges(ListSource(events), tmp_path)
+    assert result.exit_code == EXIT_PARTLY
+    for name in TRAJECTORIES:
+        assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 10
+    assert result.summary["status_counts"]["coasting"] == 1
+    text = "\n".join(result.warnings)
+    assert "1 of 10 poses have no usable edge" in text
+    assert "not finite" in text
+
+
+def test_what_was_computed_stays_where_the_input_breaks_off(tmp_path: Path) -> None:
+    source = ListSource(chain(8), RecordingError("the file ends in the middle of a message"))
+    result = smooth_edges(source, tmp_path)
+    assert result.exit_code == EXIT_PARTLY
+    assert "broke off after 8 poses" in result.warnings[0]
+    assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 8
+
+
+def test_a_graph_that_breaks_off_in_a_line_is_smoothed_up_to_there(tmp_path: Path) -> None:
+    path = tmp_path / "broken.g2o"
+    path.write_bytes(example("pose3example-grid").read_bytes()[:8300])
+    result = smooth_file(path, tmp_path / "out")
+    assert result.exit_code == EXIT_PARTLY
+    assert "broken.g2o:70" in result.summary["warnings"][0]
+    assert result.summary["window"]["n_edges"] == 42
+    lines = (tmp_path / "out/smoothed.g2o").read_text().splitlines()
+    edges = [line for line in lines if line.startswith("EDGE")]
+    assert len(edges) == 42
+
+
+def test_what_was_computed_stays_where_the_run_is_interrupted(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        smooth_edges(ListSource(chain(8), KeyboardInterrupt()), tmp_path)
+    for name in TRAJECTORIES:
+        assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 8
+
+
+def test_an_interrupted_graph_is_written_too(tmp_path: Path) -> None:
+    source: EdgeSource = open_edges([example("pose3example-grid.txt")])
+
+    def interrupt(progress: Progress) -> None:
+        if progress.n_done == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        smooth_edges(source, tmp_path, on_progress=interrupt)
+    text = (tmp_path / "smoothed.g2o").read_text()
+    assert text.count("VERTEX") == 10
+
+
+def test_an_input_without_poses_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="nothing to smooth"):
+        smooth_edges(ListSource([]), tmp_path)
+
+
+def test_fusing_independent_chains_is_better_than_the_worse(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    n = 150
+    truth, drifting = [np.eye(4)], [[np.eye(4)], [np.eye(4)]]
+    for i in range(1, n):
+        truth.append(truth[-1] @ step(i))
+        for poses, sigma in zip(drifting, (0.002, 0.006), strict=True):
+            noise = se3.exp(rng.normal(0.0, [sigma] * 3 + [5 * sigma] * 3))
+            poses.append(poses[-1] @ step(i) @ noise)
+    stamps_ns = np.arange(n) * SECOND // 10
+    paths = [tmp_path / "a.txt", tmp_path / "b.txt"]
+    for path, poses in zip(paths, drifting, strict=True):
+        write_tum(path, Trajectory(stamps_ns=stamps_ns, T_world_cam=np.stack(poses)))
+    reference = Trajectory(stamps_ns=stamps_ns, T_world_cam=np.stack(truth))
+    result = smooth_edges(open_edges(paths), tmp_path / "out", ground_truth=reference)
+    rpe = {e.name: e.rpe_m for e in result.evaluations}
+    ends = [gvo.evaluate(reference, gvo.read_trajectory(path), name="x").rpe_m for path in paths]
+    fused, worse = rpe["smoothed"], ends[1]
+    assert fused is not None
+    assert worse is not None
+    assert fused < 0.7 * worse
+    assert result.exit_code == EXIT_COMPLETE
+
+
+@pytest.mark.recorded
+def test_kitti_00_fused_lies_between_its_inputs_or_below(gvo_data: Path, tmp_path: Path) -> None:
+    folder = gvo_data / "trajectories"
+    paths = []
+    for name in ("ORB", "SPTAM", "gt"):
+        lines = (folder / f"KITTI_00_{name}.txt").read_text().splitlines(keepends=True)
+        paths.append(tmp_path / f"{name}.txt")
+        paths[-1].write_text("".join(lines[:600]))
+    truth = gvo.read_trajectory(paths[2])
+    result = smooth_edges(open_edges(paths[:2]), tmp_path / "out", ground_truth=truth)
+    errors = {e.name: e.t_pct for e in result.evaluations}
+    worse = gvo.evaluate(truth, gvo.read_trajectory(paths[1]), name="sptam").t_pct
+    assert errors["smoothed"] is not None
+    assert worse is not None
+    assert errors["smoothed"] < worse
+
+
+@pytest.mark.recorded
+def test_recorded_odometry_and_fixes_are_fused(gvo_data: Path, tmp_path: Path) -> None:
+    path = gvo_data / "bags/good/nav2_turtlebot.mcap"
+    source = open_edges([path], topics=["/odom"])
+    result = smooth_edges(source, tmp_path)
+    assert result.exit_code == EXIT_COMPLETE
+    assert result.summary["frames"] == 2639
