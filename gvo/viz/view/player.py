@@ -28,21 +28,20 @@ _MAX_GAP_S = 1.0
 
 
 class Player(AbstractContextManager["Player"]):
-    """Runs odometry over a recording on a thread of its own, as it is told.
+    """Runs odometry over a recording on a thread of its own.
 
-    Nothing is computed before `play`, `step` or `seek`. What was computed is kept, and shown
-    again when it is sought: odometry is never rewound. All methods may be called from any
-    thread, and return at once; what they ask for begins within the frame under way.
+    Nothing is computed before `play`, `step` or `seek`. Frames that were computed are shown again
+    as they were; odometry is never rewound. All methods may be called from any thread and return
+    at once; what they ask for begins after the frame under way.
 
     Parameters
     ----------
     open_source : callable
-        Opens the recording as a configuration says; is called again for `restart`, and where
-        parameters change that only matter when reading (`sync`, `images`, `runtime`,
-        `depth.scale`).
+        Opens the recording with a configuration; called again by `restart`, and where parameters
+        of reading change (`sync`, `images`, `runtime`, `depth.scale`).
     config : Config
     excerpt : Excerpt, optional
-        The part of the recording that is played; the whole where omitted.
+        The part that is played; the whole recording where omitted.
 
     Raises
     ------
@@ -66,7 +65,7 @@ class Player(AbstractContextManager["Player"]):
         self._excerpt = excerpt or Excerpt()
         self._tracking = Tracking(open_source, config, self._excerpt)
         self._history = History()
-        # All below is guarded by this condition, which tells the thread of every change.
+        # Guards all below and wakes the thread.
         self._changed = threading.Condition()
         self._config = config
         self._speed: float | None = 1.0
@@ -83,7 +82,7 @@ class Player(AbstractContextManager["Player"]):
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
         self._thread.start()
 
-    # What it is told
+    # Commands
 
     def play(self) -> None:
         """Go on from the frame shown, at the speed that is set."""
@@ -93,14 +92,14 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def pause(self) -> None:
-        """Stop, also on the way to a frame that is sought."""
+        """Stop, also on the way to a frame."""
         with self._changed:
             self._is_playing = self._is_stepping = False
             self._goal = None
             self._changed.notify_all()
 
     def step(self) -> None:
-        """Show the next frame, and pause; each further call is one frame more."""
+        """Show the next frame and pause; calls add up."""
         with self._changed:
             base = self._goal if self._is_stepping and self._goal is not None else self.index
             self._goal = base + 1
@@ -108,13 +107,12 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def seek(self, index: int) -> None:
-        """Show a frame: at once where it is done, else as soon as all up to it are.
+        """Show a frame, as soon as all frames up to it are computed; playing goes on from there.
 
         Parameters
         ----------
         index : int
-            Of the frame in the recording; before the first one, the first is shown, and after
-            the last one the last. Playing goes on from there.
+            Of the frame in the recording; clipped to the first and the last one.
         """
         with self._changed:
             self._goal = max(int(index), self.first_index)
@@ -122,12 +120,12 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def set_speed(self, factor: float | None) -> None:
-        """Play by the recording's stamps, or as fast as it goes; no frame is ever left out.
+        """Play by the recording's stamps, or as fast as possible; no frame is left out.
 
         Parameters
         ----------
         factor : float or None
-            1: as it was recorded, 2: in half the time; None: as fast as it goes.
+            1: as recorded, 2: in half the time; None: as fast as possible.
 
         Raises
         ------
@@ -143,8 +141,8 @@ class Player(AbstractContextManager["Player"]):
     def reconfigure(self, config: Config) -> None:
         """Compute with another configuration from the next frame on.
 
-        Where the recording has to be opened again for that, and cannot be, `fault` tells why,
-        and the former configuration stays.
+        Where the recording must be opened again for it and cannot be, `fault` tells why and the
+        former configuration stays.
 
         Raises
         ------
@@ -158,15 +156,14 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def restart(self, index: int | None = None) -> None:
-        """Begin odometry anew, with the present configuration.
+        """Drop what was computed and begin anew, with the present configuration.
 
-        What was computed before is dropped, and the world begins at the first frame that is
-        tracked. The numbers of the frames stay.
+        The first frame that is tracked is the world; frames keep their numbers.
 
         Parameters
         ----------
         index : int, optional
-            Where to begin: 0, or a frame that is done; the one that is shown where omitted.
+            First frame: 0, or one that is done; the one that is shown where omitted.
 
         Raises
         ------
@@ -182,12 +179,12 @@ class Player(AbstractContextManager["Player"]):
             self._changed.notify_all()
 
     def subscribe(self, callback: Subscriber) -> Callable[[], None]:
-        """Have something called with each view that is shown, on the thread of the player.
+        """Call back with each frame that is shown, on the thread of the player.
 
         Returns
         -------
         callable
-            Ends that.
+            Unsubscribes.
         """
         with self._changed:
             self._subscribers.append(callback)
@@ -199,12 +196,12 @@ class Player(AbstractContextManager["Player"]):
                 self._subscribers.remove(callback)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until nothing is left to do; return False where that takes too long."""
+        """Wait until nothing is left to do; False on timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not self.is_busy, timeout_s)
 
     def close(self) -> None:
-        """End the thread, after the frame under way; what was computed can still be read."""
+        """End the thread after the frame under way; the history can still be read."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -215,15 +212,14 @@ class Player(AbstractContextManager["Player"]):
         """Close it."""
         self.close()
 
-    # What it tells
+    # State
 
     @property
     def n_frames(self) -> int:
-        """Frames of the recording as it announces them; those there were, once it is finished."""
+        """Frames that the recording announces; those that were read, once it is finished."""
         if self._is_finished:
             return self.n_done
-        announced = self._excerpt.n_expected(self.info.n_images)
-        return max(announced, self.n_done)
+        return max(self._excerpt.n_expected(self.info.n_images), self.n_done)
 
     @property
     def n_done(self) -> int:
@@ -242,45 +238,44 @@ class Player(AbstractContextManager["Player"]):
 
     @property
     def is_playing(self) -> bool:
-        """Tell whether it goes on by itself."""
+        """Whether frames follow by themselves."""
         return self._is_playing
 
     @property
     def is_finished(self) -> bool:
-        """Tell whether all of the recording is done that can be read."""
+        """Whether the recording is read to its end, or as far as it can be."""
         return self._is_finished
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether something is under way or left to do."""
+        """Whether something is under way or left to do."""
         if self._is_closed:
             return self._is_working
-        is_asked = self._goal is not None or self._restart_index is not None
-        return self._is_playing or self._is_working or is_asked
+        return self._is_playing or self._is_working or self._is_asked()
 
     @property
     def speed(self) -> float | None:
-        """Factor on the recording's own speed; None: as fast as it goes."""
+        """Factor on the speed of the recording; None: as fast as possible."""
         return self._speed
 
     @property
     def fault(self) -> str:
-        """What went wrong last, in one line; empty after a restart or another configuration."""
+        """The last error, in one line; empty after a restart or another configuration."""
         return self._fault
 
     @property
     def config(self) -> Config:
-        """What the next frame is computed with."""
+        """Of the next frame."""
         return self._config
 
     @property
     def source(self) -> Source:
-        """The recording, as odometry began with it."""
+        """The recording."""
         return self._tracking.source
 
     @property
     def info(self) -> RecordingInfo:
-        """What the recording says of itself."""
+        """Of the recording."""
         return self._tracking.info
 
     @property
@@ -290,24 +285,23 @@ class Player(AbstractContextManager["Player"]):
 
     @property
     def history(self) -> History:
-        """What was done since the start or the last restart."""
+        """The frames since the start or the last restart."""
         return self._history
 
     @property
     def frame_view(self) -> FrameView | None:
         """The frame shown; None before there is any."""
         history = self._history
-        if history.shown < history.first_index:
-            return None
-        return history.frame_view(fault=self._fault)
+        is_any = history.shown >= history.first_index
+        return history.frame_view(fault=self._fault) if is_any else None
 
-    # What the thread does
+    # On the thread
 
     def _work(self) -> None:
         with one_opencv_thread():
             while self._wait_for_work():
                 if not self._guarded(self._turn):
-                    self._end_wishes()
+                    self._forget_commands()
                     self._publish()
         self._guarded(self._tracking.close)
 
@@ -321,7 +315,7 @@ class Player(AbstractContextManager["Player"]):
             return self._is_working
 
     def _guarded(self, work: Callable[[], None]) -> bool:
-        """Do something; keep and tell what goes wrong, for a thread that dies tells nobody."""
+        """Call; keep an error as `fault`: the thread must go on."""
         try:
             work()
         except GvoError as error:
@@ -333,7 +327,7 @@ class Player(AbstractContextManager["Player"]):
             return True
         return False
 
-    def _end_wishes(self) -> None:
+    def _forget_commands(self) -> None:
         with self._changed:
             self._is_playing = self._is_stepping = False
             self._goal = self._restart_index = None
@@ -348,7 +342,7 @@ class Player(AbstractContextManager["Player"]):
                 self._guarded(partial(callback, view))
 
     def _turn(self) -> None:
-        """Do one thing of those that were asked for: start anew, show or compute one frame."""
+        """Carry out one command: start anew, or show or compute one frame."""
         with self._changed:
             restart_index, goal = self._restart_index, self._goal
         if restart_index is not None:
@@ -372,42 +366,43 @@ class Player(AbstractContextManager["Player"]):
                 self._goal = index
 
     def _approach(self, goal: int) -> None:
-        """Show a frame that is sought, or the next one on the way to it."""
+        """Show a frame, or the next one on the way to it."""
         if goal < self.n_done:
             self._show(goal)
         elif not self._advance() and self.index < self.n_done - 1:
             self._show(self.n_done - 1)
         with self._changed:
             is_arrived = self.index == goal or self._is_finished
-            if is_arrived and self._goal == goal:  # another one may be sought by now
+            if is_arrived and self._goal == goal:  # not another one by now
                 self._goal, self._is_stepping = None, False
             self._due_s = time.monotonic()
 
     def _wait_until_due(self) -> bool:
-        """Wait until the next frame is to be shown; return False where something else is."""
+        """Wait until the next frame is due; False where another command came."""
         gap_s = self._gap_s()
         with self._changed:
             while self._is_only_playing():
                 pause_s = 0.0 if self._speed is None else gap_s / self._speed
                 now_s, due_s = time.monotonic(), self._due_s + pause_s
                 if now_s >= due_s:
-                    # Who is late by more than a frame does not catch up.
+                    # A delay of more than a frame is not caught up.
                     self._due_s = due_s if now_s - due_s <= pause_s else now_s
                     return True
                 self._changed.wait(due_s - now_s)
         return False
 
     def _is_only_playing(self) -> bool:
-        is_asked = self._goal is not None or self._restart_index is not None
-        return self._is_playing and not is_asked and not self._is_closed
+        return self._is_playing and not self._is_asked() and not self._is_closed
+
+    def _is_asked(self) -> bool:
+        return self._goal is not None or self._restart_index is not None
 
     def _gap_s(self) -> float:
         """Return how long after the frame shown the next one was recorded."""
-        if not self.first_index <= self.index:
+        if self.index < self.first_index:
             return 0.0
-        following = self.index + 1
-        if following < self.n_done:
-            next_ns = self._history.stamp_ns(following)
+        if self.index + 1 < self.n_done:
+            next_ns = self._history.stamp_ns(self.index + 1)
         elif (item := self._tracking.peek()) is not None:
             next_ns = item.stamp_ns
         else:
@@ -454,7 +449,7 @@ class Player(AbstractContextManager["Player"]):
                     self._config = self._tracking.config
 
     def _finish(self) -> None:
-        """Take the smoothed poses of the frames that the window still holds."""
+        """Add the smoothed poses of the frames that the window still holds."""
         self._is_finished = True
         if self.n_done > self.first_index:
             self._history.finish(self._tracking.finish())
