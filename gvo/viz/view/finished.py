@@ -29,7 +29,7 @@ from gvo.viz.view.panels import (
     numbers_html,
     pose_rows,
 )
-from gvo.viz.view.scene import Scene, Up
+from gvo.viz.view.scene import LAYERS, Scene, Up
 from gvo.viz.view.server import ViewServer, open_server
 
 N_ELLIPSOIDS = 60
@@ -111,7 +111,7 @@ class FinishedPage:
         self._sigmas.on_update(lambda _: self._painter.offer())
         hidden = {"keyframes", "links", "image", "points", "cloud"}
         hidden |= set() if self._truth is not None else {"truth"}
-        layers = [layer for layer in self.scene.layers if layer not in hidden]
+        layers = [layer for layer in LAYERS if layer not in hidden]
         add_layer_switches(server.gui, self.scene, layers)
         self._show_all()
         self.player.seek(self.player.n_frames - 1)
@@ -134,7 +134,7 @@ class FinishedPage:
         """Show the frame that the player is at."""
         index = self.player.index
         stamp_ns = int(self._record.frames.stamps_ns[index])
-        with self.scene.lock, self._server.atomic():
+        with self._server.atomic():
             self.playback.show(index)
             self._numbers.content = numbers_html(self._rows(index, stamp_ns))
             for name in _PATHS:

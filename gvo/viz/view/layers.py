@@ -1,4 +1,4 @@
-"""Lines and points of the scene, drawn in pieces, so that only what changed is sent."""
+"""Lines and points of the scene, sent in chunks: only those that changed."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ COLOURS = {
     "refused": REFUSED,
     "ellipsoids": OTHERS[3],
 }
-"""Of what is drawn, by name."""
+"""By name of what is drawn."""
 
-_PATH_PIECE = 256
-_CLOUD_PIECE = 8192
+_PATH_CHUNK = 256
+_CLOUD_CHUNK = 8192
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -33,115 +33,108 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-class Path:
-    """A line in pieces; the truth is dashed."""
-
-    def __init__(self, scene: viser.SceneApi, name: str) -> None:
-        self._scene = scene
-        self._name = name
-        self._pieces = ChunkedArray(_PATH_PIECE, n_shared=1)
-        self._nodes: dict[int, Any] = {}
-
-    def show(self, positions: FloatArray, *, is_visible: bool) -> None:
-        """Draw corners of shape (n, 3), metres, in the world."""
-        for number, corners in self._pieces.update(positions.astype(np.float32)).items():
-            segments = np.stack([corners[:-1], corners[1:]], axis=1)
-            if self._name == "truth":
-                segments = segments[_dashes(len(segments))]
-            self._show_piece(number, segments, is_visible)
-
-    def _show_piece(self, number: int, segments: NDArray[Any], is_visible: bool) -> None:
-        node = self._nodes.get(number)
-        if len(segments) == 0:
-            if node is not None:
-                self._nodes.pop(number).remove()
-        elif node is not None:
-            node.points = segments
-        else:
-            self._nodes[number] = self._scene.add_line_segments(
-                f"/paths/{self._name}/{number}",
-                segments,
-                rgb(COLOURS[self._name]),
-                thickness=2.0 if self._name == "truth" else 3.0,
-                thickness_units="screen",
-                visible=is_visible,
-            )
-
-    def set_visible(self, is_visible: bool) -> None:
-        """Show or hide it."""
-        for node in self._nodes.values():
-            node.visible = is_visible
-
-
-class Cloud:
-    """Points in pieces, so that those that stay are sent once."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._scene = scene
-        self._pieces = ChunkedArray(_CLOUD_PIECE)
-        self._nodes: dict[int, Any] = {}
-
-    def show(
-        self,
-        points: NDArray[np.float32],
-        colours: NDArray[np.uint8],
-        *,
-        point_size: float,
-        is_visible: bool,
-    ) -> None:
-        """Draw points of shape (n, 3), metres, in the world."""
-        rows = np.concatenate([points, colours.astype(np.float32)], axis=1)
-        for number, piece in self._pieces.update(rows).items():
-            if number in self._nodes:
-                self._nodes.pop(number).remove()
-            if len(piece) > 0:
-                self._nodes[number] = self._scene.add_point_cloud(
-                    f"/cloud/{number}",
-                    piece[:, :3],
-                    piece[:, 3:].astype(np.uint8),
-                    point_size=point_size,
-                    point_shape="circle",
-                    point_shading="flat",
-                    precision="float32",
-                    visible=is_visible,
-                )
-
-    def set_visible(self, is_visible: bool) -> None:
-        """Show or hide it."""
-        for node in self._nodes.values():
-            node.visible = is_visible
+def add_points(
+    scene: viser.SceneApi, node: str, points: NDArray[Any], colours: NDArray[Any], size_m: float
+) -> Any:  # noqa: ANN401 - a handle of viser's
+    """Add round points of shape (n, 3), metres, with colours (n, 3), RGB."""
+    return scene.add_point_cloud(
+        node,
+        points,
+        colours,
+        point_size=size_m,
+        point_shape="circle",
+        point_shading="flat",
+        precision="float32",
+    )
 
 
 class Segments:
-    """A few lines that are all drawn anew."""
+    """Lines of one colour, all sent anew.
 
-    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    node : str
+        Where they are in the scene.
+    colour : str
+        As "#RRGGBB".
+    thickness_px : float
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, node: str, colour: str, *, thickness_px: float = 2.0
+    ) -> None:
         self._scene = scene
-        self._name = name
-        self._node: Any = None
+        self._node = node
+        self._colour = rgb(colour)
+        self._thickness_px = thickness_px
+        self._handle: Any = None
 
-    def show(self, segments: FloatArray, *, is_visible: bool) -> None:
-        """Draw lines of shape (n, 2, 3), metres, in the world."""
-        if self._node is not None and len(segments) > 0:
-            self._node.points = segments.astype(np.float32)
-            return
-        if self._node is not None:
-            self._node.remove()
-            self._node = None
-        if len(segments) > 0:
-            self._node = self._scene.add_line_segments(
-                f"/{self._name.replace(' ', '_')}",
+    def show(self, segments: FloatArray) -> None:
+        """Draw lines of shape (n, 2, 3), metres."""
+        if len(segments) == 0:
+            if self._handle is not None:
+                self._handle.remove()
+                self._handle = None
+        elif self._handle is not None:
+            self._handle.points = segments.astype(np.float32)
+        else:
+            self._handle = self._scene.add_line_segments(
+                self._node,
                 segments.astype(np.float32),
-                rgb(COLOURS[self._name]),
-                thickness=2.0,
+                self._colour,
+                thickness=self._thickness_px,
                 thickness_units="screen",
-                visible=is_visible,
             )
 
-    def set_visible(self, is_visible: bool) -> None:
-        """Show or hide it."""
-        if self._node is not None:
-            self._node.visible = is_visible
+
+class Path:
+    """A line in chunks; the truth is dashed. Parameters as of `Segments`."""
+
+    def __init__(self, scene: viser.SceneApi, node: str, colour: str, *, is_dashed: bool) -> None:
+        self._scene = scene
+        self._node = node
+        self._colour = colour
+        self._is_dashed = is_dashed
+        self._corners = ChunkedArray(_PATH_CHUNK, n_shared=1)
+        self._chunks: dict[int, Segments] = {}
+
+    def show(self, positions: FloatArray) -> None:
+        """Draw corners of shape (n, 3), metres."""
+        for number, corners in self._corners.update(positions.astype(np.float32)).items():
+            segments = np.stack([corners[:-1], corners[1:]], axis=1)
+            if self._is_dashed:
+                segments = segments[_dashes(len(segments))]
+            if number not in self._chunks:
+                thickness_px = 2.0 if self._is_dashed else 3.0
+                self._chunks[number] = Segments(
+                    self._scene, f"{self._node}/{number}", self._colour, thickness_px=thickness_px
+                )
+            self._chunks[number].show(segments)
+
+
+class Cloud:
+    """Points in chunks, so that those that stay are sent once."""
+
+    def __init__(self, scene: viser.SceneApi, node: str) -> None:
+        self._scene = scene
+        self._node = node
+        self._rows = ChunkedArray(_CLOUD_CHUNK)
+        self._handles: dict[int, Any] = {}
+
+    def show(
+        self, points: NDArray[np.float32], colours: NDArray[np.uint8], *, size_m: float
+    ) -> None:
+        """Draw points of shape (n, 3), metres, with colours (n, 3), RGB."""
+        rows = np.concatenate([points, colours.astype(np.float32)], axis=1)
+        for number, chunk in self._rows.update(rows).items():
+            if number in self._handles:
+                self._handles.pop(number).remove()
+            if len(chunk) > 0:
+                colours = chunk[:, 3:].astype(np.uint8)
+                self._handles[number] = add_points(
+                    self._scene, f"{self._node}/{number}", chunk[:, :3], colours, size_m
+                )
 
 
 def _dashes(n: int) -> NDArray[np.bool_]:
@@ -151,14 +144,14 @@ def _dashes(n: int) -> NDArray[np.bool_]:
 
 
 class ChunkedArray:
-    """Cuts rows into pieces of equal size and tells which of them differ from before.
+    """Cuts rows into chunks of equal size and finds those that differ from before.
 
     Parameters
     ----------
     size : int
-        Rows of a piece.
+        Rows of a chunk.
     n_shared : int
-        Rows that a piece shares with the next: 1 where the rows are corners of a line.
+        Rows that a chunk shares with the next: 1 where the rows are corners of a line.
     """
 
     def __init__(self, size: int, *, n_shared: int = 0) -> None:
@@ -167,12 +160,7 @@ class ChunkedArray:
         self._rows: NDArray[Any] | None = None
 
     def update(self, rows: NDArray[Any]) -> dict[int, NDArray[Any]]:
-        """Return the pieces that changed, by number; an empty one went away.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n, m)
-        """
+        """Return the chunks of rows (n, m) that changed, by number; an empty one went away."""
         before, self._rows = self._rows, rows.copy()
         if before is None:
             before = rows[:0]
@@ -181,12 +169,12 @@ class ChunkedArray:
             return {}
         first = max(0, n_same - self._n_shared) // self._size
         last = (max(len(before), len(rows)) - 1) // self._size
-        return {number: self._piece(rows, number) for number in range(first, last + 1)}
+        return {number: self._chunk(rows, number) for number in range(first, last + 1)}
 
-    def _piece(self, rows: NDArray[Any], number: int) -> NDArray[Any]:
+    def _chunk(self, rows: NDArray[Any], number: int) -> NDArray[Any]:
         start = number * self._size
-        piece = rows[start : start + self._size + self._n_shared]
-        return piece if len(piece) > self._n_shared else piece[:0]
+        chunk = rows[start : start + self._size + self._n_shared]
+        return chunk if len(chunk) > self._n_shared else chunk[:0]
 
 
 def _common_prefix(before: NDArray[Any], after: NDArray[Any]) -> int:

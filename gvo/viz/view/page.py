@@ -34,7 +34,7 @@ from gvo.viz.view.panels import (
     state_html,
 )
 from gvo.viz.view.player import Player
-from gvo.viz.view.scene import Scene
+from gvo.viz.view.scene import LAYERS, Scene
 from gvo.viz.view.server import ViewServer, open_server
 
 RATE_HZ = 15.0
@@ -111,7 +111,7 @@ class Page:
 
     def draw(self, frame: FrameView) -> None:
         """Show a frame with all that was known when it was done."""
-        with self.scene.lock, self._server.atomic():
+        with self._server.atomic():
             self._place(frame)
             self.playback.show(frame.index)
             self._numbers.content = numbers_html(self._rows(frame))
@@ -153,7 +153,7 @@ class Page:
         )
         self._sigmas.on_update(lambda _: self._painter.offer())
         hidden = () if self._truth is not None else ("truth",)
-        layers = [layer for layer in self.scene.layers if layer not in hidden]
+        layers = [layer for layer in LAYERS if layer not in hidden]
         add_layer_switches(gui, self.scene, layers)
         with gui.add_folder("Parameters", expand_by_default=False):
             self.controls = ParameterControls(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -12,11 +11,26 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvo.types import FloatArray, ImageArray, IntArray
-from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, rgb
+from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, add_points, rgb
 
 Up = Literal["-y", "+z"]
 LINKS = ("step", "keyframe link", "standstill", "refused")
 """Kinds of lines between poses."""
+
+_PATHS = ("raw", "causal", "smoothed", "truth")
+# Where in the scene each layer hangs; what is below a hidden node is hidden.
+_NODES = {
+    **{name: f"/paths/{name}" for name in _PATHS},
+    "keyframes": "/keyframes",
+    "links": "/links",
+    "ellipsoids": "/ellipsoids",
+    "image": "/camera/image",
+    "points": "/camera/points",
+    "cloud": "/cloud",
+    "ground": "/ground",
+}
+LAYERS = tuple(_NODES)
+"""What can be hidden, by name."""
 
 _NO_LINES = np.zeros((0, 2, 3))
 _N_GRID_CELLS = 100
@@ -35,37 +49,28 @@ class Scene:
 
     def __init__(self, scene: viser.SceneApi, *, up: Up = "-y") -> None:
         self._scene = scene
-        self.lock = threading.RLock()
-        """Held by whoever draws: layers are switched from other threads."""
         self.up = up
         scene.set_up_direction(up)
         scene.world_axes.visible = False
-        self._paths = {name: Path(scene, name) for name in ("raw", "causal", "smoothed", "truth")}
-        self._cloud = Cloud(scene)
-        self._links = {name: Segments(scene, name) for name in LINKS}
-        self._keyframes = Segments(scene, "keyframes")
-        self._ellipsoids: Any = None
         self._camera = scene.add_frame("/camera", show_axes=False)
+        self._nodes = {
+            layer: scene.add_frame(node, show_axes=False) for layer, node in _NODES.items()
+        }
+        self._paths = {
+            name: Path(scene, _NODES[name], COLOURS[name], is_dashed=name == "truth")
+            for name in _PATHS
+        }
+        self._cloud = Cloud(scene, _NODES["cloud"])
+        self._links = {
+            name: Segments(scene, f"/links/{name.replace(' ', '_')}", COLOURS[name])
+            for name in LINKS
+        }
+        self._keyframes = Segments(scene, "/keyframes/cameras", COLOURS["keyframes"])
+        self._ellipsoids: Any = None
         self._frustum: Any = None
         self._points: Any = None
-        self._ground: Any = None
         self._size = 1.0
         self._aspect, self._fov = 4 / 3, 1.0
-        self._shown = dict.fromkeys(self.layers, True)
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """What can be hidden, by name."""
-        return (
-            *self._paths,
-            "keyframes",
-            "links",
-            "ellipsoids",
-            "image",
-            "points",
-            "cloud",
-            "ground",
-        )
 
     def set_camera(self, width: int, height: int, fy: float, *, size_m: float) -> None:
         """Set the shape of the camera; its image is drawn at a distance of `size_m`.
@@ -81,10 +86,8 @@ class Scene:
         """
         self._aspect, self._fov = width / height, 2.0 * np.arctan2(0.5 * height, fy)
         self._size = size_m
-        if self._frustum is not None:
-            self._frustum.remove()
         self._frustum = self._scene.add_camera_frustum(
-            "/camera/image",
+            "/camera/image/frustum",
             float(self._fov),
             float(self._aspect),
             scale=_frustum_scale(float(self._fov), float(self._aspect), size_m),
@@ -95,13 +98,12 @@ class Scene:
             jpeg_quality=_JPEG_QUALITY,
             cast_shadow=False,
             receive_shadow=False,
-            visible=self._shown["image"],
         )
 
     def show_ground(self, center: FloatArray, cell_m: float) -> None:
         """Draw a grid through a position (3,) of the world, thick lines ten cells apart."""
-        self._ground = self._scene.add_grid(
-            "/ground",
+        self._scene.add_grid(
+            "/ground/grid",
             width=_N_GRID_CELLS * cell_m,
             height=_N_GRID_CELLS * cell_m,
             plane="xz" if self.up == "-y" else "xy",
@@ -113,7 +115,6 @@ class Scene:
             infinite_grid=True,
             fade_distance=_N_GRID_CELLS * cell_m,
             position=_position(center),
-            visible=self._shown["ground"],
         )
 
     def show_path(self, name: str, positions_world: FloatArray) -> None:
@@ -124,7 +125,7 @@ class Scene:
         positions_world : ndarray of float64, shape (n, 3)
             Metres.
         """
-        self._paths[name].show(positions_world, is_visible=self._shown[name])
+        self._paths[name].show(positions_world)
 
     def show_pose(self, T_world_cam: FloatArray) -> None:
         """Move the camera with all that hangs on it."""
@@ -144,15 +145,8 @@ class Scene:
                 self._points = None
             return
         if self._points is None:
-            self._points = self._scene.add_point_cloud(
-                "/camera/points",
-                points_cam,
-                colours,
-                point_size=0.035 * self._size,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-                visible=self._shown["points"],
+            self._points = add_points(
+                self._scene, "/camera/points/cloud", points_cam, colours, 0.035 * self._size
             )
             return
         self._points.points = points_cam
@@ -160,21 +154,19 @@ class Scene:
 
     def show_cloud(self, points_world: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         """Draw the accumulated points, shape (n, 3), metres, in the world."""
-        self._cloud.show(
-            points_world, colours, point_size=0.025 * self._size, is_visible=self._shown["cloud"]
-        )
+        self._cloud.show(points_world, colours, size_m=0.025 * self._size)
 
     def show_keyframes(self, T_world_keyframes: FloatArray) -> None:
         """Draw small cameras at poses of shape (n, 4, 4), metres."""
         corners = _frustum_corners(self._fov, self._aspect, 0.35 * self._size)
         homogeneous = np.concatenate([corners, np.ones((*corners.shape[:2], 1))], axis=2)
         segments = np.einsum("nij,ekj->neki", T_world_keyframes, homogeneous)[..., :3]
-        self._keyframes.show(segments.reshape(-1, 2, 3), is_visible=self._shown["keyframes"])
+        self._keyframes.show(segments.reshape(-1, 2, 3))
 
     def show_links(self, segments: Mapping[str, FloatArray]) -> None:
         """Draw lines between poses, shape (n, 2, 3), metres, by a name of `LINKS`."""
         for name, node in self._links.items():
-            node.show(segments.get(name, _NO_LINES), is_visible=self._shown["links"])
+            node.show(segments.get(name, _NO_LINES))
 
     def show_ellipsoids(
         self, T_world_cam: FloatArray, covariances: FloatArray, n_sigmas: float
@@ -188,7 +180,7 @@ class Scene:
         half_axes, quaternions = position_ellipsoids(T_world_cam, covariances, n_sigmas)
         vertices, faces = unit_sphere()
         self._ellipsoids = self._scene.add_batched_meshes_simple(
-            "/ellipsoids",
+            "/ellipsoids/meshes",
             vertices,
             faces,
             quaternions,
@@ -199,31 +191,11 @@ class Scene:
             lod="off",
             cast_shadow=False,
             receive_shadow=False,
-            visible=self._shown["ellipsoids"],
         )
 
     def set_visible(self, layer: str, is_visible: bool) -> None:
-        """Show or hide one of `layers`."""
-        with self.lock:
-            self._shown[layer] = is_visible
-            for node in self._nodes(layer):
-                node.set_visible(is_visible)
-            single = {
-                "image": self._frustum,
-                "points": self._points,
-                "ellipsoids": self._ellipsoids,
-                "ground": self._ground,
-            }
-            if single.get(layer) is not None:
-                single[layer].visible = is_visible
-
-    def _nodes(self, layer: str) -> list[Path | Cloud | Segments]:
-        named: dict[str, list[Path | Cloud | Segments]] = {
-            "keyframes": [self._keyframes],
-            "cloud": [self._cloud],
-            "links": [*self._links.values()],
-        }
-        return [self._paths[layer]] if layer in self._paths else named.get(layer, [])
+        """Show or hide one of `LAYERS`."""
+        self._nodes[layer].visible = is_visible
 
 
 def _position(position: FloatArray) -> tuple[float, float, float]:

@@ -85,8 +85,8 @@ def test_the_paths_grow_and_shrink_with_the_frame(
 
 def test_links_are_told_apart(page: Page, player: FakePlayer, view: ViewServer) -> None:
     show(page, player, 4)
-    (step,) = nodes(view, "/step")
-    (refused,) = nodes(view, "/refused")
+    (step,) = nodes(view, "/links/step")
+    (refused,) = nodes(view, "/links/refused")
     np.testing.assert_allclose(step.points, [[[0, 0, 3], [0, 0, 4]]])
     np.testing.assert_allclose(refused.points, [[[0, 0, 0], [0, 0, 4]]])
 
@@ -105,15 +105,15 @@ def test_a_frame_without_points_sends_no_cloud(
         frame = frame_view_of(index)
         player.show(frame if n_clouds else replace(frame, cloud=empty_cloud()))
         page.settle()
-        assert len(nodes(view, "/camera/points")) == n_clouds
+        assert len(nodes(view, "/camera/points/")) == n_clouds
 
 
 def test_a_layer_that_is_hidden_stays_so(page: Page, player: FakePlayer, view: ViewServer) -> None:
     page.scene.set_visible("raw", False)
     show(page, player, 4)
-    assert [node.visible for node in nodes(view, "/paths/raw/")] == [False]
+    assert [node.visible for node in nodes(view, "/paths/raw")] == [False, True]  # and its line
     page.scene.set_visible("raw", True)
-    assert [node.visible for node in nodes(view, "/paths/raw/")] == [True]
+    assert [node.visible for node in nodes(view, "/paths/raw")] == [True, True]
 
 
 def test_buttons_take_the_parameters_first(page: Page, player: FakePlayer) -> None:
