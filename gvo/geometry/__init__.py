@@ -1,1 +1,1 @@
-"""Pure functions on arrays: rigid transforms, cameras, registration."""
+"""Pure functions on arrays: rigid transforms, cameras, robust registration."""

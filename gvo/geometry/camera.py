@@ -23,7 +23,7 @@ from gvo.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PinholeCamera:
-    """An undistorted pinhole camera.
+    """A pinhole camera without distortion.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class PinholeCamera:
     height: int
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera."""
+        """Check the intrinsics."""
         values = (self.fx, self.fy, self.cx, self.cy)
         if not np.all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise CalibrationError(
@@ -72,17 +72,7 @@ class PinholeCamera:
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
     def is_in_view(self, pixels: FloatArray) -> BoolArray:
-        """Tell which pixels lie within the image.
-
-        Parameters
-        ----------
-        pixels : ndarray of float64, shape (n, 2)
-            (u, v).
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-        """
+        """Tell which pixels (u, v), shape (n, 2), lie within the image; shape (n,)."""
         limits = np.array([self.width, self.height]) - 1
         return np.asarray(np.all((pixels >= 0) & (pixels <= limits), axis=1))
 
@@ -106,7 +96,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoCamera(PinholeCamera):
-    """A rectified stereo pair, or an RGB-D camera seen as one by a virtual baseline.
+    """A rectified stereo pair, or an RGB-D camera with a virtual baseline.
 
     Parameters
     ----------
@@ -123,7 +113,7 @@ class StereoCamera(PinholeCamera):
     baseline: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no stereo camera."""
+        """Check the intrinsics and the baseline."""
         PinholeCamera.__post_init__(self)
         if not np.isfinite(self.baseline) or self.baseline <= 0:
             raise CalibrationError(
@@ -280,10 +270,10 @@ def rectification_maps(calibration: Calibration) -> RectificationMaps | None:
     Returns
     -------
     tuple of two ndarrays of float32, shape (height, width), or None
-        u and v in the raw image for each rectified pixel; None where nothing is to be done.
+        u and v in the raw image for each rectified pixel; None if the images are rectified.
     """
     is_identity = (
-        calibration.model != "equidistant"  # without coefficients it is no pinhole either
+        calibration.model != "equidistant"  # also without coefficients it is no pinhole
         and not np.any(calibration.D)
         and np.array_equal(calibration.R, np.eye(3))
         and np.array_equal(calibration.K, calibration.P[:, :3])
@@ -296,7 +286,7 @@ def rectification_maps(calibration: Calibration) -> RectificationMaps | None:
 def rectify_stereo(
     left: Calibration, right: Calibration, T_left_right: FloatArray
 ) -> tuple[Calibration, Calibration]:
-    """Choose the rectification of a raw pair.
+    """Compute the rectification of a raw pair (Bouguet's algorithm).
 
     Parameters
     ----------
@@ -308,14 +298,13 @@ def rectify_stereo(
     Returns
     -------
     tuple of two Calibration
-        The same K and D with R and P set (Bouguet's algorithm). The rectified images have no
-        empty borders; where a lens is `equidistant`, they keep the resolution of the centre and
-        lose what a plane image of that size does not hold.
+        The same K and D with R and P set. The rectified images have no empty borders; with an
+        `equidistant` lens they keep the resolution of the centre and are cropped to their size.
 
     Raises
     ------
     CalibrationError
-        When sizes differ, or the cameras do not stand side by side.
+        When sizes differ, or the baseline is not along x.
     """
     _check_pair(left, right, T_left_right)
     choose = bouguet_wide if "equidistant" in (left.model, right.model) else bouguet
@@ -346,5 +335,5 @@ def _check_pair(left: Calibration, right: Calibration, T_left_right: FloatArray)
     if not np.hypot(y, z) < abs(x):
         raise CalibrationError(
             f"left and right must stand side by side, got the right camera at x={x:.4g} "
-            f"y={y:.4g} z={z:.4g} m of the left one; mend the transform between them"
+            f"y={y:.4g} z={z:.4g} m of the left one; correct the transform between them"
         )

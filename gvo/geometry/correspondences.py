@@ -1,4 +1,4 @@
-"""Points seen in two frames, as registration wants them."""
+"""3D-3D correspondences: points seen in two frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gvo.types import BoolArray, FloatArray, IntArray, Observations
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correspondences:
-    """3D-3D correspondences with what each frame measured of them.
+    """Points in two frames with their measurements in each.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Correspondences:
 
     @classmethod
     def of(cls, source: Observations, target: Observations, matches: IntArray) -> Correspondences:
-        """Gather the matched observations of two frames; matches (n, 2) are indices."""
+        """Gather matched observations of two frames; matches (n, 2) are pairs of indices."""
         i, j = matches.T
         return cls(
             source_points=source.points_cam[i],
@@ -55,7 +55,7 @@ class Correspondences:
         sigmas: tuple[FloatArray, FloatArray],
         camera: StereoCamera,
     ) -> Correspondences:
-        """Unproject what source and target measured: (n, 3) each, with standard deviations."""
+        """Back-project measurements (n, 3) in source and target, with their sigmas (n, 3)."""
         source_points, target_points = (
             camera.unproject_stereo(each[:, :2], each[:, 2]) for each in uvd
         )
@@ -69,7 +69,7 @@ class Correspondences:
         )
 
     def without_offset(self, offset_px: float, camera: StereoCamera) -> Correspondences:
-        """Take a constant error off all disparities, and move the points accordingly."""
+        """Subtract a constant offset from all disparities, and back-project again."""
         if offset_px == 0.0:
             return self
         offset = np.array([0.0, 0.0, offset_px])

@@ -62,7 +62,7 @@ def geodetic_to_ecef(
 
 
 def enu_of_ecef(latitude_deg: float, longitude_deg: float) -> FloatArray:
-    """Return the rotation R_enu_ecef, shape (3, 3), at a place.
+    """Return the rotation R_enu_ecef, shape (3, 3), at a geodetic position.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def enu_of_ecef(latitude_deg: float, longitude_deg: float) -> FloatArray:
 def local_enu(
     latitudes_deg: ArrayLike, longitudes_deg: ArrayLike, heights: ArrayLike
 ) -> FloatArray:
-    """Return positions east, north and up of the first one, in the plane that touches there.
+    """Return positions in the local tangent plane (east, north, up) at the first one.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Lenses with distortion: projection, the maps that undo it, and the rectification of pairs.
+"""Lens distortion: projection, undistortion maps, and rectification of stereo pairs.
 
 The models and the order of their coefficients are OpenCV's, which are those of `CameraInfo`.
 """
@@ -22,7 +22,7 @@ N_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
     "rational_polynomial": (8, 12, 14),
     "equidistant": (4,),
 }
-"""How many numbers describe the distortion: 12 with a thin prism, 14 with a tilted sensor."""
+"""Numbers of distortion coefficients: 12 with a thin prism, 14 with a tilted sensor."""
 
 RectificationMaps: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -87,7 +87,7 @@ class Lens:
         return np.append(np.asarray(ray, dtype=np.float64).ravel(), 1.0)
 
     def maps(self, R: FloatArray, K_rectified: FloatArray) -> RectificationMaps:
-        """Return where in the raw image the pixels of a rectified image of its size lie.
+        """Return the undistortion and rectification maps for `cv2.remap`.
 
         Parameters
         ----------
@@ -99,7 +99,7 @@ class Lens:
         Returns
         -------
         tuple of two ndarrays of float32, shape (height, width)
-            u and v in the raw image, for `cv2.remap`.
+            u and v in the raw image for each rectified pixel.
         """
         size = (self.width, self.height)
         make = cv2.initUndistortRectifyMap
@@ -111,7 +111,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rectification:
-    """How to turn and project a raw pair so that the same point lies on the same row.
+    """Rotations and projections that make the epipolar lines of a raw pair rows.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Rectification:
 
 
 def bouguet(left: Lens, right: Lens, T_right_left: FloatArray) -> Rectification:
-    """Rectify a pair by Bouguet's algorithm as OpenCV has it, without empty borders.
+    """Rectify a pair by OpenCV's version of Bouguet's algorithm, without empty borders.
 
     Parameters
     ----------
@@ -157,10 +157,10 @@ def bouguet(left: Lens, right: Lens, T_right_left: FloatArray) -> Rectification:
 
 
 def bouguet_wide(left: Lens, right: Lens, T_right_left: FloatArray) -> Rectification:
-    """Rectify a pair of wide lenses: the same rotations, the resolution of the centre kept.
+    """Rectify a pair of wide lenses by Bouguet's rotations, at the resolution of the centre.
 
-    A fisheye sees what no plane image can hold: instead of fitting all of it, the focal length
-    stays that of the raw centre, or as much longer, up to twice, as leaves no empty border.
+    A plane image cannot hold the whole view of a fisheye: the focal length is that of the raw
+    centre, or up to twice as long if that removes the empty borders.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def bouguet_wide(left: Lens, right: Lens, T_right_left: FloatArray) -> Rectifica
 
 
 def _common_rotations(T_right_left: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turn both cameras by half of what lies between them, then x along the baseline."""
+    """Split the relative rotation in half, then turn x onto the baseline."""
     half = Rotation.from_matrix(T_right_left[:3, :3]).as_rotvec() / 2
     R_half_left = Rotation.from_rotvec(half)
     t = Rotation.from_rotvec(-half).apply(T_right_left[:3, 3])
@@ -203,7 +203,7 @@ def _common_rotations(T_right_left: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _looking_at(centre: FloatArray, focal: float, lens: Lens) -> FloatArray:
-    """Return the intrinsics that show a point of the plane of depth one in the middle."""
+    """Return intrinsics whose principal ray passes through a point at depth one."""
     cx = (lens.width - 1) / 2 - focal * centre[0]
     cy = (lens.height - 1) / 2 - focal * centre[1]
     return np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])

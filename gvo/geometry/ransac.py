@@ -18,11 +18,10 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.umeyama import fit_rigid, fit_rigid_triples
 from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
-# Hypotheses that are fitted and counted together, so that calls do not cost more than arithmetic.
-# It is the least number too: any sample without outliers finds the inliers, but the best of many
-# leans less towards its own noise.
+# Hypotheses fitted and scored together, to amortize calls. Also the minimum number: any sample
+# without outliers finds the inliers, but the best of many is less biased by its own noise.
 _BLOCK = 64
-# Of not having drawn a sample without outliers when the search stops early.
+# Early stop: accepted probability that no sample without outliers was drawn.
 _MISS_PROBABILITY = 1e-3
 
 
@@ -55,11 +54,11 @@ def ransac_rigid(
     Parameters
     ----------
     correspondences : Correspondences
-        The putative matches.
+        Putative matches.
     camera : StereoCamera
         Of the target frame; used by the `reprojection` metric.
     config : RansacConfig
-        Number of hypotheses at most, metric, thresholds.
+        Maximum number of hypotheses, metric, thresholds.
     weights : ndarray of float64, shape (n,), optional
         For the refit.
     rng : numpy.random.Generator
@@ -92,7 +91,7 @@ def _search(
     *,
     near: IntArray,
 ) -> BoolArray | None:
-    """Return the largest set of inliers of the samples' fits; None without any fit."""
+    """Return the largest inlier set of the hypotheses; None if all samples are degenerate."""
     best: BoolArray | None = None
     for n_before in range(0, len(samples), _BLOCK):
         block = samples[n_before : n_before + _BLOCK]
@@ -106,7 +105,7 @@ def _search(
         found = inliers[counts.argmax()]
         if best is None or np.count_nonzero(found) > np.count_nonzero(best):
             best = found
-        # Samples are drawn of near points: the share of inliers among those is what counts.
+        # Samples are drawn from near points: their inlier ratio decides.
         share = np.count_nonzero(best[near]) / len(near)
         note("ransac.block", n_before=n_before, is_valid=is_valid, counts=counts, share=share)
         if (1.0 - share**3) ** (n_before + len(block)) < _MISS_PROBABILITY:
@@ -115,7 +114,7 @@ def _search(
 
 
 def _near(correspondences: Correspondences, config: RansacConfig) -> IntArray:
-    """Return the indices of points to fit; all of them where too few are near."""
+    """Return the indices of points near enough to fit; all if those are too few."""
     disparities = np.minimum(correspondences.source_uvd[:, 2], correspondences.target_uvd[:, 2])
     near = np.flatnonzero(disparities >= config.min_disparity_px)
     return near if len(near) >= config.min_inliers else np.arange(len(disparities))
@@ -138,7 +137,7 @@ def find_inliers(
     camera: StereoCamera,
     config: RansacConfig,
 ) -> BoolArray:
-    """Tell which correspondences agree with each of m transforms.
+    """Find the inliers of each of m transforms.
 
     Parameters
     ----------

@@ -1,12 +1,13 @@
 """Robust Gauss-Newton of a relative pose over stereo reprojection residuals.
 
-The covariance is A^-1 S A^-1 with A the second derivative of the robust cost and S the spread that
-the matches' gradients show, not the one that their sigmas promise. A common scale would not do:
-where disparities are better than stated and pixels are not, it calls the pixels better as well.
+The covariance is A^-1 S A^-1 (sandwich estimator), with A the second derivative of the robust cost
+and S the sample covariance of the matches' gradients, not that implied by their sigmas. A common
+scale would not do: if disparities are better than stated and pixels are not, it would call the
+pixels better as well.
 
-Where every disparity is too large by the same amount, in both frames, near and far points
-disagree about the motion: so the offset is a seventh parameter beside the pose. It is eliminated
-after the fact, by one step of least squares from the pose that assumes it is zero.
+If all disparities are too large by the same amount in both frames, near and far points disagree
+about the motion: this offset is a seventh parameter beside the pose, estimated by one step of least
+squares from the pose that assumes it is zero.
 
 References
 ----------
@@ -39,27 +40,26 @@ from gvo.geometry.residuals import (
 )
 from gvo.types import BoolArray, Failure, FloatArray
 
-# A step of three hundredths of a sigma no longer matters; this is its square.
+# Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-3
-# After a step that moves the residuals by less, root mean square in sigmas, that is by a pixel or
-# so, the derivatives are still right to a hundredth.
+# Root mean square change of the residuals in sigmas, about a pixel, up to which the Jacobian is
+# reused: it is still right to a hundredth.
 _SHORT = 1.0
-# The variance of a parameter, as a multiple of what it is with the others known: beyond, a
-# direction of motion is open, and what closes it is rounding.
+# Variance inflation of a parameter above which a direction of motion is unobservable.
 _MAX_INFLATION = 1e10
-# Residuals may prove the noise smaller than stated, but not absent: two copies of one image, which
-# recordings do hold, fit exactly and know no more of the motion than other pairs.
+# Lower bound of the noise scale: two copies of one image, which recordings do hold, fit exactly
+# and tell no more about the motion than other pairs.
 _MIN_SCALE = 0.1
-# The spread of the scores of few matches is itself uncertain: so many more stand in with the
-# spread that the sigmas promise. Without them 12 matches give an NEES of 3 where 1 is due.
+# Pseudo-observations with the covariance implied by the sigmas: the sample covariance of few
+# gradients is itself uncertain. Without them 12 matches give an NEES of 3 instead of 1.
 _N_PROMISED = 24
-# Where long residuals are all that holds a direction, their curvature is no measure of it: no more
-# variance than so many times that of the weights.
+# Largest ratio of variances with and without the curvature of the kernel: if long residuals alone
+# constrain a direction, their curvature is no measure of it.
 _MAX_LOSS = 10.0
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
-# Information on the offset, as a share of what target disparities would tell of it if nothing else
-# explained them: below, it is rounding.
+# Information on the offset, relative to that of the target disparities alone, below which it is
+# rounding.
 _MIN_SHARE = 1e-10
 _IDENTITY = np.eye(6)
 _OPEN = "the matches leave a direction of motion open"
@@ -67,7 +67,7 @@ _OPEN = "the matches leave a direction of motion open"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DisparityOffset:
-    """By how much disparities are measured too large.
+    """A constant error of all disparities: how much too large they are measured.
 
     Parameters
     ----------
@@ -87,17 +87,16 @@ class Refinement:
     ----------
     T_target_source : ndarray of float64, shape (4, 4)
     covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), perturbing T_target_source on the left, that is its
-        inverse on the right.
+        Of (rx, ry, rz, tx, ty, tz), left perturbation of T_target_source, that is right
+        perturbation of its inverse.
     inliers : ndarray of bool, shape (n,)
-        The matches that the pose rests on.
+        The matches used.
     scale : float
-        Root of the weighted mean square of the whitened residuals; one where the sigmas fit.
+        Weighted root mean square of the whitened residuals; one if the sigmas are right.
     residuals : StereoResiduals
-        Of all matches, whitened around the start value.
+        Of all matches, whitened at the start value.
     offset : DisparityOffset or None
-        What the inliers tell of a constant offset of the disparities, where it was asked for
-        and they tell of it.
+        Estimated from the inliers if asked for; None if unobservable.
     """
 
     T_target_source: FloatArray
@@ -119,17 +118,17 @@ def refine_pose(
 ) -> Refinement | Failure:
     """Minimize the Huber cost of whitened (u, v, disparity) residuals.
 
-    The inliers of a minimal sample lean towards its error, which shortens or stretches the
-    motion; so they are chosen again from all matches, around the pose that rests on many.
+    The inliers of a minimal sample are biased towards its error, which shortens or stretches the
+    motion: after a few iterations they are chosen again from all matches.
 
     Parameters
     ----------
     T_target_source : ndarray of float64, shape (4, 4)
         Start value.
     matches : Correspondences
-        All putative matches, n of them.
+        All n putative matches.
     inliers : ndarray of bool, shape (n,)
-        The first choice.
+        Initial inliers.
     camera : StereoCamera
         Of both frames.
     config : RegistrationConfig
@@ -140,12 +139,12 @@ def refine_pose(
     Returns
     -------
     Refinement or Failure
-        A failure where the residuals leave a direction of motion open.
+        A failure if a direction of motion is unobservable.
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
     n_first = min(_N_FIRST_ITERATIONS, config.n_iterations)
-    # Where directions are open, steps go anywhere: not finite is an answer like another.
+    # Unobservable directions may give steps that are not finite; they are checked.
     with np.errstate(over="ignore", invalid="ignore"):
         rough = _gauss_newton(T_target_source, residuals.select(inliers), n_iterations=n_first)
         if isinstance(rough, Failure):
@@ -158,7 +157,7 @@ def refine_pose(
         T = _gauss_newton(rough, residuals, n_iterations=config.n_iterations)
         if isinstance(T, Failure):
             return T
-        # Many motions are multiplied up from this one: it shall be a rotation to the last digit.
+        # Orthonormal to the last digit: many motions are composed with this one.
         T = se3.normalize(T)
         return _with_covariance(T, residuals, (chosen, every), with_offset=with_offset)
 
@@ -166,7 +165,7 @@ def refine_pose(
 def descend(
     T_target_source: FloatArray, residuals: StereoResiduals, *, n_iterations: int
 ) -> FloatArray | None:
-    """Return where a few steps lead that minimize the cost of some residuals; None where nowhere.
+    """Minimize the cost of residuals by a few Gauss-Newton steps; None if they fail.
 
     Parameters
     ----------
@@ -174,7 +173,7 @@ def descend(
         Start value.
     residuals : StereoResiduals
     n_iterations : int
-        At most.
+        Maximum number.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         T = _gauss_newton(T_target_source, residuals, n_iterations=n_iterations)
@@ -190,7 +189,7 @@ def fit_covariance(
     *,
     with_offset: bool = False,
 ) -> Refinement | Failure:
-    """Give an unrefined pose the covariance that its residuals in the image imply.
+    """Return an unrefined pose with the covariance implied by its residuals.
 
     Parameters and results are those of `refine_pose`; pose and inliers stay as they are.
     """
@@ -203,7 +202,7 @@ def fit_covariance(
 def _gauss_newton(
     T: FloatArray, residuals: StereoResiduals, *, n_iterations: int
 ) -> FloatArray | Failure:
-    """Return where steps lead; after a short one the derivatives stay."""
+    """Return the pose after the last step; after a short step the Jacobian is reused."""
     max_gain = _SHORT**2 * residuals.columns.shape[1]
     near: Linearization | None = None
     for _ in range(n_iterations):
@@ -213,7 +212,7 @@ def _gauss_newton(
         g = residuals.gradient(T, near) if near else at.g
         if isinstance(g, Failure):
             return g
-        # By LAPACK itself: numpy takes several times as long for so small a matrix.
+        # LAPACK called directly: numpy takes several times as long for so small a matrix.
         _, step, info = dposv(at.H, g)
         if info != 0 or not np.isfinite(step).all():
             return Failure(reason=_OPEN)
@@ -234,7 +233,7 @@ def _with_covariance(
     *,
     with_offset: bool,
 ) -> Refinement | Failure:
-    """Finish a refinement; `inliers` are chosen of all matches, whose residuals come with them."""
+    """Finish a refinement; `inliers` are the mask of the matches used and the residuals of all."""
     last = residuals.linearize(T)
     if isinstance(last, Failure):
         return last
@@ -262,10 +261,10 @@ def _with_covariance(
 def _sensitivity(
     at: Linearization, scores: FloatArray, H_inverse: FloatArray, huber: float
 ) -> FloatArray:
-    """Return the inverse second derivative of the robust cost: how far a gradient moves the pose.
+    """Return the inverse Hessian of the robust cost, shape (6, 6).
 
-    Beyond its threshold a residual pulls with the same force however long it is, so that along it
-    the cost does not curve. The weights of H say that it does; H alone calls the pose too sure.
+    Beyond its threshold the Huber cost is linear: residuals there have no curvature along their
+    own direction. H, which weighs them as if they had, would make the pose overconfident.
     """
     squares = at.r[0] ** 2 + at.r[1] ** 2 + at.r[2] ** 2
     far = np.flatnonzero(squares > huber**2)
@@ -281,7 +280,7 @@ def _scale(at: Linearization) -> float:
 
 
 def _spread(at: Linearization, scores: FloatArray, scale: float) -> FloatArray:
-    """Return the covariance of the gradient, shape (6, 6), as the matches show it."""
+    """Return the sample covariance of the gradient, shape (6, 6)."""
     n = at.r.shape[1]
     seen = n / max(n - 2, 1) * (scores @ scores.T)
     promised = scale**2 * at.H
@@ -294,29 +293,27 @@ def estimate_disparity_offset(
 ) -> DisparityOffset | None:
     """Estimate a constant offset of the disparities of both frames.
 
-    The derivatives are those at the points where both frames together see them. At the points as
-    measured, noise of the source would be in the derivatives and in the residuals alike, and pull
-    the estimate off zero by some hundredths of a pixel.
-
-    The sigma comes from the spread that the matches show, not from the one their sigmas promise.
+    The Jacobian is taken at the points as estimated from both frames. At the points as measured,
+    the source's noise would be in the Jacobian and in the residuals alike, and bias the estimate
+    by some hundredths of a pixel. Sigma is that of the sample, not implied by the matches' sigmas.
 
     Parameters
     ----------
     T_target_source : ndarray of float64, shape (4, 4)
         The refined pose.
     residuals : StereoResiduals
-        Of the matches it rests on.
+        Of the matches used.
     at : Linearization
         Of the residuals, at the refined pose.
 
     Returns
     -------
     DisparityOffset or None
-        None where an offset acts as a motion does, as for points at one depth.
+        None if unobservable: for points at one depth an offset acts as a motion does.
     """
     camera = residuals.camera
     source_points = residuals.settled_points(T_target_source, at)
-    # An offset moves the measurement in the target by itself, the prediction by the source's.
+    # An offset moves the measurement in the target directly, the prediction through the source.
     J_offset = -source_jacobian(T_target_source, source_points, camera)[2]
     J_offset[2] += 1.0
     target_points = T_target_source[:3, :3] @ source_points + T_target_source[:3, 3:]
@@ -326,7 +323,7 @@ def estimate_disparity_offset(
     flat, flat_pose = J_offset.ravel(), J.reshape(6, -1)
     h_pose_offset = flat_pose @ flat
     _, motion, info = dposv(flat_pose @ flat_pose.T, h_pose_offset)
-    # Of the offset, what no motion explains (Schur complement).
+    # Schur complement: the information on the offset that no motion explains.
     information = float(flat @ flat - h_pose_offset @ motion)
     if info != 0 or not information > _MIN_SHARE * np.sum(at.factors[5] ** 2):
         return None

@@ -1,10 +1,10 @@
-"""Stereo reprojection residuals of matches, whitened, and their derivatives.
+"""Whitened stereo reprojection residuals of matches, and their Jacobians.
 
-The residual of a match is its measurement in the target frame, (u, v, disparity), less the
-projection of the source frame's point. Both frames are noisy: the source's noise is carried
-through the motion and added before the residual is whitened.
+The residual of a match is its measurement (u, v, disparity) in the target frame less the
+projection of its point in the source frame. Both frames are noisy: the source's covariance is
+propagated through the motion and added before the residual is whitened.
 
-Arrays hold one match per column, so that every operation runs along contiguous memory.
+Arrays hold one match per column: all operations run along contiguous memory.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3
-# Nearer points, or points behind the camera, have no noise to speak of: they are no inliers.
+# Nearer points, and points behind the camera, are no inliers: their noise is not propagated.
 _MIN_NOISE_DEPTH_M = 0.1
 
 
 def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Differentiate (u, v, disparity) of points by a motion of theirs.
+    """Return the derivatives of (u, v, disparity) of points by their motion.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
     Returns
     -------
     ndarray of float64, shape (6, 3, n)
-        By (rx, ry, rz, tx, ty, tz), perturbing on the left: of (u, v, disparity).
+        Of (u, v, disparity) by (rx, ry, rz, tx, ty, tz), left perturbation.
     """
     inverse_z = 1.0 / points_cam[2]
     x, y = points_cam[:2] * inverse_z
@@ -56,7 +56,7 @@ def pose_jacobian(points_cam: FloatArray, camera: StereoCamera) -> FloatArray:
 def source_jacobian(
     T_target_source: FloatArray, source_points: FloatArray, camera: StereoCamera
 ) -> FloatArray:
-    """Differentiate the prediction in the target frame by the measurement in the source frame.
+    """Return the derivatives of the prediction in the target by the measurement in the source.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ def source_jacobian(
     Returns
     -------
     ndarray of float64, shape (3, 3, n)
-        By (u, v, disparity) of the source: of (u, v, disparity) of the target. Of no account,
-        but finite, for points that are not well in front of the target.
+        Of (u, v, disparity) in the target by (u, v, disparity) in the source. Meaningless, but
+        finite, for points less than 0.1 m in front of the target.
     """
     R, t = T_target_source[:3, :3], T_target_source[:3, 3:]
     rotated = R @ source_points
@@ -93,7 +93,7 @@ def source_jacobian(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearization:
-    """Residuals and derivatives at one pose, whitened, times the root of the robust weights.
+    """Residuals and Jacobian at one pose, whitened, times the square root of robust weights.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ class Linearization:
     r : ndarray of float64, shape (3, n)
         Residuals: measurement less prediction.
     roots : ndarray of float64, shape (n,)
-        Roots of the robust weights.
+        Square roots of the robust weights.
     factors : ndarray of float64, shape (6, n)
-        What whitened and weighed them, see `StereoResiduals`.
+        Factors W of `StereoResiduals`, times these roots.
     H : ndarray of float64, shape (6, 6)
     g : ndarray of float64, shape (6,)
         The normal equations H step = g.
@@ -118,13 +118,13 @@ class Linearization:
     g: FloatArray
 
     def scores(self) -> FloatArray:
-        """Return the share of each match in g, shape (6, n); at the optimum they sum to zero."""
+        """Return each match's contribution to g, shape (6, n); they sum to zero at the optimum."""
         return np.asarray(np.einsum("kin,in->kn", self.J, self.r))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StereoResiduals:
-    """Matches with what whitens their residuals.
+    """Matches with the factors that whiten their residuals.
 
     Parameters
     ----------
@@ -145,9 +145,9 @@ class StereoResiduals:
     def of(
         cls, T: FloatArray, matches: Correspondences, camera: StereoCamera, *, huber: float
     ) -> StereoResiduals:
-        """Whiten by the noise of both frames, carried through the start value T.
+        """Whiten by the noise of both frames, propagated through the start value T.
 
-        It is not carried again: it changes by far less than it is known.
+        It is not propagated again: it changes by far less than its own uncertainty.
         """
         columns = np.empty((15, len(matches)))
         columns[:3] = matches.source_points.T
@@ -164,10 +164,10 @@ class StereoResiduals:
         return self.columns[:3]
 
     def settled_points(self, T: FloatArray, at: Linearization) -> FloatArray:
-        """Return the source points where both frames together see them, shape (3, n), metres.
+        """Return the source points as estimated from both frames, shape (3, n), metres.
 
-        What the source measured is moved by its share of the residual. So moved, points do not
-        lean to the side of their own residuals, as measured ones do.
+        The source's measurement is corrected by its share of the residual. So corrected, points
+        are not correlated with their own residuals, as measured ones are.
 
         Parameters
         ----------
@@ -190,12 +190,12 @@ class StereoResiduals:
         return np.stack([x_moved, y_moved, z_moved])
 
     def select(self, chosen: BoolArray) -> StereoResiduals:
-        """Return those of some matches."""
+        """Return the residuals of some matches."""
         columns = self.columns.take(np.flatnonzero(chosen), axis=1)
         return StereoResiduals(columns=columns, camera=self.camera, huber=self.huber)
 
     def linearize(self, T: FloatArray) -> Linearization | Failure:
-        """Differentiate at T; a failure where points come to lie behind the camera."""
+        """Linearize at T; a failure if points fall behind the camera."""
         points = self._moved(T)
         if isinstance(points, Failure):
             return points
@@ -210,10 +210,10 @@ class StereoResiduals:
         )
 
     def gradient(self, T: FloatArray, near: Linearization) -> FloatArray | Failure:
-        """Return g, shape (6,), at T, by the derivatives at a pose near it.
+        """Return g, shape (6,), at T, with the Jacobian of a pose near it.
 
-        They hardly change on the last steps to the optimum, residuals and weights do: at the
-        optimum it is zero by either. It takes a third of the time of a linearization.
+        In the last steps the Jacobian hardly changes, residuals and weights do; with either, g is
+        zero at the optimum. This takes a third of the time of a linearization.
         """
         points = self._moved(T)
         if isinstance(points, Failure):
@@ -223,7 +223,7 @@ class StereoResiduals:
         return np.asarray(near.J.reshape(6, -1) @ r.ravel())
 
     def within(self, T: FloatArray, gate: float) -> BoolArray:
-        """Tell which residuals are shorter than the gate, in sigmas; none behind the camera."""
+        """Tell which residuals are shorter than a gate in sigmas; none behind the camera."""
         return np.asarray(self.squared(T) < gate**2)
 
     def squared(self, T: FloatArray) -> FloatArray:
@@ -242,7 +242,7 @@ class StereoResiduals:
         return points
 
     def _weighed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return whitened residuals (3, n) and the roots (n,) of their robust weights."""
+        """Return whitened residuals (3, n) and the square roots (n,) of their Huber weights."""
         r, squared = self._whitened(points)
         return r, np.sqrt(self.huber / np.maximum(np.sqrt(squared), self.huber))
 

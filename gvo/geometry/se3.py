@@ -20,14 +20,13 @@ from gvo.types import BoolArray, FloatArray
 
 # Radians below which the series of `log` has more digits than its closed form.
 _SMALL_ANGLE = 1e-4
-# The largest deviation of R R^T from the identity, and the largest asymmetry of correlations, that
-# is still rounding.
+# Largest deviation of R R^T from the identity, and largest asymmetry of correlations, taken for
+# rounding.
 _MAX_SKEW = 1e-6
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
-# Of correlations: the smallest eigenvalue that is more than rounding.
+# Smallest eigenvalue of correlations that is more than rounding.
 _MIN_EIGENVALUE = 1e-12
-# A covariance times this is positive definite where all eigenvalues of its correlations are
-# larger.
+# A covariance times this is positive definite if all eigenvalues of its correlations are larger.
 _LESS_DEFINITE = 1.0 - _MIN_EIGENVALUE * np.eye(6)
 
 
@@ -90,7 +89,7 @@ def exp(xi: FloatArray) -> FloatArray:
 
 
 def log(T: FloatArray) -> FloatArray:
-    """Return the twist of a transform (Sola 2018, eq. 173); the inverse of `exp`.
+    """Return the twist of a transform, the inverse of `exp` (Sola 2018, eq. 173).
 
     Parameters
     ----------
@@ -115,7 +114,7 @@ def log(T: FloatArray) -> FloatArray:
 
 
 def _log_of_one(T: FloatArray) -> FloatArray:
-    """Return the twist of one transform, in a twentieth of the time of an array of one."""
+    """Return the twist of one transform by plain numbers: a twentieth of the time of arrays."""
     qx, qy, qz, qw = quaternion(T[:3, :3])
     x, y, z = T[:3, 3].tolist()
     sine = hypot(qx, qy, qz)
@@ -139,7 +138,7 @@ def _log_of_one(T: FloatArray) -> FloatArray:
 def quaternion(R: FloatArray) -> tuple[float, float, float, float]:
     """Return the unit quaternion (x, y, z, w) of one rotation (3, 3); w >= 0.
 
-    As `quaternions`, with plain numbers: of a single rotation they take a tenth of the time.
+    As `quaternions` by plain numbers, which take a tenth of the time for one rotation.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
     rows = (
@@ -268,9 +267,9 @@ def is_rotation(R: FloatArray, *, tolerance: float) -> BoolArray:
 def is_rigid(T: FloatArray, *, tolerance: float = _MAX_SKEW) -> bool:
     """Tell whether a matrix (4, 4) is a rigid transform of finite numbers.
 
-    Poses are checked several times per frame: plain numbers take a tenth of the time of numpy's.
+    Poses are checked several times per frame: plain numbers take a tenth of the time of arrays.
     """
-    # What is not a number fails every comparison.
+    # NaN fails every comparison.
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last_row = T.tolist()
     return bool(
         last_row == _LAST_ROW
@@ -307,10 +306,10 @@ def is_definite(symmetric: FloatArray) -> bool:
 def is_plain_covariance(covariance: FloatArray) -> bool:
     """Tell whether a matrix (6, 6) is finite, exactly symmetric and positive definite.
 
-    One that is symmetric but for rounding is not plain; whether it will do takes longer to tell.
+    The quick check; `covariance_fault` also accepts one that is symmetric up to rounding.
     """
-    # What is symmetric has the same bytes row by row and column by column. Numbers that are none
-    # pass through LAPACK unnoticed, but not through a sum of squares.
+    # A symmetric matrix has the same bytes by rows and by columns. LAPACK does not notice NaN, a
+    # sum of squares does.
     return (
         isfinite(np.vdot(covariance, covariance))
         and covariance.tobytes() == covariance.tobytes("F")
@@ -327,7 +326,7 @@ def covariance_fault(covariance: FloatArray) -> str:
     variances = np.diag(covariance)
     if variances.min() <= 0.0:
         return "is not positive definite"
-    # Of correlations: rounding leaves elements that should be zero at any ratio.
+    # On correlations: rounding leaves zero elements of the covariance at any ratio.
     sigmas = np.sqrt(variances)
     correlations = covariance / np.outer(sigmas, sigmas)
     if np.abs(correlations - correlations.T).max() > _MAX_SKEW:

@@ -38,8 +38,8 @@ def fit_rigid_batch(
     Returns
     -------
     T_target_source : ndarray of float64, shape (..., 4, 4)
-        Minimizes the weighted sum of squared distances; never a reflection. The identity
-        rotation stands where there is no answer.
+        Minimizes the weighted sum of squared distances; never a reflection. Invalid fits have
+        the identity rotation.
     is_valid : ndarray of bool, shape (...)
         False for fewer than three points with weight, for points on a line, for NaN.
     """
@@ -74,8 +74,8 @@ def fit_rigid_triples(
 ) -> tuple[FloatArray, BoolArray]:
     """Fit one rigid transform to each of many triples of corresponding points.
 
-    The answer of `fit_rigid_batch` in a fraction of its time: the best rotation turns one
-    triangle's plane into the other's, where the best angle is that of a sum of complex numbers.
+    As `fit_rigid_batch` in a fraction of its time: the best rotation maps one triangle's plane to
+    the other's, and the best angle in it is that of a sum of complex numbers.
 
     Parameters
     ----------
@@ -85,8 +85,7 @@ def fit_rigid_triples(
     Returns
     -------
     T_target_source : ndarray of float64, shape (m, 4, 4)
-        Minimizes the sum of squared distances. The identity rotation stands where there is no
-        answer.
+        Minimizes the sum of squared distances. Invalid fits have the identity rotation.
     is_valid : ndarray of bool, shape (m,)
         False for points on a line, for NaN.
     """
