@@ -224,6 +224,30 @@ class Observations:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionPrior:
+    """What is expected of the motion between two frames; a guess that may be wrong.
+
+    Parameters
+    ----------
+    T_predicted : ndarray of float64, shape (4, 4)
+        T_reference_current as predicted by the last velocity, or by poses that are known.
+    T_recent : ndarray of float64, shape (4, 4), optional
+        T_reference_current at the recent mean velocity, of consecutive frames. What passes the
+        camera slowly draws the last velocity along, but not this one: it tells which of two
+        motions is the camera's.
+    """
+
+    T_predicted: FloatArray
+    T_recent: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        """Copy the arrays."""
+        _freeze_shaped(self, T_predicted=(4, 4))
+        if self.T_recent is not None:
+            _freeze_shaped(self, T_recent=(4, 4))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
     """A registration's result.
 

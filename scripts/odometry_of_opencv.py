@@ -58,7 +58,7 @@ class OpencvOdometry:
         return PreparedFrame(stamp_ns=frame.stamp_ns, frame=prepared)
 
     def register(
-        self, reference: PreparedFrame, current: PreparedFrame, prior: np.ndarray | None
+        self, reference: PreparedFrame, current: PreparedFrame, prior: gvo.MotionPrior | None
     ) -> RelativePose | Failure:
         """Align the current frame to a reference."""
         is_found, T_reference_current = self._odometry.compute(current.frame, reference.frame)
@@ -67,7 +67,8 @@ class OpencvOdometry:
         T = np.asarray(T_reference_current, dtype=np.float64)
         U, _, Vt = np.linalg.svd(T[:3, :3])  # of single precision
         T[:3, :3] = U @ Vt
-        angle, distance = size_of(T if prior is None else np.linalg.inv(prior) @ T)
+        expected = np.eye(4) if prior is None else prior.T_predicted
+        angle, distance = size_of(np.linalg.inv(expected) @ T)
         if not (angle < MAX_ANGLE_RAD and distance < MAX_DISTANCE_M):
             return Failure(reason=f"{angle:.2f} rad and {distance:.2f} m off the prediction")
         turn, way = size_of(T)

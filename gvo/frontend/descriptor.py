@@ -23,6 +23,7 @@ from gvo.types import (
     FloatArray,
     Frame,
     IntArray,
+    MotionPrior,
     Observations,
     RelativePose,
     RgbdFrame,
@@ -124,41 +125,30 @@ class DescriptorFrontend:
         return np.column_stack([pixel, pixel, np.full(len(octaves), disparity)])
 
     def register(
-        self, reference: Observations, current: Observations, prior: FloatArray | None = None
+        self, reference: Observations, current: Observations, prior: MotionPrior | None = None
     ) -> RelativePose | Failure:
         """Estimate the motion from the reference to the current frame.
 
         Parameters
         ----------
         reference, current : Observations
-        prior : ndarray of float64, shape (4, 4), optional
-            Predicted T_reference_current; matches are searched around the pixels it predicts.
-            Where it leads to nothing, a wider window is searched; without it, the wider window
-            around the previous pixels.
+        prior : MotionPrior, optional
+            Matches are searched around the pixels it predicts, then in wider windows. Without
+            it, in the wider windows around the previous pixels.
 
         Returns
         -------
         RelativePose or Failure
         """
-        return self.register_expecting(reference, current, prior, None)
-
-    def register_expecting(
-        self,
-        reference: Observations,
-        current: Observations,
-        prior: FloatArray | None,
-        T_usual: FloatArray | None,
-    ) -> RelativePose | Failure:
-        """Register, and heed the usual motion, (4, 4), in the windows around the prior."""
         narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
         if prior is not None:
-            result = self._register_within(reference, current, prior, narrow, T_usual=T_usual)
+            result = self._register_within(reference, current, prior, narrow)
             if isinstance(result, RelativePose | Contradiction):
                 return result
-        rough = self._register_within(reference, current, prior, wide, T_usual=T_usual)
+        rough = self._register_within(reference, current, prior, wide)
         if isinstance(rough, Failure):
             return rough
-        # Nothing foretold it: what else it predicts must be there too.
+        # Nothing predicted it: what else it predicts must be there too.
         return self._check_view(reference, current, rough)
 
     def relocalize(self, reference: Observations, current: Observations) -> RelativePose | Failure:
@@ -174,9 +164,9 @@ class DescriptorFrontend:
         self, reference: Observations, current: Observations, rough: RelativePose
     ) -> RelativePose | Failure:
         """Match again around what a motion predicts; refuse it where too little is there."""
-        result = self._register_within(
-            reference, current, rough.T_reference_current, self._config.temporal.radius_px
-        )
+        prior = MotionPrior(T_predicted=rough.T_reference_current)
+        radius_px = self._config.temporal.radius_px
+        result = self._register_within(reference, current, prior, radius_px)
         return check_view(result, reference.points_cam, self.camera)
 
     def _offset_px(self) -> float:
@@ -186,15 +176,14 @@ class DescriptorFrontend:
         self,
         reference: Observations,
         current: Observations,
-        prior: FloatArray | None,
+        prior: MotionPrior | None,
         radius_px: float,
-        *,
-        T_usual: FloatArray | None = None,
     ) -> RelativePose | Failure:
-        predicted = predict_pixels(reference, prior, self.camera)
+        T_predicted = None if prior is None else prior.T_predicted
+        predicted = predict_pixels(reference, T_predicted, self.camera)
         note(
             "attempt.matches",
-            prior=prior,
+            prior=T_predicted,
             radius_px=radius_px,
             predicted=predicted,
             pixels=(reference.keypoints, current.keypoints),
@@ -214,8 +203,7 @@ class DescriptorFrontend:
             self.camera,
             self._config,
             stamps_ns=(reference.stamp_ns, current.stamp_ns),
-            start=prior,
-            T_usual=T_usual,
+            prior=prior,
             with_offset=self.rig_offsets.is_learning,
         )
         if isinstance(result, Failure):

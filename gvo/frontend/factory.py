@@ -8,6 +8,7 @@ from typing import Any
 from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend, KltObservations
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 
@@ -27,7 +28,10 @@ _SECTIONS = (
 
 
 def make_frontend(
-    camera: StereoCamera | PinholeCamera, config: Config | None = None
+    camera: StereoCamera | PinholeCamera,
+    config: Config | None = None,
+    *,
+    rig_offsets: RigOffsets | None = None,
 ) -> DescriptorFrontend | KltFrontend:
     """Return the front-end of `frontend.kind`.
 
@@ -36,34 +40,14 @@ def make_frontend(
     camera : StereoCamera or PinholeCamera
         Of the rectified stereo pair, or of the colour image of an RGB-D sensor.
     config : Config, optional
+    rig_offsets : RigOffsets, optional
+        What was learnt of the rig before.
     """
     config = config or Config()
-    if config.frontend.kind == "klt":
-        return KltFrontend(camera, config)
-    return DescriptorFrontend(camera, config)
-
-
-def renew_frontend(
-    former: object,
-    camera: StereoCamera | PinholeCamera,
-    config: Config,
-    *,
-    keeps_offsets: bool,
-) -> DescriptorFrontend | KltFrontend:
-    """Return the front-end of another configuration for the same camera.
-
-    Parameters
-    ----------
-    former : DescriptorFrontend, KltFrontend or another
-        The front-end so far; what another one has learnt is not known.
-    camera : StereoCamera or PinholeCamera
-    config : Config
-    keeps_offsets : bool
-        What was learnt of the rig still holds.
-    """
-    frontend = make_frontend(camera, config)
-    if keeps_offsets and isinstance(former, DescriptorFrontend | KltFrontend):
-        frontend.rig_offsets = former.rig_offsets
+    make = KltFrontend if config.frontend.kind == "klt" else DescriptorFrontend
+    frontend = make(camera, config)
+    if rig_offsets is not None:
+        frontend.rig_offsets = rig_offsets
     return frontend
 
 

@@ -29,6 +29,7 @@ from gvo.types import (
     Frame,
     ImageArray,
     IntArray,
+    MotionPrior,
     Observations,
     RelativePose,
     RgbdFrame,
@@ -110,66 +111,58 @@ class KltFrontend:
         return self.rig_offsets.disparity.value_px, self.rig_offsets.row.value_px
 
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> RelativePose | Failure:
         """Estimate the motion from the reference to the current frame.
 
         Parameters
         ----------
         reference, current : KltObservations
-        prior : ndarray of float64, shape (4, 4), optional
-            Predicted T_reference_current; tracks start at the pixels it predicts. Without it
-            they start at the previous pixels, more levels of the pyramid are searched,
-            descriptors are matched where that leads to nothing, and what this gives is the
-            prediction of a second round.
+        prior : MotionPrior, optional
+            Tracks start at the pixels it predicts. Without it they start at the previous pixels,
+            over more levels of the pyramid; where that fails descriptors are matched; the result
+            is the prior of a second round. The same is done where a prior with a recent mean
+            motion fails: the camera may have moved as never before. A keyframe, whose prior has
+            none, is not worth that.
 
         Returns
         -------
         RelativePose or Failure
             The second column of `matches` is -1: tracks do not end at observations.
         """
-        return self.register_expecting(reference, current, prior, None)
-
-    def register_expecting(
-        self,
-        reference: KltObservations,
-        current: KltObservations,
-        prior: FloatArray | None,
-        T_usual: FloatArray | None,
-    ) -> RelativePose | Failure:
-        """Register, and heed the usual motion, (4, 4), in the round that starts from the prior.
-
-        Where that leads to nothing more levels are searched here too: the camera may have moved
-        as never before. A keyframe, of which the prior is known well, is not worth that.
-        """
-        if prior is None:
-            result = self._register_widely(None, reference, current)
-        else:
-            is_step = T_usual is not None
-            result = self._register_from(
-                prior, reference, current, is_step=is_step, T_usual=T_usual
-            )
-            if is_step and not isinstance(result, RelativePose | Contradiction):
-                result = self._register_widely(prior, reference, current)
-        result = self._check_depth(reference, current, result)
+        result = self._register(reference, current, prior)
+        if isinstance(result, RelativePose):
+            result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
             self.rig_offsets.note(result, current.stamp_ns)
             row_shift_px = reference.find_corners().row_shift_px
             self.rig_offsets.note_rows(row_shift_px, reference.stamp_ns)
         return result
 
-    def _register_widely(
-        self, prior: FloatArray | None, reference: KltObservations, current: KltObservations
+    def _register(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None
     ) -> RelativePose | Failure:
-        """Register in two rounds: over more levels of the pyramid, and from what that gives."""
-        start = np.eye(4) if prior is None else prior
+        if prior is None:
+            return self._register_widely(reference, current, None)
+        is_step = prior.T_recent is not None
+        result = self._register_from(prior, reference, current, is_step=is_step)
+        if not is_step or isinstance(result, RelativePose | Contradiction):
+            return result
+        return self._register_widely(reference, current, prior)
+
+    def _register_widely(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None
+    ) -> RelativePose | Failure:
+        """Register in two rounds: over more levels of the pyramid, and from the result."""
+        start = MotionPrior(T_predicted=np.eye(4)) if prior is None else prior
         rough = self._register_from(start, reference, current, is_wide=True)
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
             rough = self._register_descriptors(reference, current)
         if isinstance(rough, Failure):
             return rough
-        result = self._register_from(rough.T_reference_current, reference, current, is_step=True)
-        # Nothing foretold it: what else it predicts must be there too.
+        found = MotionPrior(T_predicted=rough.T_reference_current)
+        result = self._register_from(found, reference, current, is_step=True)
+        # Nothing predicted it: what else it predicts must be there too.
         return check_view(result, reference.points_cam, self.camera)
 
     def relocalize(
@@ -186,20 +179,18 @@ class KltFrontend:
         self._forget_described()
         if isinstance(rough, Failure):
             return rough
-        result = self._register_from(rough.T_reference_current, reference, current)
+        prior = MotionPrior(T_predicted=rough.T_reference_current)
+        result = self._register_from(prior, reference, current)
         result = check_view(result, reference.points_cam, self.camera)
+        if isinstance(result, Failure):
+            return result
         return self._check_depth(reference, current, result)
 
     def _check_depth(
-        self,
-        reference: KltObservations,
-        current: KltObservations,
-        result: RelativePose | Failure,
+        self, reference: KltObservations, current: KltObservations, result: RelativePose
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
         first, second = reference.frame, current.frame
-        if isinstance(result, Failure):
-            return result
         if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
             depths = first.depth, second.depth
             return check_depths(result, depths, self.camera, self._config.depth)
@@ -225,15 +216,41 @@ class KltFrontend:
 
     def _register_from(
         self,
-        T_reference_current: FloatArray,
+        prior: MotionPrior,
         reference: KltObservations,
         current: KltObservations,
         *,
         is_wide: bool = False,
         is_step: bool = False,
-        T_usual: FloatArray | None = None,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
+        source_uvd, target_uvd, indices = self._track(
+            prior.T_predicted, reference, current, is_wide=is_wide
+        )
+        result = register_correspondences(
+            self._correspondences(
+                source_uvd[indices], target_uvd, is_stereo=isinstance(current.frame, StereoFrame)
+            ),
+            np.column_stack([indices, np.full_like(indices, -1)]),
+            self.camera,
+            self._config,
+            stamps_ns=(reference.stamp_ns, current.stamp_ns),
+            prior=None if is_wide else prior,
+            with_offset=is_step and self.rig_offsets.is_learning,
+        )
+        if isinstance(result, Failure):
+            return result
+        return replace(result, covariance=self._config.klt.sigma_factor**2 * result.covariance)
+
+    def _track(
+        self,
+        T_reference_current: FloatArray,
+        reference: KltObservations,
+        current: KltObservations,
+        *,
+        is_wide: bool,
+    ) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return all (u, v, disparity) of the reference, those tracked, and whose these are."""
         klt = self._config.klt
         source_uvd = np.column_stack([reference.keypoints, reference.disparities])
         predicted, indices = self._predict(T_reference_current, source_uvd)
@@ -263,24 +280,8 @@ class KltFrontend:
                 current.frame, pixels, predicted[:, 2], is_wide=is_wide
             )
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
-        chosen = indices[is_valid]
-        result = register_correspondences(
-            self._correspondences(
-                source_uvd[chosen],
-                np.column_stack([pixels, disparities])[is_valid],
-                is_stereo=isinstance(current.frame, StereoFrame),
-            ),
-            np.column_stack([chosen, np.full_like(chosen, -1)]),
-            self.camera,
-            self._config,
-            stamps_ns=(reference.stamp_ns, current.stamp_ns),
-            start=None if is_wide else T_reference_current,
-            T_usual=T_usual,
-            with_offset=is_step and self.rig_offsets.is_learning,
-        )
-        if isinstance(result, Failure):
-            return result
-        return replace(result, covariance=klt.sigma_factor**2 * result.covariance)
+        target_uvd = np.column_stack([pixels, disparities])[is_valid]
+        return source_uvd, target_uvd, indices[is_valid]
 
     def _predict(
         self, T_reference_current: FloatArray, source_uvd: FloatArray

@@ -1,13 +1,17 @@
-"""What a front-end is: two methods, and values that the back-end understands."""
+"""What a front-end is: two methods, and optional capabilities as small protocols."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypeVar
+from collections.abc import Sized
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from gvo.config import Config
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
-from gvo.types import Failure, FloatArray, RelativePose
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
 
 
 class Stamped(Protocol):
@@ -25,21 +29,9 @@ class Frontend(Protocol[ObservationsT]):
     """Turns frames into observations, and two frames' observations into a relative pose.
 
     Any object with these two methods will do; nothing is to be inherited. Observations are the
-    front-end's own affair but for their `stamp_ns`. Where they also hold `points_cam` (n, 3),
-    points in metres in the `cam` frame, and the front-end has a `camera` (StereoCamera),
-    keyframes are chosen by the share of these points in view; else by distance and angle.
-    Where they have a length or `n_keypoints`, these are reported with each frame.
-
-    A front-end may have a third method, `relocalize(reference, current)`: what `register` does,
-    of frames that may be far apart in time and place, so that a lost camera is found again. It
-    should be right rather than successful. Without it, `register` is asked, with no prior.
-
-    Another is `register_expecting(reference, current, prior, T_usual)`: what `register` does,
-    where also the motion at the usual velocity is known, T_reference_current, shape (4, 4), by
-    the median velocity of the last second. What pulls off gently before a camera draws the
-    prior along, but not this: it tells which of two motions is that of the camera. It is a
-    guess that may be wrong. Without the method, `register` is asked. A class that derives from
-    a front-end with it and has a `register` of its own needs its own of this too.
+    front-end's own affair but for their `stamp_ns`; what else is used of them is in `HasPoints`,
+    `CountsKeypoints` and their length. What else a front-end may offer is in `Relocalizer`,
+    `Reconfigurable`, `HasCamera` and `LearnsRig`, looked up once when `Odometry` is made.
 
     `gvo.testing.check_frontend` tests the contract.
     """
@@ -55,7 +47,7 @@ class Frontend(Protocol[ObservationsT]):
         """
 
     def register(
-        self, reference: ObservationsT, current: ObservationsT, prior: FloatArray | None, /
+        self, reference: ObservationsT, current: ObservationsT, prior: MotionPrior | None, /
     ) -> RelativePose | Failure:
         """Estimate the motion from the reference to the current frame.
 
@@ -63,8 +55,8 @@ class Frontend(Protocol[ObservationsT]):
         ----------
         reference, current : observations
             What `extract` gave for either frame, neighbours in time or not; left as they are.
-        prior : ndarray of float64, shape (4, 4), or None
-            Predicted T_reference_current, a guess that may be wrong.
+        prior : MotionPrior or None
+            What is expected of the motion, a guess that may be wrong.
 
         Returns
         -------
@@ -74,55 +66,138 @@ class Frontend(Protocol[ObservationsT]):
         """
 
 
-def register_checked(
-    frontend: Frontend[ObservationsT],
-    reference: ObservationsT,
-    current: ObservationsT,
-    prior: FloatArray | None,
-    *,
-    T_usual: FloatArray | None = None,
-) -> RelativePose | Failure:
-    """Register two frames and turn a relative pose that is none into a failure.
+@runtime_checkable
+class Relocalizer(Protocol):
+    """A front-end that finds a place again, however far apart two frames are."""
+
+    def relocalize(
+        self,
+        reference: Any,  # noqa: ANN401 - the front-end's own
+        current: Any,  # noqa: ANN401
+        /,
+    ) -> RelativePose | Failure:
+        """Estimate the motion between two frames; rather fail than be wrong.
+
+        Without this method `register` is called, without a prior.
+        """
+
+
+@runtime_checkable
+class Reconfigurable(Protocol):
+    """A front-end whose parameters can change while it runs."""
+
+    def reconfigure(self, config: Config, /) -> None:
+        """Take over a configuration; observations extracted before must stay usable."""
+
+
+@runtime_checkable
+class HasCamera(Protocol):
+    """A front-end of a camera; with `HasPoints`, keyframes are chosen by view overlap."""
+
+    @property
+    def camera(self) -> StereoCamera | PinholeCamera:
+        """The camera that the points are seen by."""
+
+
+@runtime_checkable
+class LearnsRig(Protocol):
+    """A front-end that calibrates constant offsets of a stereo rig online."""
+
+    @property
+    def rig_offsets(self) -> RigOffsets:
+        """The present estimates."""
+
+
+@runtime_checkable
+class HasPoints(Protocol):
+    """Observations whose points tell the view overlap."""
+
+    @property
+    def points_cam(self) -> FloatArray:
+        """Points in the `cam` frame, metres, shape (n, 3)."""
+
+
+@runtime_checkable
+class CountsKeypoints(Protocol):
+    """Observations that know the number of keypoints detected; it is reported."""
+
+    @property
+    def n_keypoints(self) -> int:
+        """Keypoints detected, measured in 3-D or not."""
+
+
+class CheckedFrontend(Generic[ObservationsT]):
+    """A front-end with its capabilities looked up; invalid results become Failure.
 
     Parameters
     ----------
     frontend : Frontend
-    reference, current : observations
-    prior : ndarray of float64, shape (4, 4), or None
-        Predicted T_reference_current.
-    T_usual : ndarray of float64, shape (4, 4), optional
-        T_reference_current at the usual velocity, for a front-end with `register_expecting`.
 
-    Raises
-    ------
-    ValueError
-        When the front-end returns something else.
+    Attributes
+    ----------
+    camera : StereoCamera, PinholeCamera or None
+        The front-end's own, where it has one.
     """
-    expecting = getattr(frontend, "register_expecting", None)
-    if T_usual is None or expecting is None:
-        return _checked(frontend, "register", frontend.register(reference, current, prior))
-    result = expecting(reference, current, prior, T_usual)
-    return _checked(frontend, "register_expecting", result)
+
+    def __init__(self, frontend: Frontend[ObservationsT]) -> None:
+        self._frontend = frontend
+        self._relocalizer = frontend if isinstance(frontend, Relocalizer) else None
+        self._reconfigurable = frontend if isinstance(frontend, Reconfigurable) else None
+        self._learner = frontend if isinstance(frontend, LearnsRig) else None
+        camera = frontend.camera if isinstance(frontend, HasCamera) else None
+        self.camera = camera if isinstance(camera, StereoCamera | PinholeCamera) else None
+
+    @property
+    def rig_offsets(self) -> RigOffsets | None:
+        """What is learnt of a stereo rig; None where the front-end does not learn."""
+        offsets = None if self._learner is None else self._learner.rig_offsets
+        return offsets if isinstance(offsets, RigOffsets) else None
+
+    def extract(self, frame: Any, /) -> ObservationsT:  # noqa: ANN401 - the front-end's own
+        """Extract as the front-end does."""
+        return self._frontend.extract(frame)
+
+    def register(
+        self, reference: ObservationsT, current: ObservationsT, prior: MotionPrior | None, /
+    ) -> RelativePose | Failure:
+        """Register two frames.
+
+        Raises
+        ------
+        ValueError
+            When the front-end returns neither RelativePose nor Failure.
+        """
+        return self._check("register", self._frontend.register(reference, current, prior))
+
+    def relocalize(
+        self, reference: ObservationsT, current: ObservationsT
+    ) -> RelativePose | Failure:
+        """Register two frames of unknown motion; raises as `register`."""
+        if self._relocalizer is None:
+            return self.register(reference, current, None)
+        return self._check("relocalize", self._relocalizer.relocalize(reference, current))
+
+    def reconfigure(self, config: Config) -> None:
+        """Hand over a configuration, where the front-end takes one."""
+        if self._reconfigurable is not None:
+            self._reconfigurable.reconfigure(config)
+
+    def _check(self, method: str, result: object) -> RelativePose | Failure:
+        if not isinstance(result, RelativePose | Failure):
+            raise ValueError(
+                f"{method} of {type(self._frontend).__name__} must return RelativePose or "
+                f"Failure, got {type(result).__name__}"
+            )
+        fault = find_fault(result) if isinstance(result, RelativePose) else ""
+        return Failure(reason=f"the front-end is at fault: {fault}") if fault else result
 
 
-def relocalize_checked(
-    frontend: Frontend[ObservationsT], reference: ObservationsT, current: ObservationsT
-) -> RelativePose | Failure:
-    """Register two frames that nothing is known of; as `register_checked`."""
-    relocalize = getattr(frontend, "relocalize", None)
-    if relocalize is None:
-        return register_checked(frontend, reference, current, None)
-    return _checked(frontend, "relocalize", relocalize(reference, current))
-
-
-def _checked(frontend: object, method: str, result: object) -> RelativePose | Failure:
-    if not isinstance(result, RelativePose | Failure):
-        raise ValueError(
-            f"{method} of {type(frontend).__name__} must return RelativePose or Failure, "
-            f"got {type(result).__name__}"
-        )
-    fault = find_fault(result) if isinstance(result, RelativePose) else ""
-    return Failure(reason=f"the front-end is at fault: {fault}") if fault else result
+def count_points(observations: object) -> tuple[int, int]:
+    """Return the numbers of keypoints and of points, 0 where the observations do not tell."""
+    n_points = len(observations) if isinstance(observations, Sized) else 0
+    if isinstance(observations, CountsKeypoints):
+        return observations.n_keypoints, n_points
+    return n_points, n_points
 
 
 def find_fault(result: RelativePose) -> str:

@@ -12,13 +12,21 @@ from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.verification import heed_usual_motion, verify_motion
+from gvo.frontend.verification import verify_motion
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
 from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
-from gvo.types import BoolArray, Failure, FloatArray, IntArray, Observations, RelativePose
+from gvo.types import (
+    BoolArray,
+    Failure,
+    FloatArray,
+    IntArray,
+    MotionPrior,
+    Observations,
+    RelativePose,
+)
 
 # Wrong matches never agree in such numbers by chance: samples could only find the same motion.
 _MIN_KNOWN_SHARE = 0.7
@@ -31,8 +39,7 @@ def register_correspondences(
     config: Config,
     *,
     stamps_ns: tuple[int, int],
-    start: FloatArray | None = None,
-    T_usual: FloatArray | None = None,
+    prior: MotionPrior | None = None,
     with_offset: bool = False,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
@@ -49,13 +56,10 @@ def register_correspondences(
         Sections `ransac` and `registration`.
     stamps_ns : tuple of two int
         Stamps of reference and current.
-    start : ndarray of float64, shape (4, 4), optional
-        Predicted T_reference_current. Where most matches agree with it already, nothing is
-        left for samples to find: these matches and this motion are where the refinement
-        starts, which chooses its matches again anyhow. Of no use with `registration.refine`
-        none, where the fit to the consensus is the result.
-    T_usual : ndarray of float64, shape (4, 4), optional
-        T_reference_current at the usual velocity, see `heed_usual_motion`.
+    prior : MotionPrior, optional
+        Where most matches agree with its prediction, RANSAC is skipped: the refinement starts
+        from it, and chooses its inliers anew (not with `registration.refine` none, where the fit
+        to the consensus is the result).
     with_offset : bool
         Estimate a constant offset of the disparities too, `RelativePose.offset_px`.
 
@@ -67,35 +71,21 @@ def register_correspondences(
         "registration.begin",
         correspondences=correspondences,
         matches=matches,
-        start=start,
         stamps_ns=stamps_ns,
     )
-    known = _known_consensus(start, correspondences, camera, config)
+    known = _known_consensus(prior, correspondences, camera, config)
     consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
     note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
         return consensus
-    finish = fit_covariance if config.registration.refine == "none" else refine_pose
-    refined = finish(
-        consensus.T_target_source,
-        correspondences,
-        consensus.inliers,
-        camera,
-        config.registration,
+    refined = _refine(
+        *(consensus, correspondences, camera, config),
+        prior=prior,
+        make_rng=lambda: _rng(config, stamps_ns),
         with_offset=with_offset,
     )
-    note("registration.refined", refined=refined)
-    if not isinstance(refined, Failure) and config.registration.refine != "none":
-        refined = _verify(
-            *(refined, correspondences, camera, config),
-            start=start,
-            T_usual=T_usual,
-            make_rng=lambda: _rng(config, stamps_ns),
-            with_offset=with_offset,
-        )
-        note("registration.verified", refined=refined)
-    n_inliers = int(np.count_nonzero(consensus.inliers))
     if isinstance(refined, Failure):
+        n_inliers = int(np.count_nonzero(consensus.inliers))
         return replace(refined, n_matches=len(matches), n_inliers=n_inliers)
     n_inliers = int(np.count_nonzero(refined.inliers))
     if n_inliers < config.ransac.min_inliers:
@@ -108,46 +98,55 @@ def register_correspondences(
     return _relative_pose(refined, correspondences, matches)
 
 
-def _verify(
-    refined: Refinement,
+def _known_consensus(
+    prior: MotionPrior | None,
     correspondences: Correspondences,
     camera: StereoCamera,
     config: Config,
-    *,
-    start: FloatArray | None,
-    T_usual: FloatArray | None,
-    make_rng: Callable[[], np.random.Generator],
-    with_offset: bool,
-) -> Refinement | Failure:
-    """Return the motion that the predictions speak for, at the last velocity and the usual one."""
-    verified = verify_motion(
-        *(refined, correspondences, camera, config),
-        T_target_predicted=None if start is None else se3.invert(start),
-        make_rng=make_rng,
-        with_offset=with_offset,
-    )
-    if isinstance(verified, Failure) or T_usual is None:
-        return verified
-    return heed_usual_motion(
-        *(verified, correspondences, camera, config),
-        T_target_usual=se3.invert(T_usual),
-        with_offset=with_offset,
-    )
-
-
-def _known_consensus(
-    start: FloatArray | None, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Consensus | None:
-    """Return the matches that agree with a prediction, if they are most of them."""
-    if start is None or config.registration.refine == "none":
+    """Return the inliers of the prediction, if they are most of the matches."""
+    if prior is None or config.registration.refine == "none":
         return None
-    T = se3.invert(start)
+    T = se3.invert(prior.T_predicted)
     inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
     note("registration.known", inliers=inliers, n_needed=n_needed)
     if np.count_nonzero(inliers) < n_needed:
         return None
     return Consensus(T_target_source=T, inliers=inliers)
+
+
+def _refine(
+    consensus: Consensus,
+    correspondences: Correspondences,
+    camera: StereoCamera,
+    config: Config,
+    *,
+    prior: MotionPrior | None,
+    make_rng: Callable[[], np.random.Generator],
+    with_offset: bool,
+) -> Refinement | Failure:
+    """Refine the consensus, and verify that its motion is the camera's."""
+    is_refining = config.registration.refine != "none"
+    refined = (refine_pose if is_refining else fit_covariance)(
+        consensus.T_target_source,
+        correspondences,
+        consensus.inliers,
+        camera,
+        config.registration,
+        with_offset=with_offset,
+    )
+    note("registration.refined", refined=refined)
+    if isinstance(refined, Failure) or not is_refining:
+        return refined
+    verified = verify_motion(
+        *(refined, correspondences, camera, config),
+        prior=prior,
+        make_rng=make_rng,
+        with_offset=with_offset,
+    )
+    note("registration.verified", refined=verified)
+    return verified
 
 
 def search_consensus(

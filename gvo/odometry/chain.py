@@ -11,7 +11,7 @@ import numpy as np
 from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, StatusClock, predict_step
 from gvo.backend.validation import find_faults
 from gvo.config import WindowConfig
-from gvo.frontend.protocol import Frontend, ObservationsT, register_checked
+from gvo.frontend.protocol import Frontend, ObservationsT
 from gvo.geometry import se3
 from gvo.types import (
     Contradiction,
@@ -20,23 +20,95 @@ from gvo.types import (
     Failure,
     FloatArray,
     FrameId,
+    MotionPrior,
     PosePrior,
     Prior,
     RelativePose,
     Status,
 )
 
-# The usual velocity, and its usual change from step to step, are the medians of so many seconds.
-_USUAL_S = 1.0
-# A step is steady where no component changes by more than so many times what is usual. Of normal
-# errors that is 3.4 sigma; fewer changes than so many tell nothing of what is usual.
+# Velocities, and their changes from step to step, of so many seconds are the recent ones.
+_RECENT_S = 1.0
+# A step is steady where no component changes by more than so many times the median change. Of
+# normal errors that is 3.4 sigma; fewer changes than so many do not make a median.
 _STEADY = 5.0
 _MIN_CHANGES = 3
+# Registered steps whose errors add up to that of one that was coasted.
+_N_STEPS_COASTED = 1000
+
+
+class PoseChain:
+    """Composes relative poses; where one is missing, continues at constant velocity.
+
+    Parameters
+    ----------
+    config : WindowConfig
+        Sigmas of a coasted step.
+    first : Estimate
+        Where the chain starts.
+
+    Attributes
+    ----------
+    newest : Estimate
+    velocity : ndarray of float64, shape (6,), or None
+        Twist per second (rad/s, m/s) of the last measured step, set by who measures it; None:
+        standing still.
+    """
+
+    def __init__(self, config: WindowConfig, first: Estimate) -> None:
+        self.config = config
+        self.start(first)
+
+    def start(self, estimate: Estimate) -> None:
+        """Begin anew at a known pose."""
+        self.newest = estimate
+        self.velocity: FloatArray | None = None
+        self._measured_ns = estimate.stamp_ns
+
+    def append(
+        self,
+        reference: Estimate,
+        stamp_ns: int,
+        T_reference_frame: FloatArray,
+        covariance: FloatArray,
+    ) -> Estimate:
+        """Add a pose that was measured from an earlier one."""
+        self._measured_ns = stamp_ns
+        self.newest = _compose(reference, stamp_ns, T_reference_frame, covariance, Status.OK)
+        return self.newest
+
+    def predict(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the predicted T_newest_frame and its covariance (6, 6)."""
+        elapsed_s = 1e-9 * (stamp_ns - self.newest.stamp_ns)
+        coasted_s = 1e-9 * (self.newest.stamp_ns - self._measured_ns)
+        return predict_step(self.velocity, elapsed_s, self.config, coasted_s=coasted_s)
+
+    def coast(self, stamp_ns: int) -> Estimate:
+        """Add a pose by the prediction alone."""
+        step = self.predict(stamp_ns)
+        self.newest = _compose(self.newest, stamp_ns, *step, Status.COASTING)
+        return self.newest
+
+
+def _compose(
+    reference: Estimate,
+    stamp_ns: int,
+    T_reference_frame: FloatArray,
+    covariance: FloatArray,
+    status: Status,
+) -> Estimate:
+    return Estimate(
+        stamp_ns=stamp_ns,
+        # Over a million products the rotation would lose its orthogonality.
+        T_world_cam=se3.normalize(reference.T_world_cam @ T_reference_frame),
+        covariance=se3.compose_covariance(reference.covariance, T_reference_frame, covariance),
+        status=status,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawStep:
-    """One step of the chain.
+    """One step of the chain of frames.
 
     Parameters
     ----------
@@ -49,11 +121,12 @@ class RawStep:
         Of T_reference_frame.
     registration : RelativePose or None
         None where the step continues the last velocity, and for the first frame.
-    reason : str
-        Why there is no registration; empty where there is one.
-    n_matches, n_inliers : int
+    failure : Failure or None
+        Why a step was not registered.
     is_steady : bool
         The velocity changed no more than it did from step to step in the last second.
+    n_steps : int
+        Registered steps since the first frame; a coasted one counts as many.
     """
 
     estimate: Estimate
@@ -61,10 +134,9 @@ class RawStep:
     T_reference_frame: FloatArray
     covariance: FloatArray
     registration: RelativePose | None = None
-    reason: str = ""
-    n_matches: int = 0
-    n_inliers: int = 0
+    failure: Failure | None = None
     is_steady: bool = False
+    n_steps: int = 0
 
     @property
     def is_registered(self) -> bool:
@@ -72,18 +144,27 @@ class RawStep:
         return self.reference_ns is None or self.registration is not None
 
     @property
-    def flow_px(self) -> float | None:
-        """Median displacement of the inliers in the image, where it is known."""
-        return None if self.registration is None else self.registration.flow_px
+    def registered_ns(self) -> int | None:
+        """Stamp of the frame that this one is registered against; None where there is none."""
+        return None if self.registration is None else self.reference_ns
+
+    @property
+    def edge(self) -> Edge:
+        """The step as a measurement."""
+        return Edge(
+            reference_id=self.reference_ns,
+            T_reference_frame=self.T_reference_frame,
+            covariance=self.covariance,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Link(Generic[ObservationsT]):
+class _Node(Generic[ObservationsT]):
     """A frame that the next one may be registered against."""
 
     observations: ObservationsT
-    T_world_frame: FloatArray
-    covariance: FloatArray
+    estimate: Estimate
+    n_steps: int
 
 
 class RawChain(Generic[ObservationsT]):
@@ -96,23 +177,23 @@ class RawChain(Generic[ObservationsT]):
     Parameters
     ----------
     frontend : Frontend
+        Its results are not checked here, see `CheckedFrontend`.
     config : WindowConfig
-        Sigmas of a step without registration.
+        Sigmas of a coasted step.
     """
 
     def __init__(self, frontend: Frontend[ObservationsT], config: WindowConfig) -> None:
         self._frontend = frontend
         self._config = config
-        self._predecessor: _Link[ObservationsT] | None = None
-        self._anchor: _Link[ObservationsT] | None = None
-        self._velocity: FloatArray | None = None
-        self._velocities: list[tuple[int, FloatArray]] = []
-        self._changes: list[tuple[int, FloatArray]] = []
+        self._poses: PoseChain | None = None
+        # The predecessor, and the last registered frame where that is another.
+        self._nodes: list[_Node[ObservationsT]] = []
+        self._recent = _RecentVelocities()
 
     @property
     def anchor_ns(self) -> int | None:
         """Stamp of the last registered frame, which the next one may be tied to."""
-        return None if self._anchor is None else self._anchor.observations.stamp_ns
+        return self._nodes[-1].estimate.stamp_ns if self._nodes else None
 
     def reconfigure(
         self,
@@ -131,11 +212,12 @@ class RawChain(Generic[ObservationsT]):
             stamps; where one is missing, what was kept before is registered.
         """
         self._frontend, self._config = frontend, config
-        is_same = self._anchor is self._predecessor
-        self._predecessor = _with_observations(self._predecessor, observations)
-        self._anchor = (
-            self._predecessor if is_same else _with_observations(self._anchor, observations)
-        )
+        if self._poses is not None:
+            self._poses.config = config
+        self._nodes = [
+            replace(node, observations=observations.get(node.estimate.stamp_ns, node.observations))
+            for node in self._nodes
+        ]
 
     def advance(self, current: ObservationsT) -> RawStep:
         """Register the next frame and return its step.
@@ -145,168 +227,142 @@ class RawChain(Generic[ObservationsT]):
         ValueError
             For a stamp that does not advance.
         """
-        predecessor, anchor = self._predecessor, self._anchor
-        if predecessor is None or anchor is None:
+        if self._poses is None:
             return self._begin(current)
-        elapsed_s = 1e-9 * (current.stamp_ns - predecessor.observations.stamp_ns)
-        if elapsed_s <= 0:
+        predecessor_ns = self._poses.newest.stamp_ns
+        if current.stamp_ns <= predecessor_ns:
             raise ValueError(
-                f"stamp {current.stamp_ns} is not after {predecessor.observations.stamp_ns}, "
-                "that of the frame before"
+                f"stamp {current.stamp_ns} is not after {predecessor_ns}, that of the frame before"
             )
-        coasted_ns = predecessor.observations.stamp_ns - anchor.observations.stamp_ns
-        predicted = predict_step(
-            self._velocity, elapsed_s, self._config, coasted_s=1e-9 * coasted_ns
-        )
-        T_world_predicted = predecessor.T_world_frame @ predicted[0]
-        failure = Failure(reason="")
-        for link in [predecessor] if anchor is predecessor else [predecessor, anchor]:
-            result = self._register(link, current, T_world_predicted)
+        failures: list[Failure] = []
+        for node in self._nodes:
+            result = self._register(self._poses, node, current)
             if isinstance(result, RelativePose):
-                return self._append(link, current, result)
-            failure = failure if failure.reason else result
-        return self._coast(predecessor, current, predicted, failure)
+                return self._append(self._poses, node, current, result)
+            failures.append(result)
+        failure = next((each for each in failures if each.reason), failures[-1])
+        return self._coast(self._poses, current, failure)
 
     def _register(
-        self, link: _Link[ObservationsT], current: ObservationsT, T_world_predicted: FloatArray
+        self, poses: PoseChain, node: _Node[ObservationsT], current: ObservationsT
     ) -> RelativePose | Failure:
         """Search around the predicted pixels, then around the previous ones."""
-        if self._velocity is not None and self._is_foretold(current.stamp_ns):
-            T_frame_world = se3.invert(link.T_world_frame)
-            result = register_checked(
-                *(self._frontend, link.observations, current, T_frame_world @ T_world_predicted),
-                T_usual=self._usual_motion(T_frame_world, current.stamp_ns),
-            )
-            # What speaks against the prediction would be taken for true without it.
+        if self._is_prediction_valid(poses, current.stamp_ns):
+            prior = self._predict(poses, node, current.stamp_ns)
+            result = self._frontend.register(node.observations, current, prior)
+            # What contradicts the prediction would be believed without it.
             if isinstance(result, RelativePose | Contradiction):
                 return result
-        return register_checked(self._frontend, link.observations, current, None)
+        return self._frontend.register(node.observations, current, None)
 
-    def _usual_motion(self, T_frame_world: FloatArray, stamp_ns: int) -> FloatArray | None:
-        """Return the motion from a frame at the usual velocity; None before there is one."""
-        predecessor = self._predecessor
-        if predecessor is None or not self._velocities:
-            return None
-        usual = np.median([velocity for _, velocity in self._velocities], axis=0)
-        elapsed_s = 1e-9 * (stamp_ns - predecessor.observations.stamp_ns)
-        T_frame_predecessor = T_frame_world @ predecessor.T_world_frame
-        return np.asarray(T_frame_predecessor @ se3.exp(usual * elapsed_s))
+    def _is_prediction_valid(self, poses: PoseChain, stamp_ns: int) -> bool:
+        anchor_ns = self._nodes[-1].estimate.stamp_ns
+        return poses.velocity is not None and 1e-9 * (stamp_ns - anchor_ns) <= MAX_EXTRAPOLATION_S
 
-    def _is_foretold(self, stamp_ns: int) -> bool:
-        """Tell whether the last velocity still says where a frame should be."""
-        anchor_ns = self.anchor_ns
-        return anchor_ns is None or 1e-9 * (stamp_ns - anchor_ns) <= MAX_EXTRAPOLATION_S
+    def _predict(self, poses: PoseChain, node: _Node[ObservationsT], stamp_ns: int) -> MotionPrior:
+        T_world_newest = poses.newest.T_world_cam
+        T_world_predicted = T_world_newest @ poses.predict(stamp_ns)[0]
+        T_node_world = se3.invert(node.estimate.T_world_cam)
+        elapsed_s = 1e-9 * (stamp_ns - poses.newest.stamp_ns)
+        T_newest_recent = se3.exp(self._recent.mean() * elapsed_s)
+        return MotionPrior(
+            T_predicted=T_node_world @ T_world_predicted,
+            T_recent=T_node_world @ T_world_newest @ T_newest_recent,
+        )
 
     def _begin(self, current: ObservationsT) -> RawStep:
-        step = RawStep(
-            estimate=Estimate(
-                stamp_ns=current.stamp_ns, T_world_cam=np.eye(4), covariance=np.zeros((6, 6))
-            ),
+        estimate = Estimate(
+            stamp_ns=current.stamp_ns, T_world_cam=np.eye(4), covariance=np.zeros((6, 6))
+        )
+        self._poses = PoseChain(self._config, estimate)
+        self._nodes = [_Node(observations=current, estimate=estimate, n_steps=0)]
+        return RawStep(
+            estimate=estimate,
             reference_ns=None,
             T_reference_frame=np.eye(4),
             covariance=np.zeros((6, 6)),
         )
-        self._predecessor = self._anchor = _link_of(current, step.estimate)
-        return step
 
     def _append(
-        self, link: _Link[ObservationsT], current: ObservationsT, result: RelativePose
-    ) -> RawStep:
-        T_world_current = se3.normalize(link.T_world_frame @ result.T_reference_current)
-        estimate = Estimate(
-            stamp_ns=current.stamp_ns,
-            T_world_cam=T_world_current,
-            covariance=se3.compose_covariance(
-                link.covariance, result.T_reference_current, result.covariance
-            ),
-        )
-        span_s = 1e-9 * (current.stamp_ns - link.observations.stamp_ns)
-        velocity = se3.log(result.T_reference_current) / span_s
-        sigmas = np.sqrt(np.diagonal(result.covariance)) / span_s
-        is_steady = self._note_change(current.stamp_ns, velocity, sigmas)
-        self._velocity = velocity
-        self._velocities = _of_last_second(self._velocities, (current.stamp_ns, velocity))
-        self._predecessor = self._anchor = _link_of(current, estimate)
-        return RawStep(
-            estimate=estimate,
-            reference_ns=link.observations.stamp_ns,
-            T_reference_frame=result.T_reference_current,
-            covariance=result.covariance,
-            registration=result,
-            n_matches=result.n_matches,
-            n_inliers=result.n_inliers,
-            is_steady=is_steady,
-        )
-
-    def _note_change(self, stamp_ns: int, velocity: FloatArray, sigmas: FloatArray) -> bool:
-        """Note the change of the velocity, and tell whether changes like that are usual."""
-        if self._velocity is None:
-            return False
-        change = np.abs(velocity - self._velocity)
-        known = np.sort([each for _, each in self._changes], axis=0)
-        self._changes = _of_last_second(self._changes, (stamp_ns, change))
-        if len(known) < _MIN_CHANGES:
-            return False
-        usual = np.maximum(known[len(known) // 2], sigmas)
-        return bool((change <= _STEADY * usual).all())
-
-    def _coast(
         self,
-        predecessor: _Link[ObservationsT],
+        poses: PoseChain,
+        node: _Node[ObservationsT],
         current: ObservationsT,
-        predicted: tuple[FloatArray, FloatArray],
-        failure: Failure,
+        result: RelativePose,
     ) -> RawStep:
-        T_predecessor_current, covariance = predicted
-        estimate = Estimate(
-            stamp_ns=current.stamp_ns,
-            T_world_cam=se3.normalize(predecessor.T_world_frame @ T_predecessor_current),
-            covariance=se3.compose_covariance(
-                predecessor.covariance, T_predecessor_current, covariance
-            ),
-            status=Status.COASTING,
-        )
-        self._predecessor = _link_of(current, estimate)
+        reference, stamp_ns = node.estimate, current.stamp_ns
+        T, covariance = result.T_reference_current, result.covariance
+        estimate = poses.append(reference, stamp_ns, T, covariance)
+        elapsed_s = 1e-9 * (stamp_ns - reference.stamp_ns)
+        poses.velocity = se3.log(T) / elapsed_s
+        sigmas = np.sqrt(np.diagonal(covariance)) / elapsed_s
+        n_steps = node.n_steps + 1
+        self._nodes = [_Node(observations=current, estimate=estimate, n_steps=n_steps)]
         return RawStep(
             estimate=estimate,
-            reference_ns=predecessor.observations.stamp_ns,
+            reference_ns=reference.stamp_ns,
+            T_reference_frame=T,
+            covariance=covariance,
+            registration=result,
+            is_steady=self._recent.add(stamp_ns, poses.velocity, sigmas),
+            n_steps=n_steps,
+        )
+
+    def _coast(self, poses: PoseChain, current: ObservationsT, failure: Failure) -> RawStep:
+        predecessor, anchor = self._nodes[0], self._nodes[-1]
+        T_predecessor_current, covariance = poses.predict(current.stamp_ns)
+        estimate = poses.coast(current.stamp_ns)
+        n_steps = predecessor.n_steps + _N_STEPS_COASTED
+        self._nodes = [_Node(observations=current, estimate=estimate, n_steps=n_steps), anchor]
+        return RawStep(
+            estimate=estimate,
+            reference_ns=predecessor.estimate.stamp_ns,
             T_reference_frame=T_predecessor_current,
             covariance=covariance,
-            reason=failure.reason,
-            n_matches=failure.n_matches,
-            n_inliers=failure.n_inliers,
+            failure=failure,
+            n_steps=n_steps,
         )
 
 
-def _of_last_second(
-    noted: list[tuple[int, FloatArray]], newest: tuple[int, FloatArray]
-) -> list[tuple[int, FloatArray]]:
-    kept = [*noted, newest]
-    return [(ns, each) for ns, each in kept if 1e-9 * (newest[0] - ns) <= _USUAL_S]
+class _RecentVelocities:
+    """Velocities of the last second, and their changes from step to step."""
+
+    def __init__(self) -> None:
+        self._velocities: list[tuple[int, FloatArray]] = []
+        self._changes: list[tuple[int, FloatArray]] = []
+
+    def mean(self) -> FloatArray:
+        """Return the median velocity, which outliers do not move."""
+        return np.asarray(np.median([velocity for _, velocity in self._velocities], axis=0))
+
+    def add(self, stamp_ns: int, velocity: FloatArray, sigmas: FloatArray) -> bool:
+        """Add a velocity; tell whether it is steady: its change no larger than usual."""
+        is_steady = False
+        if self._velocities:
+            change = np.abs(velocity - self._velocities[-1][1])
+            is_steady = self._is_small(change, sigmas)
+            self._changes = _of_last_second([*self._changes, (stamp_ns, change)])
+        self._velocities = _of_last_second([*self._velocities, (stamp_ns, velocity)])
+        return is_steady
+
+    def _is_small(self, change: FloatArray, sigmas: FloatArray) -> bool:
+        known = np.sort([each for _, each in self._changes], axis=0)
+        if len(known) < _MIN_CHANGES:
+            return False
+        limits = _STEADY * np.maximum(known[len(known) // 2], sigmas)
+        return bool((change <= limits).all())
 
 
-def _with_observations(
-    link: _Link[ObservationsT] | None, observations: Mapping[int, ObservationsT]
-) -> _Link[ObservationsT] | None:
-    if link is None:
-        return None
-    stamp_ns = link.observations.stamp_ns
-    return replace(link, observations=observations.get(stamp_ns, link.observations))
-
-
-def _link_of(observations: ObservationsT, estimate: Estimate) -> _Link[ObservationsT]:
-    return _Link(
-        observations=observations,
-        T_world_frame=estimate.T_world_cam,
-        covariance=estimate.covariance,
-    )
+def _of_last_second(values: list[tuple[int, FloatArray]]) -> list[tuple[int, FloatArray]]:
+    newest_ns = values[-1][0]
+    return [(ns, value) for ns, value in values if 1e-9 * (newest_ns - ns) <= _RECENT_S]
 
 
 class EdgeChain:
-    """Composes the first edge of each pose.
+    """Chains the first usable edge of each pose.
 
-    A pose without a usable edge continues the last velocity, or begins the chain anew where its
-    pose in the world is given.
+    A pose without one continues the last velocity, or begins the chain anew where its pose in
+    the world is given.
 
     Parameters
     ----------
@@ -316,10 +372,8 @@ class EdgeChain:
 
     def __init__(self, config: WindowConfig) -> None:
         self._config = config
+        self._chain: PoseChain | None = None
         self._poses: dict[FrameId, Estimate] = {}
-        self._newest: Estimate | None = None
-        self._velocity: FloatArray | None = None
-        self._coasted_s = 0.0
         self._status = StatusClock(config.lost_after_s)
 
     def __len__(self) -> int:
@@ -343,56 +397,41 @@ class EdgeChain:
         Estimate
             T_world_frame of the chain and its covariance.
         """
-        if self._newest is None:
-            T, covariance, is_tied = first.T_world_cam, first.covariance, True
+        if self._chain is None:
+            self._chain, is_tied = PoseChain(self._config, first), True
         else:
-            T, covariance, is_tied = self._next(self._newest, first.stamp_ns, edges, prior)
-        estimate = Estimate(
-            stamp_ns=first.stamp_ns,
-            T_world_cam=T,
-            covariance=covariance,
-            status=self._status.next(first.stamp_ns, is_tied=is_tied),
-            frame_id=first.frame_id,
-        )
-        self._poses[first.frame_id] = self._newest = estimate
+            is_tied = self._advance(self._chain, first.stamp_ns, edges, prior)
+        status = self._status.next(first.stamp_ns, is_tied=is_tied)
+        newest = self._chain.newest
+        estimate = replace(newest, status=status, frame_id=first.frame_id, rejected=())
+        self._poses[first.frame_id] = estimate
         return estimate
 
     def forget(self, frame_ids: Iterable[FrameId]) -> None:
-        """Let go of poses that no edge will refer to any more."""
+        """Forget poses that no edge will refer to any more."""
         for frame_id in frame_ids:
             self._poses.pop(frame_id, None)
 
-    def _next(
-        self, newest: Estimate, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
-    ) -> tuple[FloatArray, FloatArray, bool]:
-        elapsed_s = 1e-9 * (stamp_ns - newest.stamp_ns)
-        edge = self._usable(edges)
+    def _advance(
+        self, chain: PoseChain, stamp_ns: int, edges: Sequence[Edge], prior: Prior | None
+    ) -> bool:
+        """Add a pose; tell whether an edge or a prior ties it."""
+        newest, edge = chain.newest, self._usable(edges)
         if edge is not None:
-            T, covariance = _compose(
-                self._poses[edge.reference_id], edge.T_reference_frame, edge.covariance
-            )
-            T_newest_frame = se3.invert(newest.T_world_cam) @ T
-            self._velocity = se3.log(T_newest_frame) / elapsed_s if elapsed_s > 0 else None
-            self._coasted_s = 0.0
-            return T, covariance, True
-        if isinstance(prior, PosePrior):
-            self._velocity, self._coasted_s = None, 0.0
-            return prior.T_world_frame, prior.covariance, True
-        step = predict_step(self._velocity, elapsed_s, self._config, coasted_s=self._coasted_s)
-        self._coasted_s += elapsed_s
-        return *_compose(newest, *step), False
+            reference = self._poses[edge.reference_id]
+            estimate = chain.append(reference, stamp_ns, edge.T_reference_frame, edge.covariance)
+            elapsed_s = 1e-9 * (stamp_ns - newest.stamp_ns)
+            T_newest_frame = se3.invert(newest.T_world_cam) @ estimate.T_world_cam
+            chain.velocity = se3.log(T_newest_frame) / elapsed_s if elapsed_s > 0 else None
+        elif isinstance(prior, PosePrior):
+            T, covariance = prior.T_world_frame, prior.covariance
+            chain.start(Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=covariance))
+        else:
+            chain.coast(stamp_ns)
+            return False
+        return True
 
     def _usable(self, edges: Sequence[Edge]) -> Edge | None:
         known = [edge for edge in edges if edge.reference_id in self._poses]
-        return next(
-            (edge for edge, fault in zip(known, find_faults(known), strict=True) if not fault),
-            None,
-        )
-
-
-def _compose(
-    reference: Estimate, T_reference_frame: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    # Of a million products the rotation would cease to be one.
-    T = se3.normalize(reference.T_world_cam @ T_reference_frame)
-    return T, se3.compose_covariance(reference.covariance, T_reference_frame, covariance)
+        sound = (edge for edge, fault in zip(known, find_faults(known), strict=True) if not fault)
+        return next(sound, None)

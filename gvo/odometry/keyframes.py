@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
@@ -11,23 +12,32 @@ from gvo.backend.gating import disagreement
 from gvo.backend.keyframe_policy import choose_links, proximity
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
-from gvo.frontend.protocol import ObservationsT
+from gvo.frontend.protocol import HasPoints, ObservationsT
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.chain import RawStep
 from gvo.types import Edge, FloatArray, FrameLink, LinkKind
 
-# Enough to tell the share in view to a few percent.
+# Points of a keyframe that its view overlap is estimated from.
 _N_SAMPLES = 64
-# Beyond this ratio of depths a point of one image size is not found again.
+# Beyond this ratio of depths a point is not matched again by patches of one size.
 _MAX_ZOOM = 1.6
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Keyframe(Generic[ObservationsT]):
+    """A kept frame, a sample of its points, and its number of steps since the first frame."""
+
+    observations: ObservationsT
+    points_cam: FloatArray | None
+    n_steps: int
+
+
 class Keyframes(Generic[ObservationsT]):
-    """The kept frames and the scores by which the policy judges them.
+    """The kept frames and their scores, by which the policy chooses.
 
     Where the observations hold `points_cam` and the camera is known, the score of a keyframe is
-    the share of its points that the current frame sees; else it is the proximity of the poses.
+    the share of its points in view of the current frame; else the proximity of the poses.
 
     Parameters
     ----------
@@ -39,8 +49,7 @@ class Keyframes(Generic[ObservationsT]):
     def __init__(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         self._camera = camera
         self._config = config
-        self._kept: dict[int, ObservationsT] = {}
-        self._samples: dict[int, FloatArray | None] = {}
+        self._kept: dict[int, _Keyframe[ObservationsT]] = {}
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -49,26 +58,37 @@ class Keyframes(Generic[ObservationsT]):
 
     def __getitem__(self, stamp_ns: int) -> ObservationsT:
         """Return the observations of a kept frame."""
-        return self._kept[stamp_ns]
+        return self._kept[stamp_ns].observations
 
     def __len__(self) -> int:
         """Return the number of kept frames."""
         return len(self._kept)
+
+    def n_steps(self, stamp_ns: int) -> int:
+        """Return the number of steps from the first frame to a kept one."""
+        return self._kept[stamp_ns].n_steps
 
     def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         """Score with another camera or configuration from now on; what is kept stays."""
         self._camera = camera
         self._config = config
 
-    def add(self, observations: ObservationsT) -> None:
-        """Keep a frame; of one that is kept already, other observations of it."""
-        self._kept[observations.stamp_ns] = observations
-        points = getattr(observations, "points_cam", None)
-        self._samples[observations.stamp_ns] = None if points is None else _sample_points(points)
+    def add(self, observations: ObservationsT, *, n_steps: int = 0) -> None:
+        """Keep a frame."""
+        points = observations.points_cam if isinstance(observations, HasPoints) else None
+        self._kept[observations.stamp_ns] = _Keyframe(
+            observations=observations,
+            points_cam=None if points is None else _sample_points(points),
+            n_steps=n_steps,
+        )
+
+    def replace(self, observations: ObservationsT) -> None:
+        """Keep other observations of a frame that is kept already."""
+        self.add(observations, n_steps=self.n_steps(observations.stamp_ns))
 
     def drop(self, stamp_ns: int) -> None:
         """Forget a kept frame."""
-        del self._kept[stamp_ns], self._samples[stamp_ns]
+        del self._kept[stamp_ns]
 
     def scores(self, T_current_keyframe: Mapping[int, FloatArray]) -> dict[int, float]:
         """Return how much the current frame has in common with keyframes, 0 to 1.
@@ -81,14 +101,14 @@ class Keyframes(Generic[ObservationsT]):
         return {stamp_ns: self._score(stamp_ns, T) for stamp_ns, T in T_current_keyframe.items()}
 
     def _score(self, stamp_ns: int, T_current_keyframe: FloatArray) -> float:
-        points = self._samples[stamp_ns]
+        points = self._kept[stamp_ns].points_cam
         if points is None or self._camera is None:
             return proximity(T_current_keyframe, self._config)
         return _overlap(points, T_current_keyframe, self._camera)
 
 
 def _sample_points(points_cam: FloatArray) -> FloatArray:
-    """Return so many of n points, shape (n, 3), as tell the share in view; of these, all."""
+    """Subsample at most 64 points of shape (n, 3)."""
     n = len(points_cam)
     chosen = np.linspace(0, n - 1, min(_N_SAMPLES, n))
     return points_cam[chosen.astype(np.int64)]
@@ -97,7 +117,7 @@ def _sample_points(points_cam: FloatArray) -> FloatArray:
 def _overlap(
     points_keyframe: FloatArray, T_current_keyframe: FloatArray, camera: StereoCamera
 ) -> float:
-    """Return the share of points that another camera sees, at about the same distance."""
+    """Return the share of points in view of another camera, at about the same distance."""
     if len(points_keyframe) == 0:
         return 0.0
     T = T_current_keyframe
@@ -110,25 +130,6 @@ def _overlap(
     return float(np.count_nonzero(is_in_view)) / len(points_keyframe)
 
 
-# Registered steps whose errors add up to that of a step which only goes on as before.
-_N_UNKNOWN = 1000
-
-
-def count_steps(step: RawStep, n_steps: Mapping[int, int]) -> int:
-    """Return over how many registered steps the errors of the chain have added up.
-
-    Parameters
-    ----------
-    step : RawStep
-        To the current frame.
-    n_steps : mapping of int to int
-        The same of earlier frames, by stamp; of that which the step starts from at least.
-    """
-    if step.reference_ns is None:
-        return 0
-    return n_steps[step.reference_ns] + (1 if step.is_registered else _N_UNKNOWN)
-
-
 def link_keyframes(
     measure: Callable[[int, FloatArray], Edge | None],
     scores: Mapping[int, float],
@@ -138,20 +139,20 @@ def link_keyframes(
     *,
     n_steps: Mapping[int, int],
 ) -> list[Edge]:
-    """Register a frame against keyframes that tell more than its steps do.
+    """Register a frame against the keyframes that add information to its steps.
 
-    Where the step was not registered, or changes the velocity as never before, or none of these
-    keyframes bears it out, others are asked, one after the other until one does.
+    Where the step was not registered, or its velocity is not steady, or no link confirms it,
+    spare keyframes are tried one by one until a link does.
 
     Parameters
     ----------
     measure : callable
         Returns the edge from a keyframe, by its stamp and the predicted T_keyframe_frame; None
-        where it cannot be registered.
+        where the registration fails.
     scores : mapping of int to float
         What keyframes have in common with the frame, by stamp, oldest first.
     T_frame_keyframes : mapping of int to ndarray of float64, shape (4, 4)
-        Their poses, as the step predicts them.
+        Their poses, as predicted by the step.
     step : RawStep
         Of the frame.
     config : WindowConfig
@@ -159,31 +160,30 @@ def link_keyframes(
         Steps since each keyframe.
     """
     chosen, spare = choose_links(scores, config, n_steps=n_steps, exclude=step.reference_ns)
-    predicted = {ns: se3.invert(T_frame_keyframes[ns]) for ns in [*chosen, *spare]}
-    links = [measure(ns, predicted[ns]) for ns in chosen]
-    is_borne_out = any(
-        _bears_out(link, predicted[ns], step, config)
-        for ns, link in zip(chosen, links, strict=True)
-    )
     if not chosen and step.is_registered and step.is_steady:
         spare = []
-    for ns in spare:
-        if is_borne_out:
+    links: list[Edge] = []
+    is_confirmed = False
+    for index, stamp_ns in enumerate([*chosen, *spare]):
+        if is_confirmed and index >= len(chosen):
             break
-        links.append(measure(ns, predicted[ns]))
-        is_borne_out = _bears_out(links[-1], predicted[ns], step, config)
-    return [link for link in links if link is not None]
+        T_keyframe_frame = se3.invert(T_frame_keyframes[stamp_ns])
+        link = measure(stamp_ns, T_keyframe_frame)
+        if link is not None:
+            links.append(link)
+            is_confirmed = is_confirmed or _confirms(link, T_keyframe_frame, step, config)
+    return links
 
 
-def _bears_out(
-    link: Edge | None, T_keyframe_frame: FloatArray, step: RawStep, config: WindowConfig
+def _confirms(
+    link: Edge, T_keyframe_frame: FloatArray, step: RawStep, config: WindowConfig
 ) -> bool:
     """Tell whether a link agrees with the step that its prediction comes from.
 
-    What the poses of the window have drifted since counts against the step too: then another
-    keyframe is asked for nothing, which is better than that one is not asked.
+    The drift of the window's poses counts against the step too: then another keyframe is tried
+    in vain, which is better than one not tried.
     """
-    if link is None or not step.is_registered:
+    if not step.is_registered:
         return False
     gate = config.gate
     return gate is None or not disagreement(link, T_keyframe_frame, step.covariance, gate=gate)
@@ -205,13 +205,13 @@ def judge_links(
     """
     accepted = {id(edge) for edge in window.edges(frame_id)}
     is_there = frame_id in window
-    known = [edge for _, edge in offered if is_there and edge.reference_id in window]
-    chi2 = {id(edge): _chi2(edge, frame_id, window) for edge in known}
     return tuple(
         FrameLink(
             reference_ns=int(edge.reference_id),  # type: ignore[call-overload]
             kind=kind,
-            chi2=chi2.get(id(edge)),
+            chi2=_chi2(edge, frame_id, window)
+            if is_there and edge.reference_id in window
+            else None,
             is_accepted=id(edge) in accepted,
         )
         for kind, edge in offered

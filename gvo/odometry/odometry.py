@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,14 +15,14 @@ from gvo.backend.keyframe_policy import choose_released, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.factory import find_change, frame_of, make_frontend, renew_frontend
-from gvo.frontend.protocol import Frontend, Stamped, register_checked, relocalize_checked
+from gvo.frontend.factory import find_change, frame_of, make_frontend
+from gvo.frontend.protocol import CheckedFrontend, Frontend, Stamped, count_points
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
-from gvo.odometry.keyframes import Keyframes, count_steps, judge_links, link_keyframes
-from gvo.odometry.segments import Segments, Sighting
+from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes
+from gvo.odometry.segments import Segments
 from gvo.types import (
     Edge,
     Estimate,
@@ -30,10 +30,13 @@ from gvo.types import (
     FloatArray,
     FrameResult,
     LinkKind,
+    MotionPrior,
     RelativePose,
     SegmentJoin,
     Status,
 )
+
+_Offer: TypeAlias = tuple[LinkKind, Edge]
 
 
 class Odometry:
@@ -62,18 +65,16 @@ class Odometry:
         frontend: Frontend[Any] | None = None,
     ) -> None:
         self._config = self._next_config = config or Config()
-        self._frontend = _choose_frontend(camera, self._config, frontend)
         self._camera = camera
         self._is_own = frontend is not None
-        # The last frame and the last registered one, in case that they are extracted again.
-        self._frames: dict[int, Stamped] = {}
+        self._frontend = CheckedFrontend(_choose_frontend(camera, self._config, frontend))
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
-        self._anchor_ns: int | None = None
         self._segments = Segments()
-        # Over how many steps the errors of the chain had added up at a frame, by stamp.
-        self._n_steps: dict[int, int] = {}
+        self._anchor_ns: int | None = None
+        # The last frame and the last registered one, in case that they are extracted again.
+        self._frames: dict[int, Stamped] = {}
 
     @property
     def config(self) -> Config:
@@ -88,8 +89,8 @@ class Odometry:
     @property
     def rig_offsets(self) -> RigOffsets | None:
         """What is learnt of a stereo rig; None where nothing is."""
-        offsets = getattr(self._frontend, "rig_offsets", None)
-        return offsets if isinstance(offsets, RigOffsets) and offsets.is_learning else None
+        offsets = self._frontend.rig_offsets
+        return offsets if offsets is not None and offsets.is_learning else None
 
     def reconfigure(self, config: Config) -> None:
         """Go on with another configuration from the next frame on.
@@ -110,8 +111,7 @@ class Odometry:
         - `runtime`: with the next frame.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 
-        A front-end of one's own is told at once by its method `reconfigure(config)`, where it
-        has one; it must go on with the observations that it gave before.
+        A front-end of one's own is told at once where it is `Reconfigurable`.
 
         Parameters
         ----------
@@ -125,9 +125,8 @@ class Odometry:
         """
         if not isinstance(config, Config):
             raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
-        tell = getattr(self._frontend, "reconfigure", None) if self._is_own else None
-        if callable(tell) and config != self._next_config:
-            tell(config)
+        if config != self._next_config:
+            self._frontend.reconfigure(config)
         self._next_config = config
 
     def track(self, frame: Stamped) -> FrameResult:
@@ -145,79 +144,81 @@ class Odometry:
         """
         watch = Stopwatch()
         with watch.stage("extract"):
-            if self._next_config is not self._config:
-                self._apply(self._next_config)
+            self._take_over_configuration()
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
             step = self._chain.advance(observations)
-            self._n_steps[frame.stamp_ns] = count_steps(step, self._n_steps)
         with watch.stage("links"):
-            offered, scores = self._edges(observations, step)
-            found = self._look_around(observations, step)
-            if found is not None:
-                offered.append(("keyframe", found))
+            scores, offered = self._link(observations, step)
+            relocalized = self._relocalize(observations, step)
+            offered += relocalized
         with watch.stage("window"):
-            edges = [edge for _, edge in offered]
-            status = None if found is None else Status.RESUMED
-            causal = self._window.add_pose(frame.stamp_ns, frame.stamp_ns, edges, status=status)
-            joins = self._note_segments(step, causal)
-            self._update_keyframes(observations, scores, causal)
-            self._hold_anchor()
-            self._hold_counts(frame.stamp_ns)
-        if not self._is_own:
-            self._hold_frame(frame)
-        n_points = _count_points(observations)
-        return FrameResult(
-            raw=replace(step.estimate, frame_id=frame.stamp_ns),
-            causal=causal,
-            finished=tuple(self._window.pop_finished()),
-            status=causal.status,
-            reason=step.reason,
-            n_keypoints=getattr(observations, "n_keypoints", n_points),
-            n_points=n_points,
-            n_matches=step.n_matches,
-            n_inliers=step.n_inliers,
-            n_links=len(edges) - len(causal.rejected),
-            registration=step.registration,
-            links=judge_links(offered, frame.stamp_ns, self._window),
-            keyframes_ns=tuple(self._keyframes.stamps_ns),
-            segment=self._segments.current,
-            joins=joins,
-            stage_ms=watch.stage_ms,
-        )
+            causal = self._add_to_window(step, offered, is_resumed=bool(relocalized))
+            joins = self._join_segments(step, causal)
+            self._select_keyframes(observations, step, scores, causal)
+            self._keep_anchor()
+        self._keep_frame(frame)
+        return self._result(observations, step, offered, causal, joins, watch.stage_ms)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
         return tuple(self._window.finish())
 
+    def _result(
+        self,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        step: RawStep,
+        offered: list[_Offer],
+        causal: Estimate,
+        joins: tuple[SegmentJoin, ...],
+        stage_ms: dict[str, float],
+    ) -> FrameResult:
+        n_keypoints, n_points = count_points(observations)
+        answer = step.registration or step.failure
+        return FrameResult(
+            raw=replace(step.estimate, frame_id=step.estimate.stamp_ns),
+            causal=causal,
+            finished=tuple(self._window.pop_finished()),
+            status=causal.status,
+            reason="" if step.failure is None else step.failure.reason,
+            n_keypoints=n_keypoints,
+            n_points=n_points,
+            n_matches=0 if answer is None else answer.n_matches,
+            n_inliers=0 if answer is None else answer.n_inliers,
+            n_links=len(offered) - len(causal.rejected),
+            registration=step.registration,
+            links=judge_links(offered, step.estimate.stamp_ns, self._window),
+            keyframes_ns=tuple(self._keyframes.stamps_ns),
+            segment=self._segments.current,
+            joins=joins,
+            stage_ms=stage_ms,
+        )
+
     def _view(self) -> StereoCamera | None:
-        """Return the camera that tells which points of a keyframe are in view."""
-        view = getattr(self._frontend, "camera", None)
-        if not isinstance(view, StereoCamera | PinholeCamera):
-            view = self._camera
+        """Return the camera of the view overlap."""
+        view = self._frontend.camera or self._camera
         return None if view is None else as_stereo(view, self._config)
 
-    def _apply(self, config: Config) -> None:
-        """Take over another configuration, before a frame."""
-        former, self._config = self._config, config
-        if config == former:
+    def _take_over_configuration(self) -> None:
+        """Take over another configuration before a frame."""
+        former, self._config = self._config, self._next_config
+        if self._config is former or self._config == former:
             return
         extracted = {} if self._is_own else self._renew_frontend(former)
-        self._window.reconfigure(config.window)
-        self._keyframes.reconfigure(self._view(), config.window)
-        self._chain.reconfigure(self._frontend, config.window, extracted)
+        self._window.reconfigure(self._config.window)
+        self._keyframes.reconfigure(self._view(), self._config.window)
+        self._chain.reconfigure(self._frontend, self._config.window, extracted)
 
     def _renew_frontend(self, former: Config) -> dict[int, Any]:
-        """Return what a new front-end keeps of the last frames, where that has changed."""
+        """Return what a new front-end extracts from the last frames, where that has changed."""
         camera = self._camera
         if camera is None:
             return {}
-        is_stereo = isinstance(camera, StereoCamera)
-        change = find_change(former, self._config, is_stereo=is_stereo)
+        change = find_change(former, self._config, is_stereo=isinstance(camera, StereoCamera))
         if change.is_any:
-            self._frontend = renew_frontend(
-                self._frontend, camera, self._config, keeps_offsets=not change.is_of_rig
-            )
+            offsets = None if change.is_of_rig else self._frontend.rig_offsets
+            frontend = make_frontend(camera, self._config, rig_offsets=offsets)
+            self._frontend = CheckedFrontend(frontend)
         extracted = {}
         if change.is_of_extraction:
             frames = sorted(self._frames.items())
@@ -227,108 +228,110 @@ class Odometry:
         return extracted
 
     def _renew_keyframes(self, extracted: dict[int, Any]) -> None:
-        """Extract keyframes again, and release those of which the frames are not at hand."""
+        """Extract keyframes again, and release those whose images are not at hand."""
         for stamp_ns in self._keyframes.stamps_ns:
             observations = extracted.get(stamp_ns)
             frame = frame_of(self._keyframes[stamp_ns])
             if observations is None and frame is not None:
                 observations = self._frontend.extract(frame)
             if observations is not None:
-                self._keyframes.add(observations)
+                self._keyframes.replace(observations)
                 continue
             self._keyframes.drop(stamp_ns)
             if stamp_ns in self._window:
                 self._window.release(stamp_ns)
 
-    def _edges(
-        self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
-        step: RawStep,
-    ) -> tuple[list[tuple[LinkKind, Edge]], dict[int, float]]:
-        """Return the edges of a frame, to its predecessor first, and the keyframes' scores."""
-        if step.reference_ns is None:
-            return [], {}
-        # A step that only goes on as before is no measurement: the window does that by itself.
-        first: list[tuple[LinkKind, Edge]] = []
-        if step.is_registered:
-            first.append(("step", _edge_of(step)))
-        if step.reference_ns not in self._window:  # not even alone would it go in
-            return first, {}
-        T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
-        apart = self._apart()
-        T_frame_keyframes = {
-            stamp_ns: se3.invert(T_world_frame) @ self._window.pose(stamp_ns)
-            for stamp_ns in self._keyframes.stamps_ns
-            if stamp_ns in self._window and stamp_ns not in apart
-        }
-        scores = self._keyframes.scores(T_frame_keyframes)
-        measure = partial(self._link, observations)
-        n_now = self._n_steps[observations.stamp_ns]
-        n_steps = {ns: n_now - self._n_steps[ns] for ns in scores}
-        config = self._config.window
-        links = link_keyframes(measure, scores, T_frame_keyframes, step, config, n_steps=n_steps)
-        edges = first + [("keyframe", edge) for edge in links]
-        still = zero_motion_edge(step, self._config.window)
-        return edges if still is None else [*edges, ("standstill", still)], scores
-
     def _link(
         self,
         observations: Any,  # noqa: ANN401 - the front-end's own
-        stamp_ns: int,
-        prior: FloatArray,
-    ) -> Edge | None:
-        keyframe = self._keyframes[stamp_ns]
-        result = register_checked(self._frontend, keyframe, observations, prior)
-        return None if isinstance(result, Failure) else self._link_edge(stamp_ns, result)
+        step: RawStep,
+    ) -> tuple[dict[int, float], list[_Offer]]:
+        """Return the keyframes' scores, and edges to the predecessor and to keyframes."""
+        # A coasted step is no measurement: the window predicts by itself.
+        offered: list[_Offer] = []
+        if step.registration is not None:
+            offered.append(("step", step.edge))
+        if step.reference_ns not in self._window:  # not even alone would it go in
+            return {}, offered
+        T_frame_keyframes = self._predict_keyframes(step)
+        scores = self._keyframes.scores(T_frame_keyframes)
+        measure = partial(self._register_keyframe, observations)
+        n_steps = {ns: step.n_steps - self._keyframes.n_steps(ns) for ns in scores}
+        config = self._config.window
+        links = link_keyframes(measure, scores, T_frame_keyframes, step, config, n_steps=n_steps)
+        offered += [("keyframe", edge) for edge in links]
+        still = zero_motion_edge(step, config)
+        return scores, offered if still is None else [*offered, ("standstill", still)]
 
-    def _link_edge(self, stamp_ns: int, result: RelativePose) -> Edge:
+    def _predict_keyframes(self, step: RawStep) -> dict[int, FloatArray]:
+        """Return T_frame_keyframe by stamp, of joined segments, as predicted by the step."""
+        T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
+        T_frame_world = se3.invert(T_world_frame)
+        unjoined = self._unjoined()
+        return {
+            ns: T_frame_world @ self._window.pose(ns)
+            for ns in self._keyframes.stamps_ns
+            if ns in self._window and ns not in unjoined
+        }
+
+    def _register_keyframe(
+        self,
+        observations: Any,  # noqa: ANN401 - the front-end's own
+        stamp_ns: int,
+        T_keyframe_frame: FloatArray,
+    ) -> Edge | None:
+        prior = MotionPrior(T_predicted=T_keyframe_frame)
+        result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
+        return None if isinstance(result, Failure) else self._edge_of(stamp_ns, result)
+
+    def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:
         return Edge(
             reference_id=stamp_ns,
             T_reference_frame=result.T_reference_current,
             covariance=self._config.window.link_sigma_factor**2 * result.covariance,
         )
 
-    def _apart(self) -> list[int]:
-        """Return the keyframes of earlier segments, which wait to be seen again."""
-        return self._segments.apart(self._keyframes.stamps_ns)
+    def _unjoined(self) -> list[int]:
+        """Return the keyframes of earlier segments that the current one is not joined to."""
+        return self._segments.unjoined(self._keyframes.stamps_ns)
 
-    def _look_around(
+    def _relocalize(
         self,
         observations: Any,  # noqa: ANN401 - the front-end's own
         step: RawStep,
-    ) -> Edge | None:
-        """Look for keyframes of earlier segments; return an edge to one that is there for sure."""
-        segments = self._segments
+    ) -> list[_Offer]:
+        """Return the edge to a keyframe of an earlier segment, where two frames agree."""
         if not self._config.window.relocalize:
-            return None
-        held_ns = [ns for ns in self._apart() if ns in self._window]
-        reference_ns = step.reference_ns if step.is_registered else None
-        for stamp_ns in segments.to_look_for(held_ns):
-            result = relocalize_checked(self._frontend, self._keyframes[stamp_ns], observations)
+            return []
+        waiting_ns = [ns for ns in self._unjoined() if ns in self._window]
+        for ns in self._segments.choose_waiting(waiting_ns):
+            result = self._frontend.relocalize(self._keyframes[ns], observations)
             if isinstance(result, Failure):
                 continue
-            edge = self._link_edge(stamp_ns, result)
-            before = segments.sighting
-            seen_ns = None if before is None else before.edge.reference_id
-            known = self._window.relative_pose(seen_ns, stamp_ns) if seen_ns in held_ns else None
-            if segments.confirms(edge, step.estimate, reference_ns, known):
-                return edge
-            segments.sighting = Sighting(raw=step.estimate, edge=edge)
-            return None
-        return None
+            edge, former_ns = self._edge_of(ns, result), self._segments.candidate_ns
+            known = self._window.relative_pose(former_ns, ns) if former_ns in waiting_ns else None
+            is_sure = self._segments.confirm(edge, step.estimate, step.registered_ns, known)
+            return [("keyframe", edge)] if is_sure else []
+        return []
 
-    def _note_segments(self, step: RawStep, causal: Estimate) -> tuple[SegmentJoin, ...]:
-        """Take what the window made of the frame; return the segments that it joins."""
+    def _add_to_window(self, step: RawStep, offered: list[_Offer], *, is_resumed: bool) -> Estimate:
+        stamp_ns = step.estimate.stamp_ns
+        edges = [edge for _, edge in offered]
+        status = Status.RESUMED if is_resumed else None
+        return self._window.add_pose(stamp_ns, stamp_ns, edges, status=status)
+
+    def _join_segments(self, step: RawStep, causal: Estimate) -> tuple[SegmentJoin, ...]:
+        """Return the segments that the accepted edges of a frame join."""
         stamp_ns = causal.stamp_ns
-        reference_ns = step.reference_ns if step.is_registered else None
-        self._segments.note_frame(stamp_ns, reference_ns, causal.status)
+        self._segments.note_frame(stamp_ns, step.registered_ns, causal.status)
         ties_ns = [int(edge.reference_id) for edge in self._window.edges(stamp_ns)]  # type: ignore[call-overload]
         joins = [self._segments.join(stamp_ns, tie_ns) for tie_ns in ties_ns]
         return tuple(join for join in joins if join is not None)
 
-    def _update_keyframes(
+    def _select_keyframes(
         self,
         observations: Any,  # noqa: ANN401 - the front-end's own
+        step: RawStep,
         scores: dict[int, float],
         causal: Estimate,
     ) -> None:
@@ -338,20 +341,20 @@ class Odometry:
             return
         config = self._config.window
         if config.n_keyframes > 0 and is_needed(scores, config):
-            self._keyframes.add(observations)
-            self._window.keep(observations.stamp_ns)
+            self._keyframes.add(observations, n_steps=step.n_steps)
+            self._window.keep(causal.stamp_ns)
             self._segments.note_keyframe()
-        apart = self._apart()
-        n_kept = len(self._keyframes) - len(apart)
+        unjoined = self._unjoined()
+        n_kept = len(self._keyframes) - len(unjoined)
         released = choose_released(scores, config, n_kept=n_kept)
-        for stamp_ns in released + apart[: max(len(apart) - config.n_keyframes, 0)]:
+        for stamp_ns in released + unjoined[: max(len(unjoined) - config.n_keyframes, 0)]:
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)
         for stamp_ns in self._keyframes.stamps_ns:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
 
-    def _hold_anchor(self) -> None:
+    def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
         previous, self._anchor_ns = self._anchor_ns, self._chain.anchor_ns
         if previous not in self._keyframes.stamps_ns and previous in self._window:
@@ -359,22 +362,12 @@ class Odometry:
         if self._anchor_ns in self._window:
             self._window.keep(self._anchor_ns)
 
-    def _hold_counts(self, stamp_ns: int) -> None:
-        needed = {stamp_ns, self._anchor_ns, *self._keyframes.stamps_ns}
-        self._n_steps = {ns: n for ns, n in self._n_steps.items() if ns in needed}
-
-    def _hold_frame(self, frame: Stamped) -> None:
-        held = {**self._frames, frame.stamp_ns: frame}
+    def _keep_frame(self, frame: Stamped) -> None:
+        if self._is_own:
+            return
+        frames = {**self._frames, frame.stamp_ns: frame}
         needed = self._anchor_ns, frame.stamp_ns
-        self._frames = {stamp_ns: held[stamp_ns] for stamp_ns in held if stamp_ns in needed}
-
-
-def _edge_of(step: RawStep) -> Edge:
-    return Edge(
-        reference_id=step.reference_ns,
-        T_reference_frame=step.T_reference_frame,
-        covariance=step.covariance,
-    )
+        self._frames = {ns: each for ns, each in frames.items() if ns in needed}
 
 
 def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
@@ -383,11 +376,14 @@ def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
     Both must hold: the image hardly moves, and the motion is insignificant against its own
     covariance, so that a slow motion that the registration can tell is not frozen.
     """
-    if not config.zero_motion or not step.is_registered or step.flow_px is None:
+    if not config.zero_motion or step.registration is None:
+        return None
+    flow_px = step.registration.flow_px
+    if flow_px is None or flow_px > config.zero_motion_flow_px:
         return None
     twist = se3.log(step.T_reference_frame)
     significance = np.sqrt(se3.mahalanobis(twist, step.covariance))
-    if step.flow_px > config.zero_motion_flow_px or significance > config.zero_motion_gate:
+    if significance > config.zero_motion_gate:
         return None
     return Edge(
         reference_id=step.reference_ns,
@@ -404,10 +400,6 @@ def _choose_frontend(
     if camera is None:
         raise ValueError("Odometry needs a camera, or a front-end of your own (frontend=...)")
     return make_frontend(camera, config)
-
-
-def _count_points(observations: object) -> int:
-    return len(observations) if isinstance(observations, Sized) else 0
 
 
 class Stopwatch:

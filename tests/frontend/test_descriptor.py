@@ -16,6 +16,7 @@ from gvo.types import (
     Failure,
     FloatArray,
     ImageArray,
+    MotionPrior,
     Observations,
     RelativePose,
     RgbdFrame,
@@ -209,7 +210,7 @@ def test_blank_images_give_no_points_and_no_motion(blank: str) -> None:
     nothing, something = frontend.extract(frame), frontend.extract(stereo_frame())
     assert len(nothing) == 0
     for pair in ((nothing, something), (something, nothing), (nothing, nothing)):
-        for prior in (None, np.eye(4)):
+        for prior in (None, MotionPrior(T_predicted=np.eye(4))):
             result = frontend.register(*pair, prior)
             assert isinstance(result, Failure)
             assert result.n_matches == 0
@@ -219,6 +220,10 @@ def moved(x_m: float) -> FloatArray:
     T = np.eye(4)
     T[0, 3] = x_m
     return T
+
+
+def expect(x_m: float) -> MotionPrior:
+    return MotionPrior(T_predicted=moved(x_m))
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
@@ -233,7 +238,7 @@ def test_the_motion_between_two_frames_is_found_with_and_without_a_prediction(
     else:
         frontend = DescriptorFrontend(COLOUR, configure())
         pair = [frontend.extract(rgbd_frame(x, stamp_ns=i)) for i, x in enumerate((0.0, x_m))]
-    priors = {"none": None, "true": moved(x_m), "wrong": moved(-0.08)}
+    priors = {"none": None, "true": expect(x_m), "wrong": expect(-0.08)}
     result = frontend.register(pair[0], pair[1], priors[prior])
     assert isinstance(result, RelativePose)
     np.testing.assert_allclose(result.T_reference_current, moved(x_m), atol=0.01)
@@ -244,8 +249,8 @@ def test_a_wrong_prediction_finds_nothing_where_the_wide_search_is_no_wider() ->
     config = configure(temporal={"radius_px": 6.0, "wide_radius_px": 6.0, "max_distance": 0.12})
     frontend = DescriptorFrontend(CAMERA, config)
     pair = [frontend.extract(stereo_frame(x, stamp_ns=i)) for i, x in enumerate((0.0, 0.12))]
-    assert isinstance(frontend.register(pair[0], pair[1], moved(-0.12)), Failure)
-    assert isinstance(frontend.register(pair[0], pair[1], moved(0.12)), RelativePose)
+    assert isinstance(frontend.register(pair[0], pair[1], expect(-0.12)), Failure)
+    assert isinstance(frontend.register(pair[0], pair[1], expect(0.12)), RelativePose)
 
 
 @settings(deadline=None, max_examples=3)

@@ -19,6 +19,7 @@ from gvo.types import (
     FaultyFrame,
     FloatArray,
     Frame,
+    MotionPrior,
     RelativePose,
     RgbdFrame,
     StereoFrame,
@@ -75,13 +76,17 @@ def test_the_points_lie_on_the_surfaces(sensor: Sensor) -> None:
     assert np.mean(np.abs(errors) < 1.0) > 0.85
 
 
+def expect(T: FloatArray | None) -> MotionPrior | None:
+    return None if T is None else MotionPrior(T_predicted=T)
+
+
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("prior", ["none", "true", "wrong", "far off"])
 def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior: str) -> None:
     T = true_motion(sensor, 0, 2)
     priors = {"none": None, "true": T, "wrong": wrong(T, 0.005), "far off": wrong(T, 0.02)}
     first, _, third = observations(sensor)[:3]
-    result = frontend(sensor).register(first, third, priors[prior])
+    result = frontend(sensor).register(first, third, expect(priors[prior]))
     assert isinstance(result, RelativePose)
     error = se3.log(se3.invert(result.T_reference_current) @ T)
     assert np.linalg.norm(error[:3]) < 1.5e-3
@@ -122,7 +127,9 @@ def test_the_errors_are_of_the_size_that_the_covariance_says(sensor: Sensor) -> 
             if reference == current:
                 continue
             T = true_motion(sensor, reference, current)
-            result = frontend(sensor).register(seen[reference], seen[current], wrong(T, 0.002))
+            result = frontend(sensor).register(
+                seen[reference], seen[current], expect(wrong(T, 0.002))
+            )
             assert isinstance(result, RelativePose)
             error = se3.log(se3.invert(result.T_reference_current) @ T)
             squares.append(error @ np.linalg.solve(result.covariance, error) / 6)
@@ -176,7 +183,7 @@ def test_blank_images_give_no_points_and_no_motion(sensor: Sensor) -> None:
     assert len(nothing) == 0
     for pair in ((nothing, something), (something, nothing), (nothing, nothing)):
         for prior in (None, np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])):
-            result = klt.register(*pair, prior)
+            result = klt.register(*pair, expect(prior))
             assert isinstance(result, Failure)
             assert "ransac.min_inliers" in result.reason
 

@@ -6,10 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gvo.frontend.protocol import Frontend, find_fault, register_checked
+from gvo.config import Config
+from gvo.frontend.protocol import CheckedFrontend, count_points, find_fault
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
-from gvo.types import Failure, FloatArray, RelativePose
+from gvo.geometry.camera import PinholeCamera
+from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
 
+CAMERA = PinholeCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
 COVARIANCE = np.diag([1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0])
 
 
@@ -69,41 +73,72 @@ class Answering:
     def extract(self, frame: Any) -> Any:
         return frame
 
-    def register(self, reference: Any, current: Any, prior: FloatArray | None) -> Any:
+    def register(self, reference: Any, current: Any, prior: MotionPrior | None) -> Any:
         return self.answer
 
 
 def ask(answer: object) -> RelativePose | Failure:
-    frontend: Frontend[Any] = Answering(answer)
-    return register_checked(frontend, None, None, None)
+    return CheckedFrontend(Answering(answer)).register(None, None, None)
 
 
-class Expecting(Answering):
-    """Says nothing but where the usual motion is known, and what it was handed."""
+class Capable(Answering):
+    """The same with all that a front-end may offer."""
 
-    handed: tuple[Any, ...] = ()
+    def __init__(self, answer: object) -> None:
+        super().__init__(answer)
+        self.camera = CAMERA
+        self.rig_offsets = RigOffsets(Config().stereo, is_stereo=True)
+        self.configs: list[Config] = []
 
-    def register_expecting(self, *handed: Any) -> Any:
-        self.handed = handed
-        return pose()
+    def relocalize(self, reference: Any, current: Any) -> Any:
+        return (reference, current) if self.answer == "pair" else self.answer
 
-
-def test_a_front_end_is_asked_with_the_usual_motion_where_it_can_be() -> None:
-    frontend, failure = Expecting(Failure(reason="dark")), Failure(reason="dark")
-    prior, T_usual = np.eye(4), se3.exp(np.ones(6))
-    assert register_checked(frontend, 1, 2, prior, T_usual=T_usual)
-    assert frontend.handed[:2] == (1, 2)
-    assert frontend.handed[2] is prior
-    assert frontend.handed[3] is T_usual
-    assert not register_checked(frontend, 1, 2, prior)
-    assert register_checked(Answering(failure), 1, 2, prior, T_usual=T_usual) is failure
+    def reconfigure(self, config: Config) -> None:
+        self.configs.append(config)
 
 
-def test_answers_with_the_usual_motion_are_checked_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    frontend = Expecting(None)
-    monkeypatch.setattr(frontend, "register_expecting", lambda *handed: None)
-    with pytest.raises(ValueError, match="register_expecting of Expecting must return"):
-        register_checked(frontend, 1, 2, None, T_usual=np.eye(4))
+def test_a_front_end_of_two_methods_is_asked_for_no_more() -> None:
+    frontend = CheckedFrontend(Answering(pose()))
+    assert frontend.camera is None
+    assert frontend.rig_offsets is None
+    frontend.reconfigure(Config())
+    assert frontend.extract(5) == 5
+    assert frontend.relocalize(1, 2)
+
+
+def test_what_a_front_end_offers_is_used() -> None:
+    inner = Capable(Failure(reason="never seen"))
+    frontend = CheckedFrontend(inner)
+    assert frontend.camera is CAMERA
+    assert frontend.rig_offsets is inner.rig_offsets
+    config = Config()
+    frontend.reconfigure(config)
+    assert inner.configs == [config]
+    assert frontend.relocalize(1, 2) is inner.answer
+
+
+def test_what_is_offered_must_be_what_its_name_says() -> None:
+    inner = Capable("pair")
+    inner.camera, inner.rig_offsets = "a camera", 0.3  # type: ignore[assignment]
+    frontend = CheckedFrontend(inner)
+    assert frontend.camera is None
+    assert frontend.rig_offsets is None
+    with pytest.raises(ValueError, match=r"relocalize of Capable must return .* got tuple"):
+        frontend.relocalize(1, 2)
+
+
+def test_points_are_counted_where_the_observations_tell() -> None:
+    assert count_points(object()) == (0, 0)
+    assert count_points([1, 2]) == (2, 2)
+    assert count_points(Observed(7)) == (7, 2)
+
+
+@dataclass
+class Observed:
+    n_keypoints: int
+
+    def __len__(self) -> int:
+        return 2
 
 
 def test_sound_answers_are_handed_through() -> None:

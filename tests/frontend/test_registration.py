@@ -14,7 +14,7 @@ from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.types import Failure, FloatArray, IntArray, Observations, RelativePose
+from gvo.types import Failure, FloatArray, IntArray, MotionPrior, Observations, RelativePose
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
@@ -65,7 +65,7 @@ def register_matches(
         camera,
         config,
         stamps_ns=(reference.stamp_ns, current.stamp_ns),
-        start=start,
+        prior=None if start is None else MotionPrior(T_predicted=start),
         with_offset=with_offset,
     )
 

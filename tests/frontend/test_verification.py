@@ -8,7 +8,7 @@ from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.types import Contradiction, Failure, FloatArray, RelativePose
+from gvo.types import Contradiction, Failure, FloatArray, MotionPrior, RelativePose
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.3)
 SIGMA_PX = 0.2
@@ -41,9 +41,9 @@ def matches_of(*groups: tuple[FloatArray, int], n_wrong: int = 0) -> Corresponde
 
 def register(matches: Correspondences, prior: FloatArray | None) -> RelativePose | Failure:
     indices = np.tile(np.arange(len(matches))[:, np.newaxis], 2)
-    start = None if prior is None else se3.exp(prior)
+    expected = None if prior is None else MotionPrior(T_predicted=se3.exp(prior))
     return register_correspondences(
-        matches, indices, CAMERA, Config(), stamps_ns=(1, 2), start=start
+        matches, indices, CAMERA, Config(), stamps_ns=(1, 2), prior=expected
     )
 
 

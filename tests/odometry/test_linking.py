@@ -8,7 +8,7 @@ import pytest
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.odometry.chain import RawStep
-from gvo.odometry.keyframes import count_steps, link_keyframes
+from gvo.odometry.keyframes import link_keyframes
 from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
 
 CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_gain=2.5, gate=10.0)
@@ -119,11 +119,3 @@ def test_an_unsteady_step_is_checked_until_a_keyframe_bears_it_out() -> None:
     assert linked(Registrations(of_80=None), unsteady, link_gain=4.0) == [10]
     unregistered = step_of(is_registered=False)
     assert linked(Registrations(), unregistered, link_gain=4.0) == [80, 10]
-
-
-def test_steps_are_counted_from_where_they_start() -> None:
-    counts = {80: 7, 90: 8}
-    assert count_steps(step_of(), counts) == 9
-    assert count_steps(step_of(reference_ns=80), counts) == 8
-    assert count_steps(step_of(is_registered=False), counts) > 100
-    assert count_steps(step_of(reference_ns=None), {}) == 0

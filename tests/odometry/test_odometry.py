@@ -24,6 +24,7 @@ from gvo.types import (
     Frame,
     FrameResult,
     ImageArray,
+    MotionPrior,
     RelativePose,
     RgbdFrame,
     Status,
@@ -378,7 +379,7 @@ class ScanFrontend:
         return frame
 
     def register(
-        self, reference: Scan, current: Scan, prior: FloatArray | None
+        self, reference: Scan, current: Scan, prior: MotionPrior | None
     ) -> RelativePose | Failure:
         self.pairs.append((reference.stamp_ns, current.stamp_ns))
         if reference.T_world_scan is None or current.T_world_scan is None:
@@ -425,7 +426,7 @@ class OnceWrongFrontend(ScanFrontend):
     """Registers one pair of consecutive scans wrong by a metre and a half, and is sure of it."""
 
     def register(
-        self, reference: Scan, current: Scan, prior: FloatArray | None
+        self, reference: Scan, current: Scan, prior: MotionPrior | None
     ) -> RelativePose | Failure:
         result = super().register(reference, current, prior)
         if isinstance(result, Failure) or self.pairs[-1] != (20 * STEP_NS, 21 * STEP_NS):

@@ -10,7 +10,15 @@ from gvo.config import Config
 from gvo.geometry import se3
 from gvo.odometry.odometry import Odometry
 from gvo.odometry.segments import Segments
-from gvo.types import Failure, FloatArray, FrameResult, RelativePose, SegmentJoin, Status
+from gvo.types import (
+    Failure,
+    FloatArray,
+    FrameResult,
+    MotionPrior,
+    RelativePose,
+    SegmentJoin,
+    Status,
+)
 
 STEP_NS = 100_000_000
 SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2])
@@ -40,7 +48,7 @@ class Beacon:
         return frame
 
     def register(
-        self, reference: Place, current: Place, prior: FloatArray | None
+        self, reference: Place, current: Place, prior: MotionPrior | None
     ) -> RelativePose | Failure:
         T = true_step(reference, current)
         if reference.is_dark or current.is_dark or np.linalg.norm(T[:3, 3]) > self.reach_m:
@@ -164,14 +172,14 @@ def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:
     assert joins[0].reference_ns == 9 * STEP_NS
 
 
-def test_sightings_that_contradict_each_other_join_nothing() -> None:
+def test_candidates_that_contradict_each_other_join_nothing() -> None:
     seen = iter(range(1000))
     results = run(Beacon(see=lambda T: np.asarray(at(0.5 * next(seen)) @ T)), walk(away=AWAY))
     assert not any(result.joins for result in results)
     assert errors(results, walk(away=AWAY))[-1] > 1.0
 
 
-def test_a_false_sighting_is_forgotten_when_the_next_two_agree() -> None:
+def test_a_false_candidate_is_forgotten_when_the_next_two_agree() -> None:
     n_false = iter(range(1000))
     places = walk(away=AWAY)
     results = run(Beacon(see=lambda T: T if next(n_false) else np.asarray(at(5.0) @ T)), places)
@@ -231,17 +239,17 @@ def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> 
         segments.note_frame(n, None, Status.LOST)
         segments.note_frame(n + 1, n, Status.RESUMED)
     assert segments.current == 3
-    assert segments.apart([5, 15, 25, 35]) == [5, 15, 25]
+    assert segments.unjoined([5, 15, 25, 35]) == [5, 15, 25]
     assert segments.join(31, 5) == SegmentJoin(segment=3, to_segment=0, stamp_ns=31, reference_ns=5)
-    assert segments.apart([5, 15, 25, 35]) == [15, 25]
+    assert segments.unjoined([5, 15, 25, 35]) == [15, 25]
     assert segments.join(32, 15) is not None
-    assert segments.apart([5, 15, 25, 35]) == [25]
+    assert segments.unjoined([5, 15, 25, 35]) == [25]
     assert segments.join(33, 5) is None
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
 def test_every_waiting_keyframe_has_its_turn(n: int) -> None:
     segments = Segments()
-    held = list(range(n))
-    looked = [ns for _ in range(10) for ns in segments.to_look_for(held)]
-    assert set(looked) == set(held)
+    waiting = list(range(n))
+    looked = [ns for _ in range(10) for ns in segments.choose_waiting(waiting)]
+    assert set(looked) == set(waiting)

@@ -16,8 +16,16 @@ from gvo.frontend.klt import KltFrontend, KltObservations
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
-from gvo.testing.fingerprint import fingerprint
-from gvo.types import Failure, FaultyFrame, FloatArray, Frame, Observations, RelativePose
+from gvo.testing.frontend import fingerprint
+from gvo.types import (
+    Failure,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    MotionPrior,
+    Observations,
+    RelativePose,
+)
 
 Result = RelativePose | Failure
 
@@ -54,7 +62,7 @@ class Faulty(KltFrontend):
         self._spoil = spoil
 
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         spoilt: Result = self._spoil(result) if isinstance(result, RelativePose) else result
@@ -143,45 +151,54 @@ def test_a_place_found_again_must_be_the_right_one(frontend: Sound, reason: str)
         check_frontend(frontend, frames("stereo"))
 
 
-class BelievesTheUsualMotion(Sound):
-    def register_expecting(self, *arguments: Any) -> Result:
-        result = super().register_expecting(*arguments)
-        if isinstance(result, Failure) or arguments[3] is None:
+class BelievesTheRecentMotion(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure) or prior is None or prior.T_recent is None:
             return result
-        return replace(result, T_reference_current=arguments[3].copy())
+        return replace(result, T_reference_current=prior.T_recent.copy())
 
 
-class ChangesTheUsualMotion(Sound):
-    def register_expecting(self, *arguments: Any) -> Result:
-        if arguments[3] is not None:
-            arguments[3][0, 3] += 1.0
-        return super().register_expecting(*arguments)
+class ChangesTheRecentMotion(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
+    ) -> Result:
+        if prior is not None and prior.T_recent is not None:
+            prior.T_recent.setflags(write=True)
+            prior.T_recent[0, 3] += 1.0
+        return super().register(reference, current, prior)
 
 
-class FailsWithTheUsualMotion(Sound):
-    def register_expecting(self, *arguments: Any) -> Result:
-        is_known = arguments[3] is not None
-        return Failure(reason="odd") if is_known else super().register_expecting(*arguments)
+class FailsWithTheRecentMotion(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
+    ) -> Result:
+        is_known = prior is not None and prior.T_recent is not None
+        return Failure(reason="odd") if is_known else super().register(reference, current, prior)
 
 
-class AlwaysFindsTheUsualMotion(Sound):
-    def register_expecting(self, *arguments: Any) -> Result:
-        result = super().register_expecting(*arguments)
-        if isinstance(result, RelativePose) or arguments[3] is None:
+class AlwaysFindsTheRecentMotion(Sound):
+    def register(
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
+    ) -> Result:
+        result = super().register(reference, current, prior)
+        if isinstance(result, RelativePose) or prior is None or prior.T_recent is None:
             return result
-        return RelativePose(T_reference_current=arguments[3].copy(), covariance=np.eye(6))
+        return RelativePose(T_reference_current=prior.T_recent.copy(), covariance=np.eye(6))
 
 
 @pytest.mark.parametrize(
     ("frontend", "reason"),
     [
-        (BelievesTheUsualMotion, "^register_expecting.* a usual motion disagree by"),
-        (ChangesTheUsualMotion, "^register_expecting.* changes its argument T_usual"),
-        (FailsWithTheUsualMotion, "^register_expecting.* fails with a usual motion.*: odd"),
-        (AlwaysFindsTheUsualMotion, "are registered"),
+        (BelievesTheRecentMotion, "^register.* a recent mean motion disagree by"),
+        (ChangesTheRecentMotion, "^register.* changes its argument prior"),
+        (FailsWithTheRecentMotion, "^register.* fails with a recent mean motion.*: odd"),
+        (AlwaysFindsTheRecentMotion, "are registered"),
     ],
 )
-def test_a_usual_motion_must_not_be_believed_blindly(frontend: type[Sound], reason: str) -> None:
+def test_a_recent_motion_must_not_be_believed_blindly(frontend: type[Sound], reason: str) -> None:
     with pytest.raises(ContractError, match=reason):
         check_frontend(frontend(), frames("stereo"))
 
@@ -214,27 +231,28 @@ class ExtractsAtRandom(SoundDescriptor):
 
 class BelievesThePrior(Sound):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         if isinstance(result, Failure) or prior is None:
             return result
-        return replace(result, T_reference_current=prior.copy())
+        return replace(result, T_reference_current=prior.T_predicted.copy())
 
 
 class ChangesThePrior(Sound):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         if prior is not None:
-            prior[0, 3] += 1.0
+            prior.T_predicted.setflags(write=True)
+            prior.T_predicted[0, 3] += 1.0
         return result
 
 
 class ChangesObservations(SoundDescriptor):
     def register(
-        self, reference: Observations, current: Observations, prior: FloatArray | None = None
+        self, reference: Observations, current: Observations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         current.points_cam[:1] += 1.0
@@ -243,7 +261,7 @@ class ChangesObservations(SoundDescriptor):
 
 class RaisesOnNothing(Sound):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         if isinstance(result, Failure):
@@ -253,7 +271,7 @@ class RaisesOnNothing(Sound):
 
 class AlwaysFindsSomething(Sound):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         if isinstance(result, Failure):
@@ -263,7 +281,7 @@ class AlwaysFindsSomething(Sound):
 
 class GivesNoReason(Sound):
     def register(
-        self, reference: KltObservations, current: KltObservations, prior: FloatArray | None = None
+        self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
     ) -> Result:
         result = super().register(reference, current, prior)
         return Failure(reason=" ") if isinstance(result, Failure) else result
@@ -312,7 +330,7 @@ class ScanFrontend:
     def extract(self, frame: Scan) -> Scan:
         return frame
 
-    def register(self, reference: Scan, current: Scan, prior: FloatArray | None) -> Result:
+    def register(self, reference: Scan, current: Scan, prior: MotionPrior | None) -> Result:
         if reference.T_world_scan is None or current.T_world_scan is None:
             return Failure(reason="an empty scan")
         T = se3.invert(reference.T_world_scan) @ current.T_world_scan
@@ -353,7 +371,7 @@ class OffByAFewSigmas(ScanFrontend):
         self._respect = respect
         self._error = se3.exp(np.array([0.0, 1e-3 * n_each, 0.0, 0.0, 0.0, 0.0]))
 
-    def register(self, reference: Scan, current: Scan, prior: FloatArray | None) -> Result:
+    def register(self, reference: Scan, current: Scan, prior: MotionPrior | None) -> Result:
         result = super().register(reference, current, prior)
         is_off = {
             "itself": reference.stamp_ns == current.stamp_ns,

@@ -11,12 +11,12 @@ from gvo.frontend.factory import make_frontend
 from gvo.frontend.protocol import Stamped
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.types import Failure, FloatArray, Frame, RelativePose
+from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:
-    """One call of a front-end's `register`, `register_expecting` or `relocalize`.
+    """One call of a front-end's `register` or `relocalize`.
 
     Parameters
     ----------
@@ -121,22 +121,13 @@ class WatchedFrontend:
         self,
         reference: Any,  # noqa: ANN401 - the front-end's own
         current: Any,  # noqa: ANN401
-        prior: FloatArray | None = None,
+        prior: MotionPrior | None = None,
     ) -> RelativePose | Failure:
         """Register as the front-end does."""
-        return self.register_expecting(reference, current, prior, None)
-
-    def register_expecting(
-        self,
-        reference: Any,  # noqa: ANN401 - the front-end's own
-        current: Any,  # noqa: ANN401
-        prior: FloatArray | None,
-        T_usual: FloatArray | None,
-    ) -> RelativePose | Failure:
-        """Register as the front-end does where the usual motion is known too."""
         with watched() as events:
-            result = self._frontend.register_expecting(reference, current, prior, T_usual)
-        self._append(reference, prior, result, events)
+            result = self._frontend.register(reference, current, prior)
+        T_predicted = None if prior is None else prior.T_predicted
+        self._append(reference, T_predicted, result, events)
         return result
 
     def relocalize(

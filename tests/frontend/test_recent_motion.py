@@ -1,4 +1,4 @@
-"""Matches that continue the usual motion, while the prediction has been drawn away from it."""
+"""Matches that continue the recent mean motion, where the prediction was drawn away from it."""
 
 from dataclasses import dataclass
 from importlib import import_module
@@ -12,13 +12,12 @@ from gvo.config import Config, WindowConfig
 from gvo.diagnostics.explain.watch import WatchedFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend
-from gvo.frontend.protocol import register_checked
 from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.odometry.chain import RawChain
-from gvo.types import Failure, FloatArray, RelativePose
+from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, RgbdFrame
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 STATED_PX = 0.7
@@ -47,12 +46,14 @@ def matches_of(*groups: tuple[FloatArray, int], noise_px: float) -> Corresponden
 
 
 def register(
-    matches: Correspondences, prior: FloatArray, T_usual: FloatArray | None = None
+    matches: Correspondences, T_predicted: FloatArray, T_recent: FloatArray | None = None
 ) -> FloatArray:
     """Return the translation that is found, metres."""
     indices = np.tile(np.arange(len(matches))[:, np.newaxis], 2)
     result = register_correspondences(
-        *(matches, indices, CAMERA, Config()), stamps_ns=(1, 2), start=prior, T_usual=T_usual
+        *(matches, indices, CAMERA, Config()),
+        stamps_ns=(1, 2),
+        prior=MotionPrior(T_predicted=T_predicted, T_recent=T_recent),
     )
     assert isinstance(result, RelativePose), result
     return np.asarray(result.T_reference_current[:3, 3])
@@ -75,7 +76,7 @@ def test_a_bus_that_has_drawn_the_prediction_along_is_not_followed(n_bus: int) -
         pytest.param((-BUS, 60), BUS, 0.05, id="the others are no nearer to it"),
     ],
 )
-def test_a_result_stays_bit_by_bit_where_the_usual_motion_says_nothing(
+def test_a_result_stays_bit_by_bit_where_the_recent_motion_says_nothing(
     others: tuple[FloatArray, int], bus: FloatArray, noise_px: float
 ) -> None:
     matches = matches_of(others, (bus, 200), noise_px=noise_px)
@@ -88,7 +89,7 @@ def test_a_result_stays_bit_by_bit_where_the_usual_motion_says_nothing(
     ("kind", "heeding", "n_rounds"),
     [("klt", [True, False, False], 1), ("descriptor", [True, True, False], 3)],
 )
-def test_the_usual_motion_is_heeded_where_the_prediction_is_and_not_in_the_round_after_it(
+def test_the_recent_motion_counts_where_the_prediction_is_and_not_in_the_round_after_it(
     kind: str, heeding: list[bool], n_rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
@@ -96,43 +97,44 @@ def test_the_usual_motion_is_heeded_where_the_prediction_is_and_not_in_the_round
         recording.info.camera, Config.model_validate({"frontend": {"kind": kind}})
     )
     pair = [frontend.extract(frame) for frame in gvo.frames(recording, Config())]
-    T_usual, handed = se3.exp(BUS), []
+    still, recent = np.eye(4), se3.exp(BUS)
+    handed: list[bool] = []
 
     def spy(*arguments: Any, **options: Any) -> RelativePose | Failure:
-        handed.append(options.get("T_usual"))
+        prior = options.get("prior")
+        handed.append(prior is not None and prior.T_recent is not None)
         # The first round leads to nothing, so that all that follow are made.
         return Failure(reason="") if len(handed) == 1 else real(*arguments, **options)
 
     module = import_module(type(frontend).__module__)
     real = module.register_correspondences
     monkeypatch.setattr(module, "register_correspondences", spy)
-    assert isinstance(frontend.register_expecting(*pair, np.eye(4), T_usual), RelativePose)
-    assert [each is T_usual for each in handed] == heeding
+    prior = MotionPrior(T_predicted=still, T_recent=recent)
+    assert isinstance(frontend.register(*pair, prior), RelativePose)
+    assert handed == heeding
     handed.clear()
     # Tracks are not searched widely where nothing but a prior is known, that of a keyframe.
-    assert isinstance(frontend.register(*pair, np.eye(4)), RelativePose) == (n_rounds > 1)
-    assert handed == [None] * n_rounds
+    prior = MotionPrior(T_predicted=still)
+    assert isinstance(frontend.register(*pair, prior), RelativePose) == (n_rounds > 1)
+    assert handed == [False] * n_rounds
 
 
-def test_a_front_end_inside_another_is_handed_the_usual_motion_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_watched_front_end_hands_on_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
-    frontend: Any = WatchedFrontend(recording.info.camera, Config())
-    first, second = (frontend.extract(frame) for frame in gvo.frames(recording, Config()))
+    frontend = WatchedFrontend(recording.info.camera, Config())
+    pair = [f for f in gvo.frames(recording, Config()) if isinstance(f, RgbdFrame)]
+    first, second = (frontend.extract(frame) for frame in pair)
     handed: list[Any] = []
 
     def spy(_: KltFrontend, *arguments: Any) -> Failure:
         handed[:] = arguments
         return Failure(reason="dark")
 
-    monkeypatch.setattr(KltFrontend, "register_expecting", spy)
-    prior, T_usual = np.eye(4), se3.exp(BUS)
-    assert not register_checked(frontend, first, second, prior, T_usual=T_usual)
-    for given, known in zip(handed, (first, second, prior, T_usual), strict=True):
+    monkeypatch.setattr(KltFrontend, "register", spy)
+    prior = MotionPrior(T_predicted=np.eye(4), T_recent=se3.exp(BUS))
+    assert not frontend.register(first, second, prior)
+    for given, known in zip(handed, (first, second, prior), strict=True):
         assert given is known
-    assert not register_checked(frontend, first, second, prior)
-    assert handed[3] is None
 
 
 @dataclass
@@ -145,30 +147,21 @@ class Scripted:
 
     def __init__(self, steps_m: list[float]) -> None:
         self.steps_m = steps_m
-        self.usual_m: list[float] = []
+        self.recent_m: list[float] = []
 
     def extract(self, frame: Seen) -> Seen:
         return frame
 
-    def register(self, reference: Seen, current: Seen, prior: FloatArray | None) -> RelativePose:
-        assert prior is None, "asked without the usual motion, which is known"
+    def register(self, reference: Seen, current: Seen, prior: MotionPrior | None) -> RelativePose:
+        if prior is not None:
+            assert prior.T_recent is not None
+            self.recent_m.append(float(prior.T_recent[0, 3]))
         T = np.eye(4)
         T[0, 3] = self.steps_m.pop(0)
-        return RelativePose(
-            T_reference_current=T,
-            covariance=1e-6 * np.eye(6),
-            matches=np.zeros((0, 2), dtype=np.int64),
-            inliers=np.zeros(0, dtype=np.bool_),
-        )
-
-    def register_expecting(
-        self, reference: Seen, current: Seen, prior: FloatArray, T_usual: FloatArray
-    ) -> RelativePose:
-        self.usual_m.append(float(T_usual[0, 3]))
-        return self.register(reference, current, None)
+        return RelativePose(T_reference_current=T, covariance=1e-6 * np.eye(6))
 
 
-def test_the_usual_velocity_is_the_median_of_the_last_second() -> None:
+def test_the_recent_velocity_is_the_median_of_the_last_second() -> None:
     # Uneven, so that every other number of steps, and their mean, would be seen.
     steps_m = [0.01 * n**2 for n in range(30)]
     frontend = Scripted(list(steps_m))
@@ -177,4 +170,4 @@ def test_the_usual_velocity_is_the_median_of_the_last_second() -> None:
         chain.advance(Seen(100_000_000 * n))
     # At 10 Hz: those that ended a second ago or later, and the last one.
     expected = [np.median(steps_m[max(n - 11, 0) : n]) for n in range(1, len(steps_m))]
-    np.testing.assert_allclose(frontend.usual_m, expected, atol=1e-12)
+    np.testing.assert_allclose(frontend.recent_m, expected, atol=1e-12)
