@@ -19,7 +19,7 @@ from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.excerpt import Excerpt, take_excerpt
 from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
-from gvo.io.sync import Pair, StrayStamps, pair_images
+from gvo.io.sync import Pair, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _ROW_STEP = 64
@@ -194,7 +194,7 @@ def paired(
     Yields
     ------
     pair of StampedImage, or FaultyFrame
-        Also for images of which the stamp alone is wrong, see `StrayStamps`.
+        Also for images of which the stamp alone is wrong, see `StampFilter`.
 
     Raises
     ------
@@ -203,9 +203,9 @@ def paired(
     """
     key = pair_limit_key(sensor)
     limit = float(getattr(sync, key)) if limit_ms is None else limit_ms
-    stamps = StrayStamps(_readable(images))
+    stamps = StampFilter(_readable(images))
     pairs = pair_images(
-        stamps.sound(),
+        stamps.images(),
         limit_ns=round(limit * 1e6),
         partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
         queue_size=sync.queue_size,

@@ -320,7 +320,7 @@ _LEAP_NS = 1_000_000_000
 _N_TO_CONFIRM = 3
 
 
-class StrayStamps:
+class StampFilter:
     """Takes out images with a stamp far ahead of those before and after.
 
     Frames have increasing stamps: one that is an hour ahead would make all frames of the next
@@ -340,7 +340,7 @@ class StrayStamps:
         self._waiting: tuple[list[StampedImage], list[StampedImage]] = ([], [])
         self._faulty: list[FaultyFrame] = []
 
-    def sound(self) -> Iterator[StampedImage]:
+    def images(self) -> Iterator[StampedImage]:
         """Yield all images but those with stray stamps.
 
         Raises

@@ -92,7 +92,7 @@ def traffic_at(speed: float, seed: int) -> SyntheticRecording:
         T_map_body[0, 3] *= speed
         return T_map_body
 
-    recording._stage = replace(recording._stage, path=path)
+    recording._moving_scene = replace(recording._moving_scene, path=path)
     return recording
 
 

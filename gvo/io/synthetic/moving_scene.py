@@ -27,7 +27,7 @@ _BEHIND_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Stage:
+class MovingScene:
     """A scene of which some rectangles move as one body, and one may be a mirror.
 
     Parameters

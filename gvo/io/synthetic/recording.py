@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
-from gvo.io.synthetic.moving_scene import Stage
+from gvo.io.synthetic.moving_scene import MovingScene
 from gvo.io.synthetic.rendering import to_uint8
 from gvo.io.synthetic.scene import Scene
 from gvo.io.synthetic.worlds.deceptive import (
@@ -189,7 +189,7 @@ _START_NS = 1_700_000_000_000_000_000
 class _World:
     """A scene, a motion through it, and the cameras that fit."""
 
-    build: Callable[[int], Scene | Stage]
+    build: Callable[[int], Scene | MovingScene]
     move: Callable[[FloatArray], FloatArray]
     camera: PinholeCamera
     baseline: float
@@ -198,7 +198,7 @@ class _World:
 
 
 def _by_car(
-    build: Callable[[int], Scene | Stage], move: Callable[[FloatArray], FloatArray]
+    build: Callable[[int], Scene | MovingScene], move: Callable[[FloatArray], FloatArray]
 ) -> _World:
     return _World(
         build=build,
@@ -213,7 +213,7 @@ def _by_car(
 
 
 def _by_hand(
-    build: Callable[[int], Scene | Stage], move: Callable[[FloatArray], FloatArray]
+    build: Callable[[int], Scene | MovingScene], move: Callable[[FloatArray], FloatArray]
 ) -> _World:
     return _World(
         build=build,
@@ -295,7 +295,7 @@ class SyntheticRecording:
         self._elapsed_ns: IntArray = frames * 1_000_000_000 // setting.rate_hz
         self._T_map_cam = setting.move(np.asarray(1e-9 * self._elapsed_ns, dtype=np.float64))
         built = setting.build(seed)
-        self._stage = built if isinstance(built, Stage) else Stage(scene=built)
+        self._moving_scene = built if isinstance(built, MovingScene) else MovingScene(scene=built)
 
     @property
     def info(self) -> RecordingInfo:
@@ -344,7 +344,7 @@ class SyntheticRecording:
         """
         T_map_cam, camera = self._view(index, stream)
         is_reflected = self._sensor == "stereo"
-        return self._stage.render_depth(
+        return self._moving_scene.render_depth(
             self._elapsed_s(index), T_map_cam, camera, is_reflected=is_reflected
         )
 
@@ -368,7 +368,7 @@ class SyntheticRecording:
     def _load_image(self, index: int, stream: int, rng: np.random.Generator) -> ImageArray:
         T_map_cam, camera = self._view(index, stream)
         elapsed_s = self._elapsed_s(index)
-        grey = self._stage.render_image(elapsed_s, T_map_cam, camera)
+        grey = self._moving_scene.render_image(elapsed_s, T_map_cam, camera)
         return to_uint8(expose(grey, self._noise, rng, stream=stream, elapsed_s=elapsed_s))
 
 

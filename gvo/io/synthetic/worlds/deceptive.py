@@ -10,7 +10,7 @@ import numpy as np
 
 from gvo.geometry.se3 import exp, make_transform
 from gvo.io.synthetic import textures as paint
-from gvo.io.synthetic.moving_scene import Stage
+from gvo.io.synthetic.moving_scene import MovingScene
 from gvo.io.synthetic.scene import Rectangle, Scene, make_scene
 from gvo.io.synthetic.textures import Texture
 from gvo.io.synthetic.worlds.building import box, plain, slab, stretched, wall
@@ -60,11 +60,11 @@ def bus_path(elapsed_s: float) -> FloatArray:
 
 
 @lru_cache(maxsize=2)
-def traffic(seed: int) -> Stage:
+def traffic(seed: int) -> MovingScene:
     """Build the street with a gap for the crossing, and the bus."""
     still = [*filter(_leaves_way, street_rectangles(seed))]
     textures = street_textures(seed) | {"bus": _bus_side(np.random.default_rng([seed, 4]))}
-    return Stage(
+    return MovingScene(
         scene=make_scene([*still, *_bus()], textures, DAYLIGHT),
         n_still=len(still),
         path=bus_path,
@@ -210,7 +210,7 @@ _BLANK_S = 2.5
 
 
 @lru_cache(maxsize=2)
-def mirror_room(seed: int) -> Stage:
+def mirror_room(seed: int) -> MovingScene:
     """Build the room with a standing mirror that swings about its upright axis."""
     still = room_rectangles()
     width, height = _MIRROR_M
@@ -223,7 +223,7 @@ def mirror_room(seed: int) -> Stage:
         *box(np.array([half + 0.03, 0.03]), 0.0, (0.04, 0.06, height), plain("wood")),
     ]
     textures = room_textures(seed) | {"black": paint.finish(paint.blank(0), (1.0, 1.0))}
-    return Stage(
+    return MovingScene(
         scene=make_scene([*still, glass, *frame], textures, LAMP),
         n_still=len(still),
         path=_swing,
@@ -240,11 +240,11 @@ def _swing(elapsed_s: float) -> FloatArray:
 
 
 @lru_cache(maxsize=2)
-def blank_room(seed: int) -> Stage:
+def blank_room(seed: int) -> MovingScene:
     """Build the room with a wall of one grey behind the camera, from floor to ceiling."""
     blank: Texture = paint.finish(paint.blank(190), (1.0, 1.0))
     board = wall(np.array([2.0, -1.97]), np.array([-2.0, -1.97]), (0.0, 2.5), stretched("blank"))
-    return Stage(
+    return MovingScene(
         scene=make_scene([*room_rectangles(), board], room_textures(seed) | {"blank": blank}, LAMP)
     )
 

@@ -29,14 +29,14 @@ def test_frames_depend_neither_on_one_another_nor_on_the_length(world, sensor) -
 
 
 def test_the_bus_stands_where_its_path_says() -> None:
-    stage = traffic(0)
+    moving = traffic(0)
     for elapsed_s in (5.0, 6.0, 7.5):
-        depth = stage.render_depth(
+        depth = moving.render_depth(
             elapsed_s, looking_north(0.0, 36.0, 1.65), CAMERA, is_reflected=False
         )
         near_side = bus_path(elapsed_s)[1, 3] - 2.55 / 2
         assert depth[60, 80] == pytest.approx(near_side - 36.0, abs=1e-4)
-    depth = stage.render_depth(0.0, looking_north(0.0, 36.0, 1.65), CAMERA, is_reflected=False)
+    depth = moving.render_depth(0.0, looking_north(0.0, 36.0, 1.65), CAMERA, is_reflected=False)
     assert depth[60, 80] > 20.0
 
 
@@ -47,10 +47,10 @@ def test_the_bus_fills_most_of_the_view_while_it_stands() -> None:
 
 
 def test_a_still_mirror_shows_the_room_behind_it() -> None:
-    stage = mirror_room(0)
+    moving = mirror_room(0)
     T_map_cam = looking_north(0.3, -0.2)
-    glass = stage.render_depth(0.0, T_map_cam, CAMERA, is_reflected=False)
-    seen = stage.render_depth(0.0, T_map_cam, CAMERA, is_reflected=True)
+    glass = moving.render_depth(0.0, T_map_cam, CAMERA, is_reflected=False)
+    seen = moving.render_depth(0.0, T_map_cam, CAMERA, is_reflected=True)
     assert glass[60, 80] == pytest.approx(1.25 + 0.2, abs=1e-4)
     # To the mirror, and from it to the wall at y = -2 behind the camera.
     assert seen[60, 80] == pytest.approx(1.45 + 3.25, abs=1e-4)
@@ -58,20 +58,20 @@ def test_a_still_mirror_shows_the_room_behind_it() -> None:
 
 def test_the_reflection_is_what_a_camera_behind_the_glass_would_see() -> None:
     """A camera mirrored in the glass sees the room, its image turned over left and right."""
-    stage = mirror_room(0)
-    scene = stage.at(1.7)
-    assert stage.mirror is not None
+    moving = mirror_room(0)
+    scene = moving.at(1.7)
+    assert moving.mirror is not None
     T_map_cam = looking_north(0.2, -0.3)
-    seen = stage.render_depth(1.7, T_map_cam, CAMERA, is_reflected=True)
-    normal = np.cross(scene.axes_s[stage.mirror], scene.axes_t[stage.mirror])
+    seen = moving.render_depth(1.7, T_map_cam, CAMERA, is_reflected=True)
+    normal = np.cross(scene.axes_s[moving.mirror], scene.axes_t[moving.mirror])
     H = np.eye(3) - 2.0 * np.outer(normal, normal)
-    point = scene.origins[stage.mirror]
+    point = scene.origins[moving.mirror]
     flip = np.diag([-1.0, 1.0, 1.0])
     T_map_twin = se3.make_transform(
         H @ T_map_cam[:3, :3] @ flip, H @ (T_map_cam[:3, 3] - point) + point
     )
     twin = render_depth(scene, T_map_twin, CAMERA, beyond=(point, -normal))[:, ::-1]
-    glass = stage.render_depth(1.7, T_map_cam, CAMERA, is_reflected=False)
+    glass = moving.render_depth(1.7, T_map_cam, CAMERA, is_reflected=False)
     is_glass = np.abs(seen - glass) > 0.05
     assert is_glass.mean() > 0.3
     assert np.quantile(np.abs(seen - twin)[is_glass], 0.98) < 1e-3

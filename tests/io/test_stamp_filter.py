@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gvo.errors import RecordingError
 from gvo.io.recording import StampedImage
-from gvo.io.sync import StrayStamps
+from gvo.io.sync import StampFilter
 
 _S = 1_000_000_000
 
@@ -20,8 +20,8 @@ def _image(stamp_ns: int, stream: int = 0) -> StampedImage:
 
 def _sorted_out(stamps_s: list[float]) -> tuple[list[float], list[float]]:
     """Return the stamps that are let through and those that are taken out, seconds."""
-    stray = StrayStamps(_image(round(stamp_s * _S)) for stamp_s in stamps_s)
-    through = [image.stamp_ns / _S for image in stray.sound()]
+    stray = StampFilter(_image(round(stamp_s * _S)) for stamp_s in stamps_s)
+    through = [image.stamp_ns / _S for image in stray.images()]
     return through, [frame.stamp_ns / _S for frame in stray.take_faulty()]
 
 
@@ -51,8 +51,8 @@ def test_whatever_else_stamps_do_is_let_through_in_its_order(stamps_s: list[floa
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(-5, 30)), max_size=30))
 def test_each_image_comes_through_or_is_taken_out(steps: list[tuple[int, int]]) -> None:
     images = [_image(number * _S // 3, stream) for stream, number in steps]
-    stray = StrayStamps(images)
-    through = list(stray.sound())
+    stray = StampFilter(images)
+    through = list(stray.images())
     assert len({id(image) for image in through}) == len(through)
     for stream in (0, 1):
         order = [images.index(image) for image in through if image.stream == stream]
@@ -67,7 +67,7 @@ def test_nothing_waits_while_stamps_go_on_evenly() -> None:
             yield _image(number * _S // 10)
         raise AssertionError("one more was asked for")
 
-    sound = StrayStamps(images()).sound()
+    sound = StampFilter(images()).images()
     assert [next(sound).stamp_ns for _ in range(3)] == [0, _S // 10, _S // 5]
 
 
@@ -76,15 +76,15 @@ def test_what_waits_is_given_before_an_error() -> None:
         yield from (_image(0), _image(5 * _S), _image(5 * _S, 1))
         raise RecordingError("cut off")
 
-    sound = StrayStamps(images()).sound()
+    sound = StampFilter(images()).images()
     assert sorted(next(sound).stamp_ns for _ in range(3)) == [0, 5 * _S, 5 * _S]
     with pytest.raises(RecordingError, match="cut off"):
         next(sound)
 
 
 def test_the_reason_tells_how_far_ahead_the_stamp_is() -> None:
-    stray = StrayStamps([_image(0), _image(7 * _S, 1), _image(9 * _S), _image(1), _image(2, 1)])
-    assert [image.stamp_ns for image in stray.sound()] == [0, 7 * _S, 1, 2]
+    stray = StampFilter([_image(0), _image(7 * _S, 1), _image(9 * _S), _image(1), _image(2, 1)])
+    assert [image.stamp_ns for image in stray.images()] == [0, 7 * _S, 1, 2]
     (frame,) = stray.take_faulty()
     assert frame.stamp_ns == 9 * _S
     assert (
