@@ -1,4 +1,4 @@
-"""What is in a recording, and what is wrong with it, before odometry runs over it."""
+"""Check a recording before odometry runs on it: stamps, images, calibration, frames."""
 
 from gvo.diagnostics.check.findings import CheckResult, Finding, format_check
 from gvo.diagnostics.check.recording import check_recording

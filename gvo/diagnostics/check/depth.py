@@ -11,44 +11,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
+from gvo.diagnostics.check.findings import Finding, Limits, measured, unknown
+from gvo.diagnostics.check.images import check_frozen
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.tracking import detect_corners
 from gvo.types import BoolArray, DepthArray, Failure, FloatArray, ImageArray, RgbdFrame
 
 _MAX_SHIFT_PX = 12
-# Depth is lost along edges (or smeared over them, negative) on both sides alike. Where the first
-# or last fits best, the two sides met edges of texture that have nothing to do with one another.
+# Pixels of depth lost along edges (negative: smeared over them), on both sides alike. If the first
+# or last fits best, the two sides have met unrelated edges of texture.
 _LOSSES_PX = range(-3, 7)
 _REACH_PX = _MAX_SHIFT_PX + max(_LOSSES_PX)
-# Depth of another focal length: sizes that colour and depth may differ by.
+# Relative differences in size of colour and depth: depth of another focal length.
 _ZOOMS = tuple(round(0.02 * step, 2) for step in range(-7, 8))
 _MIN_ZOOM_GAIN = 1.15
-# A step of depth, relative, over at most so many unknown pixels, which lie in the shadow behind.
+# A relative step of depth, across at most so many unknown pixels in the shadow behind.
 _STEP, _MAX_SHADOW_PX = 0.1, 20
 _N_POINTS_PER_FRAME = 500
 _MIN_POINTS = 300
-# How much stronger colour edges must be at the best shift than at the typical one.
+# Minimum gain in strength of the colour edges at the best shift over the typical one.
 _MIN_CONTRAST = 0.25
-# Values within this of the median tell the step there.
+# Depths this close to the median, relative, give the quantization step there.
 _NEAR_MEDIAN = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Misregistration:
-    """What moves depth onto colour.
+    """Offset of depth from colour.
 
     Parameters
     ----------
     shift_px : tuple of two float
-        (u, v) by which depth is to be moved; NaN along an axis whose edges do not tell.
+        (u, v) from depth to colour; NaN along an axis without evidence.
     zoom : float
-        Size that it is to be drawn to, about the middle of the image.
+        Size of colour over size of depth, about the middle of the image.
     contrast : float
-        How much stronger the colour edges are there than at the typical shift.
+        Gain in strength of the colour edges there over the typical shift.
     rms_px : float
-        Size of the offset over the image.
+        RMS of the offset over the image.
     """
 
     shift_px: tuple[float, float]
@@ -59,7 +60,7 @@ class Misregistration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Strips:
-    """Strength of colour edges along one axis around steps of depth, both kinds of steps.
+    """Strength of colour edges along one axis around steps of depth.
 
     `values` (n, 2 * reach + 1) are NaN outside the image; `offsets` (n,) are from its middle.
     """
@@ -72,23 +73,23 @@ _Axis = tuple[_Strips, _Strips]
 
 
 def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | Failure:
-    """Compare steps of depth with edges of the colour image.
+    """Align steps of depth with edges of the colour image.
 
-    At the last pixel of a near thing before something farther there is an edge of colour too, more
-    often than elsewhere. Its mean strength over shifts along the step has a peak at the offset.
-    Depth that is lost along edges moves steps on the left and on the right of things towards
-    each other, an offset moves both alike, so that both are sought together. Depth of another
-    focal length (not registered at all) shows as a zoom, common to both axes.
+    Where depth steps from near to far, an edge of colour is more likely than elsewhere. Its mean
+    strength over shifts along the step has a peak at the offset. Depth that is lost along edges
+    moves the left and right steps of a thing towards each other, an offset moves both alike, so
+    both are estimated together. Depth of another focal length (not registered at all) shows as a
+    zoom, common to both axes.
 
     Parameters
     ----------
     frames : sequence of RgbdFrame
-        Of one camera; the more, the less the texture beside edges matters.
+        Frames of one camera; many of them average out texture.
 
     Returns
     -------
     Misregistration or Failure
-        Failure where there are too few steps of depth, or no peak stands out.
+        Failure if there are too few steps of depth, or no peak stands out.
     """
     axes = [_collect(frames, axis) for axis in (1, 0)]
     has_enough = [_has_enough(pair) for pair in axes]
@@ -120,17 +121,17 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
 
 
 def depth_steps(depth: DepthArray) -> tuple[BoolArray, BoolArray]:
-    """Find the pixels of near things beside something farther along a row.
+    """Find the pixels next to which depth increases along a row.
 
     Parameters
     ----------
     depth : ndarray of float32, shape (height, width)
-        Metres, NaN = unknown; a few unknown pixels between near and far do not matter.
+        Metres, NaN = unknown; a few unknown pixels between near and far are allowed.
 
     Returns
     -------
     before, after : ndarray of bool, shape (height, width)
-        The farther one is on the right of the pixel; on its left.
+        Far is right of the pixel; left of it.
     """
     height, width = depth.shape
     is_known = np.isfinite(depth)
@@ -150,7 +151,7 @@ def depth_steps(depth: DepthArray) -> tuple[BoolArray, BoolArray]:
 
 
 def _lines(steps: BoolArray) -> BoolArray:
-    """Keep steps that go on over neighbouring rows: single ones are noise."""
+    """Keep steps that continue over neighbouring rows; single ones are noise."""
     counts = cv2.filter2D(
         steps.astype(np.uint8), -1, np.ones((5, 3)), borderType=cv2.BORDER_CONSTANT
     )
@@ -169,7 +170,7 @@ def _collect(frames: Sequence[RgbdFrame], axis: int) -> _Axis:
 
 
 def _edge_strength(image: ImageArray) -> NDArray[np.float32]:
-    """Return the size of the gradient along rows, cut off at its 90 % and scaled to one."""
+    """Return the gradient along rows, clipped at its 90th percentile and scaled to one."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     sizes = np.abs(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3))
     return np.asarray(np.minimum(sizes / (np.percentile(sizes, 90) + 1e-6), 1.0), dtype=np.float32)
@@ -199,7 +200,7 @@ def _has_enough(pair: _Axis) -> bool:
 
 
 def _score(pair: _Axis, zoom: float) -> FloatArray:
-    """Return the strength over (loss, shift), each kind of step relative to its typical one."""
+    """Return the edge strength over (loss, shift), relative to the typical one."""
     before, after = (_profile(strips, zoom) for strips in pair)
     shifts = np.arange(-_MAX_SHIFT_PX, _MAX_SHIFT_PX + 1) + _REACH_PX
     return np.stack([0.5 * (before[shifts + loss] + after[shifts - loss]) for loss in _LOSSES_PX])
@@ -212,9 +213,9 @@ def _profile(strips: _Strips, zoom: float) -> FloatArray:
     values = np.take_along_axis(strips.values, positions, axis=1)
     is_seen = np.isfinite(values).any(axis=0)
     if not np.any(is_seen):
-        return np.ones(values.shape[1])  # all moved out of the image: no shift stands out
+        return np.ones(values.shape[1])  # all outside the image: no peak
     seen = np.nanmean(values[:, is_seen], axis=0).astype(np.float64)
-    means = np.full(values.shape[1], np.median(seen))  # outside of the image nothing stands out
+    means = np.full(values.shape[1], np.median(seen))  # outside the image: no peak
     means[is_seen] = seen
     padded = np.pad(means, 1, mode="edge")
     smooth = np.convolve(padded, [0.25, 0.5, 0.25], mode="valid")
@@ -226,7 +227,7 @@ def _contrast(scores: Sequence[FloatArray | None]) -> float:
 
 
 def _peak(score: FloatArray) -> float:
-    """Return the shift of the maximum to a fraction of a pixel, by a parabola; NaN for none."""
+    """Return the sub-pixel shift of the maximum, by a parabola; NaN if there is none."""
     loss, best = np.unravel_index(int(np.argmax(score)), score.shape)
     if loss in (0, len(_LOSSES_PX) - 1):
         return math.nan
@@ -239,11 +240,11 @@ def _peak(score: FloatArray) -> float:
 
 
 def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
-    """Yield what the depth images say.
+    """Yield the findings on the depth images.
 
-    A wrong scale by a small factor (5000 counts per metre taken as 1000) cannot be seen in the
-    images: everything is five times as large and moves five times as far. Only a median depth
-    that no scene has gives it away, or ground truth.
+    A scale that is wrong by a small factor (5000 counts per metre taken as 1000) does not show in
+    the images: the scene is five times as large and moves five times as far. Only ground truth, or
+    a median depth that no scene has, reveals it.
     """
     check = config.check
     frames = [sample.first for sample in samples if isinstance(sample.first, RgbdFrame)]
@@ -251,43 +252,41 @@ def check_depth(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
         yield unknown("depth: median", "no depth image to look at")
         return
     depths = [frame.depth for frame in frames]
-    yield from _check_range(depths, config)
-    share_unknown = float(np.median([np.mean(~np.isfinite(depth)) for depth in depths]))
-    yield measured(
-        "depth: unknown",
-        share_unknown,
-        Limits(high=check.max_unknown_depth, fault_high=0.5 * (1.0 + check.max_unknown_depth)),
-        unit="%",
-        text=f"{share_unknown:.1%} of the pixels",
-        fix="sunlight, dark or shiny surfaces, or too near: depth is missing there",
-    )
+    yield _check_scale(depths, check)
+    yield _check_range(depths, config)
+    yield _check_holes(depths, check)
     yield _check_corners(frames, config)
-    yield from _check_levels(depths, check)
-    yield from _check_frozen(samples, check)
+    yield _check_levels(depths, check)
+    pairs = [
+        (sample.first.depth, sample.second.depth)
+        for sample in samples
+        if isinstance(sample.first, RgbdFrame) and isinstance(sample.second, RgbdFrame)
+    ]
+    if pairs:
+        yield check_frozen("depth", pairs, check)
     yield _check_registration(frames, check)
 
 
-def _check_range(depths: Sequence[DepthArray], config: Config) -> Iterator[Finding]:
-    check, limits = config.check, config.depth
+def _check_scale(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
     medians = [float(np.nanmedian(depth)) for depth in depths]
     median_m = float(np.median(medians))
-    text = f"median {median_m:.3g} m, of images {min(medians):.3g} .. {max(medians):.3g} m"
-    yield measured(
+    direction = "higher" if median_m > check.max_depth_median_m else "lower"
+    return measured(
         "depth: scale",
         median_m,
         Limits(fault_low=check.min_depth_median_m, fault_high=check.max_depth_median_m),
         unit="m",
-        text=text,
-        fix=_scale_fix(median_m, check),
+        text=f"median {median_m:.3g} m, of images {min(medians):.3g} .. {max(medians):.3g} m",
+        fix=f"set depth.scale (counts per metre: 1000 for mm, 5000 for TUM) {direction}",
     )
-    low, high = limits.min_depth_m, limits.max_depth_m
-    with np.errstate(invalid="ignore"):
-        shares = [
-            np.mean((depth[np.isfinite(depth)] >= low) & (depth[np.isfinite(depth)] <= high))
-            for depth in depths
-        ]
-    share = float(np.median(shares))
-    yield measured(
+
+
+def _check_range(depths: Sequence[DepthArray], config: Config) -> Finding:
+    check = config.check
+    low, high = config.depth.min_depth_m, config.depth.max_depth_m
+    known = [depth[np.isfinite(depth)] for depth in depths]
+    share = float(np.median([np.mean((depth >= low) & (depth <= high)) for depth in known]))
+    return measured(
         "depth: within limits",
         share,
         Limits(low=check.min_depth_in_range, fault_low=0.1 * check.min_depth_in_range),
@@ -297,8 +296,20 @@ def _check_range(depths: Sequence[DepthArray], config: Config) -> Iterator[Findi
     )
 
 
+def _check_holes(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
+    share = float(np.median([np.mean(~np.isfinite(depth)) for depth in depths]))
+    return measured(
+        "depth: unknown",
+        share,
+        Limits(high=check.max_unknown_depth, fault_high=0.5 * (1.0 + check.max_unknown_depth)),
+        unit="%",
+        text=f"{share:.1%} of the pixels",
+        fix="sunlight, dark or shiny surfaces, or too near: depth is missing there",
+    )
+
+
 def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
-    """Count what odometry can use: corners whose depth is known, in range and without a break."""
+    """Count the corners that odometry can use: depth known, in range, away from steps."""
     counts = []
     for frame in frames:
         corners = detect_corners(frame.image, config.klt)
@@ -313,19 +324,13 @@ def _check_corners(frames: Sequence[RgbdFrame], config: Config) -> Finding:
     )
 
 
-def _scale_fix(median_m: float, check: CheckConfig) -> str:
-    if median_m > check.max_depth_median_m:
-        return "set depth.scale (counts per metre: 1000 for mm, 5000 for TUM) higher"
-    return "set depth.scale (counts per metre: 1000 for mm, 5000 for TUM) lower"
-
-
-def _check_levels(depths: Sequence[DepthArray], check: CheckConfig) -> Iterator[Finding]:
+def _check_levels(depths: Sequence[DepthArray], check: CheckConfig) -> Finding:
     levels = [np.unique(depth[np.isfinite(depth)]) for depth in depths]
     count = float(np.median([len(values) for values in levels]))
     steps = [_step_at_median(values) for values in levels]
     known = [step for step in steps if math.isfinite(step)]
     step_text = f", steps of {1e3 * float(np.median(known)):.3g} mm at the median" if known else ""
-    yield measured(
+    return measured(
         "depth: levels",
         count,
         Limits(low=check.min_depth_levels, fault_low=0.25 * check.min_depth_levels),
@@ -339,25 +344,6 @@ def _step_at_median(values: DepthArray) -> float:
         return math.nan
     near = values[np.abs(values / np.median(values) - 1.0) <= _NEAR_MEDIAN]
     return float(np.median(np.diff(near))) if len(near) > 1 else math.nan
-
-
-def _check_frozen(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Finding]:
-    pairs = [
-        (sample.first.depth, sample.second.depth)
-        for sample in samples
-        if isinstance(sample.first, RgbdFrame) and isinstance(sample.second, RgbdFrame)
-    ]
-    if not pairs:
-        return
-    n_frozen = sum(np.array_equal(first, second, equal_nan=True) for first, second in pairs)
-    yield measured(
-        "depth: frozen images",
-        n_frozen / len(pairs),
-        lost_limits(check),
-        unit="%",
-        text=f"{n_frozen} of {len(pairs)} are the same as the one before",
-        fix="the driver repeats depth images: record at the camera's own rate",
-    )
 
 
 def _check_registration(frames: Sequence[RgbdFrame], check: CheckConfig) -> Finding:

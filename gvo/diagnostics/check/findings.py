@@ -1,4 +1,4 @@
-"""What a check found: values with their limits, verdicts and fixes, and their table."""
+"""Findings of a check: values with limits, verdicts and fixes, and their table."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ _HEADER = ("check", "value", "threshold", "verdict", "fix")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that was looked at; line ends in its texts become blanks.
+    """One result of a check; line breaks in its texts become blanks.
 
     Parameters
     ----------
     name : str
-        What was looked at; no two findings of a check share it.
+        What was checked, unique within a check.
     value : float or str
         A number in `unit`, or text. Shares are in percent.
     unit : str
-        Of the number; empty for none.
+        Unit of the number; may be empty.
     text : str
-        What a table shows in place of the number, where that tells more.
+        Shown in place of the number, if not empty.
     threshold : str
-        What the value is held against; empty where nothing is.
+        What the value is compared with; may be empty.
     verdict : {"ok", "warning", "fault", "info", "unknown"}
-        A warning costs accuracy or frames, a fault most of them; unknown: the recording does not
-        hold what the check needs.
+        A warning costs accuracy or frames, a fault most of them; unknown: the recording lacks
+        what the check needs.
     fix : str
-        What to do, one line; empty where nothing is.
+        What to do, one line; may be empty.
 
     Raises
     ------
@@ -54,7 +54,7 @@ class Finding:
     fix: str = ""
 
     def __post_init__(self) -> None:
-        """Make a line of each text: names and reasons may come out of damaged files."""
+        """Make each text one line: names and reasons may come from damaged files."""
         for key in ("name", "value", "text", "threshold", "fix"):
             value = getattr(self, key)
             if isinstance(value, str):
@@ -113,7 +113,7 @@ class CheckResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """The range of a value without warning, and that without fault.
+    """Range of a value without a warning, and range without a fault.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Limits:
         return "ok" if self.low <= value <= self.high else "warning"
 
     def describe(self, unit: str = "") -> str:
-        """Return the range that is held against, the tighter limit on each side."""
+        """Return the range as text, the tighter limit on each side."""
         factor = 100.0 if unit == "%" else 1.0
         low = factor * max(self.low, self.fault_low)
         high = factor * min(self.high, self.fault_high)
@@ -155,20 +155,20 @@ class Limits:
 def measured(
     name: str, value: float, limits: Limits, *, unit: str = "", fix: str = "", text: str = ""
 ) -> Finding:
-    """Hold a number against limits.
+    """Compare a number with limits.
 
     Parameters
     ----------
     name : str
     value : float
-        NaN: the recording does not tell.
+        NaN: unknown.
     limits : Limits
     unit : str
-        Of value and limits; "%": both are shares in [0, 1], shown in percent.
+        Unit of value and limits; "%": both are shares in [0, 1], shown in percent.
     fix : str
-        What to do where the value is outside.
+        What to do if the value is outside.
     text : str
-        Shown instead of the number, where it tells more.
+        Shown in place of the number, if not empty.
 
     Returns
     -------
@@ -189,18 +189,18 @@ def measured(
 def judged(
     name: str, value: str, *, is_ok: bool, threshold: str, otherwise: Verdict, fix: str
 ) -> Finding:
-    """Return a finding whose verdict is known already.
+    """Return a finding that is ok or not.
 
     Parameters
     ----------
     name, value, threshold : str
         As of `Finding`.
     is_ok : bool
-        Whether all is well.
+        Whether the verdict is "ok".
     otherwise : {"warning", "fault"}
-        The verdict where it is not.
+        The verdict otherwise.
     fix : str
-        What to do then.
+        What to do otherwise.
     """
     return Finding(
         name=name,
@@ -212,12 +212,12 @@ def judged(
 
 
 def lost_limits(check: CheckConfig) -> Limits:
-    """Return the limits of the share of frames that are lost in one way or another."""
+    """Return the limits of the share of frames that are lost, for whatever reason."""
     return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)
 
 
 def unknown(name: str, reason: str) -> Finding:
-    """Return a finding that the recording does not allow."""
+    """Return a finding without a verdict, since the recording lacks what the check needs."""
     return Finding(name=name, value=reason, verdict="unknown")
 
 
@@ -230,10 +230,9 @@ def _number_text(value: float) -> str:
 
 
 def format_check(result: CheckResult) -> str:
-    """Return what is told first, an aligned table of the rest, and a line that sums it up.
+    """Return the first infos, an aligned table of the other findings, and a summary.
 
-    Where two streams (left and right, colour and depth) were judged alike, and nothing is wrong,
-    they share a line.
+    Two streams (left and right, colour and depth) share a line if both are ok.
 
     Examples
     --------
@@ -248,24 +247,24 @@ def format_check(result: CheckResult) -> str:
     left, right: gaps  0.1 s | 0.2 s  <= 0.5 s   ok
     drive: healthy
     """
-    head = [finding.value_text for finding in takewhile(_is_told, result.findings)]
+    head = [finding.value_text for finding in takewhile(_is_info, result.findings)]
     findings = list(_merged(result.findings[len(head) :]))
     rows = [_row(finding) for finding in findings]
-    # What is only told, however long, does not push the verdicts aside.
-    measured = [
-        (row[0], "", "", "", "") if _is_told(finding) else row
+    # Infos, however long, do not widen the columns of the others.
+    wide = [
+        (row[0], "", "", "", "") if _is_info(finding) else row
         for row, finding in zip(rows, findings, strict=True)
     ]
-    table = format_table(_HEADER, rows, is_text=True, measured=measured)
+    table = format_table(_HEADER, rows, is_text=True, measured=wide)
     return "".join([*(f"{line}\n" for line in head), table, f"{_sum_up(result)}\n"])
 
 
-def _is_told(finding: Finding) -> bool:
+def _is_info(finding: Finding) -> bool:
     return finding.verdict == "info"
 
 
 def _merged(findings: Iterable[Finding]) -> Iterator[Finding]:
-    """Yield the findings, those of two streams as one where they are alike and nothing is wrong."""
+    """Yield the findings, those of two streams as one if both have the same, good verdict."""
     left = list(findings)
     while left:
         finding = left.pop(0)
@@ -297,9 +296,7 @@ def _row(finding: Finding) -> tuple[str, ...]:
 
 
 def _sum_up(result: CheckResult) -> str:
-    counts = {
-        "fault": len(result.with_verdict("fault")),
-        "warning": len(result.with_verdict("warning")),
-    }
-    parts = [f"{n} {name}{'s' if n > 1 else ''}" for name, n in counts.items() if n]
+    verdicts: tuple[Verdict, ...] = ("fault", "warning")
+    counts = [(len(result.with_verdict(verdict)), verdict) for verdict in verdicts]
+    parts = [f"{n} {verdict}{'s' if n > 1 else ''}" for n, verdict in counts if n]
     return f"{result.recording}: {', '.join(parts) or 'healthy'}"

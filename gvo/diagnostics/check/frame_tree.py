@@ -1,4 +1,4 @@
-"""The tree of frames: is the camera in it, is it one tree, does it hold all the time."""
+"""The tree of frames: one tree, with the camera in it, without gaps."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from gvo.io.poses.tf_paths import bare
 from gvo.types import Failure, IntArray
 
 _N_NAMED = 5
-# A single transform, such as that between two cameras, is no robot that misses a camera. Nor is
-# the ground truth of a data set, which has a tree of its own.
+# Two cameras, or the ground truth of a data set, are no robot that lacks a camera.
 _MIN_FRAMES = 3
 
 
@@ -27,18 +26,18 @@ def check_frame_tree(
     base_frame: str,
     check: CheckConfig,
 ) -> Iterator[Finding]:
-    """Yield what is missing between the camera, the robot's base and the root of its tree.
+    """Yield what is missing between the camera, the robot's base and the root of their tree.
 
-    Odometry needs none of it; the trajectory of another frame, and ground truth from `/tf`, do.
+    Odometry itself needs no transforms; `--frame` and ground truth from `/tf` do.
 
     Parameters
     ----------
     buffer : TfBuffer
-        The transforms of the recording.
+        Transforms of the recording.
     camera_frame : str
-        Of the images' headers; empty where they name none.
+        Frame of the images' headers; may be empty.
     stamps_ns : ndarray of int64, shape (n,)
-        Of the images.
+        Stamps of the images.
     base_frame : str
         The robot's own frame.
     check : CheckConfig
@@ -70,7 +69,7 @@ def check_frame_tree(
 
 
 def _roots(edges: Collection[tuple[str, str]]) -> set[str]:
-    """Return the frames that are nobody's child."""
+    """Return the frames that are no child of another."""
     return {parent for parent, _ in edges} - {child for _, child in edges}
 
 

@@ -1,4 +1,4 @@
-"""Images: exposure, blur, texture, and what cannot be used."""
+"""Images: exposure, blur, texture, and frames that cannot be used."""
 
 from __future__ import annotations
 
@@ -13,26 +13,35 @@ from gvo.config import CheckConfig, Config
 from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.tracking import detect_corners
-from gvo.types import BoolArray, FaultyFrame, FloatArray, Frame, ImageArray, RgbdFrame, StereoFrame
+from gvo.types import (
+    BoolArray,
+    DepthArray,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    ImageArray,
+    RgbdFrame,
+    StereoFrame,
+)
 
 _BLACK, _WHITE = 2, 253
-# Scales that the gradients are compared at, pixels, and the weakest edge that counts, grey per
-# pixel times eight (Sobel's sum).
+# Scales at which the gradients are compared, pixels; the weakest edge, grey per pixel times eight
+# (the sum of Sobel's weights).
 _FINE_PX, _COARSE_PX = 1.0, 2.0
 _MIN_GRADIENT = 8.0
 _MIN_EDGES = 20
-# Of the local maxima of the gradient this share is strong enough to be edges of things.
+# Share of the local maxima of the gradient that are taken for edges of things.
 _STRONG_SHARE = 0.3
 _MAX_RETURN_PX = 0.5
 _TRACK_WINDOW = (15, 15)
 _N_TRACK_LEVELS = 4
-# A transfer that broke off leaves the last rows alike; so large a share of them is no scene.
+# Share and number of last rows of one value that make an image torn.
 _MIN_TORN_SHARE = 0.05
 _MIN_TORN_ROWS = 4
 
 
 def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Finding]:
-    """Yield how many of the sampled frames odometry cannot use, and why."""
+    """Yield the share of the sampled frames that odometry cannot use, with the first reason."""
     looked_at = [frame for sample in samples for frame in _frames_of(sample)]
     faulty = [frame for frame in looked_at if isinstance(frame, FaultyFrame)]
     if not looked_at:
@@ -49,7 +58,7 @@ def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Find
 
 
 def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
-    """Yield what the grey images of the samples say, both of a stereo camera."""
+    """Yield the findings on the grey images of the samples, of both cameras of a stereo pair."""
     usable = [sample for sample in samples if not isinstance(sample.first, FaultyFrame)]
     if not usable:
         return
@@ -70,11 +79,11 @@ def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]
 
 
 def blur_sigma_px(image: ImageArray) -> float:
-    """Return how blurred the edges of an image are: sigma of a Gaussian, pixels.
+    """Estimate the blur of an image: sigma of a Gaussian, pixels.
 
     At a step edge the gradient of an image smoothed by sigma s falls with
-    1 / sqrt(s^2 + blur^2), whatever the contrast. So the ratio of the gradients at two scales
-    tells the blur, here as the median over the strong local maxima of the gradient.
+    1 / sqrt(s^2 + blur^2), whatever the contrast. So the blur follows from the ratio of the
+    gradients at two scales: here the median over the strong local maxima of the gradient.
 
     Parameters
     ----------
@@ -83,8 +92,8 @@ def blur_sigma_px(image: ImageArray) -> float:
     Returns
     -------
     float
-        0.3 to 1.3 for sharp cameras; NaN where the image has no edges. Of much blurred edges with
-        little contrast the noise takes some away.
+        0.3 to 1.3 for sharp cameras; NaN if the image has no edges. Too small for much blurred
+        edges of little contrast, in noise.
 
     References
     ----------
@@ -105,14 +114,14 @@ def blur_sigma_px(image: ImageArray) -> float:
 
 
 def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -> float:
-    """Return the share of corners that Lucas-Kanade finds in the next image and back again.
+    """Return the share of corners that Lucas-Kanade tracks to the next image and back.
 
     Parameters
     ----------
     first, second : ndarray of uint8, shape (height, width)
         An image and the next one.
     corners : ndarray of float64, shape (n, 2)
-        In the first image; noise gives corners too, but none that are found again.
+        Pixels in the first image; corners of noise are not found again.
     """
     if len(corners) == 0:
         return 0.0
@@ -124,10 +133,25 @@ def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -
 
 
 def n_torn_rows(image: ImageArray) -> int:
-    """Count the rows at the bottom that hold one grey value throughout, as a torn transfer does."""
+    """Count the rows of one grey value at the bottom, as an interrupted transfer leaves them."""
     is_varied = np.flatnonzero(np.any(image != image[-1, -1], axis=1))
     n_rows: int = image.shape[0]
     return n_rows - 1 - int(is_varied[-1]) if len(is_varied) else n_rows
+
+
+def check_frozen(
+    name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]], check: CheckConfig
+) -> Finding:
+    """Count the images that equal the one before."""
+    n_frozen = sum(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+    return measured(
+        f"{name}: frozen images",
+        n_frozen / len(pairs),
+        lost_limits(check),
+        unit="%",
+        text=f"{n_frozen} of {len(pairs)} are the same as the one before",
+        fix=f"the driver repeats {name} images: record at the camera's own rate",
+    )
 
 
 def _check_exposure(
@@ -208,18 +232,10 @@ def _check_transfer(
     pairs: Sequence[tuple[ImageArray, ImageArray]],
     check: CheckConfig,
 ) -> Iterator[Finding]:
-    n_frozen = sum(np.array_equal(first, second) for first, second in pairs)
     if pairs:
-        yield measured(
-            f"{name}: frozen images",
-            n_frozen / len(pairs),
-            lost_limits(check),
-            unit="%",
-            text=f"{n_frozen} of {len(pairs)} are the same as the one before",
-            fix="the driver repeats images: record at the camera's own rate",
-        )
+        yield check_frozen(name, pairs, check)
     torn = np.array([n_torn_rows(image) for image in images])
-    # Rectification leaves a border without pixels, the same in each image.
+    # Rectification leaves a border without pixels, the same in all images.
     limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
     n_torn = int(np.count_nonzero(torn - torn.min() > limit))
     yield measured(
@@ -258,6 +274,7 @@ def _follow(
 
 
 def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:
+    """Return the size of the gradient of a smoothed image."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
     along_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3)
     along_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3)

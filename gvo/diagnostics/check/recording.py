@@ -20,7 +20,7 @@ from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import RecordingInfo, Source
 from gvo.types import Failure
 
-# Cameras with eyes closer or wider than that exist, but are mostly a unit gone wrong.
+# A baseline outside is mostly one in a wrong unit.
 _BASELINES_M = (0.01, 3.0)
 
 
@@ -33,30 +33,30 @@ def check_recording(
     base_frame: str = "base_link",
     calibration_changes: Mapping[str, int] | None = None,
 ) -> CheckResult:
-    """Look for what makes odometry fail or err, before it runs.
+    """Check a recording for what makes odometry fail or err.
 
-    All stamps are read, and a few frames are decoded as odometry gets them. No more than these
-    frames and two numbers per image are held.
+    All stamps are read, and a few frames are decoded as for odometry. Memory holds these frames
+    and two numbers per image.
 
     Parameters
     ----------
     source : Source
         The recording.
     config : Config
-        `check` holds the thresholds; the rest says what odometry would use.
+        The thresholds are in `check`; the rest is as for odometry.
     n_samples : int, optional
-        Frames looked at, each with the next one; default: `check.n_samples`.
+        Number of decoded frames, each with the next one; default: `check.n_samples`.
     transforms : TfBuffer, optional
-        Of the same bag; where None, the tree of frames is not checked.
+        Transforms of the same bag; if None, the tree of frames is not checked.
     base_frame : str
         The robot's own frame in that tree.
     calibration_changes : mapping of str to int, optional
-        Of a bag: how many messages of a `CameraInfo` topic differ from its first.
+        For each `CameraInfo` topic of a bag, the number of messages that differ from its first.
 
     Returns
     -------
     CheckResult
-        What is damaged or missing is a finding, no exception.
+        Damage and missing parts are findings, not exceptions.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def _check_changes(changes: Mapping[str, int]) -> Finding:
 
 
 def _describe(info: RecordingInfo, found: Survey) -> Iterator[Finding]:
-    """Yield what is in the recording and what odometry will use."""
+    """Yield the content of the recording and what odometry will use of it."""
     first = info.calibrations[0]
     stamps_ns = found.streams[0].stamps_ns
     duration_s = float(np.ptp(stamps_ns)) / 1e9 if len(stamps_ns) else 0.0

@@ -1,4 +1,4 @@
-"""One pass over a recording: all stamps, and frames here and there with their successors."""
+"""One pass over a recording: all stamps, and a sample of frames with their successors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gvo.io.sync import Pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, IntArray
 
-# Pairs that are formed only to look at them, where none is near enough for odometry.
+# For images to look at, if none are close enough in time for odometry.
 _WIDE_LIMIT_MS = 200.0
 
 
@@ -27,11 +27,11 @@ class StreamStamps:
     Parameters
     ----------
     stamps_ns : ndarray of int64, shape (n,)
-        Of the headers.
+        Stamps of the headers.
     log_times_ns : ndarray of int64, shape (m,)
-        Of the recording, for the images that have both; empty where there is no such clock.
+        Times of recording, for the images that have both; empty if the recording has no clock.
     headers_ns : ndarray of int64, shape (m,)
-        Stamps of the headers of those images.
+        Stamps of the headers of these images.
     """
 
     stamps_ns: IntArray
@@ -46,7 +46,7 @@ class Sample:
     Parameters
     ----------
     first, second : StereoFrame, RgbdFrame or FaultyFrame
-        `second` is None where the recording ends.
+        `second` is None at the end of the recording.
     """
 
     first: Frame | FaultyFrame
@@ -55,17 +55,17 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Survey:
-    """What a pass over a recording gave.
+    """Result of a pass over a recording.
 
     Parameters
     ----------
     streams : tuple of two StreamStamps
     n_pairs : int
-        Frames that odometry gets.
+        Number of frames that odometry gets.
     samples : tuple of Sample
         Spread over the recording.
     damage : str
-        Why the recording could not be read to its end; empty where it could.
+        Why the recording could not be read to its end; empty if it could.
     """
 
     streams: tuple[StreamStamps, StreamStamps]
@@ -75,16 +75,14 @@ class Survey:
 
 
 def survey(source: Source, config: Config, *, n_samples: int) -> Survey:
-    """Read all stamps of a recording, and decode some of its frames as odometry does.
-
-    No image is decoded but those of the samples, and no more of them are held.
+    """Read all stamps of a recording, and decode a sample of its frames as for odometry.
 
     Parameters
     ----------
     source : Source
     config : Config
     n_samples : int
-        Frames looked at, each with its successor.
+        Number of decoded frames, each with its successor.
 
     Returns
     -------
@@ -162,14 +160,14 @@ class _Pass:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Chosen:
-    """The chosen pairs as a recording, so that they become frames as all others do."""
+    """The chosen pairs as a recording, so that they become frames as all others."""
 
     info: RecordingInfo
     pairs: list[Pair]
 
     def images(self) -> Iterator[StampedImage]:
         for index, (first, second) in enumerate(self.pairs):
-            # Paired already: with stamps a second apart nothing is paired anew.
+            # With stamps a second apart, the pairs stay as they are.
             yield replace(first, stamp_ns=index * 1_000_000_000)
             yield replace(second, stamp_ns=index * 1_000_000_000)
 
@@ -178,7 +176,7 @@ class _Chosen:
 
 
 def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tuple[Sample, ...]:
-    # Repeated images are looked for by a check of its own, which needs to see them.
+    # Frozen images are found by a check of their own, which needs them.
     sync = config.sync.model_copy(update={"repeated_images": "keep"})
     config = config.model_copy(update={"sync": sync})
     loaded = frames(_Chosen(info=info, pairs=[pair for run in chosen for pair in run]), config)

@@ -1,4 +1,4 @@
-"""Stereo pairs: rectified or not, left and right swapped, out of step, distorted."""
+"""Stereo pairs: matches, rectification, lens distortion, order and timing of left and right."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ from gvo.frontend.matching import descriptor_distances, mutual_best
 from gvo.geometry.camera import PinholeCamera
 from gvo.types import BoolArray, Failure, FloatArray, ImageArray, IntArray, StereoFrame
 
-# Enough for a percentile, and a quarter of the cost of the front-end's budget.
+# A quarter of the front-end's features is enough for a percentile.
 _N_FEATURES = 600
-# How far a match may lie off its row and along it, as a share of the image.
+# Search range across rows and along them, as a share of the image.
 _ROW_SHARE, _MIN_ROW_BAND_PX = 0.06, 12.0
 _COLUMN_SHARE = 0.35
-# The best must be so much nearer than the best elsewhere (D. G. Lowe's ratio).
+# Lowe's ratio of the best distance to the best one elsewhere.
 _MAX_RATIO = 0.8
 _ELSEWHERE_PX = 3.0
+# Lucas-Kanade: window, limits of the forward-backward error and of the step from the match.
 _WINDOW = (15, 15)
 _MAX_RETURN_PX, _MAX_STEP_PX = 0.3, 3.0
 _Pixels = NDArray[np.float32]
+# Fit of the lens distortion: limit of the first residuals, rounds, limit of the others, and the
+# largest standard deviation of k1 that is of use.
 _MAX_ROW_PX = 8.0
 _N_ROUNDS = 5
 _N_SIGMAS = 3.0
 _MAX_SIGMA = 0.03
-# Disparities nearer to zero have no sure sign: far points and the noise of a match.
+# The sign of smaller disparities is noise.
 _SIGN_PX = 1.0
-# Wrong matches lie anywhere; what is so far from the median is none of the rig's doing.
+# Row differences farther from the median are wrong matches.
 _OUTLIER_PX, _OUTLIER_SIGMAS = 3.0, 8.0
-# Another pairing must leave so much less of the rows' spread, and the present one so much.
+# Another pairing is better if it reduces the spread of the rows, of a minimum size, by this factor.
 _STEP_RATIO, _MIN_STEP_SPREAD_PX = 0.6, 0.5
 _MIN_STEPS = 3
 
@@ -49,7 +52,7 @@ class FreeMatches:
     Parameters
     ----------
     pixels_left, pixels_right : ndarray of float64, shape (n, 2)
-        (u, v), the right ones to a fraction of a pixel.
+        (u, v), the right ones sub-pixel.
     """
 
     pixels_left: FloatArray
@@ -79,10 +82,10 @@ class FreeMatches:
 
 
 class FreeMatcher:
-    """Match two images without the epipolar constraint and without a sign of the disparity.
+    """Match two images without the epipolar constraint, for disparities of either sign.
 
-    Mutual best of ORB descriptors that beat all others elsewhere, in a band of rows far wider
-    than any rectified pair needs, then Lucas-Kanade in both axes, there and back.
+    ORB descriptors that are mutually best and pass the ratio test, in a band of rows far wider
+    than a rectified pair needs; then Lucas-Kanade in both axes with a forward-backward check.
 
     Parameters
     ----------
@@ -126,7 +129,7 @@ class FreeMatcher:
 
 
 def _as_bright(image: ImageArray, other: ImageArray) -> ImageArray:
-    """Return an image with mean and contrast of another one: Lucas-Kanade takes both as given."""
+    """Return an image with the mean and contrast of another one, as Lucas-Kanade needs it."""
     gain = float(other.std()) / max(float(image.std()), 1.0)
     offset = float(other.mean()) - gain * float(image.mean())
     return np.asarray(cv2.addWeighted(image, gain, image, 0.0, offset), dtype=np.uint8)
@@ -135,7 +138,7 @@ def _as_bright(image: ImageArray, other: ImageArray) -> ImageArray:
 def _refine(
     left: ImageArray, right: ImageArray, pixels_left: FloatArray, pixels_right: FloatArray
 ) -> FreeMatches:
-    """Move the right pixels to a fraction of a pixel; drop what does not find back."""
+    """Refine the right pixels; drop those that fail the forward-backward check."""
     if len(pixels_left) == 0:
         return FreeMatches(pixels_left=pixels_left, pixels_right=pixels_right)
     start = pixels_left.astype(np.float32)
@@ -168,14 +171,14 @@ def _follow(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensError:
-    """Radial distortion that is left in a pair.
+    """Remaining radial distortion of a rectified pair.
 
     Parameters
     ----------
     k1 : float
         First radial coefficient, as of `plumb_bob`; the same in both cameras.
     sigma : float
-        Its standard deviation.
+        Standard deviation of `k1`.
     """
 
     k1: float
@@ -183,23 +186,23 @@ class LensError:
 
 
 def lens_error(matches: FreeMatches, camera: PinholeCamera) -> LensError | Failure:
-    """Estimate the radial distortion that both images of a pair still have.
+    """Estimate the remaining radial distortion of both images of a rectified pair.
 
-    With distortion a point moves along its radius by the factor 1 + k1 r^2. Left and right see it
-    at other radii, so that its rows differ by fy y k1 (r_left^2 - r_right^2): a pattern that
-    neither an offset nor a turn of the cameras makes. These are fitted along.
+    Distortion moves a point along its radius by the factor 1 + k1 r^2. Left and right see the point
+    at different radii, so its rows differ by fy y k1 (r_left^2 - r_right^2). Offset, scale and
+    rotation of the rows, which make other patterns, are estimated together with k1.
 
     Parameters
     ----------
     matches : FreeMatches
-        Of images that should be rectified.
+        Matches of the rectified images.
     camera : PinholeCamera
-        Of the left one.
+        Camera of the left image.
 
     Returns
     -------
     LensError or Failure
-        The failure says that the matches do not show it: all far away, or near the centre.
+        Failure if the matches do not determine k1: all far away, or near the centre.
 
     References
     ----------
@@ -230,14 +233,14 @@ def _solve(columns: FloatArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowError:
-    """By how much the rows of left and right differ.
+    """Difference of the rows of left and right.
 
     Parameters
     ----------
     median_px : float
-        Of v_right - v_left.
+        Median of v_right - v_left.
     percentile_95_px : float
-        Of the sizes.
+        95th percentile of its size.
     """
 
     median_px: float
@@ -245,10 +248,10 @@ class RowError:
 
 
 def row_error(matches: FreeMatches) -> RowError:
-    """Measure the rows over matches that were made without the epipolar constraint.
+    """Measure the row differences of matches made without the epipolar constraint.
 
-    Wrong matches are those beyond eight robust sigmas of the median (at least 3 px): a rotated
-    or distorted pair spreads its rows evenly, and keeps them all.
+    Matches beyond eight robust standard deviations of the median (at least 3 px) are wrong; a
+    rotated or distorted pair, whose rows spread evenly, keeps all.
     """
     rows = matches.row_differences
     if len(rows) == 0:
@@ -265,7 +268,7 @@ def row_error(matches: FreeMatches) -> RowError:
 def check_stereo(
     samples: Sequence[Sample], camera: PinholeCamera, config: Config
 ) -> Iterator[Finding]:
-    """Yield what the matches of left and right say."""
+    """Yield the findings on the matches of left and right."""
     check = config.check
     pairs = [sample.first for sample in samples if isinstance(sample.first, StereoFrame)]
     if not pairs:
@@ -313,7 +316,7 @@ def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
         text=f"{error.percentile_95_px:.2f} px at 95 %",
         fix=fix,
     )
-    # Corners lie on whole pixels: half a row on either side is theirs.
+    # Half rows: corners lie on whole pixels.
     seed = math.ceil(2.0 * (error.percentile_95_px + 0.25)) / 2.0
     yield Finding(
         name="left/right: row search",
@@ -354,10 +357,10 @@ def _check_order(matches: FreeMatches, check: CheckConfig) -> Finding:
 
 
 def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:
-    """Look whether the right image of the next or the last frame fits the left one better.
+    """Check whether the right image of the next or the last frame fits the left one better.
 
-    While the camera turns or shakes, rows of images that were not taken at once differ. Where
-    they differ with equal stamps and much less for another pairing, one stream lags by a frame.
+    While the camera turns or shakes, the rows of images taken at different times differ. If they
+    differ at equal stamps, and much less in another pairing, one stream lags by a frame.
     """
     name = "left/right: same moment"
     spreads = [
@@ -382,7 +385,7 @@ def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:
 
 
 def _spreads(first: StereoFrame, second: StereoFrame, matcher: FreeMatcher) -> FloatArray:
-    """Return the rows' spread of left 1 and right 1, left 1 and right 2, left 2 and right 1."""
+    """Return the row spread of left 1 and right 1, left 1 and right 2, left 2 and right 1."""
     pairs = ((first.left, first.right), (first.left, second.right), (second.left, first.right))
     errors = (row_error(matcher.match(*pair)).percentile_95_px for pair in pairs)
     return np.array(list(errors))

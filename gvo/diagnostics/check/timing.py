@@ -1,4 +1,4 @@
-"""Stamps: their order, rate and gaps, how streams fit one another, and the two clocks."""
+"""Stamps: order, rate, gaps, pairing of the two streams, and drift of the clocks."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from gvo.config import CheckConfig, Config
 from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
 from gvo.diagnostics.check.sampling import StreamStamps, Survey
 from gvo.io.frames import pair_limit_key
-from gvo.io.recording import RecordingInfo, Sensor
+from gvo.io.recording import RecordingInfo
 from gvo.types import FloatArray, IntArray
 
-# An interval this many periods long is a gap, not jitter.
+# Length of a gap, periods; shorter intervals are jitter.
 _GAP_PERIODS = 2.5
-# Medians of so many stretches of the recording tell how the two clocks run.
+# The clocks are compared by medians over stretches of the recording.
 _N_STRETCHES = 40
 _MIN_PER_STRETCH = 3
 _MIN_STRETCHES = 4
-# A drift counts where it is that many times what the scatter of the offsets explains.
+# A drift is real beyond so many standard deviations.
 _DRIFT_SIGMAS = 4.0
-# Cameras are slower and faster than that, but mostly it is a unit gone wrong.
+# A period outside is mostly one in a wrong unit.
 _PERIODS_MS = (0.5, 10_000.0)
 
 
 def check_timing(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
-    """Yield what all stamps of the recording say; no image is looked at."""
+    """Yield the findings on all stamps of the recording."""
     names = info.stream_names
     for name, stream in zip(names, survey.streams, strict=True):
         yield from _check_stream(name, stream.stamps_ns, config)
@@ -118,45 +118,37 @@ def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterato
     first, second = (stream.stamps_ns for stream in survey.streams)
     if len(first) == 0 or len(second) == 0:
         return
-    check = config.check
-    name = "/".join(info.stream_names)
-    most_ms = check.max_depth_difference_ms
-    if info.sensor == "stereo":
-        most_ms = check.max_stereo_difference_ms
-    # Of streams of two rates only the slower one's images have partners, all of them.
+    # Of RGB-D streams of two rates, each image of the slower one has a partner.
     if len(second) < len(first) and info.sensor == "rgbd":
         signed_ms = -_nearest_differences(second, first) / 1e6
     else:
         signed_ms = _nearest_differences(first, second) / 1e6
+    yield _check_difference(signed_ms, info, config.check)
+    yield _check_partners(survey, np.abs(signed_ms), info, config)
+
+
+def _check_difference(signed_ms: FloatArray, info: RecordingInfo, check: CheckConfig) -> Finding:
     sizes_ms = np.abs(signed_ms)
-    typical_ms, largest_ms = float(np.median(sizes_ms)), float(sizes_ms.max())
-    yield measured(
-        f"{name}: stamp difference",
+    typical_ms, signed = float(np.median(sizes_ms)), float(np.median(signed_ms))
+    is_stereo = info.sensor == "stereo"
+    limit_ms = check.max_stereo_difference_ms if is_stereo else check.max_depth_difference_ms
+    return measured(
+        f"{'/'.join(info.stream_names)}: stamp difference",
         typical_ms,
-        Limits(high=most_ms),
+        Limits(high=limit_ms),
         unit="ms",
-        text=f"{typical_ms:.3g} ms median ({np.median(signed_ms):+.3g} signed), "
-        f"{largest_ms:.3g} ms largest",
+        text=f"{typical_ms:.3g} ms median ({signed:+.3g} signed), {sizes_ms.max():.3g} ms largest",
         fix="trigger both by hardware; a shared offset of the clocks is to be taken off the stamps",
-    )
-    n_frames = min(len(first), len(second)) if info.sensor == "rgbd" else len(first)
-    yield _check_partners(
-        name, first, (n_frames, survey.n_pairs), sizes_ms, sensor=info.sensor, config=config
     )
 
 
 def _check_partners(
-    name: str,
-    first: IntArray,
-    counts: tuple[int, int],
-    sizes_ms: FloatArray,
-    *,
-    sensor: Sensor,
-    config: Config,
+    survey: Survey, sizes_ms: FloatArray, info: RecordingInfo, config: Config
 ) -> Finding:
-    n_frames, n_pairs = counts
-    n_alone = max(n_frames - n_pairs, 0)
-    key = pair_limit_key(sensor)
+    name, key = "/".join(info.stream_names), pair_limit_key(info.sensor)
+    first, second = (stream.stamps_ns for stream in survey.streams)
+    n_frames = min(len(first), len(second)) if info.sensor == "rgbd" else len(first)
+    n_alone = max(n_frames - survey.n_pairs, 0)
     limit_ms, enough_ms = getattr(config.sync, key), math.ceil(float(np.percentile(sizes_ms, 95)))
     return measured(
         f"{name}: frames without partner",
@@ -164,7 +156,7 @@ def _check_partners(
         lost_limits(config.check),
         unit="%",
         text=f"{n_alone} of {n_frames} at sync.{key}={limit_ms:g}",
-        # More than half a period only pairs images with the partners of others.
+        # Beyond half a period, images are paired with the partners of others.
         fix=f"--set sync.{key}={enough_ms} pairs 95 % of them"
         if limit_ms < enough_ms <= _half_period_ms(first) + 1.0
         else f"images of one stream are missing: see dropped frames and gaps of {name}",
@@ -176,7 +168,7 @@ def _half_period_ms(stamps_ns: IntArray) -> float:
 
 
 def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
-    """Return second minus first for the nearest stamp of the second stream, nanoseconds, (n,)."""
+    """Return nearest second stamp minus first stamp, nanoseconds, shape (n,)."""
     ordered = np.unique(second_ns)
     after = np.searchsorted(ordered, first_ns).clip(max=len(ordered) - 1)
     before = (after - 1).clip(min=0)
@@ -186,11 +178,11 @@ def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:
 
 
 def _check_clock(name: str, stream: StreamStamps, check: CheckConfig) -> Iterator[Finding]:
-    """Compare the header stamps with when the messages were recorded.
+    """Compare the header stamps with the times of recording.
 
-    Messages are late by chance, never early, and now and then very late, so that medians of
-    stretches of the recording are compared: their slope is the drift of one clock against the
-    other, their largest step a jump. Where the clocks differ by a constant, nothing is wrong.
+    Messages are late at random, now and then very late. So medians over stretches of the recording
+    are compared: their slope is the drift of one clock against the other, their largest step a
+    jump. A constant difference is harmless.
     """
     if len(stream.log_times_ns) == 0:
         return
@@ -236,7 +228,7 @@ def _medians(values: FloatArray, n_stretches: int) -> FloatArray:
 
 
 def _drift(middles_s: FloatArray, levels_ms: FloatArray) -> float:
-    """Return the slope in ms/min; zero where the scatter explains it."""
+    """Return the slope in ms/min; zero if it is not significant."""
     if np.ptp(middles_s) <= 0:
         return 0.0
     slope, level = np.polyfit(middles_s, levels_ms, 1)
