@@ -1,4 +1,1 @@
-"""Readers of bags that rosbags refuses: never closed, truncated, damaged.
-
-They walk over the records of a file, need no index, and allocate no more than what is there.
-"""
+"""Readers of ROS 1 bags and MCAP files without their index: never closed, truncated, damaged."""

@@ -18,10 +18,10 @@ else:
     from backports import zstd
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""What a Zstandard frame begins with, and no message in CDR does."""
+"""First bytes of a Zstandard frame, and of no CDR message."""
 
 MAX_INFLATED = 1 << 29
-"""Bytes; recorders write chunks of about one megabyte."""
+"""Bytes of a chunk; recorders write about one megabyte."""
 
 _BLOCK = 1 << 16
 _SEARCH_BLOCK = 1 << 20
@@ -35,13 +35,11 @@ _FAULTS = (OSError, RuntimeError, EOFError, ValueError, zstd.ZstdError)
 
 
 class DamageError(Exception):
-    """A record that is none; caught where the reader steps over it."""
+    """Invalid data; the reader catches it and skips the record."""
 
 
 class Window:
-    """A part of a file, read from its start.
-
-    What a file claims of itself is checked against what there is before anything is allocated.
+    """A part of a file, read from its start; nothing is allocated for bytes that do not exist.
 
     Parameters
     ----------
@@ -57,7 +55,7 @@ class Window:
 
     @property
     def rest(self) -> int:
-        """The number of bytes that are left."""
+        """The number of remaining bytes."""
         return self.end - self.position
 
     def take(self, n_bytes: int) -> bytes:
@@ -66,7 +64,7 @@ class Window:
         Raises
         ------
         DamageError
-            When there are fewer.
+            If fewer bytes remain.
         """
         start = self.position
         self.skip(n_bytes)
@@ -77,12 +75,12 @@ class Window:
         return data
 
     def skip(self, n_bytes: int) -> None:
-        """Step over the next bytes.
+        """Skip the next bytes.
 
         Raises
         ------
         DamageError
-            When there are fewer.
+            If fewer bytes remain.
         """
         if n_bytes > self.rest:
             raise DamageError(f"a record of {n_bytes} bytes is cut after {self.rest}")
@@ -93,18 +91,18 @@ class Window:
         return int.from_bytes(self.take(n_bytes), "little")
 
     def part(self, n_bytes: int) -> Window:
-        """Return a window on the next bytes, and step over them."""
+        """Return a window on the next bytes, and skip them."""
         start = self.position
         self.skip(n_bytes)
         return Window(self.file, start, self.position)
 
     def blocks(self, size: int = _SEARCH_BLOCK) -> Iterator[bytes]:
-        """Yield all that is left, block by block."""
+        """Yield the remaining bytes, block by block."""
         while self.rest:
             yield self.take(min(size, self.rest))
 
     def find(self, pattern: bytes, start: int) -> Iterator[int]:
-        """Yield the positions of a pattern from a start on; the window's own does not matter."""
+        """Yield the positions of a pattern from `start` on, whatever the position of the window."""
         search = Window(self.file, start, self.end)
         tail = b""
         for block in search.blocks():
@@ -119,14 +117,14 @@ class Window:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inflated:
-    """What came out of a compressed part of a file.
+    """The decompressed content of a part of a file.
 
     Parameters
     ----------
     data : bytes
-        All of it, or the start of it.
+        The content, or its start.
     is_cut : bool
-        The compressed part ends before the end of the data.
+        The compressed data are truncated.
     """
 
     data: bytes
@@ -134,7 +132,7 @@ class Inflated:
 
 
 def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> Inflated:
-    """Decompress what is left of a window; step over what was used.
+    """Decompress from a window; skip the compressed bytes.
 
     Parameters
     ----------
@@ -142,12 +140,12 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> I
     compression : str
         "bz2", "lz4" or "zstd".
     limit : int
-        Bytes that may come out.
+        Maximum number of decompressed bytes.
 
     Raises
     ------
     DamageError
-        When it is no such data, or more comes out than may.
+        If the data are invalid, or exceed the limit.
     """
     if compression not in _DECOMPRESSORS:
         raise DamageError(f"a chunk of unknown compression {compression!r}")
@@ -171,7 +169,7 @@ def inflate(window: Window, compression: str, *, limit: int = MAX_INFLATED) -> I
 
 
 def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) -> bytes:
-    """Decompress data that are whole, of one stream or of several in a row.
+    """Decompress complete data, of one stream or of several in a row.
 
     Parameters
     ----------
@@ -179,12 +177,12 @@ def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) ->
     compression : str
         "bz2", "lz4" or "zstd".
     limit : int, optional
-        Bytes that may come out, up to `MAX_INFLATED`.
+        Maximum number of decompressed bytes, up to `MAX_INFLATED`.
 
     Raises
     ------
     DamageError
-        When it is no such data, it is cut, or more comes out than may.
+        If the data are invalid or truncated, or exceed the limit.
     """
     parts: list[bytes] = []
     limit = MAX_INFLATED if limit is None else min(limit, MAX_INFLATED)
@@ -206,18 +204,18 @@ def inflate_whole(data: bytes, compression: str, *, limit: int | None = None) ->
 
 
 def inflate_message(data: bytes) -> bytes:
-    """Decompress a message that was compressed on its own; return any other as it is."""
+    """Decompress a message that is compressed on its own; return any other unchanged."""
     if not data.startswith(ZSTD_MAGIC):
         return data
     try:
         inflated = inflate(Window(BytesIO(data), 0, len(data)), "zstd")
     except DamageError:
-        return data  # who decodes it says that it is no message
+        return data  # the decoder of the message reports it
     return data if inflated.is_cut else inflated.data
 
 
 def inflate_file(source: Path, target: Path) -> str:
-    """Decompress a file of Zstandard frames as far as it goes.
+    """Decompress a file of Zstandard frames as far as possible.
 
     Parameters
     ----------
@@ -226,7 +224,7 @@ def inflate_file(source: Path, target: Path) -> str:
     Returns
     -------
     str
-        What is wrong; nothing where all is there.
+        What is wrong; empty if the file is complete.
     """
     decompressor = zstd.ZstdDecompressor()
     is_whole = False

@@ -1,4 +1,4 @@
-"""MCAP files read without their summary.
+"""Read MCAP files without their summary.
 
 References
 ----------
@@ -24,11 +24,11 @@ _RESERVED = 0x10  # the first one that means nothing yet
 _PRIVATE = 0x80
 _N_FOOTER = 37  # bytes, with the magic at the end
 
-_Place: TypeAlias = tuple[int, int]  # of a record: its kind, its size
+_RecordHead: TypeAlias = tuple[int, int]  # kind, size
 
 
 class McapScan(Scan):
-    """The messages of an MCAP file, found by walking over its records.
+    """The messages of an MCAP file, read record by record.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class McapScan(Scan):
         return entries
 
     def _read_content(self, record: Window, losses: Losses, *, is_whole: bool) -> list[Entry]:
-        """Return the messages of a chunk; of one that is cut the window stands where it ends."""
+        """Return the messages of a chunk; leave the window at the end of a truncated one."""
         record.skip(16)  # the times of its messages
         limit, crc = record.number(8), record.number(4)
         compression = _text(record)
@@ -90,7 +90,7 @@ class McapScan(Scan):
             entries, reason = self._read_chunk(part)
             if reason or is_cut:
                 reason = f"a chunk of {n_bytes} bytes is cut" if is_cut else reason
-                # Of a chunk that is cut the rest is read as if there were no chunk.
+                # The rest of a truncated chunk is read as records outside a chunk.
                 losses.add(part.position, part.rest if is_whole else 0, reason)
         record.position = part.position
         return entries
@@ -118,7 +118,7 @@ class McapScan(Scan):
             raise DamageError("a chunk in a chunk")
 
     def _find_record(self, window: Window, start: int) -> int:
-        """Return the next place that the summary names, if it is there: records have no mark."""
+        """Return the next place that the summary names, if it exists: records have no mark."""
         if self._places is None:
             self._places = sorted(_places_of_summary(Window(window.file, 0, self._n_bytes)))
         index = bisect_left(self._places, start)
@@ -128,8 +128,8 @@ class McapScan(Scan):
         return self._damage_of(self.losses.describe(self._n_bytes, until=self._data_end))
 
 
-def _read_record(window: Window) -> _Place:
-    """Return what a record is and how long; the window stands at its content then."""
+def _read_record(window: Window) -> _RecordHead:
+    """Return kind and size of a record; leave the window at its content."""
     op = window.number(1)
     size = window.number(8)
     if not 0 < op < _RESERVED and op < _PRIVATE:
@@ -152,7 +152,7 @@ def _check(part: Window, crc: int) -> None:
 
 
 def _places_of_summary(window: Window) -> Iterator[int]:
-    """Yield where the summary says that chunks are, and where it is itself."""
+    """Yield the places of the chunks, as the summary says, and of the summary."""
     if window.rest < _N_FOOTER:
         return
     try:

@@ -1,4 +1,4 @@
-"""Bags of ROS 1 (format 2.0) read without their index.
+"""Read bags of ROS 1 (format 2.0) without their index.
 
 References
 ----------
@@ -19,7 +19,7 @@ _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = range(2, 8)
 _INDEX_OPS = (_INDEX, _CHUNK_INFO)
 _MAX_HEADER = 1 << 16
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
-_CHUNK_HEADER = 64  # more than from the start of a chunk's header to its mark
+_CHUNK_HEADER = 64  # bytes; maximum distance of the mark from the start of a chunk
 
 
 class _Record(NamedTuple):
@@ -41,7 +41,7 @@ class _Record(NamedTuple):
 
 
 class Ros1Scan(Scan):
-    """The messages of a ROS 1 bag, found by walking over its records.
+    """The messages of a ROS 1 bag, read record by record.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Ros1Scan(Scan):
     def __init__(self, path: Path) -> None:
         self._index_position = 0
         self._n_chunks_announced = 0
-        self._whole_chunks: dict[int, int] = {}  # from where to where
+        self._whole_chunks: dict[int, int] = {}  # start: end
         super().__init__(path)
 
     def _step(self, window: Window, losses: Losses) -> list[Entry]:
@@ -86,18 +86,18 @@ class Ros1Scan(Scan):
         part = window.part(record.size)
         entries, reason = self._read_chunk(part)
         if reason:
-            # Where the size is wrong, other chunks are inside.
+            # If the size is wrong, it holds other chunks.
             window.position = self._find_record(part, part.position + 1)
             losses.add(part.position, window.position - part.position, reason)
         return entries
 
     def _read_open_chunk(self, window: Window, record: _Record, losses: Losses) -> list[Entry]:
-        """Read a chunk that was never closed and has no size, or that is cut."""
+        """Read a chunk that was never closed, and has no size, or is truncated."""
         if record.compression == "none":
             if record.size:
                 reason = f"a chunk of {record.size} bytes is cut after {window.rest}"
                 losses.add(window.position, 0, reason)
-            return []  # what is in it is read as if there were no chunk
+            return []  # its records are read as records outside a chunk
         limit = record.number(b"size") or MAX_INFLATED
         return self._read_inflated(window, record.compression, losses, limit=limit)
 
@@ -116,7 +116,7 @@ class Ros1Scan(Scan):
         elif record.op == _CONNECTION:
             self._connect(record, window)
         elif record.op in _INDEX_OPS:
-            # The count is what other readers go by; some recorders wrote another size.
+            # Other readers use the count; some recorders wrote another size.
             size = 12 * record.number(b"count") if record.op == _INDEX else size
             window.skip(size)
         else:
@@ -138,7 +138,7 @@ class Ros1Scan(Scan):
 
     def _describe_damage(self) -> str:
         n_whole, n_announced = len(self._whole_chunks), self._n_chunks_announced
-        if n_whole >= n_announced > 0:  # what follows them is an index
+        if n_whole >= n_announced > 0:  # the rest is the index
             last = max(self._whole_chunks.values())
             return self._damage_of(self.losses.describe(self._n_bytes, until=last))
         n_missing = self._index_position - self._n_bytes
@@ -151,7 +151,7 @@ class Ros1Scan(Scan):
 
 
 def _read_record(window: Window) -> _Record:
-    """Return the header of a record; the window stands at its data then."""
+    """Return the header of a record; leave the window at its data."""
     size = window.number(4)
     if size > _MAX_HEADER:
         raise DamageError(f"a record with a header of {size} bytes")
@@ -166,7 +166,7 @@ def _fields_of(data: bytes) -> dict[bytes, bytes]:
         end = position + 4 + int.from_bytes(data[position : position + 4], "little")
         name, separator, value = data[position + 4 : end].partition(b"=")
         if end > len(data) or not separator:
-            raise DamageError("a record with a header that is none")
+            raise DamageError("a record with an invalid header")
         fields[name] = value
         position = end
     return fields

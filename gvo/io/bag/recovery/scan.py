@@ -1,4 +1,4 @@
-"""The walk over the records of a file, whatever their format."""
+"""Reading a file record by record, in any format."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gvo.io.bag.recovery.inflate import DamageError, Window, inflate
 
 
 class Channel(NamedTuple):
-    """A topic of a file, and how its messages are serialised."""
+    """A topic of a file and its serialisation."""
 
     name: str
     type: str
@@ -31,7 +31,7 @@ class FoundMessage(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """Where a message is."""
+    """The place of a message in a file."""
 
     log_time_ns: int
     channel_id: int
@@ -53,17 +53,17 @@ class Loss(NamedTuple):
 
 
 class Losses:
-    """What could not be read of a file."""
+    """The parts of a file that could not be read."""
 
     def __init__(self) -> None:
         self._places: list[Loss] = []
 
     def add(self, position: int, n_bytes: int, reason: str) -> None:
-        """Add a place of a file."""
+        """Add a part of the file."""
         self._places.append(Loss(position, n_bytes, reason))
 
     def describe(self, n_bytes_file: int, *, until: int | None = None) -> str:
-        """Return what is lost before a position in one line; nothing where nothing is."""
+        """Return in one line what is lost before a position; empty if nothing."""
         places = [loss for loss in self._places if until is None or loss.position < until]
         if not places:
             return ""
@@ -76,7 +76,7 @@ class Losses:
 
 
 class Scan(ABC):
-    """The messages of a file, found by walking over its records.
+    """The messages of a file, read record by record.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ class Scan(ABC):
     def messages(self, names: Collection[str]) -> Iterator[FoundMessage]:
         """Yield the messages of some topics, in the order of the chunks they are in.
 
-        Without an index nobody knows what later chunks hold. Sorted by the time of recording is
-        therefore only what is in one chunk, which is all that recorders put in another order.
+        Messages are sorted by the time of recording within each chunk, which suffices: recorders
+        write the chunks nearly in order.
         """
         for batch in self._batches(Losses()):
             for entry in sorted(batch, key=attrgetter("log_time_ns")):
@@ -112,7 +112,7 @@ class Scan(ABC):
 
     @abstractmethod
     def _step(self, window: Window, losses: Losses) -> list[Entry]:
-        """Read the next record; a chunk with all that is in it."""
+        """Read the next record, or a chunk with all its records."""
 
     @abstractmethod
     def _read_inner(self, window: Window, entries: list[Entry]) -> None:
@@ -120,11 +120,11 @@ class Scan(ABC):
 
     @abstractmethod
     def _find_record(self, window: Window, start: int) -> int:
-        """Return where to go on after damage: the next chunk, or the end."""
+        """Return where to continue after damage: the next chunk, or the end."""
 
     @abstractmethod
     def _describe_damage(self) -> str:
-        """Return what is lost; nothing where nothing is."""
+        """Return what is lost; empty if nothing."""
 
     def _batches(self, losses: Losses) -> Iterator[list[Entry]]:
         with self.path.open("rb") as file:
@@ -141,7 +141,7 @@ class Scan(ABC):
                     yield batch
 
     def _read_chunk(self, window: Window) -> tuple[list[Entry], str]:
-        """Return the messages of a chunk up to where it is damaged, and what is wrong there."""
+        """Return the messages of a chunk up to its first damage, and the damage."""
         entries: list[Entry] = []
         while window.rest:
             start = window.position
@@ -155,11 +155,11 @@ class Scan(ABC):
     def _read_inflated(
         self, part: Window, compression: str, losses: Losses, *, limit: int, crc: int = 0
     ) -> list[Entry]:
-        """Return the messages of a compressed chunk; step over what it takes of its window."""
+        """Return the messages of a compressed chunk; skip its compressed bytes."""
         start = part.position
         inflated = inflate(part, compression, limit=limit)
         if inflated.is_cut and part.end < self._n_bytes:
-            # What comes out of the start of a chunk is its own only where the file is cut there.
+            # Only a chunk at the end of a truncated file may itself be truncated.
             raise DamageError(f"a chunk of {compression} that does not inflate")
         if crc and not inflated.is_cut and crc32(inflated.data) != crc:
             raise DamageError("a chunk whose checksum does not fit")
@@ -188,12 +188,12 @@ class Scan(ABC):
 
 
 def describe_damage(path: Path, said: str, tool: str) -> str:
-    """Return what is wrong with a file and what can be done, in one line."""
+    """Return the damage of a file and its remedy, in one line."""
     return f"{path}: {said}; copy the file anew, or mend a copy by `{tool}`"
 
 
 def share(n_bytes: int, n_bytes_all: int) -> str:
-    """Return a number of bytes and what part of all they are."""
+    """Return a number of bytes and its percentage of all, as text."""
     percent = 100 * n_bytes / max(n_bytes_all, 1)
     text = f"{percent:.1f}" if percent >= 0.1 or n_bytes == 0 else "less than 0.1"
     return f"{n_bytes} of {n_bytes_all} bytes ({text} %)"
