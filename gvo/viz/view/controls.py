@@ -16,10 +16,10 @@ from gvo.config import Config, Section, load_configuration
 from gvo.errors import ConfigurationError
 
 DELAY_S = 0.4
-"""A value is taken so long after the last change: a number is typed digit by digit."""
+"""From the last change until values are applied: numbers are typed digit by digit."""
 
 PATIENCE_S = 2.0
-"""How long a value that was refused may be mended before the one that holds is shown again."""
+"""How long a refused value is shown, to be corrected, before the valid one comes back."""
 
 Value: TypeAlias = bool | int | float | str | None
 Kind = Literal["switch", "choice", "integer", "number"]
@@ -34,7 +34,7 @@ _STARTS: Mapping[tuple[str, str], float] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Control:
-    """The handles of one parameter; `empty` is the check box of null."""
+    """The handles of a parameter; `empty` is the check box for null."""
 
     parameter: Parameter
     handle: Any
@@ -42,7 +42,7 @@ class _Control:
 
     @property
     def value(self) -> Value:
-        """What the page shows."""
+        """As the page shows it."""
         if self.empty is not None and self.empty.value:
             return None
         value = self.handle.value
@@ -67,9 +67,9 @@ class ParameterControls:
     config : Config
         Shown at first.
     apply : callable
-        Is given each new configuration; raises `ConfigurationError` to refuse it.
+        Called with each new configuration; raises `ConfigurationError` to refuse it.
     say : callable
-        Is given one line on what was refused; an empty one where all is well again.
+        Called with one line on what was refused; with an empty one once values are valid.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class ParameterControls:
 
     @property
     def config(self) -> Config:
-        """The configuration that was taken last."""
+        """The configuration that was applied last."""
         return self._config
 
     def handle(self, section: str, key: str) -> Any:  # noqa: ANN401 - one of viser's handles
@@ -113,11 +113,11 @@ class ParameterControls:
         return self._controls[section, key].empty
 
     def flush(self) -> None:
-        """Take what the controls show; where it is refused, say why and show what holds."""
-        self._take(is_typing=False)
+        """Apply what the controls show; where it is refused, say why and show what is valid."""
+        self._apply_values(is_typing=False)
 
-    def _take(self, *, is_typing: bool) -> None:
-        """Take what the controls show; nothing moves under the hand of who still types."""
+    def _apply_values(self, *, is_typing: bool) -> None:
+        """Apply values; skip a field being edited."""
         with self._lock:
             self._stop_timer()
             values = values_of(self._config)
@@ -140,7 +140,7 @@ class ParameterControls:
             self._show()
 
     def close(self) -> None:
-        """Forget changes that were not taken yet."""
+        """Drop changes that were not applied yet."""
         with self._lock:
             self._is_closed = True
             self._stop_timer()
@@ -165,7 +165,7 @@ class ParameterControls:
             self._start_timer(DELAY_S, is_typing=True)
 
     def _start_timer(self, delay_s: float, *, is_typing: bool) -> None:
-        self._timer = threading.Timer(delay_s, self._take, kwargs={"is_typing": is_typing})
+        self._timer = threading.Timer(delay_s, self._apply_values, kwargs={"is_typing": is_typing})
         self._timer.daemon = True
         self._timer.start()
 
@@ -176,7 +176,7 @@ class ParameterControls:
 
 
 def _kept(old: Value, new: Value) -> Value:
-    """Return the old value where the new one is the same number, seen through rounding."""
+    """Return the old value where the new one differs by rounding alone."""
     if isinstance(old, float) and isinstance(new, float) and math.isclose(old, new, rel_tol=1e-9):
         return old
     return new
@@ -203,7 +203,7 @@ def _add_value(gui: viser.GuiApi, parameter: Parameter, value: Value) -> Any:  #
 
 
 def _add_number(gui: viser.GuiApi, parameter: Parameter, value: Any) -> Any:  # noqa: ANN401
-    """Add a slider or a field; their type is that of the value that they start with."""
+    """Add a slider or a field; viser takes its type from the first value."""
     cast: type[int] | type[float] = int if parameter.kind == "integer" else float
     lower = None if parameter.minimum is None else cast(parameter.minimum)
     upper = None if parameter.maximum is None else cast(parameter.maximum)
@@ -215,7 +215,7 @@ def _add_number(gui: viser.GuiApi, parameter: Parameter, value: Any) -> Any:  # 
         handle = gui.add_number(
             parameter.key, cast(value), min=lower, max=upper, step=step, hint=hint
         )
-    if cast is float:  # finer values than the step can be typed
+    if cast is float:  # values finer than the step can be typed
         handle.precision = max(handle.precision, 2 - math.floor(math.log10(step)))
     return handle
 

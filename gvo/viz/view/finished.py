@@ -22,24 +22,24 @@ from gvo.viz.view.panels import (
     Playback,
     ViewPoint,
     add_frame_panel,
-    add_layer_switches,
+    add_scene_controls,
     frame_rows,
     grid_cell,
     legend_html,
     numbers_html,
     pose_rows,
 )
-from gvo.viz.view.scene import LAYERS, Scene, Up
+from gvo.viz.view.scene import Scene, Up
 from gvo.viz.view.server import ViewServer, open_server
 
 N_ELLIPSOIDS = 60
 """How many covariances are drawn at most along the path."""
 
-_RATE_HZ = 15.0
 _MAX_START_SIGMAS = 10
-# Of the extent of the path, the largest half axis at first.
+# Largest half axis at first, as a share of the extent of the path.
 _ELLIPSOID_SHARE = 0.07
 _PATHS = ("raw", "causal", "smoothed")
+_NOT_RECORDED = {"keyframes", "links", "image", "points", "cloud"}
 
 
 def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewServer:
@@ -74,7 +74,7 @@ def aligned_truth(record: RunRecord) -> Trajectory | None:
 
 
 def start_sigmas(record: RunRecord) -> int:
-    """Return how many sigmas make ellipsoids that can be seen and do not hide the path."""
+    """Return the number of sigmas with which ellipsoids are seen and do not hide the path."""
     smoothed = record.trajectories["smoothed"]
     if smoothed.covariances is None or len(smoothed) == 0:
         return _MAX_START_SIGMAS
@@ -104,20 +104,19 @@ class FinishedPage:
         self.player = RunPlayer(record.frames.stamps_ns, lambda index: self._painter.offer())
         self.playback = Playback(server.gui, self.player, before=lambda: None)
         self._view = ViewPoint(server, up, is_following=False)
-        self._sigmas = server.gui.add_slider(
-            "ellipsoid sigmas", 1, 100, 1, start_sigmas(record), hint="Half axes of the ellipsoids"
+        self._painter = Painter(self.draw)
+        self._sigmas = add_scene_controls(
+            server.gui,
+            self.scene,
+            without=_NOT_RECORDED if self._truth is not None else {*_NOT_RECORDED, "truth"},
+            n_sigmas=start_sigmas(record),
+            redraw=self._painter.offer,
         )
-        self._painter = Painter(self.draw, rate_hz=_RATE_HZ)
-        self._sigmas.on_update(lambda _: self._painter.offer())
-        hidden = {"keyframes", "links", "image", "points", "cloud"}
-        hidden |= set() if self._truth is not None else {"truth"}
-        layers = [layer for layer in LAYERS if layer not in hidden]
-        add_layer_switches(server.gui, self.scene, layers)
         self._show_all()
         self.player.seek(self.player.n_frames - 1)
 
     def close(self) -> None:
-        """End what runs beside the page."""
+        """End the threads of the page."""
         self.player.close()
         self._painter.close()
 
@@ -131,7 +130,7 @@ class FinishedPage:
         self._painter.settle()
 
     def draw(self) -> None:
-        """Show the frame that the player is at."""
+        """Draw the run up to the frame of the player."""
         index = self.player.index
         stamp_ns = int(self._record.frames.stamps_ns[index])
         with self._server.atomic():
@@ -192,13 +191,13 @@ class FinishedPage:
         return {"ms": f"{sum(known.values()):.1f} ({parts})"} if known else {}
 
     def _pose(self, stamp_ns: int) -> FloatArray | None:
-        """Return the causal pose of the newest frame that has one, until a stamp."""
+        """Return the last causal pose until a stamp."""
         causal = self._record.trajectories["causal"]
         row = int(np.searchsorted(causal.stamps_ns, stamp_ns, side="right")) - 1
         return causal.T_world_cam[row] if row >= 0 else None
 
     def _draw_ellipsoids(self, stamp_ns: int) -> None:
-        """Draw covariances along the smoothed path, the same ones whatever frame is shown."""
+        """Draw covariances along the smoothed path, of the same poses whatever frame is shown."""
         smoothed = self._record.trajectories["smoothed"]
         every = max(1, -(-len(smoothed) // N_ELLIPSOIDS))
         thinned = smoothed.select(slice(None, None, every))
@@ -210,14 +209,14 @@ class FinishedPage:
 
 
 class RunPlayer:
-    """Goes through frames by their stamps.
+    """Plays frames by their stamps.
 
     Parameters
     ----------
     stamps_ns : ndarray of int64, shape (n,)
         Of the frames, nanoseconds.
     show : callable
-        Is told the index of each frame that is to be shown.
+        Called with the index of each frame to be shown.
     period_s : float
         How often it looks whether the next frame is due.
     """
@@ -254,7 +253,7 @@ class RunPlayer:
         return self._is_playing
 
     def play(self) -> None:
-        """Go on; from the end, begin again."""
+        """Let frames follow by themselves; from the end, begin again."""
         with self._lock:
             if self._index >= self.n_frames - 1:
                 self.seek(0)
@@ -263,16 +262,16 @@ class RunPlayer:
         self._is_due.set()
 
     def pause(self) -> None:
-        """Stay."""
+        """Stop that."""
         self._is_playing = False
 
     def step(self) -> None:
-        """Go to the next frame and stay."""
+        """Show the next frame and pause."""
         self.pause()
         self.seek(self._index + 1)
 
     def seek(self, index: int) -> None:
-        """Go to a frame, or the nearest there is."""
+        """Show a frame; the index is clipped."""
         with self._lock:
             self._index = int(np.clip(index, 0, max(0, self.n_frames - 1)))
             self._ahead_ns = 0.0
@@ -283,7 +282,7 @@ class RunPlayer:
         self._speed = factor
 
     def advance(self, elapsed_s: float) -> None:
-        """Let time pass while it plays."""
+        """Play on by some time."""
         with self._lock:
             if not self._is_playing:
                 return

@@ -24,7 +24,7 @@ from gvo.viz.view.panels import (
     Playback,
     ViewPoint,
     add_frame_panel,
-    add_layer_switches,
+    add_scene_controls,
     frame_rows,
     grid_cell,
     legend_html,
@@ -34,16 +34,15 @@ from gvo.viz.view.panels import (
     state_html,
 )
 from gvo.viz.view.player import Player
-from gvo.viz.view.scene import LAYERS, Scene
+from gvo.viz.view.scene import Scene
 from gvo.viz.view.server import ViewServer, open_server
 
-RATE_HZ = 15.0
 FILE_NAME = "gvo.yaml"
 """Name under which the browser saves the configuration."""
 
 _JPEG_QUALITY = 80
 _START_SIGMAS = 10
-# the camera is drawn so deep, as a share of the median depth of what it sees first
+# Size of the drawn camera and its height above the ground, by the median depth at first.
 _CAMERA_SHARE = 0.15
 _GROUND_SHARE = 0.15
 _DEPTH_PER_BASELINE = 30.0
@@ -84,13 +83,13 @@ class Page:
         self.scene = Scene(server.scene)
         self._add_frame_panel()
         self._add_main_panel()
-        self._painter = Painter(self._draw_newest, rate_hz=RATE_HZ, idle=self._show_state)
+        self._painter = Painter(self._draw_newest, idle=self._show_state)
         self._unsubscribe = player.subscribe(lambda frame: self._painter.offer())
         if player.frame_view is not None:
             self._painter.offer()
 
     def close(self) -> None:
-        """Let go of the player."""
+        """Unsubscribe from the player and end the threads of the page."""
         self._unsubscribe()
         self._painter.close()
         self.controls.close()
@@ -106,11 +105,11 @@ class Page:
         return str(self._message.content)
 
     def settle(self) -> None:
-        """Wait until what the player told last is drawn."""
+        """Wait until the last frame that the player showed is drawn."""
         self._painter.settle()
 
     def draw(self, frame: FrameView) -> None:
-        """Show a frame with all that was known when it was done."""
+        """Draw a frame, and what was known with it."""
         with self._server.atomic():
             self._place(frame)
             self.playback.show(frame.index)
@@ -148,20 +147,20 @@ class Page:
             "save as YAML", hint="For gvo run --config; the browser saves the file"
         ).on_click(self._on_save)
         self._state = gui.add_html(state_html(player_state(self._player)))
-        self._sigmas = gui.add_slider(
-            "ellipsoid sigmas", 1, 100, 1, _START_SIGMAS, hint="Half axes of the ellipsoids"
+        self._sigmas = add_scene_controls(
+            gui,
+            self.scene,
+            without=() if self._truth is not None else ("truth",),
+            n_sigmas=_START_SIGMAS,
+            redraw=lambda: self._painter.offer(),
         )
-        self._sigmas.on_update(lambda _: self._painter.offer())
-        hidden = () if self._truth is not None else ("truth",)
-        layers = [layer for layer in LAYERS if layer not in hidden]
-        add_layer_switches(gui, self.scene, layers)
         with gui.add_folder("Parameters", expand_by_default=False):
             self.controls = ParameterControls(
                 gui, self._player.config, apply=self._player.reconfigure, say=self._say
             )
 
     def flush(self) -> None:
-        """Take the parameters as they are shown now."""
+        """Apply the parameters as they are shown."""
         self.controls.flush()
 
     def _say(self, refusal: str) -> None:
@@ -169,7 +168,7 @@ class Page:
         self._show_state()
 
     def _show_state(self) -> None:
-        """Show what the player is doing, and what it cannot do."""
+        """Show what the player is doing, and what went wrong."""
         self._state.content = state_html(player_state(self._player))
         problems = [problem for problem in (self._refusal, self._player.fault) if problem]
         self._message.content = message_html("; ".join(problems))
@@ -183,7 +182,7 @@ class Page:
             self.save(event.client)
 
     def save(self, client: viser.ClientHandle) -> None:
-        """Send the configuration to a browser, which saves it as a file."""
+        """Send the configuration to a browser as a file."""
         self.flush()
         content = describe_configuration(self.controls.config).encode()
         client.send_file_download(FILE_NAME, content, save_immediately=True)
@@ -196,7 +195,7 @@ class Page:
         return rows if frame.result is None else rows | result_rows(frame.result)
 
     def _place(self, frame: FrameView) -> None:
-        """Choose sizes and the view by what the first frame sees."""
+        """Choose sizes and view by what the first frame sees."""
         if self._placed_for == self._player.first_index:
             return
         self._placed_for = self._player.first_index
@@ -254,7 +253,7 @@ def player_state(player: Player) -> str:
 
 
 def _depth_of(frame: FrameView, camera: StereoCamera | PinholeCamera) -> float:
-    """Return how far away, metres, most of what is seen is; a guess before anything is."""
+    """Return the median depth of what is seen, metres; a guess where nothing is."""
     points_cam, _ = frame.cloud
     if len(points_cam) > 0:
         return float(np.median(points_cam[:, 2]))

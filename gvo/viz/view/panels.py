@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +14,7 @@ import viser
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import FloatArray, FrameResult
 from gvo.viz.view.layers import COLOURS
-from gvo.viz.view.scene import Scene, Up, position_sigmas
+from gvo.viz.view.scene import LAYERS, Scene, Up, position_sigmas
 
 MAIN_WIDTH_PX = 330
 FRAME_WIDTH_PX = 430
@@ -22,7 +22,7 @@ FRAME_WIDTH_PX = 430
 UP: dict[Up, FloatArray] = {"-y": np.array([0.0, -1.0, 0.0]), "+z": np.array([0.0, 0.0, 1.0])}
 """Unit vectors of the world that point up."""
 
-# Browsers that were not moved for so long are where they say that they are.
+# The view that a browser reports is up to date so long after it was moved.
 _REST_S = 1.0
 _CELL = "padding:0 0.75em 0 0;text-align:left;vertical-align:top;font-weight:400"
 _NUMBER = "font-variant-numeric:tabular-nums;overflow-wrap:anywhere;width:100%"
@@ -48,6 +48,7 @@ SPEEDS: dict[str, float | None] = {
     "fastest": None,
 }
 
+_PERIOD_S = 1.0 / 15.0  # at least, from drawing to drawing
 _IDLE_S = 0.25
 
 
@@ -62,12 +63,27 @@ def add_frame_panel(server: viser.ViserServer) -> Any:  # noqa: ANN401 - a tab o
     return tab
 
 
-def add_layer_switches(gui: viser.GuiApi, scene: Scene, layers: Iterable[str]) -> None:
-    """Add a check box for each layer of the scene."""
+def add_scene_controls(
+    gui: viser.GuiApi,
+    scene: Scene,
+    *,
+    without: Collection[str],
+    n_sigmas: int,
+    redraw: Callable[[], None],
+) -> Any:  # noqa: ANN401 - a slider of viser's
+    """Add the size of the ellipsoids, which is returned, and a check box for each layer."""
+    sigmas = gui.add_slider(
+        "ellipsoid sigmas", 1, 100, 1, n_sigmas, hint="Half axes of the ellipsoids"
+    )
+    sigmas.on_update(lambda _: redraw())
     with gui.add_folder("Show", expand_by_default=False):
-        for layer in layers:
-            box = gui.add_checkbox(layer, True)
-            box.on_update(lambda event: scene.set_visible(event.target.label, event.target.value))
+        for layer in LAYERS:
+            if layer not in without:
+                box = gui.add_checkbox(layer, True)
+                box.on_update(
+                    lambda event: scene.set_visible(event.target.label, event.target.value)
+                )
+    return sigmas
 
 
 def grid_cell(size_m: float) -> float:
@@ -76,10 +92,10 @@ def grid_cell(size_m: float) -> float:
 
 
 class ViewPoint:
-    """From where the scene is seen.
+    """From where the scene is seen, in each browser.
 
-    What a browser says of its view is late, as much as it takes to draw: while it follows, only
-    the direction and distance are taken from it, and what it looks at is known here.
+    A browser reports its view late, by the time that drawing takes. While the view follows the
+    camera, only direction and distance are taken from the report.
 
     Parameters
     ----------
@@ -97,14 +113,14 @@ class ViewPoint:
             "follow camera", is_following, hint="Move the view with the camera"
         )
         self._last = np.zeros(3)
-        # What is looked at, from the camera: at first (with from where), and of each browser.
+        # Relative to the camera: first position and target, and the target of each browser.
         self._start: tuple[FloatArray, FloatArray] | None = None
         self._offsets: dict[int, FloatArray] = {}
         self._moved_s = -np.inf
         server.on_client_connect(self._catch_up)
 
     def look_along(self, T_world_cam: FloatArray, distance_m: float) -> None:
-        """Look from behind and above along the camera's axis; also whoever connects later.
+        """Look from behind and above along the camera's axis, also in browsers that come later.
 
         Parameters
         ----------
@@ -159,9 +175,9 @@ class ViewPoint:
             client.camera.position, client.camera.look_at = position, target
 
     def _catch_up(self, client: viser.ClientHandle) -> None:
-        """Bring a browser that comes later to where the first one began, by the camera."""
+        """Show a browser that comes later what the first one saw at first, at the camera."""
         if self._start is not None and self.follow.value:
-            # What it says of its view may be from before it heard of any.
+            # Its report may be older than the view that it was given.
             position, target = (self._last + offset for offset in self._start)
             self._offsets[client.client_id] = self._start[1]
             client.camera.position, client.camera.look_at = position, target
@@ -188,7 +204,7 @@ def numbers_html(rows: Mapping[str, str]) -> str:
 
 
 def message_html(text: str) -> str:
-    """Return one line that stands out; nothing to see where there is no text."""
+    """Return one line that stands out; hidden without text."""
     colour = COLOURS["refused"]
     style = (
         f"margin:0 0.75em 0.5em;padding:0.3em 0.6em;font-size:0.85em;border-left:3px solid {colour}"
@@ -206,7 +222,7 @@ def state_html(text: str) -> str:
 
 
 def legend_html(names: Iterable[str]) -> str:
-    """Return the colours with what they stand for."""
+    """Return the colours and their meanings."""
     entries = "".join(
         '<div style="display:flex;align-items:center;gap:0.6em">'
         f'<span style="flex:none;width:1.4em;border-top:3px {_line(name)} {COLOURS[name]}"></span>'
@@ -272,10 +288,10 @@ class Playable(Protocol):
         """Whether frames follow by themselves."""
 
     def play(self) -> None:
-        """Go on."""
+        """Let frames follow by themselves."""
 
     def pause(self) -> None:
-        """Stay."""
+        """Stop that."""
 
     def step(self) -> None:
         """Go to the next frame."""
@@ -284,11 +300,11 @@ class Playable(Protocol):
         """Go to a frame."""
 
     def set_speed(self, factor: float | None) -> None:
-        """Play as recorded (1), faster, slower, or as fast as it goes (None)."""
+        """Play as recorded (1), faster, slower, or as fast as possible (None)."""
 
 
 class Playback:
-    """The controls of what can be played.
+    """Buttons, keys, slider and speed of what can be played.
 
     Parameters
     ----------
@@ -296,7 +312,7 @@ class Playback:
         Where they are added.
     playable : Playable
     before : callable
-        Called before anything is started, so that changes made until then hold.
+        Called before each command, so that changes until then count.
     """
 
     def __init__(
@@ -319,19 +335,14 @@ class Playback:
     def press(self, name: str) -> None:
         """Do what a button does: play, pause or step."""
         self._before()
-        actions = {
-            "play": self._playable.play,
-            "pause": self._playable.pause,
-            "step": self._playable.step,
-        }
-        actions[name]()
+        getattr(self._playable, name)()
 
     def toggle(self) -> None:
         """Play, or pause where it plays."""
         self.press("pause" if self._playable.is_playing else "play")
 
     def show(self, index: int) -> None:
-        """Show which frame is shown."""
+        """Move the slider to the frame that is shown."""
         last = max(1, self._playable.n_frames - 1, index)
         if self.frame.max != last:
             self.frame.max = last
@@ -353,23 +364,20 @@ class Playback:
 
 
 class Painter:
-    """Draws the newest of what is offered, in a thread of its own, at a limited rate.
+    """Draws on a thread of its own, at a limited rate; skips what is out of date by then.
 
     Parameters
     ----------
     draw : callable
-        Is called without arguments; looks up itself what there is to draw.
-    rate_hz : float
-        At most so often.
+        Draws the newest that there is.
     idle : callable, optional
-        Is called now and then while there is nothing to draw.
+        Called four times a second while there is nothing to draw.
     """
 
     def __init__(
-        self, draw: Callable[[], None], *, rate_hz: float, idle: Callable[[], None] | None = None
+        self, draw: Callable[[], None], *, idle: Callable[[], None] = lambda: None
     ) -> None:
         self._draw = draw
-        self._period_s = 1.0 / rate_hz
         self._idle = idle
         self._state = threading.Condition()
         self._n_offered = self._n_drawn = 0
@@ -378,7 +386,7 @@ class Painter:
         self._thread.start()
 
     def offer(self) -> None:
-        """Tell that there is something new."""
+        """Have drawn what is new."""
         with self._state:
             self._n_offered += 1
             self._state.notify_all()
@@ -390,7 +398,7 @@ class Painter:
             self._state.wait_for(lambda: self._n_drawn >= wanted or self._is_closed)
 
     def close(self) -> None:
-        """End the thread; what was offered last may stay undrawn."""
+        """End the thread; the last offer may stay undrawn."""
         with self._state:
             self._is_closed = True
             self._state.notify_all()
@@ -402,7 +410,7 @@ class Painter:
     def _run(self) -> None:
         try:
             self._draw_until_closed()
-        finally:  # also where drawing failed: nobody may wait for it any longer
+        finally:  # also where drawing failed, so that nobody waits for it
             with self._state:
                 self._is_closed = True
                 self._state.notify_all()
@@ -410,11 +418,11 @@ class Painter:
     def _draw_until_closed(self) -> None:
         while True:
             with self._state:
-                self._state.wait_for(self._is_due, timeout=None if self._idle is None else _IDLE_S)
+                self._state.wait_for(self._is_due, timeout=_IDLE_S)
                 if self._is_closed:
                     return
                 is_new, wanted = self._is_due(), self._n_offered
-            if not is_new and self._idle is not None:
+            if not is_new:
                 self._idle()
                 continue
             start = time.monotonic()
@@ -422,5 +430,5 @@ class Painter:
             with self._state:
                 self._n_drawn = wanted
                 self._state.notify_all()
-                rest_s = self._period_s - (time.monotonic() - start)
-                self._state.wait_for(lambda: self._is_closed, timeout=max(0.0, rest_s))
+                rest_s = max(0.0, _PERIOD_S - (time.monotonic() - start))
+                self._state.wait_for(lambda: self._is_closed, timeout=rest_s)

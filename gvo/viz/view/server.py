@@ -25,19 +25,19 @@ class LocalServer(viser.ViserServer):
     """A server that stays on this machine: it opens no tunnel to a public address."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse what any client may ask for by a message."""
+        """Refuse, whichever client asks."""
         return None
 
 
 class ViewServer(AbstractContextManager["ViewServer"]):
-    """A page that is being served.
+    """A page that is being served, until it is closed.
 
     Parameters
     ----------
     server : viser.ViserServer
         Already listening.
     note : str
-        One line on what differs from what was asked for; empty where nothing does.
+        One line where another port than the one asked for is used, else empty.
     """
 
     def __init__(self, server: viser.ViserServer, *, note: str = "") -> None:
@@ -84,7 +84,7 @@ def open_server(host: str, port: int, *, title: str) -> ViewServer:
     Raises
     ------
     ConfigurationError
-        Where the address is none of this machine's, or no port near is free.
+        Where the address is not of this machine, or no port is free.
     """
     free = find_port(host, port)
     with _silence(), _refusing_strangers(is_local=_is_loopback(host)):
@@ -98,16 +98,16 @@ def open_server(host: str, port: int, *, title: str) -> ViewServer:
 def is_own_page(origin: str | None, host: str, *, is_local: bool) -> bool:
     """Tell whether a connection comes from this page, not from another one in the browser.
 
-    A browser lets any page of the net connect to this machine, and says from where it is.
+    Browsers let any page connect to this machine, and name its origin.
 
     Parameters
     ----------
     origin : str or None
-        What the browser says; None: it is no browser.
+        As the browser says; None from other programs.
     host : str
-        Name and port that were asked for.
+        Name and port of the request.
     is_local : bool
-        Only names of this machine count: another one may be made to lead here.
+        Accept names of this machine alone: DNS may lead others here.
     """
     if origin is None:
         return True
@@ -124,7 +124,7 @@ def _is_loopback(host: str) -> bool:
 
 @contextlib.contextmanager
 def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
-    """Let a server that starts meanwhile refuse other pages; viser itself takes all."""
+    """Make a server that starts inside the context refuse other pages; viser accepts all."""
     serve = websockets_server.serve
 
     def guarded(*args: Any, process_request: Any, **options: Any) -> Any:  # noqa: ANN401
@@ -136,18 +136,11 @@ def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
 
         return serve(*args, process_request=check, **options)
 
-    with _replaced(websockets_server, "serve", guarded):
-        yield
-
-
-@contextlib.contextmanager
-def _replaced(module: Any, name: str, value: object) -> Iterator[None]:  # noqa: ANN401
-    former = getattr(module, name)
-    setattr(module, name, value)
+    websockets_server.serve = guarded  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        setattr(module, name, former)
+        websockets_server.serve = serve  # type: ignore[misc]
 
 
 def find_port(host: str, port: int) -> int:
@@ -185,5 +178,5 @@ def _try_port(host: str, port: int) -> OSError | None:
 
 
 def _silence() -> contextlib.AbstractContextManager[object]:
-    """Swallow what viser prints of itself."""
+    """Swallow what viser prints."""
     return contextlib.redirect_stdout(io.StringIO())
