@@ -567,3 +567,20 @@ class FrameResult:
     def stamp_ns(self) -> int:
         """Stamp of the frame, nanoseconds."""
         return self.raw.stamp_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far work on a recording has come.
+
+    Parameters
+    ----------
+    n_done, n_total : int
+        Frames taken, and images that are expected in all.
+    n_tracked : int
+        Frames tied to earlier ones by a registration.
+    """
+
+    n_done: int
+    n_total: int
+    n_tracked: int

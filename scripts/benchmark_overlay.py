@@ -109,7 +109,7 @@ def time_run(source: Source, excerpt: Excerpt, film: Path | None) -> float:
     elapsed_ms = 1e3 * (time.perf_counter() - start)
     if film is not None:
         film.unlink()
-    return elapsed_ms / loop.tally.n_frames
+    return elapsed_ms / loop.statistics.n_frames
 
 
 if __name__ == "__main__":

@@ -22,9 +22,8 @@ import gvo
 from gvo.config import FrontendConfig
 from gvo.io.frames import one_opencv_thread
 from gvo.io.recording import Sensor, Source
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import peak_memory_mb
-from gvo.types import FaultyFrame, Frame
+from gvo.types import FaultyFrame, Frame, Progress
 
 Estimator = Literal["raw", "causal", "smoothed"]
 Arguments = ParamSpec("Arguments")

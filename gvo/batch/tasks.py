@@ -23,8 +23,8 @@ from gvo.io.recording import Source
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.run import EXIT_COMPLETE, RunResult, run_recording
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import run_identity
+from gvo.types import Progress
 
 MARK = "batch.json"
 # How long to wait for another process that writes the folder of the run.

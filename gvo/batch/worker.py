@@ -15,7 +15,7 @@ from gvo.errors import GvoError
 if TYPE_CHECKING:
     from gvo.batch.rows import BatchRow
     from gvo.batch.tasks import Task, TaskOptions
-    from gvo.runs.statistics import Progress
+    from gvo.types import Progress
 
 _REPORT_EVERY_S = 1.0
 

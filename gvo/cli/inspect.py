@@ -64,7 +64,6 @@ def explain(
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.diagnostics.explain import explain_frame
     from gvo.io.excerpt import make_excerpt
-    from gvo.runs.statistics import Progress
     from gvo.viz.explanation import open_folder, write_explanation
 
     parameters = load(config, set_)
@@ -73,15 +72,12 @@ def explain(
     source = open_source(recordings, parameters, calibration, topics)
     open_folder(out)
     with interruptible() as check, progress(source.info.name) as show:
-        told = both(show, check)
         explanation = explain_frame(
             source,
             frame,
             config=parameters,
             excerpt=excerpt,
-            on_progress=lambda n_done, n_to_do, n_tracked: told(
-                Progress(n_done=n_done, n_total=n_to_do, n_tracked=n_tracked)
-            ),
+            on_progress=both(show, check),
         )
         written = write_explanation(explanation, out)
     for path in written:

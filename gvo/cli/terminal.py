@@ -13,7 +13,7 @@ import typer
 
 if TYPE_CHECKING:
     from gvo.runs.run import RunResult
-    from gvo.runs.statistics import Progress
+    from gvo.types import Progress
 
 ProgressT = TypeVar("ProgressT")
 # By how much the total of a progress bar may be off.

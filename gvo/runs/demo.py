@@ -11,7 +11,7 @@ from gvo.io.convert.bag_writer import write_bag
 from gvo.io.opening import open_recording
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.run import RunResult, run_recording
-from gvo.runs.statistics import Progress
+from gvo.types import Progress
 
 BAG_NAME = "drive.mcap"
 N_FRAMES = 100

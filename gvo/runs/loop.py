@@ -14,8 +14,8 @@ from gvo.io.frames import frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.runs.statistics import Progress, RunTally
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
+from gvo.runs.statistics import RunStatistics
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
 
 
 class Output(Protocol):
@@ -50,7 +50,7 @@ class RunLoop:
 
     Attributes
     ----------
-    tally : RunTally
+    statistics : RunStatistics
         What was counted.
     """
 
@@ -67,7 +67,7 @@ class RunLoop:
         self.source = source
         self.config = config
         self.frame = frame
-        self.tally = RunTally()
+        self.statistics = RunStatistics()
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
         self._items = items
@@ -99,7 +99,7 @@ class RunLoop:
                 for item in self._read():
                     self._take(item, outputs)
                     if on_progress is not None:
-                        on_progress(self.tally.progress(self._n_expected(item.stamp_ns)))
+                        on_progress(self.statistics.progress(self._n_expected(item.stamp_ns)))
             except OutputError:
                 is_writable = False
                 raise
@@ -110,16 +110,19 @@ class RunLoop:
                 self.count()
 
     def count(self) -> None:
-        """Take into the tally what others have counted so far."""
+        """Take into the statistics what others have counted so far."""
         window = self._odometry.window
-        self.tally.window, self.tally.polish = window.counts, window.polish
-        self.tally.rig_offsets = self._odometry.rig_offsets
-        self.tally.n_guessed = self.frame.n_guessed
-        self.tally.mount_travel_m = self.frame.mount_travel_m
+        self.statistics.window, self.statistics.polish = window.counts, window.polish
+        self.statistics.rig_offsets = self._odometry.rig_offsets
+        self.statistics.n_guessed = self.frame.n_guessed
+        self.statistics.mount_travel_m = self.frame.mount_travel_m
 
     def _n_expected(self, stamp_ns: int) -> int:
         """Estimate how many images are to come in all, from the stamps so far."""
-        n_images, n_done = self.source.info.n_images, self.tally.n_frames + self.tally.n_unpaired
+        n_images, n_done = (
+            self.source.info.n_images,
+            self.statistics.n_frames + self.statistics.n_unpaired,
+        )
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if n_done < 2:
@@ -138,7 +141,7 @@ class RunLoop:
             except StopIteration:
                 return
             except RecordingError as error:
-                self.tally.broken_off = str(error)
+                self.statistics.broken_off = str(error)
                 return
             self._read_ms = 1e3 * (time.perf_counter() - start)
             yield item
@@ -158,14 +161,14 @@ class RunLoop:
             finished=self._placed(result.finished),
             stage_ms={"read": self._read_ms, **result.stage_ms},
         )
-        self.tally.add_result(placed)
+        self.statistics.add_result(placed)
         for output in outputs:
             output.add_frame(item, placed)
 
     def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
-        self.tally.add_duration("read", self._read_ms)
-        self.tally.add_faulty(item, is_loss=is_loss)
+        self.statistics.add_duration("read", self._read_ms)
+        self.statistics.add_faulty(item, is_loss=is_loss)
         for output in outputs if is_loss else ():
             output.add_faulty(item)
 

@@ -19,12 +19,11 @@ from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
 from gvo.runs.loop import RunLoop
 from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import summarize
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.round_trip import Closing, close
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, FaultyFrame, Frame, StereoFrame
+from gvo.types import Failure, FaultyFrame, Frame, Progress, StereoFrame
 from gvo.viz.plots import plot_shuttle
 
 MAX_PIECE_BYTES = 256_000_000
@@ -284,9 +283,9 @@ def shuttle(
         loop.run([folder], None if on_progress is None else _doubled(on_progress))
     turn_ns = way.turn_ns
     if turn_ns is None:
-        raise RecordingError(f"{source.info.name}: no usable frame: {loop.tally.reason()}")
+        raise RecordingError(f"{source.info.name}: no usable frame: {loop.statistics.reason()}")
     closings = _close(folder.path, turn_ns, source.info.name)
-    warnings = loop.tally.warnings()
+    warnings = loop.statistics.warnings()
     summary = _summary(loop, warnings, turn_ns, closings)
     folder.write_summary(summary)
     plot_shuttle(folder.path / SHUTTLE_PICTURE, closings)
@@ -294,7 +293,7 @@ def shuttle(
         summary=summary,
         closings=closings,
         turn_ns=turn_ns,
-        exit_code=EXIT_PARTLY if loop.tally.is_partly else EXIT_COMPLETE,
+        exit_code=EXIT_PARTLY if loop.statistics.is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
     )
 

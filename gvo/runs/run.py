@@ -28,13 +28,12 @@ from gvo.io.run_folder.writer import (
 )
 from gvo.runs.loop import RunLoop
 from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import RunningSummary, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure
+from gvo.types import Failure, Progress
 
 EXIT_COMPLETE = 0
 EXIT_PARTLY = 3
@@ -148,9 +147,11 @@ def run_recording(
 
 def _refuse_nothing(loop: RunLoop, folder: RunFolder) -> None:
     """Refuse a run without a single pose; no summary is left of it."""
-    if loop.tally.n_with_pose == 0:
+    if loop.statistics.n_with_pose == 0:
         (folder.path / SUMMARY).unlink(missing_ok=True)
-        raise RecordingError(f"{loop.source.info.name}: no usable frame: {loop.tally.reason()}")
+        raise RecordingError(
+            f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -196,7 +197,7 @@ def _conclude(
     is_asked: bool,
 ) -> RunResult:
     """Write truth and summary."""
-    warnings = loop.tally.warnings() + notes
+    warnings = loop.statistics.warnings() + notes
     found = compared if isinstance(compared, TruthComparison) else None
     if found is not None:
         warnings += [f"ground truth: {text}" for text in found.warnings()]
@@ -205,7 +206,7 @@ def _conclude(
     summary = summarize(loop, compared, warnings)
     if found is not None:
         folder.write_truth(found.truth.trajectory)
-    is_partly = loop.tally.is_partly or (is_asked and found is None)
+    is_partly = loop.statistics.is_partly or (is_asked and found is None)
     exit_code = EXIT_PARTLY if is_partly else EXIT_COMPLETE
     summary |= {"exit_code": exit_code, "run": identity}
     folder.write_summary(summary)

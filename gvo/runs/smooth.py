@@ -28,12 +28,11 @@ from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY, RunResult
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, Rejected, Status
+from gvo.types import Estimate, Progress, Rejected, Status
 from gvo.viz.plots import plot_trajectories
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")

@@ -11,30 +11,13 @@ import numpy as np
 from gvo.backend.batch import BatchResult
 from gvo.backend.gating import WindowCounts
 from gvo.frontend.stereo.offsets import RigOffsets
-from gvo.types import FaultyFrame, FrameResult, SegmentJoin, Status
+from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
 # With more poses that only continue a velocity, a trajectory is in parts made up.
 _MAX_UNTIED_SHARE = 0.1
 # A head that turns on a robot moves its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Progress:
-    """How far a run has come.
-
-    Parameters
-    ----------
-    n_done, n_total : int
-        Frames taken, and images announced by the recording.
-    n_tracked : int
-        Frames tied to earlier ones by a registration.
-    """
-
-    n_done: int
-    n_total: int
-    n_tracked: int
 
 
 class _Durations:
@@ -82,7 +65,7 @@ class Segment:
 
 
 @dataclass(slots=True, kw_only=True)
-class RunTally:
+class RunStatistics:
     """Counts and times over the frames of a run."""
 
     statuses: Counter[Status] = field(default_factory=Counter)
@@ -146,7 +129,7 @@ class RunTally:
         return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
 
     def progress(self, n_images: int) -> Progress:
-        """Return how far the run is, of so many announced images."""
+        """Return how far the run is, of so many images."""
         return Progress(
             n_done=self.n_frames + self.n_unpaired, n_total=n_images, n_tracked=self.n_tracked
         )

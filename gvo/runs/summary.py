@@ -23,10 +23,9 @@ from gvo.io.poses.truth import TruthComparison
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import RunFolder
 from gvo.runs.loop import RunLoop
-from gvo.runs.statistics import Progress
 from gvo.trajectory.evaluation import Evaluation, evaluations_json
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, Status
+from gvo.types import Failure, Progress, Status
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
@@ -54,7 +53,7 @@ def summarize(
     state : {"running", "interrupted", "complete"}
         How far the run is.
     """
-    info, tally = loop.source.info, loop.tally
+    info, statistics = loop.source.info, loop.statistics
     evaluations: tuple[Evaluation, ...] = ()
     point: list[list[float]] | None = None
     stamps_from: str | None = None
@@ -64,7 +63,7 @@ def summarize(
         truth, evaluations = compared.truth.decision, compared.evaluations
         point = compared.truth.T_frame_point.tolist()
         stamps_from = compared.truth.trajectory.stamps_from
-    medians = {stage: durations.median() for stage, durations in tally.stages.items()}
+    medians = {stage: durations.median() for stage, durations in statistics.stages.items()}
     return {
         "gvo_version": __version__,
         "state": state,
@@ -75,15 +74,15 @@ def summarize(
         "ground_truth": truth,
         "T_frame_truth": point,
         "ground_truth_stamps_from": stamps_from,
-        "frames": tally.n_frames,
-        "tracked": tally.n_tracked,
-        "coverage_percent": tally.coverage_percent,
-        "segments": tally.segments_json(),
-        "status_counts": {status.value: tally.statuses[status] for status in Status},
-        "unpaired_images": tally.n_unpaired,
-        "window": asdict(tally.window),
-        "polish": None if tally.polish is None else tally.polish.as_json(),
-        "rig_offsets": None if tally.rig_offsets is None else tally.rig_offsets.as_json(),
+        "frames": statistics.n_frames,
+        "tracked": statistics.n_tracked,
+        "coverage_percent": statistics.coverage_percent,
+        "segments": statistics.segments_json(),
+        "status_counts": {status.value: statistics.statuses[status] for status in Status},
+        "unpaired_images": statistics.n_unpaired,
+        "window": asdict(statistics.window),
+        "polish": None if statistics.polish is None else statistics.polish.as_json(),
+        "rig_offsets": None if statistics.rig_offsets is None else statistics.rig_offsets.as_json(),
         "median_ms": medians,
         "peak_memory_mb": round(peak_memory_mb(), 1),
         "errors": evaluations_json(evaluations)["estimates"],
@@ -248,7 +247,7 @@ class RunningSummary:
         OutputError
             When it cannot be written.
         """
-        lines = [*warnings, *self._loop.tally.warnings()]
+        lines = [*warnings, *self._loop.statistics.warnings()]
         summary = summarize(self._loop, _NOT_YET, lines, state=state)
         self._folder.write_summary(summary | {"run": self._identity})
         self._written_s = time.monotonic()
@@ -276,6 +275,6 @@ class RunningSummary:
             self.write("interrupted", what)
 
     def _explained(self, error: OutputError) -> OutputError:
-        tally = self._loop.tally
-        text = f"{error}; {tally.n_frames} frames stand whole in {self._folder.path}"
-        return OutputError(text, is_partly=tally.n_with_pose > 0)
+        statistics = self._loop.statistics
+        text = f"{error}; {statistics.n_frames} frames stand whole in {self._folder.path}"
+        return OutputError(text, is_partly=statistics.n_with_pose > 0)

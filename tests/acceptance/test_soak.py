@@ -15,7 +15,7 @@ import pytest
 import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.synthetic.worlds.motion import LAP_M
-from gvo.runs.statistics import Progress
+from gvo.types import Progress
 
 ROOT = Path(__file__).parents[2]
 BENCHMARK = ROOT / "scripts/benchmark.py"

@@ -16,7 +16,7 @@ from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import written_alone
-from gvo.runs.statistics import Progress
+from gvo.types import Progress
 from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of
 
 CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gvo.batch.worker import BatchStoppedError, _reporter
-from gvo.runs.statistics import Progress
+from gvo.types import Progress
 
 KEY = ("batch", 7)
 _PROGRAM = """

@@ -29,9 +29,8 @@ from gvo.io.synthetic.recording import SensorNoise, expose
 from gvo.io.synthetic.rendering import render_image, to_uint8
 from gvo.io.synthetic.worlds.motion import CAMERA_HEIGHT_M, LAP_M, heading, road_point
 from gvo.io.synthetic.worlds.street import street
-from gvo.runs.statistics import Progress
 from gvo.runs.summary import peak_memory_mb
-from gvo.types import FloatArray, ImageArray
+from gvo.types import FloatArray, ImageArray, Progress
 
 # A length of lap that goes into a tenth of 10,000 or 2,000 frames: all tenths see the same road.
 N_LAP = 500

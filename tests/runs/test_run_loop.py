@@ -17,9 +17,8 @@ from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.loop import RunLoop
-from gvo.runs.statistics import Progress
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
 _N_FRAMES = 7
@@ -148,8 +147,8 @@ def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(
     walk.items, walk.damage = walk.items[:8], "the last 3 frames are missing"
     kept, loop = run(walk)
     assert len(kept.frames) == len(kept.smoothed) == 4
-    assert loop.tally.broken_off == "the last 3 frames are missing"
-    assert loop.tally.is_partly
+    assert loop.statistics.broken_off == "the last 3 frames are missing"
+    assert loop.statistics.is_partly
 
 
 @pytest.mark.parametrize(("sensor", "n_lost"), [("stereo", 1), ("rgbd", 0)])
@@ -159,8 +158,8 @@ def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lo
     kept, loop = run(source)
     assert len(kept.frames) == _N_FRAMES - 1
     assert [frame.stamp_ns for frame in kept.faulty] == [source.items[6].stamp_ns] * n_lost
-    assert loop.tally.n_faulty == n_lost
-    assert loop.tally.is_partly == bool(n_lost)
+    assert loop.statistics.n_faulty == n_lost
+    assert loop.statistics.is_partly == bool(n_lost)
 
 
 def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Rendered) -> None:

@@ -16,7 +16,7 @@ import pytest
 import gvo
 from gvo.errors import OutputError, RunBusyError
 from gvo.io.run_folder.reader import read_run
-from gvo.runs.statistics import Progress
+from gvo.types import Progress
 
 N = 12
 NO_REPORT = gvo.RunOutputs(report=False)

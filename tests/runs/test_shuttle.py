@@ -19,11 +19,11 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.opening import open_recording
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.runs.round_trip import ShuttleResult, shuttle
-from gvo.runs.statistics import Progress
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.round_trip import format_closings
 from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Progress
 
 _N_FRAMES = 6
 

@@ -18,11 +18,10 @@ from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.opening import open_edges
 from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY, RunResult
 from gvo.runs.smooth import configuration_for, smooth_edges
-from gvo.runs.statistics import Progress
 from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, FloatArray
+from gvo.types import Edge, FloatArray, Progress
 
 TRAJECTORIES = ("raw", "causal", "smoothed")
 SECOND = 1_000_000_000

@@ -21,9 +21,7 @@ from gvo.io.frames import frames
 from gvo.io.recording import Source
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
-from gvo.types import FaultyFrame, Frame, FrameResult, Status
-
-Progress = Callable[[int, int, int], None]
+from gvo.types import FaultyFrame, Frame, FrameResult, Progress, Status
 
 
 def explain_frame(
@@ -32,7 +30,7 @@ def explain_frame(
     *,
     config: Config | None = None,
     excerpt: Excerpt | None = None,
-    on_progress: Progress | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
 ) -> FrameExplanation:
     """Run up to one frame of a recording and explain what happened with it.
 
@@ -47,8 +45,7 @@ def explain_frame(
     excerpt : Excerpt, optional
         Which frames are read; the index counts those.
     on_progress : callable, optional
-        Called after each frame with the number of frames done, of those to do, and of those
-        that a registration tied to earlier ones.
+        Called after each frame.
 
     Returns
     -------
@@ -78,7 +75,7 @@ def explain_frame(
             n_tracked += drive.track(item, n).status in (Status.OK, Status.RESUMED)
         n += 1
         if on_progress is not None:
-            on_progress(n, index + 1, n_tracked)
+            on_progress(Progress(n_done=n, n_total=index + 1, n_tracked=n_tracked))
     raise RecordingError(
         f"{source.info.name}: there is no frame {index}: "
         + (f"there are {n}, counted from 0; choose one up to {n - 1}" if n else "no frame was read")

@@ -1,0 +1,119 @@
+"""Counts and warnings of a run."""
+
+import numpy as np
+import pytest
+
+from gvo.runs.statistics import RunStatistics
+from gvo.types import Estimate, FaultyFrame, FrameResult, SegmentJoin, Status
+
+
+def counted(n_ok: int, n_coasting: int) -> RunStatistics:
+    statistics = RunStatistics()
+    for number, status in enumerate([Status.OK] * n_ok + [Status.COASTING] * n_coasting):
+        add(statistics, number, status, 0)
+    return statistics
+
+
+@pytest.mark.parametrize(
+    ("n_ok", "n_coasting", "is_partly"), [(30, 0, False), (27, 3, False), (26, 4, True)]
+)
+def test_a_run_of_which_a_tenth_is_made_up_is_not_complete(
+    n_ok: int, n_coasting: int, is_partly: bool
+) -> None:
+    statistics = counted(n_ok, n_coasting)
+    assert statistics.is_partly == is_partly
+    assert len(statistics.warnings()) == (n_coasting > 0)
+
+
+def test_a_camera_that_moves_far_in_the_frame_asked_for_is_told() -> None:
+    statistics = counted(5, 0)
+    statistics.mount_travel_m = 0.6  # a head that turns
+    assert statistics.warnings() == []
+    statistics.mount_travel_m = 38.0
+    (warning,) = statistics.warnings()
+    assert "38.0 m" in warning
+
+
+def test_images_without_partner_count_as_frames_only_where_they_are_a_loss() -> None:
+    statistics = counted(5, 0)
+    statistics.add_faulty(FaultyFrame(stamp_ns=7, reason="alone", is_unpaired=True), is_loss=False)
+    assert (statistics.n_frames, statistics.is_partly) == (5, False)
+    statistics.add_faulty(FaultyFrame(stamp_ns=8, reason="dark"), is_loss=True)
+    assert (statistics.n_frames, statistics.is_partly) == (6, True)
+    assert statistics.progress(10).n_done == 7
+
+
+def add(
+    statistics: RunStatistics, stamp_ns: int, status: Status, segment: int, *joins: tuple[int, int]
+) -> None:
+    pose = Estimate(stamp_ns=stamp_ns, T_world_cam=np.eye(4), covariance=np.eye(6))
+    result = FrameResult(
+        raw=pose,
+        causal=pose,
+        finished=(),
+        status=status,
+        reason="",
+        n_keypoints=9,
+        n_points=8,
+        n_matches=7,
+        n_inliers=6,
+        n_links=3,
+        segment=segment,
+        joins=tuple(
+            SegmentJoin(segment=first, to_segment=second, stamp_ns=stamp_ns, reference_ns=0)
+            for first, second in joins
+        ),
+    )
+    statistics.add_result(result)
+
+
+def test_segments_are_told_with_their_frames_and_what_they_are_joined_to() -> None:
+    statistics = RunStatistics()
+    add(statistics, 10, Status.OK, 0)
+    add(statistics, 20, Status.COASTING, 0)
+    add(statistics, 30, Status.LOST, 1)
+    add(statistics, 40, Status.RESUMED, 1)
+    add(statistics, 50, Status.OK, 1, (1, 0))
+    statistics.add_faulty(FaultyFrame(stamp_ns=60, reason="black"), is_loss=True)
+    first, second = statistics.segments_json()
+    assert first == {
+        "id": 0,
+        "first_stamp_ns": 10,
+        "last_stamp_ns": 20,
+        "n_frames": 2,
+        "n_tracked": 1,
+        "joined_to": None,
+        "joined_at_ns": None,
+    }
+    assert (second["n_frames"], second["n_tracked"]) == (3, 2)
+    assert (second["joined_to"], second["joined_at_ns"]) == (0, 50)
+    assert statistics.coverage_percent == pytest.approx(100 * 4 / 6, abs=1e-3)
+    assert statistics.unjoined == [statistics.segments[0]]
+    assert any("joined (1 to 0)" in warning for warning in statistics.warnings())
+    assert statistics.is_partly
+
+
+def test_segments_that_nothing_ties_to_others_are_a_warning() -> None:
+    statistics = RunStatistics()
+    for segment in range(3):
+        add(statistics, 100 * segment, Status.OK, segment)
+        add(statistics, 100 * segment + 1, Status.LOST, segment)
+    assert any("3 segments are not joined" in warning for warning in statistics.warnings())
+    add(statistics, 400, Status.OK, 2, (2, 1))
+    assert len(statistics.unjoined) == 2
+    # What was joined to a segment comes along with it.
+    add(statistics, 500, Status.OK, 2, (2, 0))
+    assert [segment.joined_to for segment in statistics.segments.values()] == [None, 0, 1]
+    assert statistics.unjoined == [statistics.segments[0]]
+
+
+def test_a_segment_without_any_registration_is_not_one_that_could_be_joined() -> None:
+    statistics = RunStatistics()
+    add(statistics, 1, Status.OK, 0)
+    add(statistics, 2, Status.LOST, 1)
+    assert len(statistics.segments) == 2
+    assert len(statistics.unjoined) == 1
+
+
+def test_nothing_is_covered_where_there_is_no_frame() -> None:
+    assert RunStatistics().coverage_percent == 0.0
