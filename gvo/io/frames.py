@@ -23,6 +23,11 @@ from gvo.io.sync import Pair, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
 
 _ROW_STEP = 64
+# Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
+_N_AHEAD = 2
+# What reading or decoding one image may raise besides, in a source of one's own as well.
+_LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
+_Item = Pair | FaultyFrame
 
 
 def refuse_repeats(
@@ -110,12 +115,6 @@ def _is_same(first: ImageArray, second: ImageArray) -> bool:
     if not np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP]):
         return False
     return np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
-
-
-# Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
-_N_AHEAD = 2
-# What reading or decoding one image may raise besides, in a source of one's own as well.
-_LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 
 
 def frames(
@@ -305,7 +304,6 @@ class ImagePreparer:
 
 
 _Preparers = tuple[ImagePreparer, ImagePreparer]
-_Item = Pair | FaultyFrame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

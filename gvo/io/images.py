@@ -34,6 +34,19 @@ _TIFF_SIZE_TAGS = (256, 257)
 _TIFF_FORMS = {3: "H", 4: "I"}
 _N_HEAD = 512
 _MAX_PIXELS_PER_BYTE = 2048  # twice what deflate makes of black, four times what JPEG does
+_TOO_DARK = 1 << 12
+_MAX_FILE_BYTES = 1 << 30  # more than all pixels that are allowed need
+MILLIMETRES = 1000.0
+"""Counts per metre of depth in millimetres: integer depth in messages is so by REP 118."""
+# All positive finite numbers: neither zero nor infinity, and no comparison holds for NaN.
+_KNOWN_DEPTH_M = (
+    float(np.nextafter(np.float32(0), np.float32(1))),
+    float(np.finfo(np.float32).max),
+)
+MAX_COUNT = 65534
+"""Largest count: 0 and 65535 are unknown."""
+# Counts read as float32 metres and multiplied again miss an integer by its rounding only.
+_TOLERANCE = 5e-3
 
 
 class ImageHeader(NamedTuple):
@@ -175,9 +188,7 @@ def _tiff_size(data: NDArray[np.uint8], order: str) -> tuple[int, int]:
     return sizes[256], sizes[257]
 
 
-_TOO_DARK = 1 << 12
 _COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}
-_MAX_FILE_BYTES = 1 << 30  # more than all pixels that are allowed need
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,15 +229,6 @@ class GreyRange:
         above = np.clip(values, self.black, self.white).astype(np.uint32) - np.uint32(self.black)
         return (above * 256 // (self.white + 1 - self.black)).astype(np.uint8)
 
-
-MILLIMETRES = 1000.0
-"""Counts per metre of depth in millimetres: integer depth in messages is so by REP 118."""
-
-# All positive finite numbers: neither zero nor infinity, and no comparison holds for NaN.
-_KNOWN_DEPTH_M = (
-    float(np.nextafter(np.float32(0), np.float32(1))),
-    float(np.finfo(np.float32).max),
-)
 
 FULL_RANGE = GreyRange()
 
@@ -480,13 +482,6 @@ def _encode(suffix: str, pixels: NDArray[Any], parameters: Sequence[int] = ()) -
             f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
         )
     return data.tobytes()
-
-
-MAX_COUNT = 65534
-"""Largest count: 0 and 65535 are unknown."""
-
-# Counts read as float32 metres and multiplied again miss an integer by its rounding only.
-_TOLERANCE = 5e-3
 
 
 def is_in_counts(depth: DepthArray, scale: float) -> bool:

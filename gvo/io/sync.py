@@ -13,6 +13,10 @@ from gvo.io.recording import StampedImage
 from gvo.types import FaultyFrame
 
 Pair: TypeAlias = tuple[StampedImage, StampedImage]
+# A step so long is a gap, or a stamp gone wrong: the next images tell.
+_LEAP_NS = 1_000_000_000
+# So many images in a row that are all after the leap: it was a gap.
+_N_TO_CONFIRM = 3
 
 
 def pair_images(
@@ -312,12 +316,6 @@ def _scaled_ns(duration_ns: int, factor: float) -> int:
     seconds = (duration_ns // 10**9 + 1e-9 * (duration_ns % 10**9)) * factor
     whole = math.floor(seconds)
     return whole * 10**9 + math.floor((seconds - whole) * 1e9 + 0.5)
-
-
-# A step so long is a gap, or a stamp gone wrong: the next images tell.
-_LEAP_NS = 1_000_000_000
-# So many images in a row that are all after the leap: it was a gap.
-_N_TO_CONFIRM = 3
 
 
 class StampFilter:

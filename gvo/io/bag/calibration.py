@@ -30,6 +30,12 @@ TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 
 # The topics of one stream of a bag that librealsense wrote.
 _REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/[^/]+)/image/data")
+_REGISTERED = re.compile(r"(?<!un)(aligned|registered)")
+# Of the focal length and of the image size: calibrations of one camera differ by less.
+_TOLERANCE = 0.02
+_SAME_PLACE_M = 1e-6
+_SAME_PIXEL_PX = 0.5
+_REMEDY = "give a topic of depth registered to colour by --depth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -130,14 +136,6 @@ def _transform(message: BagMessage) -> FloatArray:
             f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
         )
     return T
-
-
-_REGISTERED = re.compile(r"(?<!un)(aligned|registered)")
-# Of the focal length and of the image size: calibrations of one camera differ by less.
-_TOLERANCE = 0.02
-_SAME_PLACE_M = 1e-6
-_SAME_PIXEL_PX = 0.5
-_REMEDY = "give a topic of depth registered to colour by --depth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,6 +16,13 @@ from gvo.errors import RecordingError
 from gvo.io.images import check_size
 from gvo.types import IntArray
 
+MAX_RVL_PIXELS = 1 << 24
+"""More than any depth camera has; to decode a pixel takes a hundred times its memory."""
+_SIZE = struct.Struct("<II")
+_MAX_NUMBERS_PER_PIXEL = 3  # a run of one value, behind none: two lengths and the value
+_MAX_NIBBLES = 64  # of a number; three make a depth
+_BLOCK_WORDS = 1 << 18
+
 
 class RawImage(Protocol):
     """What `sensor_msgs/Image` says of its pixels."""
@@ -181,15 +188,6 @@ def convert_to_bgr(pixels: NDArray[Any], to_bgr: int, what: str) -> NDArray[Any]
     except cv2.error as error:
         height, width = pixels.shape[:2]
         raise RecordingError(f"{what}: {width}x{height} values cannot be converted") from error
-
-
-MAX_RVL_PIXELS = 1 << 24
-"""More than any depth camera has; to decode a pixel takes a hundred times its memory."""
-
-_SIZE = struct.Struct("<II")
-_MAX_NUMBERS_PER_PIXEL = 3  # a run of one value, behind none: two lengths and the value
-_MAX_NIBBLES = 64  # of a number; three make a depth
-_BLOCK_WORDS = 1 << 18
 
 
 def decode_rvl(data: NDArray[np.uint8], where: str) -> NDArray[np.uint16]:

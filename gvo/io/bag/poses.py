@@ -26,6 +26,10 @@ _COVARIANCE_TYPES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovaria
 
 POSE_TYPES = (*_COVARIANCE_TYPES, "geometry_msgs/msg/PoseStamped", _TRANSFORM_TYPE)
 """Message types that hold a pose of a stamp; the last two without a covariance."""
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+"""Latitude, longitude and height of an antenna."""
+POSITION_TYPES = (FIX_TYPE, "geometry_msgs/msg/PointStamped")
+"""Message types that hold a position of a stamp."""
 
 
 class TopicStream:
@@ -190,12 +194,6 @@ def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
     streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
     streams[0].decisions[:0] = reader.notes
     return streams
-
-
-FIX_TYPE = "sensor_msgs/msg/NavSatFix"
-"""Latitude, longitude and height of an antenna."""
-POSITION_TYPES = (FIX_TYPE, "geometry_msgs/msg/PointStamped")
-"""Message types that hold a position of a stamp."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -25,6 +25,9 @@ from gvo.io.bag.topics import Topic
 STORAGE_SUFFIXES = (".mcap", ".db3")
 _COMPRESSED = ".zstd"
 _MAX_METADATA = 1 << 20  # bytes; thousands of files
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+OLD_TF_TYPE = "tf/msg/tfMessage"
+"""The type of `/tf` before tf2; it holds the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,11 +148,6 @@ def _listed_files(metadata: Path) -> dict[str, str]:
     except (YamlError, OSError, ValueError, TypeError, LookupError, AttributeError):
         return {}
     return {name: files.get(name, "") for name in names}
-
-
-TF_TYPE = "tf2_msgs/msg/TFMessage"
-OLD_TF_TYPE = "tf/msg/tfMessage"
-"""The type of `/tf` before tf2; it holds the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

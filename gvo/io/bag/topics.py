@@ -33,6 +33,8 @@ _REGISTERED = re.compile(r"aligned|registered")
 # at the start of a word: not in "unrectified" or "direct"
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 _N_LISTED = 12
+_Names: TypeAlias = tuple[str | None, str | None]
+_Score: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,10 +99,6 @@ class CameraTopics:
         """What to type to choose them."""
         names = ("left", "right") if self.sensor == "stereo" else ("color", "depth")
         return f"--{names[0]} {self.first.name} --{names[1]} {self.second.name}"
-
-
-_Names: TypeAlias = tuple[str | None, str | None]
-_Score: TypeAlias = tuple[int, ...]
 
 
 def choose_topics(topics: Sequence[Topic], choice: TopicChoice, where: str) -> CameraTopics:

@@ -17,6 +17,22 @@ from gvo.io.images import MAX_PIXELS
 from gvo.types import FloatArray
 
 _LARGEST_NUMBER = 1e9
+MAX_SIDE_PX = 32767
+"""Largest width or height of an image, pixels: what OpenCV rectifies."""
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R R^T from the identity that is the rounding of a file."""
+# As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
+_MODELS: dict[str, DistortionModel] = {
+    "plumb_bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "brown_conrady": "plumb_bob",
+    "rational_polynomial": "rational_polynomial",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,26 +146,6 @@ def read_numbers(values: object, what: str) -> FloatArray:
     if np.any(np.abs(numbers) > _LARGEST_NUMBER):
         raise CalibrationError(f"{what} holds {np.abs(numbers).max():g}, which no camera has")
     return numbers
-
-
-MAX_SIDE_PX = 32767
-"""Largest width or height of an image, pixels: what OpenCV rectifies."""
-
-ROTATION_TOLERANCE = 1e-3
-"""Largest deviation of R R^T from the identity that is the rounding of a file."""
-
-# As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
-_MODELS: dict[str, DistortionModel] = {
-    "plumb_bob": "plumb_bob",
-    "radtan": "plumb_bob",
-    "radial_tangential": "plumb_bob",
-    "brown_conrady": "plumb_bob",
-    "rational_polynomial": "rational_polynomial",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-    "kannala_brandt4": "equidistant",
-}
 
 
 def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:

@@ -29,6 +29,24 @@ from gvo.types import FloatArray
 
 _OPENCV_HEADER = "%YAML:"
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
+_FORMATS = (
+    "expected a camera of ROS (camera_info), Kalibr (camchain), EuRoC (sensor.yaml) or OpenCV"
+)
+_ROS_KEYS = {
+    "width": ("image_width", "width"),
+    "height": ("image_height", "height"),
+    "K": ("camera_matrix", "K", "k"),
+    "D": ("distortion_coefficients", "D", "d"),
+    "R": ("rectification_matrix", "R", "r"),
+    "P": ("projection_matrix", "P", "p"),
+}
+_KALIBR_CAMERA = re.compile(r"cam([0-9]{1,3})")
+_MAX_COUNT = 2**31 - 1
+_SIDES = (("left", "right"), ("LEFT", "RIGHT"))
+CalibrationPaths: TypeAlias = Sequence[Path] | Path | None
+"""One file, two of them (left and right), or a folder of them; None where none was given."""
+_SENSOR_FILES = tuple(Path(name) / "sensor.yaml" for name in ("cam0", "cam1"))
+_SIDE_FILES = (Path("left.yaml"), Path("right.yaml"))
 
 
 class _Loader(yaml.SafeLoader):
@@ -78,22 +96,6 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: the calibration holds no keys")
     return content
-
-
-_FORMATS = (
-    "expected a camera of ROS (camera_info), Kalibr (camchain), EuRoC (sensor.yaml) or OpenCV"
-)
-_ROS_KEYS = {
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-    "K": ("camera_matrix", "K", "k"),
-    "D": ("distortion_coefficients", "D", "d"),
-    "R": ("rectification_matrix", "R", "r"),
-    "P": ("projection_matrix", "P", "p"),
-}
-_KALIBR_CAMERA = re.compile(r"cam([0-9]{1,3})")
-_MAX_COUNT = 2**31 - 1
-_SIDES = (("left", "right"), ("LEFT", "RIGHT"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -309,13 +311,6 @@ def _array(content: Mapping[Any, Any], key: str, shape: tuple[int, ...], where: 
     if numbers.size != n_expected:
         raise CalibrationError(f"{where}: {key} must hold {n_expected} numbers, got {numbers.size}")
     return numbers.reshape(shape)
-
-
-CalibrationPaths: TypeAlias = Sequence[Path] | Path | None
-"""One file, two of them (left and right), or a folder of them; None where none was given."""
-
-_SENSOR_FILES = tuple(Path(name) / "sensor.yaml" for name in ("cam0", "cam1"))
-_SIDE_FILES = (Path("left.yaml"), Path("right.yaml"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -48,6 +48,8 @@ _LATCHED_QOS: Final = Qos(
     liveliness_lease_duration=QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
+# The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
+_DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
 
 
 class Header(NamedTuple):
@@ -313,10 +315,6 @@ def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made a
         child_frame_id=pose.child,
         transform=transform,
     )
-
-
-# The transport's header: how the depth is quantised, of which counts of 16 bits make no use.
-_DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
 
 
 def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:

@@ -45,6 +45,9 @@ from gvo.io.images import MILLIMETRES, exact_counts
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.types import FloatArray
 
+_SUFFIXES = (".bag", ".mcap", ".db3", "")
+_Progress: TypeAlias = Callable[[int], None]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BagStream:
@@ -180,10 +183,6 @@ def _is_in_millimetres(source: Source) -> bool:
             except RecordingError:
                 continue
     return False
-
-
-_SUFFIXES = (".bag", ".mcap", ".db3", "")
-_Progress: TypeAlias = Callable[[int], None]
 
 
 def write_bag(

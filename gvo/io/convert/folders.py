@@ -24,6 +24,11 @@ from gvo.trajectory.formats import write_euroc, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory, format_stamp
 from gvo.types import DepthArray, FaultyFrame, FloatArray
 
+_EUROC_MODELS = {"plumb_bob": "radial-tangential"}
+_SCALES = (MILLIMETRES, DEFAULT_SCALE)
+# Half as far again as the first image shows must fit.
+_RESERVE = 1.5
+
 
 class FolderStreams(ABC):
     """Writes the two streams of a recording in one layout.
@@ -82,9 +87,6 @@ class FolderStreams(ABC):
         self.left_out.add_image(
             f"{self.info.stream_names[image.stream]} image", image.stamp_ns, reason
         )
-
-
-_EUROC_MODELS = {"plumb_bob": "radial-tangential"}
 
 
 def write_projections(
@@ -306,11 +308,6 @@ class EurocFolder(FolderStreams):
         baseline = float(left.P[0, 3] - right.P[0, 3]) / float(left.P[0, 0])
         t_left_camera = np.array([stream * baseline, 0.0, 0.0])
         return np.asarray(self._T_body_cam @ se3.make_transform(np.eye(3), t_left_camera))
-
-
-_SCALES = (MILLIMETRES, DEFAULT_SCALE)
-# Half as far again as the first image shows must fit.
-_RESERVE = 1.5
 
 
 class TumFolder(FolderStreams):

@@ -17,6 +17,8 @@ from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import parse_stamp
 
 StampedPath = tuple[int, Path]
+_MAX_REASON = 300  # characters
+_Row = tuple[int, list[str]]
 
 
 class FolderSource:
@@ -105,10 +107,6 @@ def _stream(
 ) -> Iterator[StampedImage]:
     for stamp_ns, path in rows:
         yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(load, path))
-
-
-_MAX_REASON = 300  # characters
-_Row = tuple[int, list[str]]
 
 
 def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> list[_Row]:

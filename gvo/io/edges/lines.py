@@ -41,6 +41,16 @@ _NOISE_KEYS = frozenset({"sigmas", "covariance", "kernel"})
 _EDGE_KEYS = _NOISE_KEYS | {"reference", "pose"}
 _PRIOR_KEYS = _NOISE_KEYS | {"position", "pose"}
 _KEYS = _EDGE_KEYS | {"id", "stamp_ns", "edges", "prior", "keep"}
+CSV_HEADER = (
+    "id,stamp_ns,status,x,y,z,qx,qy,qz,qw,"
+    + COVARIANCE_HEADER.removeprefix("stamp_ns,")
+    + ",rejected"
+)
+"""Columns of an answer in CSV; written first where the input begins with a header."""
+_CHUNK_BYTES = 65536
+_POLL_SECONDS = 0.2
+# What is cut off here is still longer than what is understood.
+_MAX_LINE_BYTES = 4 * MAX_LINE + 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -336,19 +346,6 @@ def _prior(numbers: FloatArray, noise: FloatArray | None, kernel: object = None)
     if len(numbers) == 3:
         return PositionPrior(position_world=numbers, covariance=covariance[-3:, -3:], **chosen)
     return PosePrior(T_world_frame=_pose(numbers), covariance=covariance, **chosen)
-
-
-CSV_HEADER = (
-    "id,stamp_ns,status,x,y,z,qx,qy,qz,qw,"
-    + COVARIANCE_HEADER.removeprefix("stamp_ns,")
-    + ",rejected"
-)
-"""Columns of an answer in CSV; written first where the input begins with a header."""
-
-_CHUNK_BYTES = 65536
-_POLL_SECONDS = 0.2
-# What is cut off here is still longer than what is understood.
-_MAX_LINE_BYTES = 4 * MAX_LINE + 1
 
 
 def format_estimate(

@@ -27,6 +27,7 @@ from gvo.types import Edge, Estimate, FloatArray, PosePrior
 
 _SECOND_NS = 1_000_000_000
 _TAG = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)*$")
+GRAPH = "smoothed.g2o"
 
 
 class PoseGraphSource:
@@ -335,9 +336,6 @@ def _edge(line: Measurement) -> Edge:
         T_reference_frame=line.T_reference_frame,
         covariance=line.covariance,
     )
-
-
-GRAPH = "smoothed.g2o"
 
 
 class GraphFile:

@@ -35,6 +35,8 @@ from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 _EXPOSURE_PERIOD_S = 7.3
 _BLOB_PX = 14
 _STEP_SHARE = 0.03
+WorldName: TypeAlias = Literal["driving", "handheld", "traffic", "facade", "mirror", "wall"]
+_START_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,11 +180,6 @@ def _edges(depth: DepthArray, radius: int) -> BoolArray:
     is_step = (curvature > _STEP_SHARE * inverse_depths).astype(np.uint8)
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), dtype=np.uint8)
     return np.asarray(cv2.dilate(is_step, kernel)) > 0
-
-
-WorldName: TypeAlias = Literal["driving", "handheld", "traffic", "facade", "mirror", "wall"]
-
-_START_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,6 +21,7 @@ Plane: TypeAlias = tuple[FloatArray, FloatArray]
 NOTHING = -1
 _NEAR_M = 0.05
 _SMALL_BOX = 20_000  # pixels: not worth a closer look
+_BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -273,9 +274,6 @@ def _cut_out(
         per_pixel = np.linalg.norm([view.texels_s[k, :2], view.texels_t[k, :2]], axis=1).max()
         level = round(np.log2(max(view.corners[k, :, 2].mean() * per_pixel, 1.0)))
         mask &= view.scene.atlas.is_opaque(int(view.scene.textures[view.indices[k]]), level, s, t)
-
-
-_BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the cache
 
 
 def render_image(

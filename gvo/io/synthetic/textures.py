@@ -16,6 +16,10 @@ from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 _MAX_ROWS = 32_000  # cv2.remap addresses images with 16 bits
 _SMALLEST_LEVEL = 4
+N_TEXELS = 1024
+Canvas: TypeAlias = NDArray[np.float32]
+Box: TypeAlias = tuple[float, float, float, float]
+Point: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -169,12 +173,6 @@ def _mask_levels(mask: BoolArray | None, n_levels: int) -> list[BoolArray]:
         shares = 0.5 * (shares[:, 0::2] + shares[:, 1::2])
         levels.append(shares >= 0.5)
     return levels
-
-
-N_TEXELS = 1024
-Canvas: TypeAlias = NDArray[np.float32]
-Box: TypeAlias = tuple[float, float, float, float]
-Point: TypeAlias = tuple[float, float]
 
 
 def blank(grey: float) -> Canvas:

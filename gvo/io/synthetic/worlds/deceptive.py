@@ -30,6 +30,19 @@ _BRAKE_M_S2 = 3.2
 _HALT_S = 2.5
 _START_S = 9.5
 _START_M_S2 = 1.8
+PERIOD_M = 2.0
+_FRONT_M = 8.0
+_ENDS_M = (-60.0, 460.0)
+_FACADE_SPEED_M_S = 11.0
+_ACCELERATION_M_S2 = 3.0
+# The mirror: width and height, and where its middle is; metres.
+_MIRROR_M = (1.9, 1.5)
+_MIDDLE_M = np.array([0.0, 1.25, 1.3])
+_SWING_RAD = np.radians(5.0)
+_SWING_S = 4.0
+# The time from turning away to being turned to the blank wall, and how long it is looked at.
+_AWAY_S = (2.0, 2.0)
+_BLANK_S = 2.5
 
 
 def traffic_drive(stamps_s: FloatArray) -> FloatArray:
@@ -117,13 +130,6 @@ def _bus_side(rng: np.random.Generator) -> Texture:
     return paint.finish(canvas, (_BUS_M[0], _BUS_M[2]))
 
 
-PERIOD_M = 2.0
-_FRONT_M = 8.0
-_ENDS_M = (-60.0, 460.0)
-_FACADE_SPEED_M_S = 11.0
-_ACCELERATION_M_S2 = 3.0
-
-
 def ride(stamps_s: FloatArray) -> FloatArray:
     """Return T_map_cam, shape (n, 4, 4), of a tram that starts and rides at about 11 m/s.
 
@@ -197,16 +203,6 @@ def _window(rng: np.random.Generator) -> Texture:
     paint.fill(canvas, (0.2, 0.7, 0.6, 0.03), 205)
     paint.fill(canvas, (0.2, 0.73, 0.6, 0.012), 60)
     return paint.finish(canvas, (PERIOD_M, 3.2))
-
-
-# The mirror: width and height, and where its middle is; metres.
-_MIRROR_M = (1.9, 1.5)
-_MIDDLE_M = np.array([0.0, 1.25, 1.3])
-_SWING_RAD = np.radians(5.0)
-_SWING_S = 4.0
-# The time from turning away to being turned to the blank wall, and how long it is looked at.
-_AWAY_S = (2.0, 2.0)
-_BLANK_S = 2.5
 
 
 @lru_cache(maxsize=2)

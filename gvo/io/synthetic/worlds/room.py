@@ -18,6 +18,11 @@ _WORDS = (
     "ODOMETRY", "ATLAS", "THE RIVER", "EPIPOLAR", "ALGEBRA", "VOYAGE", "OPTICS", "MAPS",
     "NORTH", "GEODESY", "HARBOUR", "LIGHT", "STARS", "BRIDGES", "CLOCKS", "ISLANDS",
 )  # fmt: skip
+_DIAMOND = ((0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))
+_HALF_M = 2.0
+_HEIGHT_M = 2.5
+LAMP = Light(direction=(0.25, -0.5, 0.8), ambient=0.72, direct=0.38)
+_NORTH, _EAST, _WEST = 0.0, -0.5 * np.pi, 0.5 * np.pi
 
 
 def room_textures(seed: int) -> dict[str, Texture]:
@@ -79,9 +84,6 @@ def _carpet(rng: np.random.Generator) -> Texture:
             inner = [(center[0] + 0.5 * r * x, center[1] + 0.6 * r * y) for x, y in _DIAMOND]
             paint.polygon(canvas, inner, float(rng.uniform(40, 110)))
     return paint.finish(canvas + 6 * weave, (2.0, 2.0))
-
-
-_DIAMOND = ((0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))
 
 
 def _wallpaper(rng: np.random.Generator) -> Texture:
@@ -294,12 +296,6 @@ def _plant(rng: np.random.Generator) -> Texture:
         paint.polyline(canvas, path, float(rng.uniform(60, 160)), 18)
         paint.polyline(canvas, path, float(rng.uniform(150, 200)), 3)
     return paint.finish(canvas, (0.8, 0.8), mask=paint.opaque(shape))
-
-
-_HALF_M = 2.0
-_HEIGHT_M = 2.5
-LAMP = Light(direction=(0.25, -0.5, 0.8), ambient=0.72, direct=0.38)
-_NORTH, _EAST, _WEST = 0.0, -0.5 * np.pi, 0.5 * np.pi
 
 
 @lru_cache(maxsize=2)

@@ -15,6 +15,9 @@ CAR_PROFILE = (  # (along, up) in metres from the rear bumper; the upper outline
     (0.0, 0.45), (0.08, 0.95), (0.55, 1.0), (1.15, 1.46), (2.45, 1.5), (3.3, 0.98), (4.3, 0.8),
     (4.4, 0.45),
 )  # fmt: skip
+STOREY_M = 3.2
+HOUSES = ("brick", "plaster", "stone", "panel")
+SHOPS = ("shop", "doors")
 
 
 def street_textures(seed: int) -> dict[str, Texture]:
@@ -203,11 +206,6 @@ def _sky(rng: np.random.Generator) -> Texture:
         tone = grey + 5 * paint.noise(rng, exponent=0.8, largest=0.05)
         canvas = np.where(heights < profile, tone, canvas).astype(np.float32)
     return paint.finish(canvas, (600.0, 300.0))
-
-
-STOREY_M = 3.2
-HOUSES = ("brick", "plaster", "stone", "panel")
-SHOPS = ("shop", "doors")
 
 
 def _window(canvas: Canvas, rng: np.random.Generator, box: Box, frame_grey: float) -> None:
