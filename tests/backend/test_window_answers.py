@@ -1,43 +1,96 @@
-"""What the window answers at its borders: beside its measurements, not by them."""
+"""What a window answers: poses, covariances, statuses, keyframes; and over changes of its size."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from __future__ import annotations
+
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from gvo.backend.gating import WindowCounter
-from gvo.backend.isam2 import PoseGraph
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, FrameId, PositionPrior, Rejected, Status
+from gvo.types import Edge, Estimate, FloatArray, PosePrior, PositionPrior, Rejected, Status
+from tests.backend.twins import (
+    CONFIG,
+    FAULTY,
+    POSE_PRIOR,
+    assert_complete,
+    assert_sound,
+    good_edges,
+    plain_twin,
+    run,
+    stamp_of,
+)
+from tests.backend.walks import STEP, STEP_NS, edge, go_on, power, walk
 
-STEP_NS = 100_000_000
-STEP = se3.exp(np.array([0.02, 0.1, -0.01, 0.1, 0.0, 0.5]))
-FAR = np.array([[0.0, 0.0, 0.0], [0.0, -1e12, 0.0]])
+# Who is in the window.
 
 
-def edge(reference_id: FrameId, T: FloatArray, sigma: float = 0.01) -> Edge:
-    return Edge(reference_id=reference_id, T_reference_frame=T, covariance=sigma**2 * np.eye(6))
-
-
-def power(n: int) -> FloatArray:
-    return se3.normalize(np.linalg.matrix_power(STEP, n))
-
-
-def walk(config: WindowConfig, n: int) -> SlidingWindow:
-    """Return a window that was given n poses, each seen from the one before."""
-    window = SlidingWindow(config)
-    for frame in range(n):
+def test_the_window_holds_the_recent_and_the_kept_alone() -> None:
+    window = SlidingWindow(WindowConfig(size=3))
+    for frame in range(12):
         edges = [edge(frame - 1, STEP)] if frame else []
-        window.add_pose(frame, frame * STEP_NS, edges)
-    return window
+        window.add_pose(frame, frame, edges)
+        if frame in (2, 4):
+            window.keep(frame)
+        if frame == 8:
+            window.release(2)
+        assert list(window.poses()) == sorted(
+            {i for i in (2, 4) if i <= frame and not (i == 2 and frame > 8)}
+            | set(range(max(frame - 2, 0), frame + 1))
+        )
+    assert len(window) == 4
+    assert (4 in window, 3 in window) == (True, False)
 
 
-# A first position.
+def test_keyframes_are_told_oldest_first_until_they_are_released() -> None:
+    window = SlidingWindow(WindowConfig(size=2))
+    go_on(window, 0, 3)
+    window.keep(2)
+    window.keep(1)
+    assert window.kept() == [1, 2]
+    go_on(window, 3, 8)
+    assert list(window.poses()) == [1, 2, 6, 7]
+    window.release(1)
+    assert window.kept() == [2]
+    assert 1 in window  # until the next update
+    go_on(window, 8, 9)
+    assert list(window.poses()) == [2, 7, 8]
+
+
+def test_a_window_is_printed_in_one_line() -> None:
+    window = SlidingWindow(WindowConfig(size=3))
+    assert str(window) == "SlidingWindow: 0 of 0 poses, 0 edges accepted, 0 rejected"
+    for frame in range(5):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)] if frame else [])
+    window.keep(3)
+    assert isinstance(window.add_edge(4, edge("nobody", STEP)), Rejected)
+    assert str(window) == (
+        "SlidingWindow: 3 of 5 poses (newest 4, 1 kept), 4 edges accepted, 1 rejected"
+    )
+
+
+# The first pose.
+
+
+def test_the_first_pose_is_where_it_is_told_and_the_rest_follows() -> None:
+    start = se3.exp(np.array([0.3, -0.2, 0.1, 4.0, 5.0, 6.0]))
+    window = SlidingWindow()
+    first = window.add_pose(
+        "a", 0, [], PosePrior(T_world_frame=start, covariance=1e-10 * np.eye(6))
+    )
+    np.testing.assert_allclose(first.T_world_cam, start, atol=1e-12)
+    assert np.sqrt(np.diag(first.covariance)).max() < 1e-4
+    step = se3.exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 1.0]))
+    edge = Edge(reference_id="a", T_reference_frame=step, covariance=1e-4 * np.eye(6))
+    second = window.add_pose("b", 7, [edge], status=Status.RESUMED)
+    np.testing.assert_allclose(second.T_world_cam, start @ step, atol=1e-9)
+    assert (second.stamp_ns, second.frame_id, second.status) == (7, "b", Status.RESUMED)
+    assert [e.status for e in window.finish()] == [Status.OK, Status.RESUMED]
 
 
 @pytest.mark.parametrize("sigma_m", [1.0, 3e3])
@@ -51,120 +104,66 @@ def test_a_first_position_is_believed_but_for_what_is_unknown_of_it(sigma_m: flo
     np.testing.assert_allclose(np.diag(first.covariance), np.repeat([1.0, variance], 3), rtol=1e-6)
 
 
-# Names.
+# Edges.
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda window: window.add_edge([1], edge(0, STEP)),
-        lambda window: window.add_prior([1], PositionPrior(
-            position_world=np.zeros(3), covariance=np.eye(3)
-        )),
-        lambda window: window.pose({}),
-        lambda window: window.keep([1]),
-    ],
-)  # fmt: skip
-def test_a_name_that_cannot_be_one_is_told_as_such(ask: Any) -> None:
-    with pytest.raises(ValueError, match="a frame_id must be hashable"):
-        ask(walk(WindowConfig(), 2))
+def test_a_good_edge_outvotes_a_bad_one_by_their_covariances() -> None:
+    window = SlidingWindow(WindowConfig(kernel="none"))
+    window.add_pose("a", 0, [])
+    shift = np.eye(4)
+    shift[0, 3] = 0.01
+    edges = [
+        Edge(reference_id="a", T_reference_frame=np.eye(4), covariance=4e-4 * np.eye(6)),
+        Edge(reference_id="a", T_reference_frame=shift, covariance=1e-4 * np.eye(6)),
+    ]
+    estimate = window.add_pose("b", 1, edges)
+    # The mean of 0 and 1 cm, weighted by 1 / variance.
+    assert estimate.T_world_cam[0, 3] == pytest.approx(0.008, abs=1e-6)
+    np.testing.assert_allclose(np.diag(estimate.covariance), 0.8e-4, rtol=1e-3)
 
 
-# Poses that went to infinity.
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_kernel_keeps_one_bad_edge_from_moving_the_pose_wherever_it_stands(place: int) -> None:
+    found = {}
+    for kernel in ("huber", "none"):
+        window = SlidingWindow(WindowConfig.model_validate({"kernel": kernel, "gate": None}))
+        window.add_pose("a", 0, [])
+        transforms = [np.eye(4) for _ in range(3)]
+        transforms[place][0, 3] = 0.5  # fifty sigmas
+        edges = [
+            Edge(reference_id="a", T_reference_frame=T, covariance=1e-4 * np.eye(6))
+            for T in transforms
+        ]
+        found[kernel] = window.add_pose("b", 1, edges).T_world_cam[0, 3]
+    assert found["none"] == pytest.approx(0.5 / 3, rel=0.01)
+    assert found["huber"] < 0.1 * 0.5
 
 
-@pytest.mark.parametrize("is_moved", [True, False])
-def test_others_are_looked_at_where_a_new_pose_moved_them(is_moved: bool) -> None:
-    window = walk(WindowConfig(size=9, kernel="none"), 5)
-    before = window.poses()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PoseGraph, "positions", lambda _: FAR)
-        patch.setattr(PoseGraph, "iterate", lambda *_, **__: is_moved)
-        estimate = window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
-    np.testing.assert_allclose(estimate.T_world_cam, power(5), atol=1e-6)
-    assert (window.counts.n_restored > 0) is is_moved
-    assert window.counts.n_edges == (4 if is_moved else 5)
-    for frame_id, T in before.items():
-        np.testing.assert_allclose(window.pose(frame_id), T, atol=1e-9)
+def test_edges_many_sizes_apart_do_not_break_the_window() -> None:
+    # Uncertainty of coasting beside edges surer by 1e5: Cholesky factors would be indefinite.
+    window = SlidingWindow(WindowConfig(size=3))
+    for frame in range(60):
+        sigma = 30.0 if frame % 7 == 3 else 1e-4
+        covariance = sigma**2 * np.eye(6)
+        edge = Edge(reference_id=frame - 1, T_reference_frame=np.eye(4), covariance=covariance)
+        estimate = window.add_pose(frame, frame, [edge] if frame else [])
+        assert np.isfinite(estimate.covariance).all()
+    assert len(window.finish()) == 60
 
 
-def test_a_whole_graph_is_too_large_to_be_looked_at() -> None:
-    window = walk(WindowConfig(size=None, kernel="none"), 5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PoseGraph, "positions", lambda _: FAR)
-        window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
-        assert isinstance(window.add_edge(5, edge(0, power(5))), Estimate)
-    assert window.counts.n_restored == 0
+def test_arrays_rounded_to_single_precision_are_good_enough() -> None:
+    def rounded(edge: Edge) -> Edge:
+        return replace(
+            edge,
+            T_reference_frame=edge.T_reference_frame.astype(np.float32),
+            covariance=edge.covariance.astype(np.float32),
+        )
 
-
-@pytest.mark.parametrize("value", [1e12, np.nan, np.inf])
-def test_an_estimate_that_is_nowhere_is_the_causal_one(value: float) -> None:
-    window = walk(WindowConfig(size=5), 4)
-    expected = window.estimate(2)
-    nowhere = np.eye(4)
-    nowhere[1, 3] = value
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PoseGraph, "pose", lambda *_: nowhere)
-        found = window.estimate(2)
-        finished = window.finish()
-    for each in (found, finished[2]):
-        np.testing.assert_allclose(each.T_world_cam, expected.T_world_cam, atol=1e-6)
-        assert np.isfinite(each.covariance).all()
-        assert each.status is Status.OK
-
-
-@contextmanager
-def failing_updates(*calls: int) -> Iterator[list[int]]:
-    """Let updates of ISAM2 fail at these calls."""
-    original = gtsam.ISAM2.update
-    seen: list[int] = []
-
-    def update(self: Any, *arguments: Any) -> Any:
-        seen.append(len(seen))
-        if seen[-1] in calls:
-            raise RuntimeError("Indeterminant linear system detected\nand more lines")
-        return original(self, *arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gtsam.ISAM2, "update", update)
-        yield seen
-
-
-def test_a_late_edge_is_tried_once_more_with_a_hardened_graph_and_no_more() -> None:
-    loop = edge(0, power(4))
-    window = walk(WindowConfig(size=None, kernel="none"), 5)
-    # The update, that of making the hardened graph, and the update again.
-    with failing_updates(0, 2) as seen:
-        answer = window.add_edge(4, loop)
-    assert isinstance(answer, Rejected)
-    assert (answer.frame_id, answer.reference_id, answer.stamp_ns) == (4, 0, 4 * STEP_NS)
-    assert "GTSAM gave up on the update" in answer.reason
-    assert len(seen) == 3
-    counts = window.counts
-    assert (counts.n_restored, counts.n_rejected, counts.n_gated, counts.n_edges) == (2, 1, 0, 4)
-    # Now it is hardened: one try is all.
-    with failing_updates(0) as seen:
-        assert isinstance(window.add_edge(4, loop), Rejected)
-    assert (len(seen), window.counts.n_restored) == (1, 3)
-    assert isinstance(window.add_edge(4, loop), Estimate)
-    assert [each.frame_id for each in window.finish()] == list(range(5))
-
-
-def test_a_late_edge_is_refused_where_not_even_the_hardened_graph_can_be_made() -> None:
-    window = walk(WindowConfig(size=None, kernel="none"), 5)
-    with failing_updates(0, 1) as seen:
-        answer = window.add_edge(4, edge(0, power(4)))
-    assert isinstance(answer, Rejected)
-    assert "GTSAM gave up on the update" in answer.reason
-    assert len(seen) == 2
-    assert [each.frame_id for each in window.finish()] == list(range(5))
-
-
-def test_a_sliding_window_tries_a_late_edge_once() -> None:
-    window = walk(WindowConfig(size=9, kernel="none"), 5)
-    with failing_updates(0) as seen:
-        assert isinstance(window.add_edge(4, edge(0, power(4))), Rejected)
-    assert (len(seen), window.counts.n_restored) == (1, 1)
+    found = run(edges=tuple(rounded(edge) for edge in good_edges()[FAULTY]))
+    assert found.causal[FAULTY].rejected == ()
+    assert_complete(found)
+    for one, other in zip(found.causal, plain_twin().causal, strict=True):
+        np.testing.assert_allclose(one.T_world_cam, other.T_world_cam, atol=1e-5)
 
 
 def test_late_measurements_are_listed_with_the_others() -> None:
@@ -176,31 +175,481 @@ def test_late_measurements_are_listed_with_the_others() -> None:
     assert ends == [(0, 1), (1, 2), (None, 2), (2, 3), (0, 3)]
 
 
-# What is counted.
-
-
-def test_a_refusal_is_gated_only_where_it_is_called_so() -> None:
-    counter = WindowCounter()
-    first = Rejected(frame_id="a", stamp_ns=7, reason="one", reference_id="b")
-    second = Rejected(frame_id="c", stamp_ns=None, reason="two")
-    assert (str(first), str(second)) == ("edge 'b' -> 'a' at 7 ns: one", "prior 'c': two")
-    counter.add_rejected(first)
-    counter.add_rejected(second, is_gated=True)
-    counter.add(n_poses=2, n_edges=3)
-    counter.add(n_poses=1)
-    counts = counter.counts
-    assert (counts.n_poses, counts.n_edges, counts.n_rejected, counts.n_gated) == (3, 3, 2, 1)
-    assert counts.first_rejected == str(first)
-    assert (counts.n_priors, counts.n_coasting, counts.n_restored, counts.n_rebuilt) == (0,) * 4
-
-
-def test_a_window_is_printed_in_one_line() -> None:
-    window = SlidingWindow(WindowConfig(size=3))
-    assert str(window) == "SlidingWindow: 0 of 0 poses, 0 edges accepted, 0 rejected"
+def test_all_late_measurements_are_polished_with_the_others() -> None:
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    loop = edge(0, se3.normalize(np.linalg.matrix_power(STEP, 4) @ se3.exp(np.full(6, 0.02))))
+    assert isinstance(window.add_edge(4, loop), Estimate)
+    place = PositionPrior(position_world=window.pose(2)[:3, 3] + 0.05, covariance=1e-4 * np.eye(3))
+    assert isinstance(window.add_prior(2, place), Estimate)
+    smoothed = window.finish()
+    assert window.polish is not None
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.01)
+    sure = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), sure))
+    for frame in range(1, 5):
+        graph.add(gtsam.BetweenFactorPose3(frame - 1, frame, gtsam.Pose3(STEP), noise))
+    graph.add(gtsam.BetweenFactorPose3(0, 4, gtsam.Pose3(loop.T_reference_frame), noise))
+    position = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    robust = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(3.55), position
+    )
+    graph.add(gtsam.GPSFactor(2, place.position_world, robust))
     for frame in range(5):
-        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)] if frame else [])
-    window.keep(3)
-    assert isinstance(window.add_edge(4, edge("nobody", STEP)), Rejected)
-    assert str(window) == (
-        "SlidingWindow: 3 of 5 poses (newest 4, 1 kept), 4 edges accepted, 1 rejected"
+        values.insert(frame, gtsam.Pose3(np.linalg.matrix_power(STEP, frame)))
+    optimum = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    # The polish of the window is the same optimum, and its error the same sum.
+    assert window.polish.error_after == pytest.approx(graph.error(optimum), rel=1e-4)
+    assert window.polish.error_after > 1.0
+    assert window.polish.as_json() == {
+        "error_isam2": window.polish.error_before,
+        "error": window.polish.error_after,
+        "iterations": window.polish.n_iterations,
+    }
+    for frame, each in enumerate(smoothed):
+        expected = optimum.atPose3(frame).matrix()
+        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-4)
+
+
+def test_a_pose_is_known_for_sure_in_itself() -> None:
+    window = SlidingWindow(WindowConfig(size=9))
+    go_on(window, 0, 3)
+    found = window.relative_pose(2, 2)
+    assert found.reference_id == 2
+    np.testing.assert_allclose(found.T_reference_frame, np.eye(4), atol=1e-12)
+    np.testing.assert_array_equal(found.covariance, np.zeros((6, 6)))
+
+
+# A pose without edges.
+
+
+def straight_window(n: int = 4, config: WindowConfig = CONFIG) -> tuple[SlidingWindow, FloatArray]:
+    """Return a window that moved by the same step n - 1 times, and that step."""
+    step = se3.exp(np.array([0.02, 0.05, -0.01, 0.1, 0.0, 0.3]))
+    window = SlidingWindow(config)
+    for frame in range(n):
+        edge = Edge(reference_id=frame - 1, T_reference_frame=step, covariance=1e-6 * np.eye(6))
+        window.add_pose(frame, stamp_of(frame), [edge] if frame else [])
+    return window, step
+
+
+def test_a_pose_without_edges_continues_the_last_velocity() -> None:
+    for share in (0.5, 1.0, 3.0):
+        window, step = straight_window()
+        newest = window.pose(3)
+        estimate = window.add_pose("x", stamp_of(3) + round(share * STEP_NS), [])
+        assert estimate.status == Status.COASTING
+        assert estimate.rejected == ()
+        expected = newest @ se3.exp(share * se3.log(step))
+        np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-6)
+        assert window.counts.n_coasting == 1
+        assert [e.status for e in window.finish()][-1] == Status.COASTING
+
+
+def test_the_covariance_of_coasting_grows_by_the_sigmas_per_second() -> None:
+    for seconds in (0.1, 0.5, 2.0):
+        window, _ = straight_window()
+        before = window.covariance(3)
+        estimate = window.add_pose("x", stamp_of(3) + round(seconds * 1e9), [])
+        turn = np.deg2rad(CONFIG.coasting_sigma_deg_per_s) * seconds
+        shift = CONFIG.coasting_sigma_m_per_s * seconds
+        sigmas = np.r_[np.full(3, turn), np.full(3, shift)]
+        Ad = se3.adjoint(se3.invert(window.pose("x")) @ window.pose(3))
+        expected = Ad @ before @ Ad.T + np.diag(sigmas**2)
+        scale = np.outer(sigmas, sigmas)
+        np.testing.assert_allclose(estimate.covariance / scale, expected / scale, atol=1e-3)
+
+
+def test_the_second_pose_without_edges_stays_where_the_first_is() -> None:
+    window = SlidingWindow(CONFIG)
+    window.add_pose("a", 0, [], POSE_PRIOR)
+    estimate = window.add_pose("b", STEP_NS, [])
+    assert estimate.status == Status.COASTING
+    np.testing.assert_allclose(estimate.T_world_cam, POSE_PRIOR.T_world_frame, atol=1e-6)
+
+
+def test_a_gap_of_many_poses_loses_none_and_an_edge_across_it_brings_all_back() -> None:
+    window, step = straight_window(config=WindowConfig(size=60, kernel="none"))
+    last = 3
+    for frame in range(4, 44):
+        estimate = window.add_pose(frame, stamp_of(frame), [])
+        assert_sound(estimate)
+        seconds = 1e-9 * (stamp_of(frame) - stamp_of(last))
+        if abs(seconds - CONFIG.lost_after_s) > 0.15:  # a step more or less is all the same
+            is_lost = seconds > CONFIG.lost_after_s
+            assert estimate.status == (Status.LOST if is_lost else Status.COASTING)
+    across = step @ step
+    edge = Edge(reference_id=last, T_reference_frame=across, covariance=1e-6 * np.eye(6))
+    back = window.add_pose(44, stamp_of(44), [edge])
+    assert back.rejected == ()
+    assert back.status == Status.RESUMED
+    assert window.counts.n_coasting == 40
+    np.testing.assert_allclose(back.T_world_cam, window.pose(last) @ across, atol=1e-5)
+    assert [e.frame_id for e in window.finish()] == list(range(45))
+
+
+def test_a_full_prior_alone_is_enough_for_a_pose() -> None:
+    window, _ = straight_window()
+    place = se3.exp(np.array([0.1, 0.2, 0.3, 5.0, 6.0, 7.0]))
+    prior = PosePrior(T_world_frame=place, covariance=1e-4 * np.eye(6))
+    estimate = window.add_pose("x", stamp_of(4), [], prior)
+    assert (estimate.status, estimate.rejected) == (Status.OK, ())
+    np.testing.assert_allclose(estimate.T_world_cam, place, atol=1e-6)
+    np.testing.assert_allclose(estimate.covariance, 1e-4 * np.eye(6), atol=1e-6)
+    assert [e.frame_id for e in window.finish()] == [0, 1, 2, 3, "x"]
+
+
+def test_a_position_alone_holds_a_coasting_pose() -> None:
+    window, step = straight_window()
+    place = (window.pose(3) @ step)[:3, 3] + [0.1, -0.1, 0.05]
+    prior = PositionPrior(position_world=place, covariance=1e-6 * np.eye(3))
+    estimate = window.add_pose("x", stamp_of(4), [], prior)
+    assert estimate.rejected == ()
+    np.testing.assert_allclose(estimate.T_world_cam[:3, 3], place, atol=1e-3)
+    assert np.diag(estimate.covariance)[3:].max() < 1.1e-6
+
+
+def test_a_status_that_is_given_counts_where_a_measurement_ties_the_pose() -> None:
+    window = SlidingWindow(WindowConfig(size=4))
+    go_on(window, 0, 2)
+    found = window.add_pose(2, 2 * STEP_NS, [edge(1, STEP)], status=Status.RESUMED)
+    assert found.status is Status.RESUMED
+    found = window.add_pose(3, 3 * STEP_NS, [], status=Status.RESUMED)
+    assert found.status is Status.COASTING
+    found = window.add_pose(4, 4 * STEP_NS, [], POSE_PRIOR, status=Status.OK)
+    assert found.status is Status.OK
+    found = window.add_pose(5, 5 * STEP_NS, [])
+    assert found.status is Status.COASTING
+    found = window.add_pose(6, 6 * STEP_NS, [edge(5, STEP)])
+    assert found.status is Status.RESUMED
+
+
+# A keyframe outlives what it was measured against.
+
+
+def two_edges(frame: int) -> list[Edge]:
+    return [edge(frame - span, power(span), 0.01) for span in (1, 2) if span <= frame]
+
+
+def test_a_keyframe_forgets_edges_to_poses_that_left() -> None:
+    # A name that left is free again: an edge to the old bearer must not be told of the new one.
+    window = SlidingWindow(WindowConfig(size=3, kernel="none"))
+    for frame in range(3):
+        window.add_pose(frame, frame * STEP_NS, two_edges(frame))
+    window.keep(2)
+    for frame in range(3, 8):
+        window.add_pose(frame, frame * STEP_NS, two_edges(frame))
+    assert 2 in window
+    assert not {0, 1, 3} & set(window.poses())
+    for again, frame in zip((0, 1), (8, 9), strict=True):
+        previous = edge(7 if again == 0 else 0, STEP, 0.01)
+        window.add_pose(again, frame * STEP_NS, [previous])
+        told = [(each.reference_id, each.frame_id) for each in window.graph()]
+        assert (again, 2) not in told
+        assert ((7, 0) if again == 0 else (0, 1)) in told
+    assert all(each.chi2 < 1.0 for each in window.graph())
+
+
+def test_a_keyframe_keeps_edges_to_keyframes_only() -> None:
+    window = SlidingWindow(WindowConfig(size=2, kernel="none"))
+    window.add_pose(0, 0, [])
+    window.keep(0)
+    window.add_pose(1, STEP_NS, two_edges(1))
+    window.keep(1)
+    for frame in range(2, 30):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 0.01)])
+        if frame % 3:
+            loop = edge(frame, se3.invert(power(frame - 1)), 0.1)
+            assert isinstance(window.add_edge(1, loop), Estimate)
+    ends = [(each.reference_id, each.frame_id) for each in window.graph()]
+    assert sorted(ends, key=str) == sorted([(0, 1), (28, 1), (29, 1), (28, 29)], key=str)
+
+
+def test_an_edge_to_a_name_that_left_is_not_told_of_its_next_bearer() -> None:
+    window = SlidingWindow(WindowConfig(size=3, kernel="none"))
+    for frame in range(4):
+        window.add_pose(frame, frame * STEP_NS, two_edges(frame))
+    window.add_pose(0, 4 * STEP_NS, [edge(3, STEP, 0.01)])
+    ends = [(each.reference_id, each.frame_id) for each in window.graph()]
+    assert ends == [(2, 3), (3, 0)]
+
+
+# Keyframes by distance, as a ruler on the known path tells.
+
+
+def drive(steps: list[FloatArray], config: WindowConfig) -> list[list[int]]:
+    """Return whom the window keeps after each pose of a path of exact steps."""
+    window = SlidingWindow(config, keyframes="distance")
+    kept = []
+    for frame in range(len(steps) + 1):
+        edges = []
+        if frame:
+            T, covariance = steps[frame - 1], 1e-6 * np.eye(6)
+            edges = [Edge(reference_id=frame - 1, T_reference_frame=T, covariance=covariance)]
+        window.add_pose(frame, frame * STEP_NS, edges)
+        # What is in the window besides is recent alone.
+        recent = range(max(frame + 1 - (config.size or 0), 0), frame + 1)
+        assert set(window.poses()) >= {*recent}
+        names = window.kept()
+        kept.append([name for name in names if isinstance(name, int)])
+    return kept
+
+
+def forward(length_m: float) -> FloatArray:
+    return se3.make_transform(np.eye(3), np.array([0.0, 0.0, length_m]))
+
+
+def turn(angle_deg: float) -> FloatArray:
+    return se3.exp(np.array([0.0, np.radians(angle_deg), 0.0, 0.0, 0.0, 0.0]))
+
+
+def config_of(**changes: float) -> WindowConfig:
+    values = {
+        "size": 3,
+        "n_keyframes": 4,
+        "keyframe_distance_m": 1.0,
+        "keyframe_angle_deg": 10.0,
+        "keyframe_overlap": 0.9,
+        "min_overlap": 0.35,
+    }
+    return WindowConfig.model_validate(values | changes)
+
+
+@pytest.mark.parametrize("step", [forward(0.3), turn(3.0)], ids=["distance", "turn"])
+def test_the_next_keyframe_is_a_metre_or_ten_degrees_from_the_last(step: FloatArray) -> None:
+    # Steps of 0.3 of the distance: each fourth pose is the first beyond it.
+    kept = drive([step] * 30, config_of())
+    for frame, names in enumerate(kept):
+        every = list(range(0, frame + 1, 4))
+        # Four at most, and none so far that less than min_overlap is left: 6.5 distances.
+        assert names == [name for name in every[-4:] if 0.3 * (frame - name) < 6.5]
+    assert kept[-1] == [16, 20, 24, 28]
+
+
+def test_a_keyframe_leaves_where_too_little_is_left_in_common() -> None:
+    kept = drive([forward(0.3)] * 30, config_of(n_keyframes=100, min_overlap=0.75))
+    for frame, names in enumerate(kept):
+        assert names == [name for name in range(0, frame + 1, 4) if 0.3 * (frame - name) < 2.5]
+
+
+def test_a_camera_that_comes_back_needs_no_new_keyframe() -> None:
+    there, back = [forward(0.6)] * 6, [forward(-0.6)] * 6
+    kept = drive([*there, *back], config_of())
+    assert kept[6] == [0, 2, 4, 6]
+    assert kept[12] == [0, 2, 4, 6]
+
+
+def test_without_keyframes_nobody_is_kept() -> None:
+    assert drive([forward(2.0)] * 5, config_of(n_keyframes=0)) == [[]] * 6
+
+
+# From one start to the next.
+
+
+@pytest.mark.parametrize(("before", "after"), [(5, None), (None, 5), (3, 6)])
+def test_an_empty_window_takes_another_size_as_if_it_had_begun_with_it(
+    before: int | None, after: int | None
+) -> None:
+    window = SlidingWindow(WindowConfig(size=before))
+    window.reconfigure(WindowConfig(size=after))
+    go_on(window, 0, 12)
+    assert len(window) == (12 if after is None else after)
+    assert len(window.pop_finished()) == (0 if after is None else 12 - after)
+    window.finish()
+    assert (window.polish is not None) == (after is None)
+
+
+def test_what_the_last_polish_gained_is_not_told_of_the_next_run() -> None:
+    window = SlidingWindow(WindowConfig(size=None))
+    go_on(window, 0, 4)
+    window.finish()
+    assert window.polish is not None
+    window.reconfigure(WindowConfig(size=3))
+    go_on(window, 0, 6)
+    assert len(window) == 3
+    assert [each.frame_id for each in window.finish()] == list(range(6))
+    assert window.polish is None
+    # And back: a window that slid can keep everything from its next start on.
+    go_on(window, 0, 4)
+    window.reconfigure(WindowConfig(size=None))
+    window.finish()
+    assert window.polish is None
+    go_on(window, 0, 4)
+    window.finish()
+    assert window.polish is not None
+
+
+def test_a_window_that_finished_knows_nothing_of_the_motion_before() -> None:
+    window = SlidingWindow(WindowConfig(size=4))
+    go_on(window, 0, 4)
+    assert window.add_pose("lost", 4 * STEP_NS, []).status is Status.COASTING
+    window.finish()
+    first = window.add_pose("a", 0, [])
+    assert first.status is Status.OK
+    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    second = window.add_pose("b", STEP_NS, [])
+    assert second.status is Status.COASTING
+    np.testing.assert_allclose(second.T_world_cam, np.eye(4), atol=1e-9)
+    assert window.newest == "b"
+
+
+# Another configuration while it runs.
+
+
+COVARIANCE = np.diag([1e-5, 2e-5, 1e-5, 1e-4, 2e-4, 1e-4])
+
+
+GAUSSIAN = WindowConfig(kernel="none", gate=None)
+
+
+def edge_to(reference: int, n_steps: int, rng: np.random.Generator) -> Edge:
+    """Return a noisy edge from a frame to one a few steps later, on a bend."""
+    step = se3.exp(np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.3]))
+    T = np.linalg.matrix_power(step, n_steps) @ se3.exp(0.01 * rng.normal(size=6))
+    return Edge(reference_id=reference, T_reference_frame=T, covariance=COVARIANCE)
+
+
+def edges_of(frame: int, rng: np.random.Generator) -> list[Edge]:
+    return [edge_to(frame - n, n, rng) for n in (1, 2) if frame - n >= 0]
+
+
+def reconfigured(
+    changes: dict[int, WindowConfig], start: WindowConfig, n: int
+) -> tuple[SlidingWindow, list[Estimate]]:
+    """Add n poses; before some of them the configuration changes."""
+    rng = np.random.default_rng(0)
+    window = SlidingWindow(start)
+    causal = []
+    for frame in range(n):
+        if frame in changes:
+            window.reconfigure(changes[frame])
+        edges = [edge for edge in edges_of(frame, rng) if edge.reference_id in window]
+        causal.append(window.add_pose(frame, frame * STEP_NS, edges))
+    return window, causal
+
+
+def stacked(estimates: list[Estimate]) -> FloatArray:
+    ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
+    return np.stack([estimate.T_world_cam for estimate in ordered])
+
+
+def test_a_smaller_window_lets_poses_leave_with_the_next_update() -> None:
+    window, _ = reconfigured(
+        {12: GAUSSIAN.model_copy(update={"size": 3})}, WindowConfig(size=10), 12
+    )
+    window.pop_finished()
+    window.reconfigure(WindowConfig(size=3))
+    assert len(window) == 10
+    window.add_pose(12, 12 * STEP_NS, [edge_to(11, 1, np.random.default_rng(1))])
+    assert [estimate.frame_id for estimate in window.pop_finished()] == list(range(2, 10))
+    assert list(window.poses()) == [10, 11, 12]
+
+
+def test_a_size_that_changes_leaves_a_gaussian_graph_at_the_same_optimum() -> None:
+    """Each edge is there with either size, so marginals and whole graph must agree."""
+    wide = GAUSSIAN.model_copy(update={"size": 20})
+    sizes = {8: wide.model_copy(update={"size": 4}), 11: wide.model_copy(update={"size": 15})}
+    changed, _ = reconfigured(sizes, wide, 18)
+    untouched, _ = reconfigured({}, wide, 18)
+    for frame in (15, 16, 17):
+        np.testing.assert_allclose(changed.pose(frame), untouched.pose(frame), atol=2e-4)
+        expected = untouched.covariance(frame)
+        np.testing.assert_allclose(changed.covariance(frame), expected, rtol=0.02, atol=1e-7)
+
+
+def test_a_window_that_keeps_all_can_begin_to_slide_and_stop_again() -> None:
+    whole, sliding = GAUSSIAN.model_copy(update={"size": None}), GAUSSIAN
+    window, _ = reconfigured({60: sliding, 80: whole}, whole, 100)
+    finished = window.pop_finished()
+    assert len(window) > 20  # none left after the second change
+    finished += window.finish()
+    assert window.polish is None
+    assert sorted(estimate.frame_id for estimate in finished) == list(range(100))  # type: ignore[type-var]
+    reference, _ = reconfigured({}, whole, 100)
+    expected = stacked(reference.finish())
+    np.testing.assert_allclose(stacked(finished)[-1], expected[-1], atol=0.02)
+
+
+def test_many_poses_leave_a_few_at_a_time() -> None:
+    window, _ = reconfigured({}, GAUSSIAN.model_copy(update={"size": None}), 80)
+    window.reconfigure(GAUSSIAN)
+    sizes, rng = [], np.random.default_rng(3)
+    for frame in range(80, 84):
+        window.add_pose(frame, frame * STEP_NS, edges_of(frame, rng))
+        sizes.append(len(window))
+    assert sizes == [49, 18, 5, 5]
+
+
+def test_an_edge_keeps_the_kernel_that_it_went_in_with() -> None:
+    window, _ = reconfigured({}, WindowConfig(kernel="none", gate=None, size=10), 4)
+    rng = np.random.default_rng(5)
+    window.reconfigure(WindowConfig(kernel="cauchy", kernel_threshold=0.5, gate=None, size=10))
+    window.add_pose(4, 4 * STEP_NS, [edge_to(3, 1, rng), edge_to(2, 2, rng)])
+    weights = {(edge.reference_id, edge.frame_id): edge.weight for edge in window.graph()}
+    assert all(weight == 1.0 for (_, frame), weight in weights.items() if frame != 4)
+    assert weights[3, 4] < 1.0
+    assert weights[2, 4] < 1.0
+
+
+def test_the_gate_is_that_of_the_present() -> None:
+    window, _ = reconfigured({}, WindowConfig(gate=None, size=10), 6)
+    rng = np.random.default_rng(7)
+    wrong = replace(edge_to(3, 3, rng), T_reference_frame=se3.exp(np.full(6, 1.0)))
+    good = [edge_to(5, 1, rng), edge_to(4, 2, rng)]
+    assert not window.add_pose(6, 6 * STEP_NS, [*good, wrong]).rejected
+    window.reconfigure(WindowConfig(gate=10.0, size=10))
+    good = [edge_to(6, 1, rng), edge_to(5, 2, rng)]
+    wrong = replace(wrong, reference_id=4)
+    assert [r.reference_id for r in window.add_pose(7, 7 * STEP_NS, [*good, wrong]).rejected] == [4]
+
+
+def test_coasting_goes_on_over_a_change_and_is_lost_by_the_new_limit() -> None:
+    window, _ = reconfigured({}, WindowConfig(), 5)
+    statuses = []
+    for frame in range(5, 11):
+        if frame == 8:
+            window.reconfigure(WindowConfig(lost_after_s=0.35, coasting_sigma_m_per_s=300.0))
+        estimate = window.add_pose(frame, frame * STEP_NS, [])
+        statuses.append((estimate.status, estimate.covariance[5, 5] > 100.0))
+    assert [status for status, _ in statuses] == [Status.COASTING] * 3 + [Status.LOST] * 3
+    assert [is_unsure for _, is_unsure in statuses] == [False] * 3 + [True] * 3
+
+
+configurations = st.builds(
+    WindowConfig,
+    size=st.none() | st.integers(2, 30),
+    kernel=st.sampled_from(["none", "huber", "cauchy", "geman_mcclure", "dcs"]),
+    kernel_threshold=st.none() | st.floats(0.1, 20.0),
+    gate=st.none() | st.floats(0.5, 20.0),
+    lost_after_s=st.floats(0.1, 5.0),
+    coasting_sigma_m_per_s=st.floats(0.01, 100.0),
+)
+
+
+@given(
+    changes=st.dictionaries(st.integers(0, 39), configurations, max_size=8),
+    kept=st.sets(st.integers(0, 39)),
+    gaps=st.sets(st.integers(1, 39), max_size=10),
+)
+@settings(max_examples=15, deadline=None)
+def test_each_pose_is_finished_exactly_once_over_any_changes(
+    changes: dict[int, WindowConfig], kept: set[int], gaps: set[int]
+) -> None:
+    rng = np.random.default_rng(0)
+    window = SlidingWindow()
+    finished = []
+    for frame in range(40):
+        if frame in changes:
+            window.reconfigure(changes[frame])
+        window.add_pose(frame, frame * STEP_NS, [] if frame in gaps else edges_of(frame, rng))
+        if frame in kept and frame in window:
+            window.keep(frame)
+        if frame % 7 == 6:
+            for kept_id in window.kept()[:2]:
+                window.release(kept_id)
+        finished += window.pop_finished()
+    finished += window.finish()
+    assert sorted(estimate.stamp_ns for estimate in finished) == [n * STEP_NS for n in range(40)]
+    assert all(
+        np.isfinite(e.T_world_cam).all() and np.isfinite(e.covariance).all() for e in finished
     )

@@ -1,4 +1,4 @@
-"""The window against GTSAM's batch optimiser on the same measurements."""
+"""The window against GTSAM's batch optimizer on the same measurements."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ from gvo.types import (
     Rejected,
     Status,
 )
+from tests.backend.walks import STEP, STEP_NS, edge, power
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
-STEP_NS = 100_000_000
+
+
 KERNELS = ["none", "huber", "cauchy", "geman_mcclure", "dcs"]
+
+
 THRESHOLDS = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
 
 
@@ -124,8 +128,8 @@ def feed(window: SlidingWindow, problem: Problem) -> list[Estimate]:
         stamp = frame * STEP_NS
         estimate = window.add_pose(frame, stamp, frame_edges, problem.priors.get(frame))
         assert estimate.rejected == ()
-        for late_frame, edge in problem.late_edges.get(frame, []):
-            answer: object = window.add_edge(late_frame, edge)
+        for late_frame, late in problem.late_edges.get(frame, []):
+            answer: object = window.add_edge(late_frame, late)
             assert isinstance(answer, Estimate), answer
         for late_frame, prior in problem.late_priors.get(frame, []):
             answer = window.add_prior(late_frame, prior)
@@ -146,8 +150,8 @@ def build(
             sigmas = np.r_[np.ones(3), np.full(3, 1e6)]
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
-    for frame, edge in problem.all_edges(n):
-        graph.add(between_factor(frame, edge, kernel, threshold))
+    for frame, each in problem.all_edges(n):
+        graph.add(between_factor(frame, each, kernel, threshold))
     for frame, prior in problem.all_priors(n):
         graph.add(prior_factor(frame, prior))
     return graph
@@ -226,9 +230,6 @@ def assert_equal_covariances(found: FloatArray, expected: FloatArray, tolerance:
     np.testing.assert_allclose(found / scale, expected / scale, atol=tolerance)
 
 
-# Full smoothing is the batch optimum.
-
-
 @settings(deadline=None, max_examples=8)
 @given(seed=seeds, with_priors=st.booleans())
 def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_priors: bool) -> None:
@@ -285,9 +286,6 @@ def test_a_late_loop_answers_with_the_pose_it_moved() -> None:
     np.testing.assert_allclose(answer.T_world_cam, expected, atol=1e-5)
     np.testing.assert_allclose(answer.T_world_cam, window.pose(29), atol=1e-12)
     assert_equal_covariances(answer.covariance, marginals.marginalCovariance(29), 5e-3)
-
-
-# Marginals of the window.
 
 
 def small_window(seed: int, size: int | None) -> tuple[SlidingWindow, Problem]:
@@ -367,9 +365,6 @@ def test_the_relative_pose_of_a_single_edge_is_the_edge() -> None:
     assert_equal_covariances(back.covariance, Ad @ found.covariance @ Ad.T, 1e-3)
 
 
-# The graph as edges.
-
-
 def expected_factor(problem: Problem, edge: GraphEdge, kernel: str) -> tuple[Any, Any]:
     """Return the measurement that an edge of the graph tells of, as a factor, and its kernel."""
     frame = number(edge.frame_id)
@@ -411,17 +406,17 @@ def test_the_graph_tells_residuals_and_weights_as_gtsam_does(kernel: Any, size: 
     ) + sum(frame in alive for frame, _ in problem.all_priors(30))
     assert len(graph) == n_expected
     weights = []
-    for edge in graph:
-        factor, its_kernel = expected_factor(problem, edge, kernel)
+    for each in graph:
+        factor, its_kernel = expected_factor(problem, each, kernel)
         expected = factor.whitenedError(values)
-        assert edge.residual.shape == expected.shape
-        assert edge.chi2 == pytest.approx(2 * factor.error(values), rel=1e-6, abs=1e-9)
+        assert each.residual.shape == expected.shape
+        assert each.chi2 == pytest.approx(2 * factor.error(values), rel=1e-6, abs=1e-9)
         # Which square root of the information whitens is free; what it makes of noise is not.
-        assert np.linalg.norm(edge.residual) == pytest.approx(np.linalg.norm(expected), abs=1e-6)
+        assert np.linalg.norm(each.residual) == pytest.approx(np.linalg.norm(expected), abs=1e-6)
         norm = float(np.linalg.norm(expected))
         weight = 1.0 if its_kernel == "none" else make_kernel(its_kernel).weight(norm)
-        assert edge.weight == pytest.approx(weight, rel=1e-6)
-        weights.append(edge.weight)
+        assert each.weight == pytest.approx(weight, rel=1e-6)
+        weights.append(each.weight)
     assert kernel in ("none", "huber", "dcs") or min(weights) < 0.99
 
 
@@ -437,9 +432,6 @@ def test_without_a_prior_the_graph_tells_at_most_the_start_beside_the_edges() ->
     window.finish()
     assert window.polish is not None
     assert window.polish.error_before == pytest.approx(0.5 * chi2, rel=1e-3)
-
-
-# Robust kernels.
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:])
@@ -504,9 +496,6 @@ def test_an_edge_may_have_its_own_kernel(kernel: Any) -> None:
     assert second_pose(kernel, "none") == pytest.approx(second_pose(None, kernel), rel=1e-9)
     assert second_pose("none", kernel) == [1.0, 1.0, 1.0]
     assert min(second_pose(kernel, "none")) < 1.0
-
-
-# Gating.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -660,9 +649,6 @@ def test_a_loop_closure_after_long_drift_is_not_refused_later(seed: int) -> None
     np.testing.assert_allclose(window.finish()[149].T_world_cam, poses[149], atol=0.01)
 
 
-# Absolute measurements.
-
-
 def test_a_known_start_places_the_first_pose() -> None:
     start = se3.exp(np.array([0.3, -0.2, 0.1, 4.0, 5.0, 6.0]))
     prior = PosePrior(
@@ -718,9 +704,6 @@ def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) ->
             np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-5)
 
 
-# What redundancy does, and what it does not.
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(("size", "n"), [(2, 300), (5, 1000), (None, 300)])
 def test_smoothing_consecutive_edges_returns_the_chain(
@@ -738,3 +721,200 @@ def test_smoothing_consecutive_edges_returns_the_chain(
             chained = chained @ edges[frame][0].T_reference_frame
         np.testing.assert_allclose(causal[frame].T_world_cam, chained, atol=1e-6)
         np.testing.assert_allclose(smoothed[frame].T_world_cam, chained, atol=1e-6)
+
+
+# Keyframes that come and go.
+
+
+def test_marginals_carry_on_what_left_the_window() -> None:
+    # The last pose hangs on everything before it, though only three poses are left.
+    rng = np.random.default_rng(7)
+    poses = wander(rng, 40)
+    edges: list[list[Edge]] = [[]]
+    for frame in range(1, 40):
+        references = [frame - 1] if frame == 1 else [frame - 1, frame - 2]
+        edges.append([measure(poses, i, frame, rng, 2e-4) for i in references])
+    causal = feed(
+        SlidingWindow(WindowConfig(size=3, kernel="none")), Problem(poses=poses, edges=edges)
+    )
+    optimum, marginals = batch(Problem(poses=poses, edges=edges))
+    np.testing.assert_allclose(causal[-1].T_world_cam, optimum.atPose3(39).matrix(), atol=1e-5)
+    ratio = np.diag(causal[-1].covariance) / np.diag(marginals.marginalCovariance(39))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.01)
+
+
+def random_soak(
+    seed: int, n: int, n_kept_limit: int
+) -> tuple[list[FloatArray], list[list[Edge]], list[Estimate], int]:
+    """Drive a window of five with keyframes kept and released at random."""
+    rng = np.random.default_rng(seed)
+    poses = wander(rng, n)
+    window = SlidingWindow(WindowConfig(size=5, kernel="none"))
+    edges: list[list[Edge]] = []
+    kept: list[int] = []
+    finished: list[Estimate] = []
+    largest = 0
+    for frame in range(n):
+        references = [frame - 1] if frame else []
+        candidates = [number(i) for i in window.poses() if i != frame - 1]
+        references += rng.permutation(np.array(candidates, dtype=int))[:2].tolist()
+        edges.append([measure(poses, i, frame, rng, 2e-3) for i in references])
+        estimate = window.add_pose(frame, frame * STEP_NS, edges[-1])
+        assert np.isfinite(estimate.T_world_cam).all()
+        assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+        finished += window.pop_finished()
+        if rng.random() < 0.4:
+            window.keep(frame)
+            kept.append(frame)
+        while len(kept) > n_kept_limit or (kept and rng.random() < 0.1):
+            window.release(kept.pop(int(rng.integers(len(kept)))))
+        largest = max(largest, len(window))
+        assert all(i in window for i in kept)
+    finished += window.finish()
+    return poses, edges, finished, largest
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_keyframes_may_come_and_go_for_hundreds_of_poses(seed: int) -> None:
+    n = 300
+    poses, edges, finished, largest = random_soak(seed, n, n_kept_limit=6)
+    # Each pose is handed over exactly once.
+    assert sorted(number(estimate.frame_id) for estimate in finished) == list(range(n))
+    assert all(e.stamp_ns == number(e.frame_id) * STEP_NS for e in finished)
+    assert largest <= 5 + 6 + 1
+    optimum, _ = batch(Problem(poses=poses, edges=edges))
+    windowed = np.array([e.T_world_cam[:3, 3] for e in sorted(finished, key=lambda e: e.stamp_ns)])
+    batched = np.array([optimum.atPose3(i).matrix()[:3, 3] for i in range(n)])
+    length = np.linalg.norm(np.diff(batched, axis=0), axis=1).sum()
+    assert np.abs(windowed - batched).max() < 0.002 * length
+    chained = [np.eye(4)]
+    for frame_edges in edges[1:]:
+        chained.append(chained[-1] @ frame_edges[0].T_reference_frame)
+    drift = np.abs(np.array(chained)[:, :3, 3] - batched).max()
+    assert np.abs(windowed - batched).max() < 0.7 * drift
+
+
+# A loop that turns what it closes: one linearization is not enough.
+
+
+N = 9
+
+
+ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
+
+
+def optimum_of(
+    start: PosePrior, edges: Sequence[tuple[int, Edge]], poses: Sequence[FloatArray]
+) -> tuple[gtsam.Values, FloatArray]:
+    """Return the least squares of a start and edges (frame, edge), and all poses' covariance.
+
+    By GTSAM's batch with QR, and a QR decomposition of the whole Jacobian.
+    """
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Gaussian.Covariance(start.covariance)
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start.T_world_frame), noise))
+    for frame, each in edges:
+        assert isinstance(each.reference_id, int)
+        noise = gtsam.noiseModel.Gaussian.Covariance(each.covariance)
+        T = gtsam.Pose3(each.T_reference_frame)
+        graph.add(gtsam.BetweenFactorPose3(each.reference_id, frame, T, noise))
+    for frame, pose in enumerate(poses):
+        values.insert(frame, gtsam.Pose3(pose))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setRelativeErrorTol(1e-14)
+    parameters.setAbsoluteErrorTol(0.0)
+    optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    J, _ = graph.linearize(optimum).jacobian()
+    R_inverse = np.linalg.inv(np.linalg.qr(J, mode="r"))
+    return optimum, R_inverse @ R_inverse.T
+
+
+def drifted_chain(turn_rad: float) -> tuple[SlidingWindow, list[tuple[int, Edge]], FloatArray]:
+    """Return a window that holds N poses whose steps turn too far, their edges, the true end."""
+    wrong_step = se3.normalize(STEP @ se3.exp(np.array([0.0, turn_rad / N, 0.0, 0.0, 0.0, 0.0])))
+    edges = [(frame, edge(frame - 1, wrong_step, 0.1)) for frame in range(1, N)]
+    window = SlidingWindow(WindowConfig(size=N + 3, kernel="none", gate=None))
+    window.add_pose(0, 0, [])
+    for frame, each in edges:
+        window.add_pose(frame, frame * STEP_NS, [each])
+    return window, edges, power(N - 1)
+
+
+@pytest.mark.parametrize("turn_rad", [0.6, -1.2])
+def test_a_loop_with_a_large_turn_is_closed_when_the_call_returns(turn_rad: float) -> None:
+    window, edges, T_end = drifted_chain(turn_rad)
+    before = window.poses()
+    loop = edge(0, T_end, 1e-3)
+    answer = window.add_edge(N - 1, loop)
+    assert isinstance(answer, Estimate)
+    optimum, _ = optimum_of(ORIGIN, [*edges, (N - 1, loop)], list(before.values()))
+    moved = se3.invert(before[N - 1]) @ optimum.atPose3(N - 1).matrix()
+    assert se3.rotation_angle(moved) > 0.4
+    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N - 1).matrix(), atol=1e-4)
+    for frame, T in enumerate(window.poses().values()):
+        np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
+
+
+@pytest.mark.parametrize("turn_rad", [0.6, -1.2])
+def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once(turn_rad: float) -> None:
+    # It starts where one of its edges leads, and ends where both pull alike.
+    window, edges, _ = drifted_chain(turn_rad)
+    before = window.poses()
+    arriving = [edge(0, power(N), 0.3), edge(N - 1, STEP, 0.1)]
+    answer = window.add_pose(N, N * STEP_NS, arriving)
+    assert answer.rejected == ()
+    everything = [*edges, *((N, each) for each in arriving)]
+    optimum, _ = optimum_of(ORIGIN, everything, [*before.values(), power(N)])
+    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N).matrix(), atol=1e-4)
+
+
+def test_a_pose_that_closes_a_loop_with_a_large_turn_settles_the_others_too() -> None:
+    window, edges, _ = drifted_chain(-1.2)
+    before = window.poses()
+    arriving = [edge(0, power(N), 1e-3), edge(N - 1, STEP, 0.1)]
+    window.add_pose(N, N * STEP_NS, arriving)
+    everything = [*edges, *((N, each) for each in arriving)]
+    optimum, _ = optimum_of(ORIGIN, everything, [*before.values(), power(N)])
+    for frame, T in enumerate(window.poses().values()):
+        np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
+
+
+# Sigmas many orders of magnitude apart: Cholesky calls the system indeterminate, QR solves it.
+
+
+@pytest.mark.parametrize(("start_sigma", "sigma"), [(1e2, 1e-2), (1e4, 1.0), (1.0, 1e-4)])
+def test_a_whole_graph_takes_sigmas_at_which_cholesky_gives_up(
+    start_sigma: float, sigma: float
+) -> None:
+    start = PosePrior(T_world_frame=np.eye(4), covariance=start_sigma**2 * np.eye(6))
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    window.add_pose(0, 0, [], start)
+    edges: list[tuple[int, Edge]] = []
+    for frame in range(1, N):
+        arriving = [edge(frame - span, power(span), sigma) for span in (1, 2) if span <= frame]
+        estimate = window.add_pose(frame, frame * STEP_NS, arriving)
+        assert (estimate.rejected, estimate.status) == ((), Status.OK)
+        edges += [(frame, each) for each in arriving]
+    counts = window.counts
+    assert counts.n_restored >= 1  # there was something to survive
+    assert (counts.n_rejected, counts.n_coasting, counts.n_rebuilt) == (0, 0, 0)
+    assert (counts.n_edges, len(window.graph())) == (len(edges), len(edges) + 1)
+    optimum, covariance = optimum_of(start, edges, [power(frame) for frame in range(N)])
+    relative = window.relative_pose(0, N - 1)
+    np.testing.assert_allclose(relative.T_reference_frame, power(N - 1), atol=1e-6 * N)
+    np.testing.assert_allclose(window.pose(N - 1), optimum.atPose3(N - 1).matrix(), atol=1e-4)
+    expected = covariance[-6:, -6:]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(window.covariance(N - 1) / scale, expected / scale, atol=1e-3)
+
+
+def test_a_late_edge_at_which_cholesky_gives_up_is_taken() -> None:
+    start = PosePrior(T_world_frame=np.eye(4), covariance=1e4 * np.eye(6))
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    window.add_pose(0, 0, [], start)
+    for frame in range(1, N):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 1.0)])
+    assert window.counts.n_restored == 0
+    answer = window.add_edge(N - 1, edge(0, power(N - 1), 1e-6))
+    assert isinstance(answer, Estimate), answer

@@ -1,0 +1,476 @@
+"""What a window answers where GTSAM fails."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gvo.backend.isam2 import PoseGraph
+from gvo.backend.window import SlidingWindow
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.types import Estimate, PosePrior, PositionPrior, Rejected, Status
+from tests.backend.twins import (
+    FAULTY,
+    NEWEST,
+    POSE_PRIOR,
+    POSITION_PRIOR,
+    Act,
+    N,
+    Run,
+    assert_as_twin,
+    assert_complete,
+    assert_sound,
+    good_edges,
+    number,
+    plain_twin,
+    run,
+    stamp_of,
+    true_poses,
+    twin_without_edges,
+)
+from tests.backend.walks import (
+    STEP,
+    STEP_NS,
+    edge,
+    failing_updates,
+    giving_up,
+    go_on,
+    messages,
+    power,
+    walk,
+)
+
+
+@contextmanager
+def failing(
+    name: str, calls: Sequence[int] | range, error: type[Exception] = RuntimeError
+) -> Iterator[list[int]]:
+    """Make a method of GTSAM's ISAM2 fail at these calls, counted from here."""
+    original = getattr(gtsam.ISAM2, name)
+    seen, failed = [0], []
+
+    def give_up(self: Any, *arguments: Any, **options: Any) -> Any:
+        call = seen[0]
+        seen[0] += 1
+        if call in calls:
+            failed.append(call)
+            raise error("Indeterminant linear system detected\nand more lines")
+        return original(self, *arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam.ISAM2, name, give_up)
+        yield failed
+
+
+def run_failing(
+    name: str, calls: Sequence[int] | range, error: type[Exception] = RuntimeError
+) -> tuple[Run, list[int]]:
+    """Drive a window while GTSAM fails at these calls since pose 8."""
+    failures: list[list[int]] = []
+    with ExitStack() as stack:
+        found = run(lambda _: failures.append(stack.enter_context(failing(name, calls, error))))
+    return found, failures[0]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, IndexError])
+def test_one_failing_update_is_undone_and_its_pose_coasts(
+    error: type[Exception], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, logger="gvo"):
+        found, failed = run_failing("update", [0], error)
+    assert failed == [0]
+    assert found.causal[FAULTY].status == Status.COASTING
+    assert_as_twin(found, twin_without_edges())
+    assert (found.window.counts.n_restored, found.window.counts.n_rebuilt) == (1, 0)
+    told = [record for record in caplog.records if record.name.split(".")[0] == "gvo"]
+    assert len(told) == 1
+    line = told[0].getMessage()
+    assert repr(FAULTY) in line
+    assert "\n" not in line
+
+
+def test_an_update_and_its_coasting_failing_restart_the_graph(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.WARNING, logger="gvo"):
+        found, failed = run_failing("update", [0, 1])
+    assert failed == [0, 1]
+    assert_complete(found)
+    assert found.window.counts.n_rebuilt == 1
+    assert found.window.counts.n_restored >= 1
+    assert any(record.name.split(".")[0] == "gvo" for record in caplog.records)
+    # What follows hangs on the pose the graph began again from: the motion is kept.
+    for frame in range(FAULTY + 4, N):
+        ours = np.linalg.inv(found.causal[frame - 1].T_world_cam) @ found.causal[frame].T_world_cam
+        theirs = np.linalg.inv(true_poses()[frame - 1]) @ true_poses()[frame]
+        np.testing.assert_allclose(ours, theirs, atol=0.02)
+
+
+@pytest.mark.parametrize("n_failures", [3, 4, 5, 10, 40, 10_000])
+def test_nothing_is_lost_when_updates_fail_many_times_in_a_row(n_failures: int) -> None:
+    found, failed = run_failing("update", range(n_failures))
+    assert len(failed) >= min(n_failures, N - FAULTY)
+    assert_complete(found)
+    assert found.window.counts.n_poses == N
+    assert found.window.counts.n_restored >= 1
+
+
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.too_slow])
+@given(calls=st.sets(st.integers(0, 60), min_size=1))
+def test_nothing_is_lost_wherever_updates_fail(calls: set[int]) -> None:
+    with failing("update", sorted(calls)) as failed:
+        found = run()
+    assert_complete(found)
+    if failed:
+        assert found.window.counts.n_restored >= 1
+    else:
+        assert_as_twin(found, plain_twin())
+
+
+@pytest.mark.parametrize("name", ["marginalizeLeaves", "jointMarginalCovariance"])
+@pytest.mark.parametrize("n_failures", [1, 2, 3, 10])
+def test_nothing_is_lost_when_other_steps_of_gtsam_fail(name: str, n_failures: int) -> None:
+    found, failed = run_failing(name, range(n_failures))
+    assert failed
+    assert_complete(found)
+    assert found.window.counts.n_restored >= 1
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda window: window.add_edge(NEWEST, good_edges()[NEWEST][0]),
+        lambda window: window.add_prior(NEWEST, POSITION_PRIOR),
+        lambda window: window.add_prior(NEWEST, POSE_PRIOR),
+    ],
+    ids=["an edge", "a position", "a pose"],
+)
+def test_an_edge_or_a_prior_at_which_gtsam_fails_is_refused_and_leaves_no_trace(act: Act) -> None:
+    def act_and_fail(window: SlidingWindow) -> object:
+        before = window.poses()
+        with failing("update", [0]) as failed:
+            answer = act(window)
+        assert failed == [0]
+        for name, pose in window.poses().items():
+            np.testing.assert_array_equal(pose, before[name])
+        return answer
+
+    found = run(act_and_fail)
+    assert isinstance(found.answer, Rejected)
+    assert found.answer.frame_id == NEWEST
+    assert_as_twin(found, plain_twin())
+    assert found.window.counts.n_restored == 1
+
+
+def test_a_polish_that_fails_leaves_the_estimates_as_they_were(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    failed = []
+
+    def give_up(*_: Any) -> None:
+        failed.append(True)
+        raise RuntimeError("Indeterminant linear system detected\nand more lines")
+
+    window = SlidingWindow(WindowConfig(size=None))
+    for frame, frame_edges in enumerate(good_edges()):
+        window.add_pose(frame, stamp_of(frame), frame_edges)
+    before = window.poses()
+    for name in ("optimize", "optimizeSafely", "iterate"):
+        monkeypatch.setattr(gtsam.LevenbergMarquardtOptimizer, name, give_up)
+    with caplog.at_level(logging.WARNING, logger="gvo"):
+        finished = window.finish()
+    assert failed
+    assert [e.frame_id for e in finished] == list(range(N))
+    for estimate in finished:
+        assert_sound(estimate)
+        np.testing.assert_allclose(
+            estimate.T_world_cam, before[number(estimate.frame_id)], atol=1e-9
+        )
+    assert any(record.name.split(".")[0] == "gvo" for record in caplog.records)
+
+
+# Poses that diverge.
+
+
+FAR = np.array([[0.0, 0.0, 0.0], [0.0, -1e12, 0.0]])
+
+
+@pytest.mark.parametrize("is_moved", [True, False])
+def test_others_are_looked_at_where_a_new_pose_moved_them(is_moved: bool) -> None:
+    window = walk(WindowConfig(size=9, kernel="none"), 5)
+    before = window.poses()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PoseGraph, "positions", lambda _: FAR)
+        patch.setattr(PoseGraph, "iterate", lambda *_, **__: is_moved)
+        estimate = window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
+    np.testing.assert_allclose(estimate.T_world_cam, power(5), atol=1e-6)
+    assert (window.counts.n_restored > 0) is is_moved
+    assert window.counts.n_edges == (4 if is_moved else 5)
+    for frame_id, T in before.items():
+        np.testing.assert_allclose(window.pose(frame_id), T, atol=1e-9)
+
+
+def test_a_whole_graph_is_too_large_to_be_looked_at() -> None:
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PoseGraph, "positions", lambda _: FAR)
+        window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
+        assert isinstance(window.add_edge(5, edge(0, power(5))), Estimate)
+    assert window.counts.n_restored == 0
+
+
+@pytest.mark.parametrize("value", [1e12, np.nan, np.inf])
+def test_an_estimate_that_is_nowhere_is_the_causal_one(value: float) -> None:
+    window = walk(WindowConfig(size=5), 4)
+    expected = window.estimate(2)
+    nowhere = np.eye(4)
+    nowhere[1, 3] = value
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PoseGraph, "pose", lambda *_: nowhere)
+        found = window.estimate(2)
+        finished = window.finish()
+    for each in (found, finished[2]):
+        np.testing.assert_allclose(each.T_world_cam, expected.T_world_cam, atol=1e-6)
+        assert np.isfinite(each.covariance).all()
+        assert each.status is Status.OK
+
+
+def test_a_pose_that_went_to_infinity_is_where_it_was_when_it_came() -> None:
+    window = walk(WindowConfig(size=5), 4)
+    here = window.poses()
+    far = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 1e12, 0.0]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam.ISAM2, "calculateEstimatePose3", lambda *_: far)
+        for frame_id, T in window.poses().items():
+            np.testing.assert_allclose(T, here[frame_id], atol=1e-9)
+
+
+def test_an_edge_that_sends_another_pose_away_is_refused_and_leaves_no_trace() -> None:
+    window = walk(WindowConfig(size=9, kernel="none"), 5)
+    before = window.poses()
+    known = window.relative_pose(1, 4).T_reference_frame
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PoseGraph, "positions", lambda _: np.array([[0.0, 0, 0], [0, -1e12, 0]]))
+        answer = window.add_edge(4, edge(1, known))
+    assert isinstance(answer, Rejected)
+    assert "diverged to 1e+12 m" in answer.reason
+    assert (window.counts.n_restored, window.counts.n_edges) == (1, 4)
+    for frame_id, T in window.poses().items():
+        np.testing.assert_array_equal(T, before[frame_id])
+    assert isinstance(window.add_edge(4, edge(1, known)), Estimate)
+
+
+# Late measurements.
+
+
+def test_a_late_edge_is_tried_once_more_with_a_hardened_graph_and_no_more() -> None:
+    loop = edge(0, power(4))
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    # The update, that of making the hardened graph, and the update again.
+    with failing_updates(0, 2) as seen:
+        answer = window.add_edge(4, loop)
+    assert isinstance(answer, Rejected)
+    assert (answer.frame_id, answer.reference_id, answer.stamp_ns) == (4, 0, 4 * STEP_NS)
+    assert "GTSAM gave up on the update" in answer.reason
+    assert len(seen) == 3
+    counts = window.counts
+    assert (counts.n_restored, counts.n_rejected, counts.n_gated, counts.n_edges) == (2, 1, 0, 4)
+    # Now it is hardened: one try is all.
+    with failing_updates(0) as seen:
+        assert isinstance(window.add_edge(4, loop), Rejected)
+    assert (len(seen), window.counts.n_restored) == (1, 3)
+    assert isinstance(window.add_edge(4, loop), Estimate)
+    assert [each.frame_id for each in window.finish()] == list(range(5))
+
+
+def test_a_late_edge_is_refused_where_not_even_the_hardened_graph_can_be_made() -> None:
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    with failing_updates(0, 1) as seen:
+        answer = window.add_edge(4, edge(0, power(4)))
+    assert isinstance(answer, Rejected)
+    assert "GTSAM gave up on the update" in answer.reason
+    assert len(seen) == 2
+    assert [each.frame_id for each in window.finish()] == list(range(5))
+
+
+def test_a_sliding_window_tries_a_late_edge_once() -> None:
+    window = walk(WindowConfig(size=9, kernel="none"), 5)
+    with failing_updates(0) as seen:
+        assert isinstance(window.add_edge(4, edge(0, power(4))), Rejected)
+    assert (len(seen), window.counts.n_restored) == (1, 1)
+
+
+# What is given up.
+
+
+PLACE = PosePrior(T_world_frame=STEP, covariance=1e-4 * np.eye(6))
+
+
+def test_an_update_that_fails_takes_all_measurements_of_its_pose_along() -> None:
+    window = SlidingWindow(WindowConfig(size=9))
+    go_on(window, 0, 5)
+    place = PositionPrior(position_world=power(5)[:3, 3], covariance=np.eye(3))
+    with failing_updates(0):
+        found = window.add_pose(
+            5, 5 * STEP_NS, [edge(4, STEP), edge(3, power(2))], place, status=Status.OK
+        )
+    assert [each.reference_id for each in found.rejected] == [4, 3, None]
+    assert {each.reason for each in found.rejected} == {"GTSAM gave up on the update"}
+    assert found.status is Status.COASTING
+    np.testing.assert_allclose(found.T_world_cam, power(5), atol=1e-6)
+    counts = window.counts
+    assert (counts.n_edges, counts.n_priors, counts.n_rejected) == (4, 0, 3)
+    assert (counts.n_gated, counts.n_coasting, counts.n_poses) == (0, 1, 6)
+    assert (counts.n_restored, counts.n_rebuilt) == (1, 0)
+    assert window.edges(5) == ()
+    assert [each.frame_id for each in window.graph()] == [1, 2, 3, 4]
+
+
+def test_a_graph_that_is_made_anew_knows_its_poses_and_no_measurements() -> None:
+    window = SlidingWindow(WindowConfig(size=9))
+    go_on(window, 0, 5)
+    before = {frame: window.estimate(frame) for frame in range(5)}
+    with failing_updates(0, 1):
+        window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
+    assert (window.counts.n_restored, window.counts.n_rebuilt) == (2, 1)
+    assert window.graph() == []
+    assert all(window.edges(frame) == () for frame in range(6))
+    for frame, each in before.items():
+        found = window.estimate(frame)
+        np.testing.assert_allclose(found.T_world_cam, each.T_world_cam, atol=1e-9)
+        # As told before but for what the poses have in common, which can only be less.
+        assert np.all(np.diag(found.covariance) <= np.diag(each.covariance) * (1 + 1e-6))
+        np.testing.assert_allclose(np.diag(found.covariance), np.diag(each.covariance), rtol=0.3)
+    assert [each.frame_id for each in window.finish()] == list(range(6))
+
+
+def test_the_first_pose_that_fails_is_the_origin_no_more_but_stays_where_it_is() -> None:
+    window = SlidingWindow(WindowConfig(size=9))
+    with failing_updates(0):
+        first = window.add_pose("a", 0, [], PLACE)
+    assert [each.reference_id for each in first.rejected] == [None]
+    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    assert (window.counts.n_priors, window.counts.n_rejected) == (0, 1)
+    assert first.status is Status.OK
+    second = window.add_pose("b", STEP_NS, [edge("a", STEP)])
+    np.testing.assert_allclose(second.T_world_cam, STEP, atol=1e-9)
+
+
+def test_a_first_pose_that_gtsam_never_takes_is_handed_over_where_the_world_begins() -> None:
+    window = SlidingWindow(WindowConfig(size=5))
+    with giving_up("update"):
+        first = window.add_pose("a", 0, [])
+        second = window.add_pose("b", STEP_NS, [])
+    assert len(window) == 0
+    for estimate in (first, second):
+        np.testing.assert_array_equal(estimate.T_world_cam, np.eye(4))
+    assert np.linalg.eigvalsh(first.covariance)[0] > 0.0
+    assert second.covariance[5, 5] > first.covariance[5, 5]
+    # The window itself is whole: the next pose that GTSAM takes begins it.
+    third = window.add_pose("c", 2 * STEP_NS, [])
+    assert list(window.poses()) == ["c"]
+    assert [each.frame_id for each in window.finish()] == ["a", "b", "c"]
+    assert third.stamp_ns == 2 * STEP_NS
+
+
+def test_where_there_is_no_covariance_any_more_the_causal_pose_stands(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    window = walk(WindowConfig(size=5, kernel="none", gate=None), 4)
+    causal = window.add_pose(4, 4 * STEP_NS, [edge(3, STEP), edge("nobody", STEP)])
+    assert len(causal.rejected) == 1
+    turned = edge(0, se3.normalize(STEP @ STEP @ STEP @ STEP @ STEP), 1e-3)
+    assert isinstance(window.add_edge(4, turned), Estimate)
+    assert not np.allclose(window.pose(4), causal.T_world_cam, atol=1e-4)
+    with caplog.at_level(logging.WARNING, logger="gvo"), giving_up("marginalCovariance"):
+        found = window.estimate(4)
+    np.testing.assert_array_equal(found.T_world_cam, causal.T_world_cam)
+    np.testing.assert_array_equal(found.covariance, causal.covariance)
+    assert (found.frame_id, found.stamp_ns, found.status) == (4, 4 * STEP_NS, causal.status)
+    assert found.rejected == ()  # told once, with the pose
+    (line,) = messages(caplog)
+    assert "4 at 400000000 ns" in line
+    assert "\n" not in line
+
+
+def test_where_the_joint_covariance_is_lost_two_poses_share_nothing() -> None:
+    window = walk(WindowConfig(size=6, kernel="none"), 6)
+    first, last = (window.estimate(frame) for frame in (2, 5))
+    with giving_up("jointMarginalCovariance"):
+        found = window.relative_pose(2, 5)
+    H_first, H_last = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
+    between = gtsam.Pose3(first.T_world_cam).between(gtsam.Pose3(last.T_world_cam), H_first, H_last)
+    expected = H_first @ first.covariance @ H_first.T + H_last @ last.covariance @ H_last.T
+    np.testing.assert_allclose(found.T_reference_frame, between.matrix(), atol=1e-9)
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-6, atol=1e-12)
+    shared = window.relative_pose(2, 5)
+    np.testing.assert_allclose(shared.T_reference_frame, found.T_reference_frame, atol=1e-12)
+    assert np.linalg.eigvalsh(found.covariance - shared.covariance)[0] > 0.0
+    assert not window.relative_pose(4, 4).covariance.any()
+
+
+def test_a_whole_window_that_cannot_be_made_to_slide_goes_on_all_the_same(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    window = walk(WindowConfig(size=None), 6)
+    before = window.poses()
+    with caplog.at_level(logging.WARNING, logger="gvo"), giving_up("update"):
+        window.reconfigure(WindowConfig(size=3))
+    (line,) = messages(caplog)
+    assert "the graph stays as it is" in line
+    assert "\n" not in line
+    for frame_id, T in window.poses().items():
+        np.testing.assert_allclose(T, before[frame_id], atol=1e-9)
+    for frame in range(6, 12):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)])
+    assert len(window) == 3
+    finished = window.finish()
+    assert [each.frame_id for each in finished] == list(range(12))
+    for frame, each in enumerate(finished):
+        expected = np.linalg.matrix_power(STEP, frame)
+        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-6)
+
+
+def test_measurements_at_which_cholesky_gives_up_are_smoothed_and_polished() -> None:
+    window = SlidingWindow(WindowConfig(size=None, kernel="none"))
+    window.add_pose(0, 0, [], PosePrior(T_world_frame=np.eye(4), covariance=1e4 * np.eye(6)))
+    for frame in range(1, 6):
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 1e-3)])
+    assert window.counts.n_restored >= 1  # there was something to survive
+    smoothed = window.finish()
+    assert window.polish is not None
+    assert window.polish.error_after == pytest.approx(0.0, abs=1e-6)
+    for frame, each in enumerate(smoothed):
+        expected = np.linalg.matrix_power(STEP, frame)
+        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-4)
+
+
+def test_where_cholesky_gives_up_the_polish_is_done_by_qr() -> None:
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    place = PositionPrior(position_world=window.pose(4)[:3, 3] + 0.1, covariance=1e-4 * np.eye(3))
+    assert isinstance(window.add_prior(4, place), Estimate)
+    original, solvers = gtsam.LevenbergMarquardtOptimizer, []
+
+    def picky(factors: Any, values: Any, parameters: Any) -> Any:
+        solvers.append(parameters.getLinearSolverType())
+        if solvers[-1] == "MULTIFRONTAL_CHOLESKY":
+            raise RuntimeError("Indeterminant linear system detected")
+        return original(factors, values, parameters)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gtsam, "LevenbergMarquardtOptimizer", picky)
+        finished = window.finish()
+    assert solvers == ["MULTIFRONTAL_CHOLESKY", "MULTIFRONTAL_QR"]
+    assert window.polish is not None
+    assert window.polish.error_after < window.polish.error_before
+    assert window.polish.n_iterations > 0
+    assert [each.frame_id for each in finished] == list(range(5))
