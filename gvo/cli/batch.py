@@ -21,8 +21,9 @@ from gvo.cli.options import (
     Right,
     Settings,
     Start,
+    recording_options,
 )
-from gvo.cli.terminal import both, interruptible, warn
+from gvo.cli.terminal import both, interruptible, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -83,7 +84,6 @@ def batch(
     """Run many recordings, or many parameters: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
     from gvo.io.excerpt import make_excerpt
-    from gvo.io.opening import RecordingOptions
 
     if scheduler is not None and workers is not None:
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
@@ -92,12 +92,8 @@ def batch(
     variants = make_variants(files, set_ or [], sweep or [])
     found = find_recordings(asked)
     options = BatchOptions(
-        recording=RecordingOptions(
-            calibration=tuple(path.absolute() for path in calibration or ()),
-            left=left,
-            right=right,
-            color=color,
-            depth=depth,
+        recording=recording_options(
+            [path.absolute() for path in calibration or ()], left, right, color, depth
         ),
         excerpt=excerpt,
         report=with_report,
@@ -108,7 +104,7 @@ def batch(
     typer.echo(", ".join(counts))
     with (
         interruptible() as check,
-        _told_how_to_go_on(out),
+        told_where_it_stands(out, and_then=": the same command goes on"),
         connected(scheduler, workers) as client,
         _progress() as show,
     ):
@@ -135,17 +131,6 @@ def _sort_arguments(
             raise ConfigurationError(f"{pattern}: no such configuration")
         files += matches
     return rest, files
-
-
-@contextmanager
-def _told_how_to_go_on(out: str) -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        typer.echo(
-            f"gvo: interrupted; what was done stands in {out}: the same command goes on", err=True
-        )
-        raise
 
 
 @contextmanager

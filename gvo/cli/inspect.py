@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +24,7 @@ from gvo.cli.options import (
     Start,
     load,
     open_source,
+    recording_options,
 )
 from gvo.cli.terminal import both, interruptible, progress, warn
 from gvo.errors import ConfigurationError, GvoError
@@ -68,8 +70,8 @@ def explain(
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, None, every)
-    topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = open_source(recordings, parameters, calibration, topics)
+    options = recording_options(calibration, left, right, color, depth)
+    source = open_source(recordings, parameters, options)
     open_folder(out)
     with interruptible() as check, progress(source.info.name) as show:
         explanation = explain_frame(
@@ -110,14 +112,14 @@ def view(
     with interruptible() as check, ExitStack() as stack:
         shown: Player | Path = recordings[0]
         truth: Trajectory | None = None
-        topics = {"left": left, "right": right, "color": color, "depth": depth}
+        options = recording_options(calibration, left, right, color, depth)
         if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
-            given = {"config": config, "set": set_, "calibration": calibration, **topics}
+            given = {"config": config, "set": set_, **asdict(options)}
             _refuse_for_a_run(recordings[0], given)
         else:
 
             def open_again(config: Config) -> Source:
-                return open_source(recordings, config, calibration, topics)
+                return open_source(recordings, config, options)
 
             player = stack.enter_context(Player(open_again, load(config, set_)))
             shown, truth = player, _find_truth(player.source)
@@ -171,8 +173,8 @@ def shuttle(
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)
-    topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = open_source(recordings, parameters, calibration, topics)
+    options = recording_options(calibration, left, right, color, depth)
+    source = open_source(recordings, parameters, options)
     for line in source.info.decisions:
         typer.echo(line)
     with interruptible() as check, progress(source.info.name) as show:

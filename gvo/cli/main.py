@@ -28,6 +28,7 @@ from gvo.cli.options import (
     Start,
     load,
     open_source,
+    recording_options,
 )
 from gvo.cli.terminal import (
     both,
@@ -167,8 +168,8 @@ def run(
     outputs = RunOutputs(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
-    topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = open_source(recordings, parameters, calibration, topics)
+    options = recording_options(calibration, left, right, color, depth)
+    source = open_source(recordings, parameters, options)
     placed = choose_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
     truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
     for line in source.info.decisions:
@@ -212,8 +213,8 @@ def check_(
     from gvo.io.poses.inputs import count_calibration_changes, read_transforms
 
     parameters = load(config, set_)
-    topics = {"left": left, "right": right, "color": color, "depth": depth}
-    source = open_source(recordings, parameters, calibration, topics)
+    options = recording_options(calibration, left, right, color, depth)
+    source = open_source(recordings, parameters, options)
     with interruptible():
         result = check_recording(
             source,
@@ -396,9 +397,9 @@ def convert_(
     from gvo.io.convert.convert import convert
     from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 
-    topics = {"left": left, "right": right, "color": color, "depth": depth}
+    options = recording_options(calibration, left, right, color, depth)
     settings = load(config, set_)
-    source = open_source(recordings, settings, calibration, topics)
+    source = open_source(recordings, settings, options)
     with interruptible() as check:
         written = convert(
             source,

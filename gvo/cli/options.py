@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from gvo.config import Config
+    from gvo.io.opening import RecordingOptions
     from gvo.io.recording import Source
 
 Settings = Annotated[
@@ -48,14 +49,23 @@ def load(path: Path | None, settings: list[str] | None) -> Config:
     return load_configuration(path, settings or [])
 
 
-def open_source(
-    recordings: Sequence[Path],
-    config: Config,
+def recording_options(
     calibration: Sequence[Path] | None,
-    topics: Mapping[str, str | None],
-) -> Source:
-    """Open what the options name."""
-    from gvo.io.opening import RecordingOptions, open_recording
+    left: str | None,
+    right: str | None,
+    color: str | None,
+    depth: str | None,
+) -> RecordingOptions:
+    """Return what the options say about a recording."""
+    from gvo.io.opening import RecordingOptions
 
-    options = RecordingOptions(calibration=tuple(calibration or ()), **topics)
+    return RecordingOptions(
+        calibration=tuple(calibration or ()), left=left, right=right, color=color, depth=depth
+    )
+
+
+def open_source(recordings: Sequence[Path], config: Config, options: RecordingOptions) -> Source:
+    """Open a recording as the options say."""
+    from gvo.io.opening import open_recording
+
     return open_recording(recordings, config=config, options=options)

@@ -162,10 +162,10 @@ def interruptible() -> Iterator[Callable[[object], None]]:
 
 
 @contextmanager
-def told_where_it_stands(out: Path) -> Iterator[None]:
-    """Say, where a run is interrupted, where its files are."""
+def told_where_it_stands(out: Path | str, *, and_then: str = "") -> Iterator[None]:
+    """Say, if the work is interrupted, where its files are, and how to go on."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"gvo: interrupted; what was done stands in {out}", err=True)
+        typer.echo(f"gvo: interrupted; what was done stands in {out}{and_then}", err=True)
         raise
