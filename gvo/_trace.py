@@ -1,7 +1,7 @@
-"""What happens inside a computation, told to whoever watches.
+"""Record what happens inside a computation.
 
-Nobody watches in a run: then a note costs less than a microsecond. Whoever explains a frame
-watches the very computation that gave its pose, so that what is shown is what happened.
+Nothing is recorded in a run: a note then costs less than a microsecond. An explained frame is
+recorded by the computation that gave its pose, so that what is shown is what happened.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from itertools import pairwise, takewhile
 from typing import Any
 
 import numpy as np
@@ -17,60 +18,80 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Event:
-    """One thing that happened.
+    """What happened at one place of a computation.
 
     Parameters
     ----------
     name : str
         Where it happened, and what: `ransac.block`.
     values : mapping of str to anything
-        What is known there; arrays are copies.
+        Arrays are copies.
     """
 
     name: str
     values: Mapping[str, Any]
 
 
-_EVENTS: ContextVar[list[Event] | None] = ContextVar("events", default=None)
+class Trace(list[Event]):
+    """Events in the order in which they happened."""
+
+    def all(self, name: str) -> list[Mapping[str, Any]]:
+        """Return the values of all events of a name."""
+        return [event.values for event in self if event.name == name]
+
+    def find(self, name: str) -> Mapping[str, Any] | None:
+        """Return the values of the first event of a name; None if there is none."""
+        return next((event.values for event in self if event.name == name), None)
+
+    def before(self, name: str) -> Trace:
+        """Return the events before the first one of a name; all if there is none."""
+        return Trace(takewhile(lambda event: event.name != name, self))
+
+    def split(self, *names: str) -> list[Trace]:
+        """Return the parts that begin with an event of one of the names."""
+        starts = [n for n, event in enumerate(self) if event.name in names]
+        return [Trace(self[start:end]) for start, end in pairwise([*starts, len(self)])]
+
+
+_TRACE: ContextVar[Trace | None] = ContextVar("trace", default=None)
 
 
 def note(name: str, **values: object) -> None:
-    """Tell what happened, where somebody watches.
+    """Record an event, if anyone watches.
 
     Parameters
     ----------
     name : str
     **values
-        Arrays are copied: what is done to them later does not show.
+        Arrays are copied, as they may change later.
     """
-    events = _EVENTS.get()
-    if events is not None:
-        kept = {key: _kept(value) for key, value in values.items()}
-        events.append(Event(name=name, values=kept))
+    trace = _TRACE.get()
+    if trace is not None:
+        trace.append(Event(name=name, values={key: _kept(each) for key, each in values.items()}))
 
 
 @contextmanager
-def watched() -> Iterator[list[Event]]:
-    """Watch what happens inside the context, on this thread.
+def watched() -> Iterator[Trace]:
+    """Record the events inside the context, on this thread.
 
     Yields
     ------
-    list of Event
-        Grows as things happen. What an inner context watches does not reach the outer one.
+    Trace
+        Grows with each event. Events of an inner context do not reach the outer one.
 
     Examples
     --------
-    >>> with watched() as events:
+    >>> with watched() as trace:
     ...     note("search.done", n_found=3)
-    >>> events[0].name, events[0].values["n_found"]
-    ('search.done', 3)
+    >>> trace.all("search.done")
+    [{'n_found': 3}]
     """
-    events: list[Event] = []
-    token = _EVENTS.set(events)
+    trace = Trace()
+    token = _TRACE.set(trace)
     try:
-        yield events
+        yield trace
     finally:
-        _EVENTS.reset(token)
+        _TRACE.reset(token)
 
 
 def _kept(value: object) -> object:

@@ -98,10 +98,9 @@ def main() -> None:
 def explain(task: Task) -> Picture:
     """Return the stereo matches of a frame explained."""
     source = gvo.open_recording(task.bag)
-    explanation = explain_frame(source, task.frame, config=Config())
-    if explanation.stereo is None:
+    if source.info.sensor != "stereo":
         raise RecordingError(f"{task.bag}: expected a stereo recording, got {source.info.sensor}")
-    drawn = draw_stereo(explanation, explanation.stereo)
+    drawn = draw_stereo(explain_frame(source, task.frame, config=Config()))
     return scaled(decoded(drawn.png or b""), 860)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo._trace import note
 from gvo.config import FeaturesConfig
 from gvo.types import FloatArray, ImageArray, IntArray
 
@@ -196,7 +197,9 @@ def choose_spread(
     ranks = np.empty(len(pixels), dtype=np.uint16)
     ranks[by_cell] = np.minimum(rank_in_group(cells[by_response][by_cell]), 65535)
     # The first of every cell before the second of any: the weakest rank is cut by response.
-    return np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
+    chosen = np.sort(by_response[np.argsort(ranks, kind="stable")[:n_chosen]])
+    note("keypoints.spread", pixels=pixels, chosen=chosen)
+    return chosen
 
 
 def rank_in_group(sorted_groups: NDArray[Any]) -> IntArray:

@@ -7,6 +7,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
@@ -167,6 +168,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         ValueError
             When the front-end returns neither RelativePose nor Failure.
         """
+        note("frontend.begin", reference=reference)
         return self._check("register", self._frontend.register(reference, current, prior))
 
     def relocalize(
@@ -175,6 +177,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         """Register two frames of unknown motion; raises as `register`."""
         if self._relocalizer is None:
             return self.register(reference, current, None)
+        note("frontend.begin", reference=reference)
         return self._check("relocalize", self._relocalizer.relocalize(reference, current))
 
     def reconfigure(self, config: Config) -> None:
@@ -189,7 +192,9 @@ class CheckedFrontend(Generic[ObservationsT]):
                 f"Failure, got {type(result).__name__}"
             )
         fault = find_fault(result) if isinstance(result, RelativePose) else ""
-        return Failure(reason=f"the front-end is at fault: {fault}") if fault else result
+        checked = Failure(reason=f"the front-end is at fault: {fault}") if fault else result
+        note("frontend.end", result=checked)
+        return checked
 
 
 def count_points(observations: object) -> tuple[int, int]:

@@ -65,6 +65,7 @@ def sample_depth(
     # Beside a hole or the border the plane continues, but not beyond all that was seen.
     fitted = np.clip(fitted, lowest[chosen], highest[chosen])
     depths[chosen] = np.where(is_fitted, fitted, depths[chosen])
+    note("depth.sampled", pixels=keypoints, depths=depths, is_valid=is_valid)
     return depths, is_valid
 
 

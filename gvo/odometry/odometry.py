@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from gvo._trace import note
 from gvo.backend.keyframe_policy import choose_released, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
@@ -247,6 +248,7 @@ class Odometry:
         step: RawStep,
     ) -> tuple[dict[int, float], list[_Offer]]:
         """Return the keyframes' scores, and edges to the predecessor and to keyframes."""
+        note("odometry.step", step=step)
         # A coasted step is no measurement: the window predicts by itself.
         offered: list[_Offer] = []
         if step.registration is not None:
@@ -255,6 +257,7 @@ class Odometry:
             return {}, offered
         T_frame_keyframes = self._predict_keyframes(step)
         scores = self._keyframes.scores(T_frame_keyframes)
+        note("odometry.scores", scores=scores)
         measure = partial(self._register_keyframe, observations)
         n_steps = {ns: step.n_steps - self._keyframes.n_steps(ns) for ns in scores}
         config = self._config.window

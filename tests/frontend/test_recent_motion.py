@@ -9,15 +9,13 @@ import pytest
 
 import gvo
 from gvo.config import Config, WindowConfig
-from gvo.diagnostics.explain.watch import WatchedFrontend
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.klt import KltFrontend
 from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.odometry.chain import RawChain
-from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, RgbdFrame
+from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 STATED_PX = 0.7
@@ -117,24 +115,6 @@ def test_the_recent_motion_counts_where_the_prediction_is_and_not_in_the_round_a
     prior = MotionPrior(T_predicted=still)
     assert isinstance(frontend.register(*pair, prior), RelativePose) == (n_rounds > 1)
     assert handed == [False] * n_rounds
-
-
-def test_a_watched_front_end_hands_on_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
-    frontend = WatchedFrontend(recording.info.camera, Config())
-    pair = [f for f in gvo.frames(recording, Config()) if isinstance(f, RgbdFrame)]
-    first, second = (frontend.extract(frame) for frame in pair)
-    handed: list[Any] = []
-
-    def spy(_: KltFrontend, *arguments: Any) -> Failure:
-        handed[:] = arguments
-        return Failure(reason="dark")
-
-    monkeypatch.setattr(KltFrontend, "register", spy)
-    prior = MotionPrior(T_predicted=np.eye(4), T_recent=se3.exp(BUS))
-    assert not frontend.register(first, second, prior)
-    for given, known in zip(handed, (first, second, prior), strict=True):
-        assert given is known
 
 
 @dataclass

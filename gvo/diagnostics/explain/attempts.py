@@ -1,126 +1,93 @@
-"""The ways in which one frame was tried to be registered against another."""
+"""The registrations of a frame against earlier ones, and the attempts that each made."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from gvo._trace import Event
-from gvo.diagnostics.explain.watch import Registration
-from gvo.types import RelativePose
+from gvo._trace import Trace
+from gvo.types import Failure, RelativePose
 
 _TRACKS = "attempt.tracks"
 _MATCHES = "attempt.matches"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Attempt:
-    """One way to match, and what the registration made of it.
+class Registration:
+    """One registration of the current frame.
 
     Parameters
     ----------
-    start : Event
-        How it was matched.
-    events : list of Event
-        What came of it.
+    reference_ns : int
+        Stamp of the reference.
+    result : RelativePose or Failure
+    attempts : list of Trace
+        Each begins with how it matched.
     """
 
-    start: Event
-    events: list[Event] = field(default_factory=list)
-
-    @property
-    def is_of_tracks(self) -> bool:
-        """Tell that corners were tracked; else descriptors were matched."""
-        return self.start.name == _TRACKS
-
-    def all(self, name: str) -> list[Event]:
-        """Return the events of a name."""
-        return [event for event in self.events if event.name == name]
-
-    def find(self, name: str) -> Event | None:
-        """Return the first event of a name."""
-        return next(iter(self.all(name)), None)
-
-    @property
-    def failure(self) -> str:
-        """Why it failed; empty where it did not fail in the geometry."""
-        for name, key in (
-            ("registration.refined", "refined"),
-            ("registration.consensus", "consensus"),
-        ):
-            event = self.find(name)
-            if event is not None:
-                outcome = event.values[key]
-                return "" if outcome else str(outcome.reason)
-        return "not registered"
+    reference_ns: int
+    result: RelativePose | Failure
+    attempts: list[Trace]
 
 
-def attempts_of(events: Sequence[Event]) -> list[Attempt]:
-    """Split what happened in a registration into its attempts."""
-    attempts: list[Attempt] = []
-    for event in events:
-        if event.name in (_TRACKS, _MATCHES):
-            attempts.append(Attempt(start=event))
-        elif attempts:
-            attempts[-1].events.append(event)
-    return attempts
-
-
-def n_chain_calls(calls: Sequence[Registration], registration: RelativePose | None) -> int:
-    """Tell how many of the first registrations of a frame were those of the raw chain.
-
-    Where it failed, its last one was without a prediction; links to keyframes always have one.
-    """
-    found = [
-        n
-        for n, call in enumerate(calls, start=1)
-        if not call.is_relocalization
-        and (call.prior is None if registration is None else call.result is registration)
-    ]
-    return found[-1] if found else 0
-
-
-def describe(call: Registration, indices: Mapping[int, int]) -> list[str]:
-    """Describe the attempts of a registration, a line each.
-
-    Parameters
-    ----------
-    call : Registration
-    indices : mapping of int to int
-        Of frames by their stamps.
-    """
-    reference = indices[call.reference_ns]
-    attempts = attempts_of(call.events)
-    lines = []
-    for number, attempt in enumerate(attempts, start=1):
-        is_last = number == len(attempts)
-        lines.append(
-            f"against frame {reference}, {_method(attempt)}: {_outcome(attempt, call, is_last)}"
+def registrations_of(trace: Trace) -> list[Registration]:
+    """Return the registrations of a frame in order."""
+    return [
+        Registration(
+            reference_ns=part[0].values["reference"].stamp_ns,
+            result=end["result"],
+            attempts=part.before("frontend.end").split(_TRACKS, _MATCHES),
         )
-    return lines or [f"against frame {reference}: {_answer(call)}"]
+        for part in trace.split("frontend.begin")
+        if (end := part.find("frontend.end")) is not None
+    ]
 
 
-def _method(attempt: Attempt) -> str:
-    values = attempt.start.values
-    if not attempt.is_of_tracks:
-        place = "the previous pixels" if values["prior"] is None else "the predicted pixels"
-        return f"descriptors within {values['radius_px']:g} px of {place}"
+def is_of_tracks(attempt: Trace) -> bool:
+    """Tell whether corners were tracked; else descriptors were matched."""
+    return attempt[0].name == _TRACKS
+
+
+def describe(registration: Registration, indices: Mapping[int, int]) -> list[str]:
+    """Describe the attempts of a registration, one a line.
+
+    Parameters
+    ----------
+    registration : Registration
+    indices : mapping of int to int
+        Numbers of frames by their stamps.
+    """
+    against = f"against frame {indices[registration.reference_ns]}"
+    answer = _answer(registration.result)
+    if not registration.attempts:
+        return [f"{against}: {answer}"]
+    *failed, last = registration.attempts
+    lines = [f"{against}, {_method(attempt)}: {_outcome(attempt)}" for attempt in failed]
+    return [*lines, f"{against}, {_method(last)}: {answer}"]
+
+
+def _method(attempt: Trace) -> str:
+    values = attempt[0].values
+    if not is_of_tracks(attempt):
+        place = "previous" if values["prior"] is None else "predicted"
+        return f"descriptors within {values['radius_px']:g} px of the {place} pixels"
     if values["is_wide"]:
-        return "tracks with the wide pyramid, followed back"
+        return "tracks with the wide pyramid, checked backwards"
     return "tracks from the predicted pixels"
 
 
-def _outcome(attempt: Attempt, call: Registration, is_last: bool) -> str:
-    if is_last:
-        return _answer(call)
-    event = attempt.find("registration.refined")
-    if attempt.failure or event is None:
-        return attempt.failure
-    refined = event.values["refined"]
-    return f"{int(refined.inliers.sum())} inliers, taken as the prediction of the next attempt"
+def _outcome(attempt: Trace) -> str:
+    """Tell what came of an attempt that another one followed."""
+    ends = attempt.find("registration.refined") or attempt.find("registration.consensus") or {}
+    answer = ends.get("refined", ends.get("consensus"))
+    if answer is None:
+        return "not registered"
+    if isinstance(answer, Failure):
+        return answer.reason
+    return f"{int(answer.inliers.sum())} inliers, used as the prediction of the next attempt"
 
 
-def _answer(call: Registration) -> str:
-    if isinstance(call.result, RelativePose):
-        return f"registered, {call.result.n_inliers} inliers of {call.result.n_matches} matches"
-    return call.result.reason
+def _answer(result: RelativePose | Failure) -> str:
+    if isinstance(result, Failure):
+        return result.reason
+    return f"registered, {result.n_inliers} inliers of {result.n_matches} matches"

@@ -2,224 +2,147 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from typing import Any
 
-from gvo._trace import Event
-from gvo.config import Config, DepthConfig, FeaturesConfig, StereoConfig
-from gvo.diagnostics.explain.values import DepthStep, KeypointStep, Sorting, StereoStep
-from gvo.diagnostics.explain.watch import WatchedFrame
-from gvo.frontend.features import FeatureExtractor, Features
-from gvo.frontend.klt import image_of
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo._trace import Trace
+from gvo.config import DepthConfig, StereoConfig
+from gvo.diagnostics.explain.values import Sorting, SubpixelStep
+from gvo.frontend.features import Features
 from gvo.frontend.matching import best_ratios
 from gvo.frontend.rgbd import sample_depth
-from gvo.frontend.stereo.matching import candidate_pairs
-from gvo.frontend.tracking import detect_corners
-from gvo.geometry.camera import StereoCamera
-from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray, RgbdFrame
+from gvo.frontend.stereo.corners import N_SEARCH_STEPS
+from gvo.frontend.stereo.disparity import follow_disparities
+from gvo.types import BoolArray, FloatArray, ImageArray, IntArray, RgbdFrame, StereoFrame
 
-# A budget that no image fills.
-_UNLIMITED = 20_000
-
-
-def find_event(events: list[Event], name: str) -> Event | None:
-    """Return the first event of a name."""
-    return next((event for event in events if event.name == name), None)
+# Of the curve of squared differences around the result, pixels.
+_REACH_PX = 4
+_STEP_PX = 0.125
 
 
-def explain_keypoints(watch: WatchedFrame, config: Config) -> KeypointStep:
-    """Return the keypoints within the budget, and those without one."""
-    image = image_of(watch.frame)
-    corners = find_event(watch.events, "klt.corners")
-    if corners is not None:
-        unlimited = config.klt.model_copy(update={"n_corners": _UNLIMITED})
-        return KeypointStep(
-            detected=detect_corners(image, unlimited),
-            kept=corners.values["corners"],
-            cell_size_px=config.klt.cell_size_px,
-            budget=config.klt.n_corners,
-        )
-    features = _features(watch)
-    return KeypointStep(
-        detected=_detect_all(image, config.features),
-        kept=features.keypoints,
-        cell_size_px=config.features.cell_size_px,
-        budget=config.features.n_features,
-    )
+def explain_keypoints(trace: Trace) -> Sorting:
+    """Sort the keypoints detected into those within the budget and the others."""
+    spread = trace.find("keypoints.spread")
+    if spread is None:
+        return Sorting.by({}, np.zeros((0, 2)))
+    pixels = np.asarray(spread["pixels"], dtype=np.float64)
+    return Sorting.by({"over the budget": as_mask(spread["chosen"], len(pixels))}, pixels)
 
 
-def _features(watch: WatchedFrame) -> Features:
-    for event in watch.events:
-        if event.name == "descriptor.stereo":
-            left: Features = event.values["features"][0]
-            return left
-        if event.name == "descriptor.depth":
-            features: Features = event.values["features"]
-            return features
-    raise ValueError("the front-end did not tell of its keypoints")
+def explain_stereo(trace: Trace, config: StereoConfig, row_offset_px: float) -> Sorting:
+    """Sort the keypoints by the tests of their matches in the right image."""
+    matched = trace.find("descriptor.stereo")
+    corners, searched = trace.find("klt.corners"), trace.find("corners.searched")
+    if corners is not None and searched is not None:
+        return _sort_corners(corners, searched, row_offset_px)
+    if matched is None:
+        raise ValueError("the trace holds no stereo matches")
+    return _sort_matches(matched, trace.find("stereo.candidates"), config)
 
 
-def _detect_all(image: ImageArray, config: FeaturesConfig) -> FloatArray:
-    """Detect by the threshold that filled the budget, or else by the lower one."""
-    found = np.zeros((0, 2))
-    for threshold in (config.fast_threshold, min(config.low_fast_threshold, config.fast_threshold)):
-        unlimited = config.model_copy(
-            update={
-                "n_features": _UNLIMITED,
-                "fast_threshold": threshold,
-                "low_fast_threshold": threshold,
-            }
-        )
-        found = FeatureExtractor(unlimited).extract(image).keypoints
-        if len(found) >= config.n_features:
-            break
-    return found
-
-
-def explain_stereo(watch: WatchedFrame, camera: StereoCamera, config: Config) -> StereoStep | None:
-    """Return the stereo matches and why the others are none; None for RGB-D."""
-    if isinstance(watch.frame, RgbdFrame):
-        return None
-    event = find_event(watch.events, "descriptor.stereo")
-    if event is None:
-        pixels, partners, disparities, sorting = _corners(watch, config)
-    else:
-        pixels, partners, disparities, sorting = _matches(event, watch, camera, config)
-    return StereoStep(
-        pixels=pixels,
-        partners=partners,
-        disparities=disparities,
-        sorting=sorting,
-        min_disparity_px=float(camera.depth_to_disparity(config.stereo.max_depth_m)),
-        max_disparity_px=float(camera.depth_to_disparity(config.stereo.min_depth_m)),
-    )
-
-
-_Matches = tuple[FloatArray, FloatArray, FloatArray, Sorting]
-
-
-def _corners(watch: WatchedFrame, config: Config) -> _Matches:
-    """Sort the corners of `KltFrontend` by its tests."""
-    final = find_event(watch.events, "klt.corners")
-    searched = find_event(watch.events, "corners.searched")
-    if final is None or searched is None:
-        raise ValueError("the front-end did not tell of its corners")
-    pixels, disparities = final.values["corners"], final.values["disparities"]
+def _sort_corners(
+    corners: Mapping[str, Any], searched: Mapping[str, Any], row_offset_px: float
+) -> Sorting:
+    pixels, disparities = corners["corners"], corners["disparities"]
     is_placed = np.isfinite(disparities)
-    sorting = Sorting.by(
-        {
-            "coarse correlation too weak": searched.values["is_found"],
-            "patch leaves an image": is_placed,
-            "no rest of the steps": searched.values["is_at_rest"],
-            "left and right unlike": searched.values["are_reliable"],
-            "depth out of range": final.values["is_valid"],
-        },
-        len(pixels),
-    )
-    shown = np.where(is_placed, disparities, searched.values["rough"])
-    partners = np.column_stack([pixels[:, 0] - shown, pixels[:, 1] + watch.row_offset_px])
-    return pixels, partners, disparities, sorting
-
-
-def _matches(event: Event, watch: WatchedFrame, camera: StereoCamera, config: Config) -> _Matches:
-    """Sort the keypoints of `DescriptorFrontend` by its tests."""
-    left, right = event.values["features"]
-    pairs, n = event.values["pairs"], len(left)
-    candidates = find_event(watch.events, "stereo.candidates")
-    tried = np.zeros((0, 2), np.int64) if candidates is None else candidates.values["pairs"]
-    distances = np.zeros(0) if candidates is None else candidates.values["distances"]
-    best = best_candidates(tried, distances, n)
-    is_fitted, is_in_range = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    is_fitted[pairs[:, 0]] = event.values["is_fitted"]
-    is_in_range[pairs[:, 0]] = event.values["is_in_range"]
-    is_matched = have(pairs, n)
     tests = {
-        "row": _have_rows(left, right, config.stereo),
-        "range": have(candidate_pairs(left, right, camera, config.stereo), n),
-        "octave": have(tried, n),
-        **distance_tests(
-            tried,
-            distances,
-            n,
-            max_distance=config.stereo.max_distance,
-            max_ratio=config.stereo.max_ratio,
-        ),
-        "reciprocity": is_matched,
-        "sub-pixel": is_fitted,
-        "depth out of range": is_in_range,
+        "coarse correlation too weak": searched["is_found"],
+        "patch leaves an image": is_placed,
+        "did not converge": searched["is_at_rest"],
+        "left and right unlike": searched["are_reliable"],
+        "depth out of range": corners["is_valid"],
+    }
+    shown = np.where(is_placed, disparities, searched["rough"])
+    partners = np.column_stack([pixels[:, 0] - shown, pixels[:, 1] + row_offset_px])
+    return Sorting.by(tests, pixels, partners=partners, values=disparities)
+
+
+def _sort_matches(
+    matched: Mapping[str, Any], candidates: Mapping[str, Any] | None, config: StereoConfig
+) -> Sorting:
+    left, right = matched["features"]
+    pairs, n = matched["pairs"], len(left)
+    tried = candidates or no_candidates()
+    tests = {
+        "row": _have_rows(left, right, config.row_tolerance_px),
+        "range": as_mask(tried["in_range"][:, 0], n),
+        "octave": as_mask(tried["pairs"][:, 0], n),
+        **distance_tests(tried, n, max_distance=config.max_distance, max_ratio=config.max_ratio),
+        "reciprocity": as_mask(pairs[:, 0], n),
+        "sub-pixel": as_mask(pairs[matched["is_fitted"], 0], n),
+        "depth out of range": as_mask(pairs[matched["is_in_range"], 0], n),
     }
     disparities = np.full(n, np.nan)
-    disparities[pairs[:, 0]] = event.values["disparities"]
-    partners = np.full((n, 2), np.nan)
-    partners[best >= 0] = right.keypoints[best[best >= 0]]
+    disparities[pairs[:, 0]] = matched["disparities"]
+    partners = best_partners(tried, right.keypoints, n)
     partners[pairs[:, 0]] = right.keypoints[pairs[:, 1]]
-    measured = np.isfinite(disparities)
-    partners[measured, 0] = left.keypoints[measured, 0] - disparities[measured]
-    return left.keypoints, partners, disparities, Sorting.by(tests, n)
+    is_measured = np.isfinite(disparities)
+    partners[is_measured, 0] = left.keypoints[is_measured, 0] - disparities[is_measured]
+    return Sorting.by(tests, left.keypoints, partners=partners, values=disparities)
 
 
-def have(pairs: IntArray, n: int) -> BoolArray:
-    """Tell which of n first members are in a pair."""
-    return np.asarray(np.bincount(pairs[:, 0], minlength=n) > 0)
+def _have_rows(left: Features, right: Features, tolerance_px: float) -> BoolArray:
+    """Tell which left keypoints have any right one on about their row."""
+    differences = left.keypoints[:, 1:] - right.keypoints[:, 1]
+    return np.asarray((np.abs(differences) <= tolerance_px).any(axis=1))
 
 
-def best_candidates(pairs: IntArray, distances: FloatArray, n: int) -> IntArray:
-    """Return the second member of the best pair of each of n first members; -1 without."""
-    best = np.full(n, -1, dtype=np.int64)
-    worst_first = np.argsort(-distances, kind="stable")
-    best[pairs[worst_first, 0]] = pairs[worst_first, 1]
-    return best
+def no_candidates() -> dict[str, Any]:
+    """Return the candidates of a search that had nothing to compare."""
+    pairs = np.zeros((0, 2), dtype=np.int64)
+    return {"in_range": pairs, "pairs": pairs, "distances": np.zeros(0)}
+
+
+def best_partners(candidates: Mapping[str, Any], pixels: FloatArray, n: int) -> FloatArray:
+    """Return the pixel of the best candidate of each of n points, shape (n, 2); NaN = none."""
+    partners = np.full((n, 2), np.nan)
+    worst_first = candidates["pairs"][np.argsort(-candidates["distances"], kind="stable")]
+    partners[worst_first[:, 0]] = pixels[worst_first[:, 1]]
+    return partners
 
 
 def distance_tests(
-    pairs: IntArray, distances: FloatArray, n: int, *, max_distance: float, max_ratio: float
+    candidates: Mapping[str, Any], n: int, *, max_distance: float, max_ratio: float
 ) -> dict[str, BoolArray]:
-    """Tell which of n first members have a candidate that is near, and one that stands out."""
-    tests = {"descriptor distance": have(pairs[distances <= max_distance], n)}
+    """Tell which of n points have a candidate near enough, and one that stands out."""
+    pairs, distances = candidates["pairs"], candidates["distances"]
+    tests = {"descriptor distance": as_mask(pairs[distances <= max_distance, 0], n)}
     if max_ratio < 1.0:
         tests["ratio"] = best_ratios(pairs[:, 0], distances, n) <= max_ratio
     return tests
 
 
-def _have_rows(left: Features, right: Features, config: StereoConfig) -> BoolArray:
-    """Tell which keypoints have any in the right image on about their row."""
-    if len(right) == 0:
-        return np.zeros(len(left), dtype=np.bool_)
-    differences = left.keypoints[:, 1:] - right.keypoints[:, 1]
-    return np.asarray((np.abs(differences) <= config.row_tolerance_px).any(axis=1))
+def as_mask(indices: IntArray, n: int) -> BoolArray:
+    """Return n flags, True at some indices."""
+    mask = np.zeros(n, dtype=np.bool_)
+    mask[indices] = True
+    return mask
 
 
-def explain_depth(watch: WatchedFrame, config: Config) -> DepthStep | None:
-    """Return the depth at the keypoints and why some have none; None for stereo."""
-    frame = watch.frame
-    if not isinstance(frame, RgbdFrame):
-        return None
-    corners = find_event(watch.events, "klt.corners")
-    pixels = _features(watch).keypoints if corners is None else corners.values["corners"]
-    depths, is_valid = sample_depth(frame.depth, pixels, config.depth)
-    height, width = frame.depth.shape
-    grid = np.column_stack([axis.ravel() for axis in np.mgrid[:height, :width][::-1]])
-    return DepthStep(
-        pixels=pixels,
-        depths=depths,
-        sorting=sort_depths(depths, is_valid, config.depth),
-        depth=frame.depth,
-        pixel_sorting=_sort_pixels(frame.depth, grid.astype(np.float64), config.depth),
-    )
+def explain_depth(trace: Trace, config: DepthConfig) -> Sorting:
+    """Sort the keypoints by the tests of their depth."""
+    sampled = trace.find("depth.sampled")
+    if sampled is None:
+        raise ValueError("the trace holds no depths")
+    pixels, depths, is_valid = (sampled[name] for name in ("pixels", "depths", "is_valid"))
+    return Sorting.by(depth_tests(depths, is_valid, config), pixels, values=depths)
 
 
-def _sort_pixels(depth: DepthArray, grid: FloatArray, config: DepthConfig) -> Sorting:
-    return sort_depths(*sample_depth(depth, grid, config), config)
-
-
-def sort_depths(depths: FloatArray, is_valid: BoolArray, config: DepthConfig) -> Sorting:
-    """Sort what `sample_depth` gave by its tests."""
-    return Sorting.by(depth_tests(depths, is_valid, config), len(depths))
+def explain_depth_pixels(frame: RgbdFrame, config: DepthConfig) -> Sorting:
+    """Sort all pixels of a depth image by the same tests, row by row."""
+    rows, columns = np.indices(frame.depth.shape, dtype=np.float64)
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    return Sorting.by(depth_tests(*sample_depth(frame.depth, pixels, config), config), pixels)
 
 
 def depth_tests(
     depths: FloatArray, is_valid: BoolArray, config: DepthConfig
 ) -> dict[str, BoolArray]:
-    """Tell which depths pass each of the tests of `sample_depth`."""
+    """Tell which results of `sample_depth` pass each of its tests."""
     with np.errstate(invalid="ignore"):
         is_in_range = (depths >= config.min_depth_m) & (depths <= config.max_depth_m)
     return {
@@ -227,3 +150,79 @@ def depth_tests(
         "depth out of range": is_in_range,
         "depth edge": is_valid,
     }
+
+
+def explain_subpixel(
+    trace: Trace, frame: StereoFrame, stereo: Sorting, config: StereoConfig, row_offset_px: float
+) -> SubpixelStep | None:
+    """Follow the match of the median horizontal gradient; None if no match was kept."""
+    kept, images = np.flatnonzero(stereo.are_kept), (frame.left, frame.right)
+    if len(kept) == 0:
+        return None
+    radius = config.patch_radius_px
+    gradients = [_gradient(frame.left, pixel, radius) for pixel in stereo.pixels[kept]]
+    chosen = int(kept[np.argsort(gradients, kind="stable")[len(kept) // 2]])
+    pixel, disparity = stereo.pixels[chosen], float(stereo.values[chosen])
+    searched, matched = trace.find("corners.searched"), trace.find("descriptor.stereo")
+    if searched is not None:
+        method, rough = "gauss-newton", searched["rough"][chosen : chosen + 1]
+        iterates = _follow(images, pixel, rough, config, row_offset_px)
+        columns = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX) + round(disparity)
+    elif matched is not None:
+        # Patches are those of whole pixels, and so are the columns.
+        method, pixel, row_offset_px = "parabola", np.rint(pixel), 0.0
+        start = float(pixel[0] - np.rint(_partner(matched, chosen)[0]))
+        iterates, reach = np.array([start, disparity]), config.search_radius_px
+        columns = start + np.arange(-reach, reach + 1, dtype=np.float64)
+    u, v = pixel
+    left = _patch(frame.left, u, v, radius)
+    patches = [_patch(frame.right, u - d, v + row_offset_px, radius) for d in columns]
+    return SubpixelStep(
+        pixel=pixel,
+        left=left,
+        right=_patch(frame.right, u - disparity, v + row_offset_px, radius),
+        columns=columns,
+        ssd=np.array([_ssd(left, patch) for patch in patches]),
+        iterates=iterates,
+        disparity=disparity,
+        method="none" if config.subpixel == "none" else method,
+    )
+
+
+def _partner(matched: Mapping[str, Any], index: int) -> FloatArray:
+    """Return the right keypoint that a left one was matched with."""
+    pairs, keypoints = matched["pairs"], matched["features"][1].keypoints
+    return np.asarray(keypoints[pairs[pairs[:, 0] == index, 1][0]])
+
+
+def _follow(
+    images: tuple[ImageArray, ImageArray],
+    pixel: FloatArray,
+    rough: FloatArray,
+    config: StereoConfig,
+    row_offset_px: float,
+) -> FloatArray:
+    """Return the disparities at the start and after each step of the front-end."""
+    ends = [
+        follow_disparities(
+            images, pixel[np.newaxis], rough, config, n_steps=n, row_offset_px=row_offset_px
+        )[0]
+        for n in range(1, N_SEARCH_STEPS + 1)
+    ]
+    return np.concatenate([rough, *ends])
+
+
+def _gradient(image: ImageArray, pixel: FloatArray, radius: int) -> float:
+    """Return how well a patch determines its column: the sum of squared horizontal gradients."""
+    return float(np.sum(np.diff(_patch(image, pixel[0], pixel[1], radius), axis=1) ** 2))
+
+
+def _patch(image: ImageArray, u: float, v: float, radius: int) -> NDArray[np.float32]:
+    size = 2 * radius + 1
+    patch = cv2.getRectSubPix(image, (size, size), (float(u), float(v)), patchType=cv2.CV_32F)
+    return np.asarray(patch, dtype=np.float32)
+
+
+def _ssd(left: NDArray[np.float32], right: NDArray[np.float32]) -> float:
+    difference = (right - left).astype(np.float64)
+    return float(np.sum((difference - difference.mean()) ** 2))

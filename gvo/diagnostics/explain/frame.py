@@ -1,27 +1,40 @@
-"""Drive the odometry up to a frame, then tell what happened with it."""
+"""Odometry up to a frame, then what happened with it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.attempts import attempts_of, describe, n_chain_calls
-from gvo.diagnostics.explain.extraction import explain_depth, explain_keypoints, explain_stereo
-from gvo.diagnostics.explain.links import Before, explain_links
-from gvo.diagnostics.explain.matching import explain_temporal
-from gvo.diagnostics.explain.motion import explain_consensus, explain_refinement
-from gvo.diagnostics.explain.subpixel import explain_subpixel
-from gvo.diagnostics.explain.values import FrameExplanation
-from gvo.diagnostics.explain.watch import Registration, WatchedFrontend
+from gvo.diagnostics.explain.attempts import Registration, describe, registrations_of
+from gvo.diagnostics.explain.extraction import (
+    explain_depth,
+    explain_depth_pixels,
+    explain_keypoints,
+    explain_stereo,
+    explain_subpixel,
+)
+from gvo.diagnostics.explain.motion import explain_consensus, explain_matches, explain_refinement
+from gvo.diagnostics.explain.values import FrameExplanation, KeyframeLink
 from gvo.errors import RecordingError
-from gvo.frontend.protocol import Stamped
+from gvo.frontend.descriptor import as_stereo
+from gvo.frontend.klt import image_of
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames
 from gvo.io.recording import Source
-from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
-from gvo.types import FaultyFrame, Frame, FrameResult, Progress, Status
+from gvo.types import (
+    Failure,
+    FaultyFrame,
+    Frame,
+    FrameLink,
+    FrameResult,
+    Progress,
+    RelativePose,
+    Status,
+    StereoFrame,
+)
 
 
 def explain_frame(
@@ -83,88 +96,125 @@ def explain_frame(
 
 
 class _Drive:
-    """Odometry, with all that is needed to tell what it does with the next frame."""
+    """Odometry that keeps the frames which the next one may be registered against."""
 
     def __init__(self, source: Source, config: Config) -> None:
-        self._name = source.info.name
-        self._config = config
-        self._frontend = WatchedFrontend(source.info.camera, config)
-        self._odometry = Odometry(source.info.camera, config, frontend=self._frontend)
-        self._keyframes: Keyframes[Stamped] = Keyframes(self._frontend.camera, config.window)
+        # Only this thread is watched; results do not depend on the number of threads.
+        runtime = config.runtime.model_copy(update={"threads": 1})
+        watchable = config.model_copy(update={"runtime": runtime})
+        self._odometry = Odometry(source.info.camera, watchable)
+        self._camera = as_stereo(source.info.camera, config)
+        self._name, self._config = source.info.name, config
         self._frames: dict[int, Frame] = {}
         self._indices: dict[int, int] = {}
         self._anchor_ns: int | None = None
-        self._previous: FrameResult | None = None
 
     def track(self, frame: Frame, index: int) -> FrameResult:
-        """Take a frame as a run does."""
+        """Track a frame as a run does."""
         result = self._odometry.track(frame)
-        self._frames[frame.stamp_ns], self._indices[frame.stamp_ns] = frame, index
-        if result.registration is not None or self._previous is None:
+        if result.registration is not None or self._anchor_ns is None:
             self._anchor_ns = frame.stamp_ns
-        self._follow_keyframes(result)
-        kept = {frame.stamp_ns, self._anchor_ns, *result.keyframes_ns}
-        self._frames = {ns: self._frames[ns] for ns in self._frames if ns in kept}
-        self._previous = result
+        held = {**self._frames, frame.stamp_ns: frame}
+        needed = {frame.stamp_ns, self._anchor_ns, *result.keyframes_ns}
+        self._frames = {ns: held[ns] for ns in held if ns in needed}
+        self._indices[frame.stamp_ns] = index
         return result
 
-    def _follow_keyframes(self, result: FrameResult) -> None:
-        """Keep what the odometry keeps."""
-        for stamp_ns in self._keyframes.stamps_ns:
-            if stamp_ns not in result.keyframes_ns:
-                self._keyframes.drop(stamp_ns)
-        if result.stamp_ns in result.keyframes_ns:
-            self._keyframes.add(self._frontend.latest.observations)
-
     def explain(self, frame: Frame, index: int) -> FrameExplanation:
-        """Take a frame and tell what happened with it."""
-        before = Before(
-            T_world_frames={
-                ns: self._odometry.window.pose(ns)
-                for ns in self._frames
-                if ns in self._odometry.window
-            },
-            keyframes=self._keyframes,
-            frames=dict(self._frames),
-            indices=dict(self._indices),
-            previous=self._previous,
-            min_overlap=self._config.window.min_overlap,
-        )
-        self._frontend.is_watching = True
-        result = self._odometry.track(frame)
-        calls = self._frontend.latest.registrations
-        chain = calls[: n_chain_calls(calls, result.registration)]
+        """Track a frame and tell what happened with it."""
+        with watched() as trace:
+            result = self._odometry.track(frame)
+        registrations = registrations_of(trace)
+        chain = registrations_of(trace.before("odometry.step"))
         reference_ns = chain[-1].reference_ns if chain else None
+        scores = (trace.find("odometry.scores") or {"scores": {}})["scores"]
         return FrameExplanation(
             recording=self._name,
             index=index,
             config=self._config,
-            camera=self._frontend.camera,
+            camera=self._camera,
             frame=frame,
-            reference=None if reference_ns is None else before.frames[reference_ns],
-            reference_index=None if reference_ns is None else before.indices[reference_ns],
+            reference=None if reference_ns is None else self._frames[reference_ns],
+            reference_index=None if reference_ns is None else self._indices[reference_ns],
             result=result,
-            rig_offsets=self._odometry.rig_offsets,
-            attempts=tuple(line for call in chain for line in describe(call, before.indices)),
-            links=explain_links(calls, len(chain), result, before),
-            became_keyframe=frame.stamp_ns in result.keyframes_ns,
-            **self._steps(chain[-1] if chain else None),
+            attempts=tuple(line for each in chain for line in describe(each, self._indices)),
+            links=tuple(self._links(registrations[len(chain) :], scores, result)),
+            **self._extraction(trace, frame),
+            **self._motion(chain[-1].attempts if chain else []),
         )
 
-    def _steps(self, call: Registration | None) -> dict[str, Any]:
-        """Return what was found in the frame, and the last attempt to register it."""
-        watch, camera, config = self._frontend.latest, self._frontend.camera, self._config
-        stereo = explain_stereo(watch, camera, config)
-        attempts = [] if call is None else attempts_of(call.events)
-        last = attempts[-1] if attempts else None
+    def _extraction(self, trace: Trace, frame: Frame) -> dict[str, Any]:
+        offsets = trace.find("rig.offsets") or {"disparity_px": 0.0, "row_px": 0.0}
+        subpixel = depth_pixels = None
+        if isinstance(frame, StereoFrame):
+            config, row_px = self._config.stereo, offsets["row_px"]
+            measured = explain_stereo(trace, config, row_px)
+            subpixel = explain_subpixel(trace, frame, measured, config, row_px)
+        else:
+            measured = explain_depth(trace, self._config.depth)
+            depth_pixels = explain_depth_pixels(frame, self._config.depth)
         return {
-            "offset_px": watch.offset_px,
-            "row_offset_px": watch.row_offset_px,
-            "keypoints": explain_keypoints(watch, config),
-            "stereo": stereo,
-            "depth": explain_depth(watch, config),
-            "subpixel": explain_subpixel(watch, stereo, config),
-            "temporal": None if last is None else explain_temporal(last, watch.frame, config),
-            "consensus": None if last is None else explain_consensus(last, camera, config),
-            "refinement": None if last is None else explain_refinement(last, camera, config),
+            "offset_px": offsets["disparity_px"],
+            "row_offset_px": offsets["row_px"],
+            "keypoints": explain_keypoints(trace),
+            "measured": measured,
+            "subpixel": subpixel,
+            "depth_pixels": depth_pixels,
         }
+
+    def _motion(self, attempts: Sequence[Trace]) -> dict[str, Any]:
+        """Explain the last attempt."""
+        if not attempts:
+            return dict.fromkeys(("matches", "consensus", "refinement"))
+        last, camera, config = attempts[-1], self._camera, self._config
+        return {
+            "matches": explain_matches(last, config),
+            "consensus": explain_consensus(last, camera, config),
+            "refinement": explain_refinement(last, camera, config),
+        }
+
+    def _links(
+        self, tried: Sequence[Registration], scores: Mapping[int, float], result: FrameResult
+    ) -> Iterator[KeyframeLink]:
+        """Tell what each earlier frame contributed."""
+        registrations = {each.reference_ns: each.result for each in tried}
+        keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
+        steps = [link for link in result.links if link.kind != "keyframe"]
+        others = sorted({*scores} - {link.reference_ns for link in steps} | {*registrations})
+        for ns, link, registration in [
+            *((link.reference_ns, link, result.registration) for link in steps),
+            *((ns, keyframes.get(ns), registrations.get(ns)) for ns in others),
+        ]:
+            is_accepted = link is not None and link.is_accepted
+            unused = "keyframe" if registration is not None else "not linked"
+            yield KeyframeLink(
+                reference_ns=ns,
+                index=self._indices[ns],
+                kind=unused if link is None else link.kind,
+                image=image_of(self._frames[ns]),
+                overlap=scores.get(ns),
+                registration=registration,
+                chi2=None if link is None else link.chi2,
+                is_accepted=is_accepted,
+                reason="" if is_accepted else self._reason(ns, link, registration, scores, result),
+            )
+
+    def _reason(
+        self,
+        ns: int,
+        link: FrameLink | None,
+        registration: RelativePose | Failure | None,
+        scores: Mapping[int, float],
+        result: FrameResult,
+    ) -> str:
+        """Tell why an earlier frame has no edge in the window."""
+        if isinstance(registration, Failure):
+            return registration.reason
+        if link is not None:
+            reasons = [each.reason for each in result.causal.rejected if each.reference_id == ns]
+            return next(iter(reasons), "not taken by the window")
+        if registration is not None:
+            return "another frame must confirm it first"
+        if scores[ns] < self._config.window.min_overlap:
+            return "too little overlap"
+        return "steps or other keyframes constrain the pose as well"

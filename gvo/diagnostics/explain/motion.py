@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 
-from gvo._trace import Event, watched
+from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.attempts import Attempt
-from gvo.diagnostics.explain.extraction import find_event
-from gvo.diagnostics.explain.values import ConsensusStep, RefinementStep, SampleSearch
+from gvo.diagnostics.explain.attempts import is_of_tracks
+from gvo.diagnostics.explain.extraction import (
+    as_mask,
+    best_partners,
+    depth_tests,
+    distance_tests,
+    no_candidates,
+)
+from gvo.diagnostics.explain.values import ConsensusStep, MatchStep, RefinementStep, Sorting
 from gvo.frontend.registration import search_consensus
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -19,52 +22,111 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus
 from gvo.geometry.refinement import Refinement
 from gvo.geometry.residuals import StereoResiduals, whiten_in_place
-from gvo.types import Failure, FloatArray
+from gvo.types import BoolArray, Failure, FloatArray, IntArray
 
 _MIN_DEPTH_M = 1e-3
 
 
-def explain_consensus(
-    attempt: Attempt, camera: StereoCamera, config: Config
-) -> ConsensusStep | None:
-    """Return which matches agree; None where it did not come to that."""
-    begin, done = attempt.find("registration.begin"), attempt.find("registration.consensus")
-    if begin is None or done is None:
+def explain_matches(attempt: Trace, config: Config) -> MatchStep:
+    """Sort the points of the reference by the tests of their matches."""
+    return _tracks(attempt, config) if is_of_tracks(attempt) else _descriptors(attempt, config)
+
+
+def _tracks(attempt: Trace, config: Config) -> MatchStep:
+    begin = attempt[0].values
+    pixels, indices = begin["source_uvd"][:, :2], begin["indices"]
+    n, tracked = len(pixels), indices[begin["is_tracked"]]
+    predicted, found = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    predicted[indices] = begin["predicted"][:, :2]
+    found[tracked] = begin["pixels"][begin["is_tracked"]]
+    tests = {"out of view": as_mask(indices, n), "track lost": as_mask(tracked, n)}
+    for name, passes in _track_tests(attempt, config).items():
+        tests[name] = as_mask(tracked[passes], n)
+    return MatchStep(
+        method="tracks",
+        is_wide=begin["is_wide"],
+        has_prior=not np.array_equal(begin["prior"], np.eye(4)),
+        radius_px=float(config.klt.window_radius_px),
+        sorting=Sorting.by(tests, pixels, partners=found, predicted=predicted),
+    )
+
+
+def _track_tests(attempt: Trace, config: Config) -> dict[str, BoolArray]:
+    """Tell which tracks pass each test of their disparity or depth."""
+    measured, sampled = attempt.find("klt.measured"), attempt.find("depth.sampled")
+    followed = attempt.find("klt.followed")
+    if measured is None:
+        return {}
+    if followed is not None:
+        return {
+            "patch leaves an image": np.isfinite(followed["disparities"]),
+            "did not converge": followed["is_at_rest"],
+            "depth out of range": measured["is_valid"],
+        }
+    if sampled is None:
+        return {"depth out of range": measured["is_valid"]}
+    return depth_tests(sampled["depths"], sampled["is_valid"], config.depth)
+
+
+def _descriptors(attempt: Trace, config: Config) -> MatchStep:
+    begin, temporal = attempt[0].values, config.temporal
+    (reference, current), (expected, indices) = begin["pixels"], begin["predicted"]
+    n, candidates = len(reference), attempt.find("temporal.candidates") or no_candidates()
+    registered = attempt.find("registration.begin") or {"matches": no_candidates()["pairs"]}
+    matches = registered["matches"]
+    predicted = np.full((n, 2), np.nan)
+    predicted[indices] = expected
+    found = best_partners(candidates, current, n)
+    found[matches[:, 0]] = current[matches[:, 1]]
+    limits = {"max_distance": temporal.max_distance, "max_ratio": temporal.max_ratio}
+    tests = {
+        "behind the camera": as_mask(indices, n),
+        "none within the radius": as_mask(candidates["pairs"][:, 0], n),
+        **distance_tests(candidates, n, **limits),
+        "reciprocity": as_mask(matches[:, 0], n),
+    }
+    return MatchStep(
+        method="descriptors",
+        is_wide=begin["radius_px"] == temporal.wide_radius_px,
+        has_prior=begin["prior"] is not None,
+        radius_px=float(begin["radius_px"]),
+        sorting=Sorting.by(tests, reference, partners=found, predicted=predicted),
+    )
+
+
+def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> ConsensusStep | None:
+    """Return which matches agree; None if nothing was registered."""
+    begin, end = attempt.find("registration.begin"), attempt.find("registration.consensus")
+    if begin is None or end is None:
         return None
-    matches: Correspondences = begin.values["correspondences"]
-    consensus: Consensus | Failure = done.values["consensus"]
-    is_known = bool(done.values["is_known"])
-    events, found = attempt.events, consensus
-    if is_known:
-        with watched() as events:
-            found = search_consensus(matches, camera, config, begin.values["stamps_ns"])
+    matches: Correspondences = begin["correspondences"]
+    consensus: Consensus | Failure = end["consensus"]
+    search, sampled = attempt.before("registration.consensus"), consensus
+    if end["is_known"]:
+        with watched() as search:
+            sampled = search_consensus(matches, camera, config, begin["stamps_ns"])
     known = attempt.find("registration.known")
+    samples = search.find("ransac.samples") or {"samples": (), "near": ()}
+    blocks = search.all("ransac.block")
     return ConsensusStep(
         pixels_reference=matches.source_uvd[:, :2],
         pixels_current=matches.target_uvd[:, :2],
-        is_known=is_known,
-        n_agreeing=None if known is None else int(np.count_nonzero(known.values["inliers"])),
-        n_needed=0.0 if known is None else float(known.values["n_needed"]),
-        inliers=None if isinstance(consensus, Failure) else consensus.inliers,
-        search=_search(events, found),
-    )
-
-
-def _search(events: Sequence[Event], found: Consensus | Failure) -> SampleSearch:
-    drawn = find_event(list(events), "ransac.samples")
-    blocks = [event.values for event in events if event.name == "ransac.block"]
-    return SampleSearch(
-        counts=_counts(blocks),
-        n_planned=0 if drawn is None else len(drawn.values["samples"]),
+        inliers=consensus.inliers if isinstance(consensus, Consensus) else None,
+        n_agreeing=None if known is None else int(np.count_nonzero(known["inliers"])),
+        n_needed=0.0 if known is None else float(known["n_needed"]),
+        is_known=end["is_known"],
+        n_planned=len(samples["samples"]),
+        n_near=len(samples["near"]),
+        counts=_counts(search),
         share=float(blocks[-1]["share"]) if blocks else 0.0,
-        n_near=0 if drawn is None else len(drawn.values["near"]),
-        inliers=None if isinstance(found, Failure) else found.inliers,
-        reason=found.reason if isinstance(found, Failure) else "",
+        sampled=sampled.inliers if isinstance(sampled, Consensus) else None,
+        reason=sampled.reason if isinstance(sampled, Failure) else "",
     )
 
 
-def _counts(blocks: Sequence[Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Return the inliers by sample; -1 where three points lie on a line."""
+def _counts(search: Trace) -> IntArray:
+    """Return the inliers of each sample; -1 for three points on a line."""
+    blocks = search.all("ransac.block")
     n_drawn = max((block["n_before"] + len(block["is_valid"]) for block in blocks), default=0)
     counts = np.full(n_drawn, -1, dtype=np.int64)
     for block in blocks:
@@ -73,35 +135,31 @@ def _counts(blocks: Sequence[Any]) -> np.ndarray[tuple[int, ...], np.dtype[np.in
 
 
 def explain_refinement(
-    attempt: Attempt, camera: StereoCamera, config: Config
+    attempt: Trace, camera: StereoCamera, config: Config
 ) -> RefinementStep | None:
-    """Return the residuals before and after; None where there was no refinement."""
-    names = ("registration.begin", "registration.consensus", "refinement.begin")
-    begin, done, opened = (attempt.find(name) for name in names)
-    last = attempt.find("registration.refined")
-    if begin is None or done is None or opened is None or last is None:
+    """Return the residuals before and after; None if the refinement was not reached."""
+    names = "registration.begin", "registration.consensus", "refinement.begin"
+    begin, consensus, start = (attempt.find(name) for name in names)
+    end = attempt.find("registration.refined")
+    if begin is None or consensus is None or start is None or end is None or not end["refined"]:
         return None
-    consensus, refined = done.values["consensus"], last.values["refined"]
-    if not isinstance(refined, Refinement):
-        return None
-    gated = attempt.find("refinement.gated")
-    start = consensus.T_target_source
-    between = start if gated is None else gated.values["T_target_source"]
-    residuals: StereoResiduals = opened.values["residuals"]
-    matches: Correspondences = begin.values["correspondences"]
-    ends = [_residuals(T, matches, camera) for T in (start, refined.T_target_source)]
+    residuals: StereoResiduals = start["residuals"]
+    ends: tuple[Consensus, Refinement] = consensus["consensus"], end["refined"]
+    residuals_px = [
+        _residuals(each.T_target_source, begin["correspondences"], camera) for each in ends
+    ]
+    gated, gate = attempt.find("refinement.gated"), config.registration.gate
+    within = None if gated is None else residuals.within(gated["T_target_source"], gate)
     return RefinementStep(
-        T_target_source=np.stack([start, between, refined.T_target_source]),
-        residuals_px=np.stack(ends),
-        whitened=np.stack([_whiten(each, residuals) for each in ends]),
-        gate=config.registration.gate,
-        inliers=np.stack([consensus.inliers, refined.inliers]),
-        n_within=None
-        if gated is None
-        else int(np.count_nonzero(residuals.within(between, config.registration.gate))),
-        n_steps=len(attempt.all("refinement.step")),
-        scale=refined.scale,
-        correspondences=matches,
+        T_target_source=np.stack([each.T_target_source for each in ends]),
+        residuals_px=np.stack(residuals_px),
+        whitened=np.stack([_whiten(each, residuals) for each in residuals_px]),
+        inliers=np.stack([each.inliers for each in ends]),
+        depths=begin["correspondences"].target_points[:, 2],
+        n_within=None if within is None else int(np.count_nonzero(within)),
+        n_steps=len(attempt.before("registration.refined").all("refinement.step")),
+        gate=gate,
+        scale=ends[1].scale,
     )
 
 

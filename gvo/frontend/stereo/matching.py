@@ -73,12 +73,12 @@ def match_stereo(
     ndarray of int64, shape (m, 2)
         Indices into left and right, each at most once.
     """
-    pairs = candidate_pairs(left, right, camera, config)
+    in_range = pairs = candidate_pairs(left, right, camera, config)
     octave_steps = left.octaves[pairs[:, 0]] - right.octaves[pairs[:, 1]]
     pairs = pairs[np.abs(octave_steps) <= 1]
     distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
     is_usable = distances <= config.max_distance
-    note("stereo.candidates", pairs=pairs, distances=distances)
+    note("stereo.candidates", in_range=in_range, pairs=pairs, distances=distances)
     if config.max_ratio < 1.0:
         ratios = best_ratios(pairs[:, 0], distances, len(left))
         is_usable &= ratios[pairs[:, 0]] <= config.max_ratio

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 
+from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.types import RelativePose
 
@@ -127,6 +128,7 @@ class RigOffsets:
         if self._pending_row is not None:
             self.row.update(self._pending_row, _ROW_SIGMA_PX)
             self._pending_row = None
+        note("rig.offsets", disparity_px=self.disparity.value_px, row_px=self.row.value_px)
 
     def as_json(self) -> dict[str, float]:
         """Return values and sigmas as plain numbers."""

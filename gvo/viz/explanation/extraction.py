@@ -6,29 +6,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.diagnostics.explain.values import (
-    DepthStep,
-    FrameExplanation,
-    KeypointStep,
-    Sorting,
-    StereoStep,
-)
-from gvo.types import FloatArray, ImageArray, StereoFrame
+from gvo.config import Config, DepthConfig, StereoConfig
+from gvo.diagnostics.explain.values import FrameExplanation, Sorting, SubpixelStep
+from gvo.types import FloatArray, IntArray, RgbdFrame, StereoFrame
 from gvo.viz.explanation.sheet import (
+    AFTER,
     BEFORE,
     KEPT,
     LIMIT,
+    MARKERS,
+    REASONS,
     Picture,
-    close_sheet,
+    Sheet,
     count_text,
     draw_segments,
+    finish_axes,
     image_height,
     is_wide,
     join_images,
     legend_below,
-    open_sheet,
     paired_height,
-    reason_style,
+    set_title,
     show_image,
 )
 
@@ -37,266 +35,245 @@ if TYPE_CHECKING:
 
 # Cells are given their numbers where they are at least so wide in the picture, pixels.
 _MIN_CELL_PX = 34.0
+# Width of an image over the whole picture, pixels.
+_IMAGE_PX = 1260.0
+
+
+def budget_of(config: Config) -> tuple[int, int]:
+    """Return the number of keypoints kept at most, and the size of the cells that share it."""
+    if config.frontend.kind == "klt":
+        return config.klt.n_corners, config.klt.cell_size_px
+    return config.features.n_features, config.features.cell_size_px
 
 
 def draw_keypoints(explanation: FrameExplanation) -> Picture:
     """Draw the keypoints and the cells that share the budget."""
-    step, image = explanation.keypoints, explanation.image
-    detected, kept = (step.per_cell(each, image.shape) for each in (step.detected, step.kept))
-    title = "Keypoints and buckets"
+    keypoints, image = explanation.keypoints, explanation.image
+    budget, size = budget_of(explanation.config)
+    detected = _per_cell(keypoints.pixels, size, image.shape)
+    kept = _per_cell(keypoints.pixels[keypoints.are_kept], size, image.shape)
+    is_klt = explanation.config.frontend.kind == "klt"
+    spacing = f"; the strongest of each {explanation.config.klt.min_distance_px} px"
     caption = (
-        f"{len(step.detected)} keypoints detected (grey{_detection(explanation)}), "
-        f"{len(step.kept)} kept (blue), of a budget of {step.budget}. They are kept in rounds, "
-        f"the strongest of each cell of {step.cell_size_px} px first, so that no part of the "
-        "image takes it all: "
-        f"{np.count_nonzero(kept)} of {kept.size} cells hold one, {np.count_nonzero(detected)} "
-        f"had one to offer; the fullest keeps {kept.max()}."
+        f"{len(keypoints)} keypoints detected (grey{spacing if is_klt else ''}), {kept.sum()} kept "
+        f"(blue), of a budget of {budget}. They are kept in rounds, the strongest of each cell of "
+        f"{size} px first, so that they spread over the image: {np.count_nonzero(kept)} of "
+        f"{kept.size} cells hold one, {np.count_nonzero(detected)} had one to offer; the fullest "
+        f"keeps {kept.max()}."
     )
     stacked = is_wide(image.shape)
     height = 2 * image_height(image.shape) if stacked else image_height(image.shape, share=0.5)
-    sheet = open_sheet(height, title, caption)
-    shape = (2, 1) if stacked else (1, 2)
-    first, second = sheet.panels.subplots(*shape)
+    sheet = Sheet("01_keypoints", "Keypoints and buckets", caption, height)
+    first, second = sheet.panels.subplots(*((2, 1) if stacked else (1, 2)))
     show_image(first, image, "detected (grey) and kept (blue)")
-    first.plot(*step.detected.T, ".", color="#CCCCCC", markersize=3.0)
-    first.plot(*step.kept.T, "o", color=KEPT, markersize=5.0, markerfacecolor="none")
-    width_px = 1260.0 / (1 if stacked else 2)
-    _draw_cells(
-        second, (kept, detected), step, image, width_px * step.cell_size_px / image.shape[1]
-    )
-    return close_sheet(sheet, "01_keypoints", title, caption)
+    first.plot(*keypoints.pixels.T, ".", color="#CCCCCC", markersize=3.0)
+    shown = keypoints.pixels[keypoints.are_kept]
+    first.plot(*shown.T, "o", color=KEPT, markersize=5.0, markerfacecolor="none")
+    cell_px = _IMAGE_PX / (1 if stacked else 2) * size / image.shape[1]
+    _draw_cells(second, kept, detected, size, image.shape, has_numbers=cell_px >= _MIN_CELL_PX)
+    return sheet.picture()
 
 
-def _detection(explanation: FrameExplanation) -> str:
-    if explanation.config.frontend.kind != "klt":
-        return ""
-    return f"; the strongest of each {explanation.config.klt.min_distance_px} px"
+def _per_cell(pixels: FloatArray, size: int, shape: tuple[int, ...]) -> IntArray:
+    """Count pixels by cell, shape (rows, columns), of an image of (height, width)."""
+    counts = np.zeros([-(-side // size) for side in shape], dtype=np.int64)
+    np.add.at(counts, tuple((pixels[:, ::-1] // size).astype(np.int64).T), 1)
+    return counts
 
 
 def _draw_cells(
     axes: Axes,
-    counts: tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], ...],
-    step: KeypointStep,
-    image: ImageArray,
-    cell_px: float,
+    kept: IntArray,
+    detected: IntArray,
+    size: int,
+    shape: tuple[int, ...],
+    *,
+    has_numbers: bool,
 ) -> None:
-    kept, detected = counts
-    has_numbers = cell_px >= _MIN_CELL_PX
-    title = "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
-    rows, columns = kept.shape
-    size = step.cell_size_px
-    axes.imshow(
-        kept,
-        cmap="Blues",
-        vmin=0,
-        vmax=max(2 * int(kept.max()), 1),
-        extent=(-0.5, columns * size - 0.5, rows * size - 0.5, -0.5),
-    )
-    axes.set_xlim(-0.5, image.shape[1] - 0.5)
-    axes.set_ylim(image.shape[0] - 0.5, -0.5)
+    (rows, columns), (height, width) = kept.shape, shape
+    edges = (-0.5, columns * size - 0.5, rows * size - 0.5, -0.5)
+    axes.imshow(kept, cmap="Blues", vmin=0, vmax=max(2 * int(kept.max()), 1), extent=edges)
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
     axes.set_xticks(np.arange(size, columns * size, size) - 0.5, labels=[])
     axes.set_yticks(np.arange(size, rows * size, size) - 0.5, labels=[])
     axes.tick_params(length=0)
     axes.grid(color="#BBBBBB", linewidth=0.5)
-    axes.set_title(title, fontsize=11, loc="left")
+    set_title(
+        axes, "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
+    )
     if not has_numbers:
         return
     for (row, column), number in np.ndenumerate(detected):
-        right = min((column + 1) * size, image.shape[1])
-        bottom = min((row + 1) * size, image.shape[0])
-        if number and right - column * size > 0.9 * size and bottom - row * size > 0.4 * size:
-            middle = (0.5 * (column * size + right) - 0.5, 0.5 * (row * size + bottom) - 0.5)
-            axes.text(
-                *middle, f"{kept[row, column]}/{number}", fontsize=8, ha="center", va="center"
+        left, top = column * size, row * size
+        right, bottom = min(left + size, width), min(top + size, height)
+        if number and right - left > 0.9 * size and bottom - top > 0.4 * size:
+            u, v = 0.5 * (left + right - 1), 0.5 * (top + bottom - 1)
+            text = f"{kept[row, column]}/{number}"
+            axes.text(u, v, text, fontsize=8, ha="center", va="center")
+
+
+def draw_stereo(explanation: FrameExplanation) -> Picture:
+    """Draw the stereo matches, and what became of the other keypoints."""
+    frame, stereo = explanation.frame, explanation.measured
+    if not isinstance(frame, StereoFrame):
+        raise ValueError("stereo matches need a stereo frame")
+    shape, kept = frame.left.shape, stereo.are_kept
+    heights = [
+        0.95 * paired_height(shape),
+        image_height(shape, share=0.93 * (1.0 if is_wide(shape) else 0.6)) + 0.5,
+    ]
+    sheet = Sheet("02_stereo", "Stereo matches", _stereo_caption(explanation, stereo), sum(heights))
+    upper, lower = sheet.panels.subplots(2, 1, height_ratios=heights)
+    canvas, shift = join_images(frame.left, frame.right)
+    show_image(upper, canvas, f"left and right: {kept.sum()} matches, by disparity")
+    pixels, disparities = stereo.pixels[kept], stereo.values[kept]
+    # A single wrong match must not take all the colours.
+    low, high = np.percentile(disparities, [1, 97]) if kept.any() else (0.0, 1.0)
+    colours = {"cmap": "viridis", "clim": (low, high), "linewidths": 0.9}
+    ends = stereo.partners[kept] + shift
+    lines = draw_segments(upper, pixels, ends, array=disparities, **colours)
+    upper.scatter(*pixels.T, s=9, c=disparities, cmap="viridis", vmin=low, vmax=high)
+    if kept.any():
+        sheet.colorbar(lines, upper, fraction=0.02, extend="max", label="disparity [px]")
+    show_image(lower, frame.left, "keypoints without a match, by the first test that they failed")
+    draw_reasons(lower, stereo)
+    legend_below(lower, 4)
+    return sheet.picture()
+
+
+def _stereo_caption(explanation: FrameExplanation, stereo: Sorting) -> str:
+    config, camera, rows = explanation.config.stereo, explanation.camera, ""
+    low, high = (camera.depth_to_disparity(z) for z in (config.max_depth_m, config.min_depth_m))
+    tests = (
+        f"Tests in order: a keypoint on its rows ({config.row_tolerance_px:g} px), within the "
+        f"range of disparities, of about its octave; descriptor distance {config.max_distance:g}; "
+        + (
+            "the ratio test is off (stereo.max_ratio 1)"
+            if config.max_ratio == 1.0
+            else f"ratio to the second best {config.max_ratio:g}"
+        )
+        + "; each the best of the other (reciprocity); a minimum for the sub-pixel fit."
+    )
+    if explanation.config.frontend.kind == "klt":
+        rows = f"; rows of the right image are {explanation.row_offset_px:+.3f} px off"
+        tests = (
+            "Each corner is searched along its row in small images (correlation), then by "
+            "Gauss-Newton steps in the full ones; left and right must look alike there, and the "
+            "depth lie within the limits. They serve the frames that come next: tracks into this "
+            "frame are measured by themselves."
+        )
+    return (
+        f"Of {len(stereo)} keypoints: {count_text(stereo.counts())}. {tests} Matches lie on equal "
+        f"rows and to the left in the right image, by a disparity between {low:.1f} and "
+        f"{high:.1f} px, the depth limits {config.max_depth_m:g} and {config.min_depth_m:g} m."
+        f"\nLearnt of the rig before this frame: {explanation.offset_px:+.3f} px are subtracted "
+        f"from all disparities{rows}."
+    )
+
+
+def draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None) -> None:
+    """Mark the pixels dropped, or others in their place, by reason, with a legend that counts."""
+    places, counts = sorting.pixels if pixels is None else pixels, sorting.counts()
+    for number, name in enumerate(sorting.names[:-1]):
+        if counts[name]:
+            axes.plot(
+                *places[sorting.are(name)].T,
+                color=REASONS[number % len(REASONS)],
+                marker=MARKERS[number % len(MARKERS)],
+                linestyle="none",
+                markersize=6.0,
+                label=f"{name}: {counts[name]}",
             )
 
 
-def draw_stereo(explanation: FrameExplanation, step: StereoStep) -> Picture:
-    """Draw the stereo matches, and what became of the other keypoints."""
-    frame = explanation.frame
-    if not isinstance(frame, StereoFrame):
-        raise ValueError("stereo matches need a stereo frame")
-    title, counts = "Stereo matches", step.sorting.counts()
-    rows = ""
-    if explanation.config.frontend.kind == "klt":
-        rows = f"; rows of the right image are {explanation.row_offset_px:+.3f} px off"
+def draw_depth(explanation: FrameExplanation, pixels: Sorting) -> Picture:
+    """Draw the depth image and which of it is valid."""
+    config, counts, frame = explanation.config.depth, pixels.counts(), explanation.frame
+    if not isinstance(frame, RgbdFrame):
+        raise ValueError("a depth image needs an RGB-D frame")
+    shares = [f"{100 * count / len(pixels):.1f} % {name}" for name, count in counts.items()]
     caption = (
-        f"Of {len(step.sorting)} keypoints: {count_text(counts)}. {_stereo_tests(explanation)} "
-        f"Matches lie on equal rows and to the left in the right image, by a disparity between "
-        f"{step.min_disparity_px:.1f} and {step.max_disparity_px:.1f} px, the depth limits "
-        f"{explanation.config.stereo.max_depth_m:g} and "
-        f"{explanation.config.stereo.min_depth_m:g} m."
-        f"\nLearnt of the rig before this frame: {explanation.offset_px:+.3f} px are taken off "
-        f"all disparities{rows}."
-    )
-    ratios = [
-        0.95 * paired_height(frame.left.shape),
-        image_height(frame.left.shape, share=0.93 * _lower(frame)) + 0.5,
-    ]
-    sheet = open_sheet(sum(ratios), title, caption)
-    upper, lower = sheet.panels.subplots(2, 1, height_ratios=ratios)
-    canvas, shift = join_images(frame.left, frame.right)
-    show_image(upper, canvas, f"left and right: {counts['kept']} matches, by disparity")
-    kept = step.sorting.are_kept
-    # A single wrong match must not take all the colours.
-    clim = tuple(np.percentile(step.disparities[kept], [1, 97])) if kept.any() else (0.0, 1.0)
-    lines = draw_segments(
-        upper,
-        step.pixels[kept],
-        step.partners[kept] + shift,
-        array=step.disparities[kept],
-        cmap="viridis",
-        clim=clim,
-        linewidths=0.9,
-    )
-    u, v = step.pixels[kept].T
-    upper.scatter(u, v, s=9, c=step.disparities[kept], cmap="viridis", vmin=clim[0], vmax=clim[1])
-    if kept.any():
-        bar = sheet.figure.colorbar(lines, ax=upper, fraction=0.02, pad=0.01, extend="max")
-        bar.set_label("disparity [px]")
-    show_image(lower, frame.left, "keypoints without a match, by the first test that they failed")
-    draw_reasons(lower, step.pixels, step.sorting)
-    legend_below(lower, 4)
-    return close_sheet(sheet, "02_stereo", title, caption)
-
-
-def _lower(frame: StereoFrame) -> float:
-    return 1.0 if is_wide(frame.left.shape) else 0.6
-
-
-def _stereo_tests(explanation: FrameExplanation) -> str:
-    stereo = explanation.config.stereo
-    if explanation.config.frontend.kind == "klt":
-        return (
-            "Each corner is looked for along its row in small images (correlation), then by "
-            "Gauss-Newton steps in the full ones; left and right must look alike there, and the "
-            "depth lie within the limits. They serve the frames that come next: the tracks into "
-            "this frame are measured by themselves."
-        )
-    ratio = (
-        "the ratio test is off (stereo.max_ratio 1)"
-        if stereo.max_ratio == 1.0
-        else f"ratio to the second best {stereo.max_ratio:g}"
-    )
-    return (
-        f"Tests in order: a keypoint on its rows ({stereo.row_tolerance_px:g} px), within the "
-        f"range of disparities, of about its octave; descriptor distance {stereo.max_distance:g}; "
-        f"{ratio}; each the best of the other (reciprocity); a minimum for the sub-pixel fit."
-    )
-
-
-def draw_reasons(axes: Axes, pixels: FloatArray, sorting: Sorting) -> None:
-    """Mark dropped pixels by their reasons, with a legend that counts."""
-    number = 0
-    for name, count in sorting.counts().items():
-        if name == "kept":
-            continue
-        style = reason_style(number)
-        number += 1
-        if count:
-            axes.plot(*pixels[sorting.are(name)].T, **style, label=f"{name}: {count}")
-
-
-def draw_depth(explanation: FrameExplanation, step: DepthStep) -> Picture:
-    """Draw the depth image and which of it counts as valid."""
-    title, config = "Depth and what of it is valid", explanation.config.depth
-    counts, n = step.pixel_sorting.counts(), step.depth.size
-    shares = ", ".join(f"{100 * number / n:.1f} % {name}" for name, number in counts.items())
-    caption = (
-        f"Of all pixels: {shares.replace('kept', 'valid')}. Valid depth is known, lies between "
-        f"{config.min_depth_m:g} and {config.max_depth_m:g} m (depth.min_depth_m, "
+        f"Of all pixels: {', '.join(shares).replace('kept', 'valid')}. Valid depth is known, lies "
+        f"between {config.min_depth_m:g} and {config.max_depth_m:g} m (depth.min_depth_m, "
         f"depth.max_depth_m) and varies by at most {100 * config.max_edge_step:g} % within "
         f"{config.edge_radius_px} px (depth.max_edge_step): at an edge, a shift of a pixel between "
         "colour and depth moves a point by far."
     )
-    sheet = open_sheet(image_height(step.depth.shape, share=0.5) + 0.6, title, caption)
+    height = image_height(frame.depth.shape, share=0.5) + 0.6
+    sheet = Sheet("02_depth", "Valid depth", caption, height)
     first, second = sheet.panels.subplots(1, 2)
-    finite = step.depth[np.isfinite(step.depth)]
-    shown = np.ma.masked_invalid(step.depth)
+    finite = frame.depth[np.isfinite(frame.depth)]
     top = float(np.percentile(finite, 99)) if len(finite) else 1.0
-    show_image(first, shown, "depth (white: unknown)", cmap="viridis_r", vmin=0.0, vmax=top)
-    mappable = first.images[0]
-    sheet.panels.colorbar(mappable, ax=first, fraction=0.04, pad=0.01, label="depth [m]")
-    _draw_mask(second, step.pixel_sorting, step.depth.shape)
-    return close_sheet(sheet, "02_depth", title, caption)
+    depth = np.ma.masked_invalid(frame.depth)
+    show_image(first, depth, "depth (white: unknown)", cmap="viridis_r", vmin=0.0, vmax=top)
+    sheet.colorbar(first.images[0], first, fraction=0.04, label="depth [m]")
+    _draw_mask(second, pixels, frame.depth.shape)
+    return sheet.picture()
 
 
-def _draw_mask(axes: Axes, sorting: Sorting, shape: tuple[int, ...]) -> None:
+def _draw_mask(axes: Axes, pixels: Sorting, shape: tuple[int, ...]) -> None:
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
     colours = ["#000000", "#D55E00", "#E69F00", KEPT]
     palette = (255 * np.array([to_rgb(colour) for colour in colours])).astype(np.uint8)
-    show_image(axes, palette[sorting.codes.reshape(shape)], "what of it is valid")
-    handles = [
-        Patch(color=colour, label=name.replace("kept", "valid"))
-        for colour, name in zip(colours, sorting.names, strict=True)
-    ]
-    axes.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(0.0, -0.01),
-        ncols=4,
-        fontsize=10,
-        frameon=False,
-    )
+    show_image(axes, palette[pixels.codes.reshape(shape)], "which of it is valid")
+    names = [*pixels.names[:-1], "valid"]
+    handles = [Patch(color=c, label=name) for c, name in zip(colours, names, strict=True)]
+    legend_below(axes, 4, handles=handles)
 
 
-def draw_depth_keypoints(explanation: FrameExplanation, step: DepthStep) -> Picture:
-    """Draw which keypoints have a depth to rely on."""
-    title = "Keypoints with depth"
+def draw_depth_keypoints(explanation: FrameExplanation) -> Picture:
+    """Draw which keypoints have a valid depth."""
+    depth = explanation.measured
     caption = (
-        f"Of {len(step.sorting)} keypoints: {count_text(step.sorting.counts())}. Those kept are "
-        "coloured by depth; the others are marked by the first test that they failed."
+        f"Of {len(depth)} keypoints: {count_text(depth.counts())}. Those kept are coloured by "
+        "depth; the others are marked by the first test that they failed."
     )
-    shape = explanation.image.shape
-    sheet = open_sheet(image_height(shape, share=0.75) + 0.5, title, caption)
-    axes = sheet.panels.subplots(1, 1)
+    height = image_height(explanation.image.shape, share=0.75) + 0.5
+    sheet = Sheet("03_depth_keypoints", "Keypoints with depth", caption, height)
+    axes, kept = sheet.panels.subplots(1, 1), depth.are_kept
+    u, v = depth.pixels[kept].T
     show_image(axes, explanation.image)
-    kept = step.sorting.are_kept
-    u, v = step.pixels[kept].T
-    dots = axes.scatter(u, v, s=22, c=step.depths[kept], cmap="viridis_r")
+    dots = axes.scatter(u, v, s=22, c=depth.values[kept], cmap="viridis_r")
     if kept.any():
-        sheet.panels.colorbar(dots, ax=axes, fraction=0.03, pad=0.01, label="depth [m]")
-    draw_reasons(axes, step.pixels, step.sorting)
-    if not kept.all():
-        legend_below(axes, 4)
-    return close_sheet(sheet, "03_depth_keypoints", title, caption)
+        sheet.colorbar(dots, axes, fraction=0.03, label="depth [m]")
+    draw_reasons(axes, depth)
+    legend_below(axes, 4)
+    return sheet.picture()
 
 
 def draw_histograms(explanation: FrameExplanation) -> Picture:
-    """Draw how disparities and depths are spread, with the limits."""
-    stereo, depth, config = explanation.stereo, explanation.depth, explanation.config
-    title = "Disparity and depth"
-    camera = explanation.camera
-    if stereo is not None:
-        disparities = stereo.disparities[stereo.sorting.are_kept]
+    """Draw the distribution of disparities and depths, with the limits."""
+    camera, measured = explanation.camera, explanation.measured
+    limits: StereoConfig | DepthConfig
+    if isinstance(explanation.frame, StereoFrame):
+        limits, what = explanation.config.stereo, "Disparities"
+        disparities = measured.values[measured.are_kept]
         depths = camera.disparity_to_depth(disparities - explanation.offset_px)
-        limits = config.stereo.min_depth_m, config.stereo.max_depth_m
-        what = "Disparities"
-    elif depth is not None:
-        depths = depth.depths[depth.sorting.are_kept]
-        disparities = camera.depth_to_disparity(depths)
-        limits = config.depth.min_depth_m, config.depth.max_depth_m
-        what = f"Virtual disparities (baseline {camera.baseline:g} m)"
     else:
-        disparities = depths = np.zeros(0)
-        limits, what = (0.0, 0.0), "Disparities"
-    bounds = camera.depth_to_disparity(limits[1]), camera.depth_to_disparity(limits[0])
+        limits, what = (
+            explanation.config.depth,
+            f"Virtual disparities (baseline {camera.baseline:g} m)",
+        )
+        depths = measured.values[measured.are_kept]
+        disparities = camera.depth_to_disparity(depths)
+    near, far = limits.min_depth_m, limits.max_depth_m
+    high, low = (float(camera.depth_to_disparity(z)) for z in (near, far))
     caption = (
-        f"{what} and depths of the {len(depths)} keypoints kept, {_spread(disparities, 'px')} "
-        "and "
-        f"{_spread(depths, 'm')} (median, 5 to 95 %). The limits of {limits[0]:g} and "
-        f"{limits[1]:g} m are disparities of {bounds[1]:.1f} and {bounds[0]:.2f} px; they are "
-        "drawn where they lie in the picture. A depth is known to z squared times the noise of the "
-        f"disparity over {camera.fx * camera.baseline:.1f} px m: far points hold the rotation, "
-        "near ones the translation."
+        f"{what} and depths of the {len(depths)} keypoints kept, {_spread(disparities, 'px')} and "
+        f"{_spread(depths, 'm')} (median, 5 to 95 %). The limits of {near:g} and {far:g} m are "
+        f"disparities of {high:.1f} and {low:.2f} px; they are drawn where they lie in the "
+        "picture. The standard deviation of a depth is z squared times that of the disparity, over "
+        f"{camera.fx * camera.baseline:.1f} px m: far points determine the rotation, near ones the "
+        "translation."
     )
-    sheet = open_sheet(3.6, title, caption)
+    sheet = Sheet("04_disparity_and_depth", "Disparity and depth", caption, 3.6)
     first, second = sheet.panels.subplots(1, 2)
-    _histogram(first, disparities, "disparity [px]", bounds)
-    _histogram(second, depths, "depth [m]", limits)
-    return close_sheet(sheet, "04_disparity_and_depth", title, caption)
+    _histogram(first, disparities, "disparity [px]", (low, high))
+    _histogram(second, depths, "depth [m]", (near, far))
+    return sheet.picture()
 
 
 def _spread(values: FloatArray, unit: str) -> str:
@@ -306,20 +283,82 @@ def _spread(values: FloatArray, unit: str) -> str:
     return f"{middle:.2f} {unit} ({low:.2f} to {high:.2f})"
 
 
-def _histogram(
-    axes: Axes,
-    values: FloatArray,
-    label: str,
-    limits: tuple[FloatArray | float, FloatArray | float],
-) -> None:
+def _histogram(axes: Axes, values: FloatArray, label: str, limits: tuple[float, float]) -> None:
     if len(values):
         axes.hist(values, bins=40, color=KEPT)
     low, high = axes.get_xlim()
-    for limit in (float(limits[0]), float(limits[1])):
+    for limit in limits:
         if low - 0.3 * (high - low) <= limit <= high + 0.3 * (high - low):
             axes.axvline(limit, color=LIMIT, linestyle="--", label=f"limit {limit:.3g}")
-    axes.set_xlabel(label)
-    axes.set_ylabel("keypoints")
-    axes.grid(color=BEFORE, alpha=0.3)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend()
+    finish_axes(axes, label, "keypoints", fontsize=10)
+
+
+def draw_subpixel(explanation: FrameExplanation, step: SubpixelStep) -> Picture:
+    """Draw the patches of one match and how its disparity was found."""
+    sheet = Sheet(
+        "03_subpixel", "Sub-pixel disparity of one match", _subpixel_caption(explanation, step), 4.0
+    )
+    axes = sheet.panels.subplots(1, 4, width_ratios=[1, 1, 1, 2.2])
+    low, high = float(step.left.min()), float(step.left.max())
+    show_image(axes[0], step.left, "left patch", vmin=low, vmax=high)
+    show_image(axes[1], step.right, f"right, at {step.disparity:.2f} px", vmin=low, vmax=high)
+    difference, limit = step.right - step.left, 0.5 * max(high - low, 1.0)
+    difference = difference - difference.mean()
+    show_image(axes[2], difference, "difference (grey: none)", vmin=-limit, vmax=limit)
+    _draw_curve(axes[3], step)
+    return sheet.picture()
+
+
+def _subpixel_caption(explanation: FrameExplanation, step: SubpixelStep) -> str:
+    offset_px, (u, v), size = explanation.offset_px, step.pixel, len(step.left)
+    whole = max(round(step.disparity), 1)
+    depth, whole_depth = (
+        float(explanation.camera.disparity_to_depth(d - offset_px)) for d in (step.disparity, whole)
+    )
+    return (
+        f"Of all matches kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}) in "
+        f"the left image: patches of {size} x {size} px and their difference, and the sum of "
+        f"squared differences, means removed, over the disparity. {_subpixel_method(step)} It ends "
+        f"at {step.disparity:.3f} px, "
+        + (f"less the learnt {offset_px:+.3f} px " if offset_px else "")
+        + f"a depth of {depth:.2f} m; the nearest whole pixel would be {whole} px, "
+        f"{whole_depth:.2f} m."
+    )
+
+
+def _subpixel_method(step: SubpixelStep) -> str:
+    if step.method == "none":
+        return "The sub-pixel fit is off (stereo.subpixel none)."
+    if step.method == "parabola":
+        return (
+            f"The search starts at the keypoints' whole pixels, {step.iterates[0]:.0f} px; the "
+            "vertex of the parabola through the best column and its neighbours gives the fraction."
+        )
+    steps = np.diff(step.iterates)
+    return (
+        f"The coarse search gives {step.iterates[0]:.2f} px; {len(steps)} Gauss-Newton steps "
+        f"follow ({', '.join(f'{each:+.3f}' for each in steps)} px). They use the gradients of the "
+        "left patch: where left and right differ a little, they end beside the minimum of the "
+        "curve. Between whole pixels the right image is interpolated, which smooths its noise: "
+        "hence the kinks."
+    )
+
+
+def _draw_curve(axes: Axes, step: SubpixelStep) -> None:
+    columns, ssd = step.columns, step.ssd
+    is_sampled = step.method == "parabola"
+    axes.plot(columns, ssd, "o-" if is_sampled else "-", color=BEFORE, label="SSD of the patches")
+    if is_sampled:
+        best = int(np.clip(ssd.argmin(), 1, len(ssd) - 2))
+        near = slice(best - 1, best + 2)
+        shown = np.linspace(columns[best] - 1.2, columns[best] + 1.2, 50)
+        fitted = np.polyval(np.polyfit(columns[near], ssd[near], 2), shown)
+        axes.plot(shown, fitted, color=AFTER, label="parabola")
+    elif step.method == "gauss-newton":
+        at_steps = np.interp(step.iterates, columns, ssd)
+        label = "Gauss-Newton steps"
+        axes.plot(step.iterates, at_steps, "o-", color=AFTER, markersize=5, label=label)
+    axes.axvline(step.disparity, color=LIMIT, linestyle="--", label=f"end: {step.disparity:.3f} px")
+    axes.set_ylim(0.0, 1.4 * float(ssd.max()))
+    place = {"loc": "upper center", "ncols": 2}
+    finish_axes(axes, "disparity [px]", "squared difference [grey²]", **place)

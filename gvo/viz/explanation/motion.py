@@ -9,12 +9,11 @@ import numpy as np
 from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,
+    MatchStep,
     RefinementStep,
-    SampleSearch,
-    TemporalStep,
 )
 from gvo.frontend.klt import image_of
-from gvo.types import BoolArray, FloatArray
+from gvo.types import FloatArray
 from gvo.viz.explanation.extraction import draw_reasons
 from gvo.viz.explanation.sheet import (
     AFTER,
@@ -23,15 +22,16 @@ from gvo.viz.explanation.sheet import (
     LIMIT,
     REFUSED,
     Picture,
-    close_sheet,
+    Sheet,
     count_text,
     draw_segments,
+    finish_axes,
     image_height,
     is_wide,
     join_images,
     legend_below,
-    open_sheet,
     paired_height,
+    set_title,
     show_image,
     split,
 )
@@ -42,151 +42,121 @@ if TYPE_CHECKING:
 _N_CROPS = 6
 
 
-def draw_matches(explanation: FrameExplanation, step: TemporalStep) -> Picture:
-    """Draw the matches as flow, side by side, and some of them near."""
+def draw_matches(explanation: FrameExplanation, step: MatchStep) -> Picture:
+    """Draw the matches as flow, side by side, and some of them enlarged."""
     if explanation.reference is None:
         raise ValueError("matches need a reference frame")
-    image, reference = explanation.image, image_of(explanation.reference)
-    title = f"Matches with frame {explanation.reference_index}"
-    caption = _matches_caption(explanation, step)
+    image, sorting = explanation.image, step.sorting
     heights = [
         image_height(image.shape, share=1.0 if is_wide(image.shape) else 0.6) + 0.4,
         paired_height(image.shape),
         2.4,
     ]
-    sheet = open_sheet(sum(heights) + 0.4, title, caption)
+    title = f"Matches with frame {explanation.reference_index}"
+    sheet = Sheet("05_matches", title, _matches_caption(explanation, step), sum(heights) + 0.4)
     upper, middle, lower = split(sheet.panels, heights)
-    kept = step.sorting.are_kept
-    flow = upper.subplots(1, 1)
+    starts, ends = sorting.pixels[sorting.are_kept], sorting.partners[sorting.are_kept]
+    flow, pair = upper.subplots(1, 1), middle.subplots(1, 1)
     show_image(flow, image, "flow over the current image: from where a point was to where it is")
-    draw_segments(flow, step.reference_pixels[kept], step.found[kept], colors=KEPT)
-    flow.plot(*step.found[kept].T, ".", color=KEPT, markersize=5, label=f"kept: {kept.sum()}")
-    _draw_dropped(flow, step)
+    draw_segments(flow, starts, ends, colors=KEPT)
+    flow.plot(*ends.T, ".", color=KEPT, markersize=5, label=f"kept: {len(ends)}")
+    draw_reasons(flow, sorting, sorting.predicted)
     legend_below(flow, 5)
-    pair = middle.subplots(1, 1)
-    canvas, shift = join_images(reference, image)
+    canvas, shift = join_images(image_of(explanation.reference), image)
     show_image(pair, canvas, "reference and current image")
-    draw_segments(
-        pair, step.reference_pixels[kept], step.found[kept] + shift, colors=KEPT, linewidths=0.7
-    )
+    draw_segments(pair, starts, ends + shift, colors=KEPT, linewidths=0.7)
     _draw_crops(lower.subplots(1, _N_CROPS), explanation, step)
-    return close_sheet(sheet, "05_matches", title, caption)
+    return sheet.picture()
 
 
-def _draw_dropped(axes: Axes, step: TemporalStep) -> None:
-    """Mark what was dropped where it was expected, as far as that is in the image."""
-    pixels = np.where(np.isfinite(step.predicted), step.predicted, np.nan)
-    draw_reasons(axes, pixels, step.sorting)
-
-
-def _matches_caption(explanation: FrameExplanation, step: TemporalStep) -> str:
-    radius = step.radius_px
+def _matches_caption(explanation: FrameExplanation, step: MatchStep) -> str:
+    sorting, radius, numbers, crops = step.sorting, step.radius_px, "", ""
+    counts = count_text(sorting.counts())
+    side = 2 * radius + 1
     if step.method == "tracks":
-        start = (
-            "the pixels that the predicted motion gives" if step.has_prior else "their own pixels"
-        )
-        wide = ", with the wide pyramid and followed back" if step.is_wide else ""
+        start = "the pixels that the predicted motion gives" if step.has_prior else "their own"
+        wide = ", with the wide pyramid and checked backwards" if step.is_wide else ""
         how = (
-            f"Windows of {2 * radius + 1:g} x {2 * radius + 1:g} px are tracked by Lucas-Kanade "
-            f"from {start}{wide}, then "
-            "measured in 3-D where they end."
+            f"Windows of {side:g} x {side:g} px are tracked by Lucas-Kanade from {start}{wide}, "
+            "then measured in 3-D where they end."
         )
+        marks = "the window there (dashed) and where it ended (blue)"
     else:
-        how = (
-            f"Descriptors are compared within {radius:g} px of the "
-            f"{'predicted' if step.has_prior else 'previous'} pixels."
+        place = "predicted" if step.has_prior else "previous"
+        how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
+        marks = "the search radius (dashed) and the match (blue)"
+    kept = sorting.are_kept
+    if kept.any():
+        flow, error = (
+            np.linalg.norm(sorting.partners[kept] - each[kept], axis=1)
+            for each in (sorting.pixels, sorting.predicted)
         )
-    kept = step.sorting.are_kept
-    flow = np.linalg.norm(step.found[kept] - step.reference_pixels[kept], axis=1)
-    error = np.linalg.norm(step.found[kept] - step.predicted[kept], axis=1)
-    numbers = (
-        f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they are "
-        f"{np.median(error):.1f} px (median, at most {error.max():.1f}) from where they were "
-        "expected."
-        if len(flow)
-        else ""
-    )
-    return (
-        f"Of {len(step.sorting)} points of the reference: {count_text(step.sorting.counts())}. "
-        f"{how}{numbers} Dropped points are marked where they were expected; those expected "
-        "outside of the image are not shown.\n"
-        + (f"Below: six matches near, {_crop_words(step)}\n" if len(flow) else "")
-        + "Attempts: "
-        + "; ".join(explanation.attempts)
-        + "."
-    )
-
-
-def _crop_words(step: TemporalStep) -> str:
-    if step.method == "tracks":
-        return (
-            "the predicted pixel (orange-red cross), the window there (dashed) and where it ended "
-            "(blue)."
+        numbers = (
+            f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they "
+            f"are {np.median(error):.1f} px (median, at most {error.max():.1f}) from where they "
+            "were expected."
         )
+        crops = f"Below: six matches enlarged, the predicted pixel (orange-red cross), {marks}.\n"
     return (
-        "the predicted pixel (orange-red cross), the search radius (dashed) and the match (blue)."
+        f"Of {len(sorting)} points of the reference: {counts}. {how}{numbers} "
+        "Dropped points are marked where they were expected; those expected outside of the image "
+        f"are not shown.\n{crops}Attempts: {'; '.join(explanation.attempts)}."
     )
 
 
 def _draw_crops(
     panels: np.ndarray[tuple[int, ...], np.dtype[np.object_]],
     explanation: FrameExplanation,
-    step: TemporalStep,
+    step: MatchStep,
 ) -> None:
-    """Show matches near: those that spread evenly over the errors of the prediction."""
-    kept = np.flatnonzero(step.sorting.are_kept)
-    errors = np.linalg.norm(step.found[kept] - step.predicted[kept], axis=1)
-    order = kept[np.argsort(errors, kind="stable")]
+    """Enlarge matches that spread evenly over the errors of the prediction."""
+    sorting, kept = step.sorting, np.flatnonzero(step.sorting.are_kept)
+    errors = np.linalg.norm(sorting.partners - sorting.predicted, axis=1)
+    order = kept[np.argsort(errors[kept], kind="stable")]
     chosen = order[np.linspace(0, len(order) - 1, _N_CROPS).astype(int)] if len(order) else order
     for axes, index in zip(panels, chosen, strict=False):
-        reach = max(2.2 * step.radius_px, 18.0)
+        predicted, found = sorting.predicted[index], sorting.partners[index]
         show_image(axes, explanation.image)
-        _draw_search(axes, step, int(index))
-        middle = step.predicted[index]
-        reach = max(reach, 1.2 * float(np.abs(step.found[index] - middle).max()) + 6.0)
-        axes.set_xlim(middle[0] - reach, middle[0] + reach)
-        axes.set_ylim(middle[1] + reach, middle[1] - reach)
-        error = np.linalg.norm(step.found[index] - middle)
-        axes.set_title(f"{error:.1f} px off", fontsize=10)
+        _draw_search(axes, step, predicted, found)
+        away = 1.2 * float(np.abs(found - predicted).max()) + 6.0
+        reach = max(2.2 * step.radius_px, 18.0, away)
+        axes.set_xlim(predicted[0] - reach, predicted[0] + reach)
+        axes.set_ylim(predicted[1] + reach, predicted[1] - reach)
+        axes.set_title(f"{errors[index]:.1f} px off", fontsize=10)
     for axes in panels[len(chosen) :]:
         axes.set_axis_off()
 
 
-def _draw_search(axes: Axes, step: TemporalStep, index: int) -> None:
+def _draw_search(axes: Axes, step: MatchStep, predicted: FloatArray, found: FloatArray) -> None:
     from matplotlib.patches import Circle, Rectangle
 
-    (u, v), radius = step.predicted[index], step.radius_px
-    options: dict[str, Any] = {
-        "fill": False,
-        "edgecolor": LIMIT,
-        "linestyle": "--",
-        "linewidth": 1.2,
-    }
+    side, (u, v) = 2 * step.radius_px + 1, predicted
+    left, top = found - side / 2
+    dashed: dict[str, Any] = {"fill": False, "ec": LIMIT, "linestyle": "--", "linewidth": 1.2}
     if step.method == "tracks":
-        side = 2 * radius + 1
-        axes.add_patch(Rectangle((u - side / 2, v - side / 2), side, side, **options))
-        corner = step.found[index] - side / 2
-        axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=KEPT, linewidth=1.5))
+        axes.add_patch(Rectangle((u - side / 2, v - side / 2), side, side, **dashed))
+        window = Rectangle((left, top), side, side, fill=False, ec=KEPT, linewidth=1.5)
+        axes.add_patch(window)
     else:
-        axes.add_patch(Circle((u, v), radius, **options))
+        axes.add_patch(Circle((u, v), step.radius_px, **dashed))
     axes.plot(u, v, "+", color=LIMIT, markersize=11, markeredgewidth=1.6)
-    axes.plot(*step.found[index], "o", color=KEPT, markersize=6, markerfacecolor="none", mew=1.6)
+    axes.plot(*found, "o", color=KEPT, markersize=6, markerfacecolor="none", mew=1.6)
 
 
 def draw_consensus(explanation: FrameExplanation, step: ConsensusStep) -> Picture:
     """Draw which matches agree on a motion, and what the samples found."""
-    title, image = "Consensus: which matches agree on a motion", explanation.image
-    n = len(step.pixels_reference)
+    image, n = explanation.image, len(step.pixels_reference)
     inliers = np.zeros(n, np.bool_) if step.inliers is None else step.inliers
-    caption = _consensus_caption(explanation, step, int(inliers.sum()))
     stacked = is_wide(image.shape)
     height = image_height(image.shape, share=1.0 if stacked else 0.5) + 0.4
-    sheet = open_sheet(height + (3.0 if stacked else 0.4), title, caption)
+    heights = [height, 3.0 if stacked else 0.4]
+    title = "Consensus: which matches agree on a motion"
+    sheet = Sheet("06_consensus", title, _consensus_caption(explanation, step), sum(heights))
     if stacked:
-        upper, lower = sheet.panels.subplots(2, 1, height_ratios=[height, 3.0])
+        upper, lower = sheet.panels.subplots(2, 1, height_ratios=heights)
     else:
         upper, lower = sheet.panels.subplots(1, 2)
-    show_image(upper, image, "")
+    show_image(upper, image)
     for chosen, colour, marker, name in (
         (~inliers, REFUSED, "x", "disagree"),
         (inliers, KEPT, "o", "agree"),
@@ -195,20 +165,17 @@ def draw_consensus(explanation: FrameExplanation, step: ConsensusStep) -> Pictur
             start, end = step.pixels_reference[chosen], step.pixels_current[chosen]
             draw_segments(upper, start, end, colors=colour)
             upper.plot(*end.T, marker, color=colour, markersize=4, label=f"{name}: {chosen.sum()}")
-    if n:
-        legend_below(upper, 2)
-    _draw_samples(lower, step, n)
-    return close_sheet(sheet, "06_consensus", title, caption)
+    legend_below(upper, 2)
+    _draw_samples(lower, step)
+    return sheet.picture()
 
 
-def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep, n_inliers: int) -> str:
+def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep) -> str:
     n, ransac = len(step.pixels_reference), explanation.config.ransac
-    metric = (
-        f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
-        if ransac.inlier_metric == "reprojection"
-        else f"{ransac.inlier_threshold_m:g} m"
-    )
-    text = f"A match agrees with a motion where it is less than {metric} off. "
+    limit = f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
+    if ransac.inlier_metric == "distance":
+        limit = f"{ransac.inlier_threshold_m:g} m"
+    text = f"A match agrees with a motion if its error is less than {limit}. "
     if step.n_agreeing is not None:
         text += (
             f"{step.n_agreeing} of {n} matches agree with the predicted motion; from "
@@ -216,96 +183,116 @@ def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep, n_inl
         )
     if step.is_known:
         text += (
-            "So none were drawn: these matches and the predicted motion are where the refinement "
-            "starts. The curve shows what the samples would have found: "
+            "So none were drawn: the refinement starts from these matches and the predicted "
+            "motion. The curve shows what the samples would have found: "
         )
-    text += _search_text(step.search)
+    text += _samples_text(step)
     if step.inliers is not None and not step.is_known:
-        text += f" Refitted to its inliers, {n_inliers} of {n} agree."
+        text += f" Refitted to its inliers, {step.inliers.sum()} of {n} agree."
     return text
 
 
-def _search_text(search: SampleSearch) -> str:
-    if not len(search.counts):
-        return search.reason + "." if search.reason else "no samples."
-    best = int(search.counts.max())
+def _samples_text(step: ConsensusStep) -> str:
+    if not len(step.counts):
+        return step.reason + "." if step.reason else "no samples."
     text = (
-        f"{len(search.counts)} of at most {search.n_planned} samples of three of the "
-        f"{search.n_near} points with disparity enough; the best one finds {best}"
+        f"{len(step.counts)} of at most {step.n_planned} samples of three of the {step.n_near} "
+        f"points with enough disparity; the best one finds {step.counts.max()}"
     )
-    if search.is_stopped_early:
+    if step.is_stopped_early:
         text += (
-            f"; stopped early, as {100 * search.share:.0f} % of those points agree with it and not "
-            "having drawn a sample without outliers is less likely than one in a thousand"
+            f"; stopped early, as {100 * step.share:.0f} % of those points agree with it: the "
+            "probability that no sample was without outliers is less than one in a thousand"
         )
-    text += "."
-    if search.inliers is None:
-        text += f" It fails: {search.reason}."
-    return text
+    return f"{text}. It fails: {step.reason}." if step.reason else f"{text}."
 
 
-def _draw_samples(axes: Axes, step: ConsensusStep, n_matches: int) -> None:
-    counts = step.search.counts
-    number = np.arange(1, len(counts) + 1)
-    is_fitted = counts >= 0
+def _draw_samples(axes: Axes, step: ConsensusStep) -> None:
+    counts, n_matches = step.counts, len(step.pixels_reference)
+    number, is_fitted = np.arange(1, len(counts) + 1), counts >= 0
     axes.plot(number[is_fitted], counts[is_fitted], ".", color=BEFORE, label="one sample")
     if len(counts):
-        best = np.maximum.accumulate(counts)
-        axes.step(number, np.maximum(best, 0), where="post", color=AFTER, label="best so far")
-    if step.search.is_stopped_early and len(counts):
-        axes.axvline(len(counts), color=LIMIT, linestyle="--", label=f"stopped after {len(counts)}")
+        best = np.maximum(np.maximum.accumulate(counts), 0)
+        axes.step(number, best, where="post", color=AFTER, label="best so far")
+        if step.is_stopped_early:
+            label = f"stopped after {len(counts)}"
+            axes.axvline(len(counts), color=LIMIT, linestyle="--", label=label)
     axes.axhline(n_matches, color="black", linestyle=":", label=f"all {n_matches} matches")
-    axes.set_xlim(0, max(step.search.n_planned, 1) * 1.02)
+    axes.set_xlim(0, max(step.n_planned, 1) * 1.02)
     axes.set_ylim(0, 1.25 * max(n_matches, 1))
-    axes.set_xlabel("sample")
-    axes.set_ylabel("inliers")
-    axes.set_title(
-        "what the samples would have found" if step.is_known else "what the samples found",
-        fontsize=11,
-        loc="left",
-    )
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(loc="upper right", ncols=4, fontsize=9)
+    set_title(axes, f"what the samples {'would have ' if step.is_known else ''}found")
+    finish_axes(axes, "sample", "inliers", loc="upper right", ncols=4)
 
 
 def draw_residuals(explanation: FrameExplanation, step: RefinementStep) -> Picture:
     """Draw the residuals before and after the refinement."""
     title = "Residuals before and after the refinement"
-    norms = np.linalg.norm(step.whitened, axis=2)
-    caption = _residuals_caption(explanation, step, norms)
-    sheet = open_sheet(6.8, title, caption)
-    axes = sheet.panels.subplots(2, 3)
+    sheet = Sheet("07_residuals", title, _residuals_caption(explanation, step), 6.8)
+    axes, gate = sheet.panels.subplots(2, 3), step.gate
     for column, name in enumerate(("u", "v", "disparity")):
-        _compare(axes[0, column], step.residuals_px[:, :, column], f"residual of {name} [px]")
-    _draw_norms(axes[1, 0], norms, step.gate)
+        values = step.residuals_px[:, :, column]
+        finite = values[np.isfinite(values)]
+        reach = 1.1 * (float(np.percentile(np.abs(finite), 95)) if len(finite) else 1.0) + 1e-9
+        _compare(axes[0, column], values, np.linspace(-reach, reach, 41))
+        axes[0, column].locator_params(axis="x", nbins=7)
+        finish_axes(axes[0, column], f"residual of {name} [px], outer bins: beyond", "matches")
+    norms, cloud, by_depth = axes[1]
+    lengths = np.nan_to_num(np.linalg.norm(step.whitened, axis=2), nan=np.inf)
+    _compare(norms, lengths, np.linspace(0.0, 3.0 * gate, 46))
+    norms.axvline(gate, color=LIMIT, linestyle="--", label=f"gate {gate:g}")
+    finish_axes(norms, "whitened norm [sigma], last bin: beyond", "matches")
+    u, v, disparity = np.clip(step.whitened[1].T, -2.0 * gate, 2.0 * gate)
+    _draw_after(cloud, u, v, step)
+    circle = gate * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 100))
+    cloud.plot(circle.real, circle.imag, "--", color=LIMIT, linewidth=1.0, label="gate")
+    cloud.set_aspect("equal")
+    cloud.set_xlim(-2.1 * gate, 2.1 * gate)
+    place: dict[str, Any] = {"loc": "upper center", "columnspacing": 0.8, "handletextpad": 0.2}
+    labels = "after, whitened u [sigma], at the border: beyond", "whitened v [sigma]"
+    finish_axes(cloud, *labels, ncols=3, **place)
+    _draw_after(by_depth, step.depths, disparity, step)
+    by_depth.axhline(0.0, color="black", linewidth=0.8)
+    label = "after, whitened disparity [sigma],\nat the border: beyond"
+    finish_axes(by_depth, "depth [m]", label, ncols=2, loc="upper center")
+    return sheet.picture()
+
+
+def _compare(axes: Axes, values: FloatArray, bins: FloatArray) -> None:
+    """Draw histograms of values before and after; the outer bins take what is beyond."""
+    for row, colour, name in ((0, BEFORE, "before"), (1, AFTER, "after")):
+        shown = np.clip(values[row][~np.isnan(values[row])], bins[0], bins[-1])
+        axes.hist(shown, bins.tolist(), histtype="stepfilled", alpha=0.6, color=colour, label=name)
+
+
+def _draw_after(axes: Axes, x: FloatArray, y: FloatArray, step: RefinementStep) -> None:
+    """Draw what is left after the refinement, within twice the gate."""
     inliers = step.inliers[1]
-    _draw_cloud(axes[1, 1], step.whitened[1], inliers, step.gate)
-    _draw_by_depth(axes[1, 2], step, inliers)
-    return close_sheet(sheet, "07_residuals", title, caption)
+    axes.plot(x[~inliers], y[~inliers], "x", color=REFUSED, markersize=5, label="outliers")
+    axes.plot(x[inliers], y[inliers], ".", color=KEPT, markersize=6, label="inliers")
+    axes.set_ylim(-2.1 * step.gate, 2.9 * step.gate)
 
 
-def _residuals_caption(
-    explanation: FrameExplanation, step: RefinementStep, norms: FloatArray
-) -> str:
-    def median(values: FloatArray) -> str:
-        return ", ".join(f"{each:.2f}" for each in np.nanmedian(np.abs(values), axis=0))
-
-    start = "the predicted pose" if _starts_at_prediction(explanation) else "the pose of RANSAC"
-    moved = step.T_target_source[2] @ np.linalg.inv(step.T_target_source[0])
+def _residuals_caption(explanation: FrameExplanation, step: RefinementStep) -> str:
+    before, after = (
+        ", ".join(f"{each:.2f}" for each in np.nanmedian(np.abs(residuals), axis=0))
+        for residuals in step.residuals_px
+    )
+    is_known = explanation.consensus is not None and explanation.consensus.is_known
+    moved = step.T_target_source[1] @ np.linalg.inv(step.T_target_source[0])
     angle = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1.0, 1.0)))
     return (
-        f"Measured less predicted, of {norms.shape[1]} matches. Before, at {start}: medians of the "
-        f"absolute residuals of (u, v, disparity) {median(step.residuals_px[0])} px; after "
-        f"{step.n_steps} Gauss-Newton steps, which moved the pose by "
-        f"{1e3 * np.linalg.norm(moved[:3, 3]):.1f} mm and {angle:.3f} deg: "
-        f"{median(step.residuals_px[1])} px. Whitened, that is in sigmas of both frames' noise "
-        f"carried through the motion; the root mean square of what the pose rests on is "
-        f"{step.scale:.2f}, one where the stated sigmas are right. {_gate_text(step)}"
+        f"Measured less predicted, of {len(step.depths)} matches. Before, at the "
+        f"{'predicted pose' if is_known else 'pose of RANSAC'}: medians of the absolute residuals "
+        f"of (u, v, disparity) {before} px; after {step.n_steps} Gauss-Newton steps, which moved "
+        f"the pose by {1e3 * np.linalg.norm(moved[:3, 3]):.1f} mm and {angle:.3f} deg: {after} px. "
+        "Whitened residuals are in sigmas, from the noise of both frames propagated through the "
+        f"motion; the root mean square of the inliers is {step.scale:.2f}, 1 if the stated sigmas "
+        f"are right. {_gate_text(step)}"
     )
 
 
 def _gate_text(step: RefinementStep) -> str:
-    before, after = int(step.inliers[0].sum()), int(step.inliers[1].sum())
+    before, after = step.inliers.sum(axis=1).tolist()
     if step.n_within is None:
         return f"Pose and matches stay as they are, {after} (registration.refine none)."
     gate = f"The gate of {step.gate:g} sigma (registration.gate)"
@@ -319,64 +306,3 @@ def _gate_text(step: RefinementStep) -> str:
         f"{before} from before stay, those far off with less weight. The residuals are larger than "
         "the stated sigmas here."
     )
-
-
-def _starts_at_prediction(explanation: FrameExplanation) -> bool:
-    return explanation.consensus is not None and explanation.consensus.is_known
-
-
-def _compare(axes: Axes, values: FloatArray, label: str) -> None:
-    finite = values[np.isfinite(values)]
-    reach = float(np.percentile(np.abs(finite), 95)) if len(finite) else 1.0
-    bins = np.linspace(-1.1 * reach - 1e-9, 1.1 * reach + 1e-9, 41).tolist()
-    for row, colour, name in ((0, BEFORE, "before"), (1, AFTER, "after")):
-        clipped = np.clip(values[row][np.isfinite(values[row])], bins[0], bins[-1])
-        axes.hist(clipped, bins=bins, histtype="stepfilled", alpha=0.6, color=colour, label=name)
-    axes.locator_params(axis="x", nbins=7)
-    axes.set_xlabel(f"{label}, outer bins: beyond")
-    axes.set_ylabel("matches")
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(fontsize=9)
-
-
-def _draw_norms(axes: Axes, norms: FloatArray, gate: float) -> None:
-    top = 3.0 * gate
-    bins = np.linspace(0.0, top, 46).tolist()
-    for row, colour, name in ((0, BEFORE, "before"), (1, AFTER, "after")):
-        clipped = np.minimum(np.nan_to_num(norms[row], nan=top), top)
-        axes.hist(clipped, bins=bins, histtype="stepfilled", alpha=0.6, color=colour, label=name)
-    axes.axvline(gate, color=LIMIT, linestyle="--", label=f"gate {gate:g}")
-    axes.set_xlabel("whitened norm [sigma], last bin: beyond")
-    axes.set_ylabel("matches")
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(fontsize=9)
-
-
-def _draw_cloud(axes: Axes, whitened: FloatArray, inliers: BoolArray, gate: float) -> None:
-    reach = 2.0 * gate
-    shown = np.clip(whitened, -reach, reach)
-    axes.plot(*shown[~inliers, :2].T, "x", color=REFUSED, markersize=5, label="outliers")
-    axes.plot(*shown[inliers, :2].T, ".", color=KEPT, markersize=6, label="inliers")
-    circle = gate * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 100))
-    axes.plot(circle.real, circle.imag, "--", color=LIMIT, linewidth=1.0, label="gate")
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.05 * reach, 1.05 * reach)
-    axes.set_ylim(-1.05 * reach, 1.45 * reach)
-    axes.set_xlabel("after, whitened u [sigma], at the border: beyond")
-    axes.set_ylabel("whitened v [sigma]")
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(fontsize=9, ncols=3, loc="upper center", columnspacing=0.8, handletextpad=0.2)
-
-
-def _draw_by_depth(axes: Axes, step: RefinementStep, inliers: BoolArray) -> None:
-    depths = step.correspondences.target_points[:, 2]
-    reach = 2.0 * step.gate
-    shown = np.clip(step.whitened[1, :, 2], -reach, reach)
-    axes.plot(depths[~inliers], shown[~inliers], "x", color=REFUSED, markersize=5, label="outliers")
-    axes.plot(depths[inliers], shown[inliers], ".", color=KEPT, markersize=6, label="inliers")
-    axes.axhline(0.0, color="black", linewidth=0.8)
-    axes.set_ylim(-1.05 * reach, 1.45 * reach)
-    axes.set_xlabel("depth [m]")
-    axes.set_ylabel("after, whitened disparity [sigma],\nat the border: beyond")
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(fontsize=9, ncols=2, loc="upper center")

@@ -1,4 +1,4 @@
-"""Pictures of the pose and of what it is tied to."""
+"""Pictures of the pose and of its edges in the window."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from gvo.viz.explanation.sheet import (
     KEPT,
     REFUSED,
     Picture,
-    close_sheet,
-    open_sheet,
+    Sheet,
+    finish_axes,
+    set_title,
     show_image,
-    words_only,
 )
 
 if TYPE_CHECKING:
@@ -34,25 +34,30 @@ def position_covariance(T: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def draw_pose(explanation: FrameExplanation) -> Picture:
-    """Draw how sure the pose is, with all its numbers."""
-    title, result = "The pose and its covariance", explanation.result
-    relative = result.registration
-    caption = _pose_caption(explanation)
-    sheet = open_sheet(5.6, title, caption)
-    panels = sheet.panels.subplots(1, 3, width_ratios=[1.0, 1.0, 1.15])
-    ellipses = [("causal", result.causal.T_world_cam, result.causal.covariance)]
+    """Draw the covariance of the pose, with all its numbers."""
+    result, relative = explanation.result, explanation.result.registration
+    poses = [
+        ("raw, in the world", result.raw.T_world_cam, result.raw.covariance),
+        (
+            f"causal, in the world ({result.status})",
+            result.causal.T_world_cam,
+            result.causal.covariance,
+        ),
+    ]
+    name, (_, T, covariance) = "causal", poses[1]
     if relative is not None:
-        ellipses.insert(0, ("relative", relative.T_reference_current, relative.covariance))
-    name, T, covariance = ellipses[0]
+        name, T, covariance = "relative", relative.T_reference_current, relative.covariance
+        poses.insert(0, (f"relative to frame {explanation.reference_index}", T, covariance))
     spread = 1e6 * position_covariance(T, covariance)
-    _draw_ellipses(panels[0], spread[np.ix_([0, 2], [0, 2])], ("x", "z"), f"{name}, from above")
-    _draw_ellipses(panels[1], spread[np.ix_([2, 1], [2, 1])], ("z", "y"), f"{name}, from the side")
-    panels[1].invert_yaxis()
-    panels[2].set_axis_off()
-    panels[2].text(
-        0.0, 1.0, _numbers(explanation), family="monospace", fontsize=10, va="top", linespacing=1.4
-    )
-    return close_sheet(sheet, "08_pose", title, caption)
+    sheet = Sheet("08_pose", "The pose and its covariance", _pose_caption(explanation), 5.6)
+    above, side, numbers = sheet.panels.subplots(1, 3, width_ratios=[1.0, 1.0, 1.15])
+    _draw_ellipses(above, spread[np.ix_([0, 2], [0, 2])], ("x", "z"), f"{name}, from above")
+    _draw_ellipses(side, spread[np.ix_([2, 1], [2, 1])], ("z", "y"), f"{name}, from the side")
+    side.invert_yaxis()
+    numbers.set_axis_off()
+    text = "\n\n".join(_numbers(*pose) for pose in poses)
+    numbers.text(0.0, 1.0, text, family="monospace", fontsize=10, va="top", linespacing=1.4)
+    return sheet.picture()
 
 
 def _draw_ellipses(axes: Axes, covariance: FloatArray, names: tuple[str, str], title: str) -> None:
@@ -66,12 +71,11 @@ def _draw_ellipses(axes: Axes, covariance: FloatArray, names: tuple[str, str], t
     reach = 1.15 * max(3.0 * float(np.sqrt(np.maximum(np.diag(covariance), 0.0)).max()), 1e-3)
     axes.set_aspect("equal")
     axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, 1.3 * reach) if names[1] == "z" else axes.set_ylim(-1.3 * reach, reach)
-    axes.set_xlabel(f"{names[0]} - estimate [mm]")
-    axes.set_ylabel(f"{names[1]} - estimate [mm]")
-    axes.set_title(title, fontsize=11, loc="left")
-    axes.grid(color=BEFORE, alpha=0.3)
-    axes.legend(loc="upper center", ncols=3, fontsize=9, columnspacing=0.8)
+    # Room for the legend above; y points down.
+    axes.set_ylim(*((-reach, 1.3 * reach) if names[1] == "z" else (-1.3 * reach, reach)))
+    set_title(axes, title)
+    place = {"loc": "upper center", "ncols": 3, "columnspacing": 0.8}
+    finish_axes(axes, f"{names[0]} - estimate [mm]", f"{names[1]} - estimate [mm]", **place)
 
 
 def _pose_caption(explanation: FrameExplanation) -> str:
@@ -82,44 +86,21 @@ def _pose_caption(explanation: FrameExplanation) -> str:
             "camera, with its ellipses of 1, 2 and 3 sigma (39, 86 and 99 % of a plane). x points "
             "right, y down, z forward. "
         )
-    elif result.raw.stamp_ns == result.causal.stamp_ns and explanation.index == 0:
+    elif explanation.index == 0:
         text = "The first frame: it is the origin of the world, held by a prior of small sigma. "
     else:
         text = (
-            f"Not registered: {result.reason or 'there is no earlier frame'}. The pose goes on as "
-            "before, and its covariance grows accordingly; the ellipses are of the causal pose. "
+            f"Not registered: {result.reason or 'there is no earlier frame'}. The pose is "
+            "predicted, and its covariance grows accordingly; the ellipses are of the causal pose. "
         )
     return text + (
-        "Numbers: rotation as a vector, its length the angle; sigmas are roots of the covariance's "
-        "diagonal, in the axes of this camera. Raw is the chain of frame-to-frame motions, causal "
-        "the window's answer with this frame."
+        "Rotations are vectors whose length is the angle; sigmas are square roots of the "
+        "covariance's diagonal, in the axes of this camera. Raw is the chain of frame-to-frame "
+        "motions, causal the estimate of the window with this frame."
     )
 
 
-def _numbers(explanation: FrameExplanation) -> str:
-    result = explanation.result
-    blocks = []
-    if result.registration is not None:
-        relative = result.registration
-        blocks.append(
-            _block(
-                f"relative to frame {explanation.reference_index}",
-                relative.T_reference_current,
-                relative.covariance,
-            )
-        )
-    blocks.append(_block("raw, in the world", result.raw.T_world_cam, result.raw.covariance))
-    blocks.append(
-        _block(
-            f"causal, in the world ({result.status})",
-            result.causal.T_world_cam,
-            result.causal.covariance,
-        )
-    )
-    return "\n\n".join(blocks)
-
-
-def _block(name: str, T: FloatArray, covariance: FloatArray) -> str:
+def _numbers(name: str, T: FloatArray, covariance: FloatArray) -> str:
     rotation = np.degrees(Rotation.from_matrix(T[:3, :3]).as_rotvec())
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     rows = [
@@ -128,75 +109,72 @@ def _block(name: str, T: FloatArray, covariance: FloatArray) -> str:
         ("rotation [deg] ", rotation, "9.4f"),
         ("  sigma [mdeg] ", 1e3 * np.degrees(sigmas[:3]), "9.3f"),
     ]
-    lines = [name + "\n" + " " * 15 + "".join(f"{axis:>9}" for axis in "xyz")]
-    lines += [
-        label + "".join(f"{value:{form}}" for value in values) for label, values, form in rows
-    ]
-    length, angle = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(rotation))
-    lines.append(f"length {length:.4f} m, angle {angle:.4f} deg")
-    return "\n".join(lines)
+    length, angle = np.linalg.norm(T[:3, 3]), np.linalg.norm(rotation)
+    return "\n".join(
+        [
+            name,
+            " " * 15 + "".join(f"{axis:>9}" for axis in "xyz"),
+            *(label + "".join(f"{each:{form}}" for each in row) for label, row, form in rows),
+            f"length {length:.4f} m, angle {angle:.4f} deg",
+        ]
+    )
 
 
 def draw_links(explanation: FrameExplanation) -> Picture:
     """Draw the earlier frames with what each contributed."""
     title, name, links = "Links to earlier frames", "09_links", explanation.links
     if not links:
-        return words_only(name, title, "None: there is no earlier frame to be linked to.")
-    caption = _links_caption(explanation)
+        return Picture(
+            name=name, title=title, caption="None: there is no earlier frame to link to."
+        )
     shown = [link for link in links if link.kind != "standstill"]
     n_columns = min(_N_COLUMNS, max(len(shown), 3))
     n_rows = -(-len(shown) // n_columns)
-    shape = explanation.image.shape
-    height = n_rows * (12.6 / n_columns * shape[0] / shape[1] + 0.65)
-    sheet = open_sheet(height, title, caption)
+    rows, columns = explanation.image.shape
+    height = n_rows * (12.6 / n_columns * rows / columns + 0.65)
+    sheet = Sheet(name, title, _links_caption(explanation), height)
     panels = sheet.panels.subplots(n_rows, n_columns, squeeze=False).ravel()
     for axes, link in zip(panels, shown, strict=False):
         _draw_link(axes, link)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
-    return close_sheet(sheet, name, title, caption)
+    return sheet.picture()
 
 
 def _draw_link(axes: Axes, link: KeyframeLink) -> None:
-    colour = KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
+    what = {"step": "predecessor", "keyframe": "keyframe", "not linked": "keyframe, not linked"}
+    overlap = "" if link.overlap is None else f", overlap {link.overlap:.2f}"
+    answer = "failed" if link.kind == "keyframe" else link.reason
     show_image(axes, link.image)
     if isinstance(link.registration, RelativePose):
         pixels, inliers = link.registration.pixels_reference, link.registration.inliers
         axes.plot(*pixels[~inliers].T, "x", color=REFUSED, markersize=3)
         axes.plot(*pixels[inliers].T, ".", color=KEPT, markersize=3)
-    for spine in axes.spines.values():
-        spine.set_edgecolor(colour)
-        spine.set_linewidth(3)
-    axes.set_title(_link_text(link), fontsize=9, loc="left")
-
-
-def _link_text(link: KeyframeLink) -> str:
-    what = {"step": "predecessor", "keyframe": "keyframe", "not linked": "keyframe, not linked"}
-    score = "" if link.score is None else f", overlap {link.score:.2f}"
-    lines = [f"frame {link.index}, {what[link.kind]}{score}"]
-    if isinstance(link.registration, RelativePose):
-        counts = f"{link.registration.n_inliers} of {link.registration.n_matches} inliers"
         chi2 = "" if link.chi2 is None else f", chi2 {link.chi2:.2f}"
-        lines.append(f"{counts}{chi2}, {'accepted' if link.is_accepted else 'refused'}")
-    else:
-        lines.append("failed" if link.kind == "keyframe" else link.reason)
-    return "\n".join(lines)
+        counts = f"{link.registration.n_inliers} of {link.registration.n_matches} inliers"
+        answer = f"{counts}{chi2}, {'accepted' if link.is_accepted else 'refused'}"
+    for spine in axes.spines.values():
+        spine.set_edgecolor(
+            KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
+        )
+        spine.set_linewidth(3)
+    text = f"frame {link.index}, {what[link.kind]}{overlap}\n{answer}"
+    axes.set_title(text, fontsize=9, loc="left")
 
 
 def _links_caption(explanation: FrameExplanation) -> str:
     window, links = explanation.config.window, explanation.links
-    n_accepted = sum(link.is_accepted for link in links)
     text = (
-        f"{n_accepted} edges tie the frame to earlier ones (blue frames); {window.n_links} "
-        "registrations at most are tried (window.n_links). Overlap is the share of a keyframe's "
-        f"points in view: below {window.min_overlap:g} it is let go (window.min_overlap), "
-        f"times the steps since it must be {window.link_gain:g} to be linked (window.link_gain) "
-        "unless the step is in doubt, "
-        f"and where all are below {window.keyframe_overlap:g} the frame becomes a keyframe itself "
+        f"{sum(link.is_accepted for link in links)} edges connect the frame to earlier ones (blue "
+        f"frames); at most {window.n_links} registrations are tried (window.n_links). Overlap is "
+        f"the share of a keyframe's points in view: below {window.min_overlap:g} the keyframe is "
+        "released (window.min_overlap), times the steps since it must reach "
+        f"{window.link_gain:g} for a link (window.link_gain) unless the step is in doubt, and if "
+        f"all are below {window.keyframe_overlap:g} the frame becomes a keyframe itself "
         "(window.keyframe_overlap), as this one "
         f"{'did' if explanation.became_keyframe else 'did not'}. "
-        "Chi2 is the squared distance of the edge from the window's poses in sigmas; of 6 degrees "
-        "of freedom, about 6 or less where the stated covariances are right or cautious."
+        "Chi2 is the squared Mahalanobis distance of the edge from the window's poses, 6 degrees "
+        "of freedom: about 6 or less where the stated covariances are right or cautious."
     )
     for link in links:
         if link.kind == "standstill":

@@ -22,15 +22,16 @@ REFUSED: Final = OUTLIERS
 BEFORE: Final = "#999999"
 AFTER: Final = "#0072B2"
 LIMIT: Final = "#D55E00"
-_REASONS: Final = ("#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#0072B2", "#009E73", "#999999")
-_MARKERS: Final = "xsD^vP+"
+REASONS: Final = ("#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#0072B2", "#009E73", "#999999")
+MARKERS: Final = "xsD^vP+"
 _WIDTH_INCHES: Final = 13.0
 _DPI: Final = 100
 _CAPTION_CHARACTERS: Final = 165
 _MIN_CAPTION_CHARACTERS: Final = 80
 # The margin of the title, on both sides.
-_CAPTION_INCHES: Final = _WIDTH_INCHES * (1.0 - 2 * 0.008)
+_MARGIN: Final = 0.008
 _LINE_INCHES: Final = 0.235
+_TITLE_INCHES: Final = 0.45
 _FONT_SIZE: Final = 11.0
 
 
@@ -44,44 +45,54 @@ class Picture:
         Of the file, without its ending: `01_keypoints`.
     title, caption : str
     png : bytes or None
-        None where there is nothing to show, and the caption says why.
+        None if there is nothing to show; the caption says why.
     """
 
     name: str
     title: str
     caption: str
-    png: bytes | None
+    png: bytes | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A figure that is being drawn.
+    """A picture that is being drawn.
 
     Parameters
     ----------
-    figure : Figure
+    name, title, caption : str
+    height_inches : float
+        Of the axes.
+
+    Attributes
+    ----------
     panels : SubFigure
-        Where the axes go.
+        The room for the axes.
     """
 
-    figure: Figure
-    panels: SubFigure
+    def __init__(self, name: str, title: str, caption: str, height_inches: float) -> None:
+        from matplotlib.figure import Figure
 
+        self._texts = {"name": name, "title": title, "caption": caption}
+        lines = _wrap(caption)
+        heights = [height_inches + _TITLE_INCHES, _LINE_INCHES * (len(lines) + 0.8)]
+        self._figure = Figure(figsize=(_WIDTH_INCHES, sum(heights)), dpi=_DPI, layout="constrained")
+        self.panels, footer = split(self._figure, heights)
+        self.panels.suptitle(title, x=_MARGIN, ha="left", fontsize=14, fontweight="bold")
+        text = "\n".join(lines)
+        footer.text(_MARGIN, 0.95, text, va="top", fontsize=_FONT_SIZE, linespacing=1.35)
 
-def open_sheet(height_inches: float, title: str, caption: str) -> Sheet:
-    """Make a figure with room for axes of some height between title and caption."""
-    from matplotlib.figure import Figure
+    def colorbar(self, mappable: Any, axes: Axes, **options: Any) -> None:  # noqa: ANN401
+        """Add a colour bar beside axes."""
+        self._figure.colorbar(mappable, ax=axes, **{"pad": 0.01, **options})
 
-    lines = wrap(caption)
-    below = _LINE_INCHES * (len(lines) + 0.8)
-    figure = Figure(
-        figsize=(_WIDTH_INCHES, height_inches + 0.45 + below), dpi=_DPI, layout="constrained"
-    )
-    heights = [height_inches + 0.45, below]
-    panels, footer = split(figure, heights)
-    panels.suptitle(title, x=0.008, ha="left", fontsize=14, fontweight="bold")
-    footer.text(0.008, 0.95, "\n".join(lines), va="top", fontsize=_FONT_SIZE, linespacing=1.35)
-    return Sheet(figure=figure, panels=panels)
+    def picture(self) -> Picture:
+        """Return the picture drawn."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        FigureCanvasAgg(self._figure)
+        buffer = io.BytesIO()
+        self._figure.savefig(buffer, format="png", metadata={"Software": None})
+        return Picture(**self._texts, png=buffer.getvalue())
 
 
 def split(figure: Figure | SubFigure, heights: Sequence[float]) -> list[SubFigure]:
@@ -90,51 +101,34 @@ def split(figure: Figure | SubFigure, heights: Sequence[float]) -> list[SubFigur
     return [row[0] for row in np.asarray(rows)]
 
 
-def close_sheet(sheet: Sheet, name: str, title: str, caption: str) -> Picture:
-    """Turn a drawn figure into a picture."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    FigureCanvasAgg(sheet.figure)
-    buffer = io.BytesIO()
-    sheet.figure.savefig(buffer, format="png", metadata={"Software": None})
-    return Picture(name=name, title=title, caption=caption, png=buffer.getvalue())
-
-
-def words_only(name: str, title: str, caption: str) -> Picture:
-    """Return a step that has nothing to show."""
-    return Picture(name=name, title=title, caption=caption, png=None)
-
-
-def wrap(text: str) -> list[str]:
+def _wrap(text: str) -> list[str]:
     """Break a caption into lines; its own line breaks stay."""
-    return [line for paragraph in text.split("\n") for line in _wrapped(paragraph)]
+    return [line for paragraph in text.split("\n") for line in _wrap_paragraph(paragraph)]
 
 
-def _wrapped(paragraph: str) -> list[str]:
+def _wrap_paragraph(paragraph: str) -> list[str]:
     # Letters differ in width: as many characters as fit in the widest line.
     n_characters = _CAPTION_CHARACTERS
     while True:
         lines = textwrap.wrap(paragraph, n_characters) or [""]
         width = max(_width_inches(line) for line in lines)
-        if width <= _CAPTION_INCHES or n_characters <= _MIN_CAPTION_CHARACTERS:
+        if width <= _WIDTH_INCHES * (1 - 2 * _MARGIN) or n_characters <= _MIN_CAPTION_CHARACTERS:
             return lines
         n_characters -= 2
 
 
 def _width_inches(line: str) -> float:
-    """Return how wide a line of a caption becomes."""
+    """Return the width of a line of a caption."""
     from matplotlib.backends.backend_agg import RendererAgg
     from matplotlib.font_manager import FontProperties
 
     make_renderer: Any = RendererAgg  # has no types
-    renderer = make_renderer(1, 1, _DPI)
-    font = FontProperties(size=_FONT_SIZE)
-    width, _, _ = renderer.get_text_width_height_descent(line, font, ismath=False)
-    return float(width) / _DPI
+    renderer, font = make_renderer(1, 1, _DPI), FontProperties(size=_FONT_SIZE)
+    return float(renderer.get_text_width_height_descent(line, font, ismath=False)[0]) / _DPI
 
 
 def is_wide(shape: Sequence[int]) -> bool:
-    """Tell that images of (height, width) read better above each other than side by side."""
+    """Tell whether images of (height, width) belong above each other rather than side by side."""
     return shape[1] > 2 * shape[0]
 
 
@@ -145,23 +139,36 @@ def image_height(shape: Sequence[int], *, share: float = 1.0) -> float:
 
 def paired_height(shape: Sequence[int]) -> float:
     """Return the height in inches of two images with lines between them."""
-    joined = (2 * shape[0], shape[1]) if is_wide(shape) else (shape[0], 2 * shape[1])
-    return image_height(joined)
+    return image_height((2 * shape[0], shape[1]) if is_wide(shape) else (shape[0], 2 * shape[1]))
 
 
 def show_image(axes: Axes, image: Any, title: str = "", **options: Any) -> None:  # noqa: ANN401
-    """Show an image, grey unless told otherwise, without ticks."""
+    """Show an image, grey by default, without ticks."""
     axes.imshow(image, **{"cmap": "gray", "vmin": 0, "vmax": 255, **options})
     axes.set_xlim(-0.5, image.shape[1] - 0.5)
     axes.set_ylim(image.shape[0] - 0.5, -0.5)
     axes.set_xticks([])
     axes.set_yticks([])
     if title:
-        axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
+        set_title(axes, title)
+
+
+def set_title(axes: Axes, title: str) -> None:
+    """Set the title of axes."""
+    axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
+
+
+def finish_axes(axes: Axes, x_label: str, y_label: str, **legend: Any) -> None:  # noqa: ANN401
+    """Label axes, with a grid and a legend."""
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(color=BEFORE, alpha=0.3)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(**{"fontsize": 9, **legend})
 
 
 def join_images(first: ImageArray, second: ImageArray) -> tuple[ImageArray, FloatArray]:
-    """Put two images above each other or side by side; also the second's first pixel."""
+    """Put two images above each other or side by side; also return the second's first pixel."""
     axis = 0 if is_wide(first.shape) else 1
     shift = np.zeros(2)
     shift[1 - axis] = first.shape[axis]
@@ -182,28 +189,22 @@ def draw_segments(
     return lines
 
 
-def reason_style(number: int) -> dict[str, Any]:
-    """Return colour and marker of a reason to drop something."""
-    colour, marker = _REASONS[number % len(_REASONS)], _MARKERS[number % len(_MARKERS)]
-    return {"color": colour, "marker": marker, "linestyle": "none", "markersize": 6.0}
-
-
-def legend_below(axes: Axes, n_columns: int) -> None:
+def legend_below(axes: Axes, n_columns: int, **options: Any) -> None:  # noqa: ANN401
     """Put the legend under the axes, where it hides nothing."""
-    if not axes.get_legend_handles_labels()[1]:
-        return
-    axes.legend(
-        loc="upper left",
-        bbox_to_anchor=(0.0, -0.01),
-        ncols=n_columns,
-        fontsize=10,
-        frameon=False,
-        borderaxespad=0.0,
-        handletextpad=0.3,
-        columnspacing=1.2,
-    )
+    if options or axes.get_legend_handles_labels()[1]:
+        axes.legend(
+            loc="upper left",
+            bbox_to_anchor=(0.0, -0.01),
+            ncols=n_columns,
+            fontsize=10,
+            frameon=False,
+            borderaxespad=0.0,
+            handletextpad=0.3,
+            columnspacing=1.2,
+            **options,
+        )
 
 
 def count_text(counts: dict[str, int]) -> str:
-    """Return counts as words: `track lost 3, kept 12`; what did not occur is left out."""
+    """Return counts as words, zeros left out: `track lost 3, kept 12`."""
     return ", ".join(f"{name} {number}" for name, number in counts.items() if number) or "none"

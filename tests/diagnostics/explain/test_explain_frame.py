@@ -83,10 +83,11 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
     registration, refinement = expected.registration, explanation.refinement
     assert registration is not None
     assert refinement is not None
-    assert explanation.temporal is not None
+    assert explanation.matches is not None
     assert explanation.consensus is not None
-    kept = explanation.temporal.sorting.are_kept
-    T_end = refinement.T_target_source[2]
+    matches = explanation.matches.sorting
+    kept = matches.are_kept
+    T_end = refinement.T_target_source[1]
     assert np.array_equal(se3.invert(T_end), registration.T_reference_current)
     assert explanation.result.registration is not None
     for name in (
@@ -100,10 +101,8 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
         shown = getattr(explanation.result.registration, name)
         assert np.array_equal(shown, getattr(registration, name)), name
     assert np.array_equal(refinement.inliers[1], registration.inliers)
-    assert np.array_equal(explanation.temporal.found[kept], registration.pixels_current)
-    assert np.array_equal(
-        explanation.temporal.reference_pixels[kept], registration.pixels_reference
-    )
+    assert np.array_equal(matches.partners[kept], registration.pixels_current)
+    assert np.array_equal(matches.pixels[kept], registration.pixels_reference)
     assert np.array_equal(explanation.result.causal.T_world_cam, expected.causal.T_world_cam)
     assert np.array_equal(explanation.result.raw.covariance, expected.raw.covariance)
 
@@ -114,20 +113,23 @@ def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
     kind: str, sensor: Sensor
 ) -> None:
     explanation = explained(kind, sensor)
-    step = explanation.stereo if sensor == "stereo" else explanation.depth
-    assert step is not None
-    counts = step.sorting.counts()
-    assert sum(counts.values()) == explanation.result.n_keypoints == len(explanation.keypoints.kept)
+    counts = explanation.measured.counts()
+    assert sum(counts.values()) == explanation.result.n_keypoints
     assert counts["kept"] == explanation.result.n_points
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_kept_keypoints_were_detected(kind: str, sensor: Sensor) -> None:
-    step = explained(kind, sensor).keypoints
-    detected = {tuple(pixel) for pixel in step.detected.tolist()}
-    assert {tuple(pixel) for pixel in step.kept.tolist()} <= detected
-    assert len(step.kept) <= step.budget
+def test_the_keypoints_within_the_budget_are_those_that_were_measured(
+    kind: str, sensor: Sensor
+) -> None:
+    explanation = explained(kind, sensor)
+    keypoints, measured = explanation.keypoints, explanation.measured.pixels
+    kept = keypoints.pixels[keypoints.are_kept]
+    assert sorted(kept.tolist()) == sorted(measured.tolist())
+    config = explanation.config
+    budget = config.klt.n_corners if kind == "klt" else config.features.n_features
+    assert len(kept) == min(budget, len(keypoints))
 
 
 def test_the_steps_to_the_fraction_of_a_pixel_end_where_the_front_end_ended() -> None:
@@ -163,10 +165,10 @@ def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
     monkeypatch.setattr(Keyframes, "scores", scores)
     monkeypatch.setattr("gvo.odometry.keyframes.choose_links", choose)
     explanation = explain_frame(recording("stereo"), LAST, config=configuration(kind))
-    chosen_by, shown = seen[-2:]
-    assert chosen_by == shown
+    shown = {link.reference_ns: link.overlap for link in explanation.links}
+    assert seen[-1].items() <= shown.items()
     linked = {link.reference_ns for link in explanation.links if link.kind == "keyframe"}
-    (chosen, spare), *_ = chosen_links[-2:]
+    chosen, spare = chosen_links[-1]
     assert set(chosen) <= linked <= {*chosen, *spare}
     assert linked
 
@@ -174,8 +176,8 @@ def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
 def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> None:
     step = explained("klt", "stereo").consensus
     assert step is not None
-    assert len(step.search.counts) > 0
-    assert step.search.inliers is not None
+    assert len(step.counts) > 0
+    assert step.sampled is not None
     if step.is_known:
         assert step.n_agreeing is not None
         assert step.n_agreeing >= step.n_needed
@@ -185,9 +187,9 @@ def test_a_first_frame_is_explained_without_a_motion() -> None:
     explanation = explained("klt", "stereo", 0)
     assert explanation.reference is None
     assert explanation.links == ()
-    assert explanation.temporal is None
+    assert explanation.matches is None
     assert explanation.refinement is None
-    assert explanation.stereo is not None
+    assert explanation.measured.are_kept.any()
 
 
 @pytest.mark.parametrize("kind", KINDS)

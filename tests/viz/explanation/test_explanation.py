@@ -17,7 +17,7 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.viz.explanation import open_folder, write_explanation
 from gvo.viz.explanation.motion import draw_residuals
 from gvo.viz.explanation.pose import position_covariance
-from gvo.viz.explanation.sheet import close_sheet, open_sheet
+from gvo.viz.explanation.sheet import Sheet
 
 STEREO = [
     "01_keypoints",
@@ -77,7 +77,7 @@ def test_a_folder_that_is_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("word", ["WWMM", "moved", "ill,"])
 def test_no_line_of_a_caption_leaves_the_picture(word: str) -> None:
     caption = " ".join([word] * 120)
-    picture = close_sheet(open_sheet(1.0, "Title", caption), "name", "Title", caption)
+    picture = Sheet("name", "Title", caption, 1.0).picture()
     assert picture.png is not None
     image = cv2.imdecode(np.frombuffer(picture.png, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert image is not None
