@@ -6,12 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import get_type_hints
+from typing import get_args, get_type_hints
 
 import pandas as pd
 import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
 
-from gvo.batch.rows import BatchRow, Value
+from gvo.batch.rows import BatchRow, RunStatus, Value
 from gvo.errors import OutputError
 from gvo.io.run_folder.line_file import replace_bytes
 
@@ -39,6 +39,14 @@ def to_frame(rows: Sequence[BatchRow]) -> pd.DataFrame:
     for place, key in enumerate(keys, start=len(_FIRST)):
         frame.insert(place, key, _column([row.parameters.get(key) for row in rows]))
     return frame
+
+
+def outcome(table: pd.DataFrame) -> tuple[dict[str, int], list[str]]:
+    """Return the number of runs of each status that occurs, and why runs are not complete."""
+    counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}
+    unfinished = table[table["status"] != "complete"]
+    reasons = [f"{row.folder}: {row.status}: {row.reason}" for row in unfinished.itertuples()]
+    return {status: n for status, n in counts.items() if n}, reasons
 
 
 def write_results(frame: pd.DataFrame, folder: Path) -> None:

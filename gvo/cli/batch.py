@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -27,8 +27,6 @@ from gvo.cli.terminal import both, interruptible, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from gvo.batch import BatchProgress
 
 _CONFIGURATIONS = (".yaml", ".yml")
@@ -50,22 +48,25 @@ def batch(
     out: Annotated[str, typer.Option(metavar="DIR", help="Folder to write, or a URL.")],
     sweep: Annotated[
         list[str] | None,
-        typer.Option(metavar="SECTION.KEY=A,B,C", help="Run each value; several: each pair."),
+        typer.Option(
+            metavar="SECTION.KEY=A,B,C", help="Run each value; with several, each combination."
+        ),
     ] = None,
     configs: Annotated[
         list[str] | None,
         typer.Option(
-            "--configs", "--config", metavar="FILE...", help="YAML; each is a configuration."
+            "--configs", "--config", metavar="FILE...", help="YAML files, each a configuration."
         ),
     ] = None,
     set_: Settings = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Processes here; one a core.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Worker processes here; one a core if omitted."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="URL", help="Of a cluster, such as tcp://host:8786.")
+        str | None, typer.Option(metavar="URL", help="Of a Dask cluster, such as tcp://host:8786.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Run what is finished, too.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Run finished runs again.")] = False,
     start: Start = 0.0,
     duration: Duration = None,
     every: Every = 1,
@@ -81,8 +82,9 @@ def batch(
     color: Color = None,
     depth: Depth = None,
 ) -> None:
-    """Run many recordings, or many parameters: one table, one report."""
+    """Run many recordings or configurations: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
+    from gvo.batch.results import outcome
     from gvo.io.excerpt import make_excerpt
 
     if scheduler is not None and workers is not None:
@@ -108,17 +110,16 @@ def batch(
         connected(scheduler, workers) as client,
         _progress() as show,
     ):
-        told = both(show, check)
         table = run_batch(
-            found, variants, out=out, client=client, options=options, on_progress=told
+            found, variants, out=out, client=client, options=options, on_progress=both(show, check)
         )
-    _report(table, out)
+    _report(*outcome(table), out)
 
 
 def _sort_arguments(
     recordings: list[str], configs: list[str] | None
 ) -> tuple[list[str], list[Path]]:
-    """Return recordings and configurations: of `--configs *.yaml` the shell makes arguments."""
+    """Return recordings and configurations: the shell expands `--configs *.yaml` to arguments."""
     given = [*(configs or []), *(one for one in recordings if one.endswith(_CONFIGURATIONS))]
     rest = [one for one in recordings if not one.endswith(_CONFIGURATIONS)]
     if not rest:
@@ -135,7 +136,7 @@ def _sort_arguments(
 
 @contextmanager
 def _progress() -> Iterator[Callable[[BatchProgress], None]]:
-    """Give a callback that draws a line on a terminal, and writes one for each run elsewhere."""
+    """Yield a callback: a status line on a terminal, elsewhere a line for each run."""
     if not sys.stderr.isatty():
         yield _print_row
         return
@@ -170,22 +171,17 @@ def _clock(seconds: float) -> str:
     return time.strftime("%H:%M:%S" if seconds >= 3600 else "%M:%S", time.gmtime(seconds))
 
 
-def _report(table: pd.DataFrame, out: str) -> NoReturn:
-    """Print what a batch gave, and end with its exit code."""
-    from gvo.batch.rows import RunStatus
+def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn:
+    """Print the outcome of a batch, and end with its exit code."""
     from gvo.io.run_folder.writer import REPORT
     from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 
-    counts = {status: int((table["status"] == status).sum()) for status in get_args(RunStatus)}
-    unfinished = table[table["status"] != "complete"]
-    lines = [f"{row.folder}: {row.status}: {row.reason}" for row in unfinished.itertuples()]
-    warn(lines[:_MAX_WARNINGS])
-    if len(lines) > _MAX_WARNINGS:
-        warn([f"{len(lines) - _MAX_WARNINGS} more runs are not complete, see the table"])
-    words = ", ".join(f"{n} {status}" for status, n in counts.items() if n)
-    typer.echo(f"{_count(len(table), 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
-    if counts["complete"] == len(table):
-        raise typer.Exit(EXIT_COMPLETE)
-    if counts["failed"] == len(table):
+    warn(reasons[:_MAX_WARNINGS])
+    if len(reasons) > _MAX_WARNINGS:
+        warn([f"{len(reasons) - _MAX_WARNINGS} more runs are not complete, see the table"])
+    words = ", ".join(f"{n} {status}" for status, n in counts.items())
+    n_runs = sum(counts.values())
+    typer.echo(f"{_count(n_runs, 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
+    if counts.get("failed") == n_runs:
         raise ConfigurationError("all runs failed")
-    raise typer.Exit(EXIT_PARTLY)
+    raise typer.Exit(EXIT_PARTLY if reasons else EXIT_COMPLETE)
