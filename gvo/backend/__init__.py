@@ -1,1 +1,1 @@
-"""The sliding window; the only part that knows GTSAM."""
+"""The sliding window of poses; the only room that imports GTSAM."""

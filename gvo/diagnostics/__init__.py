@@ -1,1 +1,1 @@
-"""Diagnostics: check a recording before a run, explain one of its frames."""
+"""Diagnostics: a recording checked before a run, one frame explained."""

@@ -1,1 +1,1 @@
-"""Images to observations to relative poses."""
+"""From images to observations, from two frames' observations to a relative pose."""

@@ -1,1 +1,1 @@
-"""Recordings: folders, bags and rendered worlds, read as frames."""
+"""Recordings, poses and edges: read and written."""

@@ -1,4 +1,4 @@
-"""Tests that others can run on what they plug in."""
+"""Tests for a front-end of one's own, and faults to put into recordings."""
 
 from gvo.testing.frontend import ContractError, check_frontend
 

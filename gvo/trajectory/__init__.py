@@ -1,1 +1,1 @@
-"""Trajectories, their files, their alignment and evaluation."""
+"""Trajectories: their files, alignment and evaluation."""

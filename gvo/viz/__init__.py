@@ -1,1 +1,1 @@
-"""Plots, pictures, reports and films."""
+"""Plots, overlays, films, reports and the page in the browser."""

@@ -1,4 +1,4 @@
-"""Check a recording before odometry runs on it: stamps, images, calibration, frames."""
+"""A recording checked before odometry runs: stamps, images, calibration, frames."""
 
 from gvo.diagnostics.check.findings import CheckResult, Finding, format_check
 from gvo.diagnostics.check.recording import check_recording

@@ -1,4 +1,4 @@
-"""One frame explained: what the front-end and the window did with it, step by step."""
+"""One frame explained: what front-end and window did with it, step by step."""
 
 from gvo.diagnostics.explain.frame import explain_frame
 from gvo.diagnostics.explain.values import FrameExplanation

@@ -1,4 +1,4 @@
-"""Bad recordings on purpose: faults that are put into any recording."""
+"""Faults that are put into any recording."""
 
 from gvo.testing.faults.delivery import (
     BrokenOff,

@@ -1,1 +1,1 @@
-"""Readers of ROS 1 bags and MCAP files without their index: never closed, truncated, damaged."""
+"""Readers of ROS 1 bags and MCAP files without their index."""
