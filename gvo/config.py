@@ -422,7 +422,7 @@ def load_configuration(path: Path | None = None, settings: Sequence[str] = ()) -
                 "window.n_links=3"
             )
         values.setdefault(section, {})[name] = _parse_value(setting, text)
-    return _validate(values)
+    return validate_configuration(values)
 
 
 def _parse_value(setting: str, text: str) -> object:
@@ -453,7 +453,8 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
     return content
 
 
-def _validate(values: Mapping[str, object]) -> Config:
+def validate_configuration(values: Mapping[str, object]) -> Config:
+    """Return the configuration of values by section and key; see `load_configuration`."""
     try:
         config = Config.model_validate(values)
     except ValidationError as error:
@@ -478,18 +479,19 @@ def _explain(error: ValidationError) -> str:
     name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
         return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config`"
-    known = _known_keys() if "." in name else list(_sections())
+    known = _known_keys() if "." in name else list(sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config` lists all"
 
 
 def _known_keys() -> list[str]:
     return [
-        f"{section}.{key}" for section, group in _sections().items() for key in group.model_fields
+        f"{section}.{key}" for section, group in sections().items() for key in group.model_fields
     ]
 
 
-def _sections() -> dict[str, type[Section]]:
+def sections() -> dict[str, type[Section]]:
+    """Return the classes of the sections by name, in their order."""
     return {
         name: field.annotation
         for name, field in Config.model_fields.items()
@@ -500,20 +502,20 @@ def _sections() -> dict[str, type[Section]]:
 def describe_configuration(config: Config) -> str:
     """Return the configuration as YAML, each key with unit, range and meaning."""
     lines: list[str] = []
-    for section, group in _sections().items():
+    for section, group in sections().items():
         lines += ["", f"# {group.__doc__}".rstrip("."), f"{section}:"]
         values = getattr(config, section)
         for key, field in group.model_fields.items():
             text = yaml.safe_dump(getattr(values, key)).splitlines()[0]
-            notes = ", ".join(filter(None, [_unit(field), _choices(field)]))
-            comment = f"{field.description}" + (f" [{notes}]" if notes else "")
-            lines.append(f"  {key}: {text}".ljust(34) + f"  # {comment}")
+            lines.append(f"  {key}: {text}".ljust(34) + f"  # {describe_field(field)}")
     return "\n".join(lines[1:]) + "\n"
 
 
-def _unit(field: Any) -> str:  # noqa: ANN401
-    extra = field.json_schema_extra or {}
-    return str(extra.get("unit", ""))
+def describe_field(field: Any) -> str:  # noqa: ANN401 - a field of pydantic's
+    """Return the meaning of a parameter with its unit and range."""
+    unit = str((field.json_schema_extra or {}).get("unit", ""))
+    notes = ", ".join(filter(None, [unit, _choices(field)]))
+    return f"{field.description}" + (f" [{notes}]" if notes else "")
 
 
 def _choices(field: Any) -> str:  # noqa: ANN401

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import viser
 import yaml
 
-from gvo.config import Config, Section, load_configuration
+from gvo.config import Config, describe_field, sections, validate_configuration
 from gvo.errors import ConfigurationError
 
 DELAY_S = 0.4
@@ -88,10 +88,10 @@ class ParameterControls:
         self._timer: threading.Timer | None = None
         self._is_closed = False
         self._controls: dict[tuple[str, str], _Control] = {}
-        values = values_of(config)
+        values = config.model_dump()
         for section, parameters in list_parameters().items():
             with gui.add_folder(section, expand_by_default=False):
-                gui.add_markdown(f"*{section_meaning(section)}*")
+                gui.add_markdown(f"*{sections()[section].__doc__}*")
                 for parameter in parameters:
                     control = _add(gui, parameter, values[section][parameter.key])
                     self._controls[section, parameter.key] = control
@@ -120,14 +120,14 @@ class ParameterControls:
         """Apply values; skip a field being edited."""
         with self._lock:
             self._stop_timer()
-            values = values_of(self._config)
+            values = self._config.model_dump()
             for (section, key), control in self._controls.items():
                 values[section][key] = _kept(values[section][key], control.value)
-            if values == values_of(self._config):
+            if values == self._config.model_dump():
                 self._tell("")
                 return
             try:
-                config = configuration_of(values)
+                config = validate_configuration(values)
                 self._apply(config)
             except ConfigurationError as error:
                 self._tell(str(error))
@@ -151,7 +151,7 @@ class ParameterControls:
             self._say(refusal)
 
     def _show(self) -> None:
-        values = values_of(self._config)
+        values = self._config.model_dump()
         for (section, key), control in self._controls.items():
             control.show(values[section][key])
 
@@ -261,59 +261,24 @@ class Parameter:
 
 def list_parameters() -> dict[str, list[Parameter]]:
     """Return the parameters by section, in the order of the configuration."""
-    sections = {
-        name: field.annotation
-        for name, field in Config.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Section)
-    }
     return {
         section: [_parameter(section, key, field) for key, field in model.model_fields.items()]
-        for section, model in sections.items()
+        for section, model in sections().items()
     }
-
-
-def section_meaning(section: str) -> str:
-    """Return one line on a section."""
-    model = Config.model_fields[section].annotation
-    return (getattr(model, "__doc__", None) or "").strip().splitlines()[0]
-
-
-def values_of(config: Config) -> dict[str, dict[str, Value]]:
-    """Return the values by section and key."""
-    return config.model_dump()
-
-
-def configuration_of(values: Mapping[str, Mapping[str, Value]]) -> Config:
-    """Return the configuration of values by section and key.
-
-    Raises
-    ------
-    ConfigurationError
-        Where a value is out of its range or does not go with another.
-    """
-    return load_configuration(
-        settings=[
-            f"{section}.{key}={_yaml(value)}"
-            for section, group in values.items()
-            for key, value in group.items()
-        ]
-    )
-
-
-def _yaml(value: Value) -> str:
-    return str(yaml.safe_dump(value)).splitlines()[0]
 
 
 def _parameter(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
     options = get_args(field.annotation)
+    default = yaml.safe_dump(field.default).splitlines()[0]
     limits = {type(limit).__name__: limit for limit in field.metadata}
     kind = _kind(field.annotation)
     lower, upper = _bound(limits, "Ge", "Gt"), _bound(limits, "Le")
     start = field.default
     if start is None:
         start = _STARTS.get((section, key), 1.0)
-    is_slider = kind in ("integer", "number") and _is_near(lower, upper)
-    step = _step(kind, float(start) if is_number(start) else 0.0, lower, upper, is_slider)
+    span = math.inf if lower is None or upper is None else upper - lower
+    is_slider = kind in ("integer", "number") and span <= _WIDEST_SLIDER
+    step = _step(kind, float(start) if is_number(start) else 0.0, span)
     if lower is not None and "Gt" in limits and (is_slider or kind == "integer"):
         lower += step
     return Parameter(
@@ -328,7 +293,7 @@ def _parameter(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
         is_slider=is_slider,
         default=field.default,
         start=start,
-        hint=_hint(field, limits),
+        hint=f"{describe_field(field)}; default {default}",
     )
 
 
@@ -351,18 +316,12 @@ def _bound(limits: Mapping[str, Any], *names: str) -> float | None:
     return float(found[0]) if found else None
 
 
-def _is_near(lower: float | None, upper: float | None) -> bool:
-    return lower is not None and upper is not None and upper - lower <= _WIDEST_SLIDER
-
-
-def _step(
-    kind: Kind, start: float, lower: float | None, upper: float | None, is_slider: bool
-) -> float:
+def _step(kind: Kind, start: float, span: float) -> float:
     """Return a step of one digit, fine enough for the range, or for the start value."""
     if kind == "integer":
         return 1.0
-    if is_slider and lower is not None and upper is not None:
-        return _one_digit((upper - lower) / _N_STEPS)
+    if span <= _WIDEST_SLIDER:
+        return _one_digit(span / _N_STEPS)
     return 10.0 ** (math.floor(math.log10(start)) - 1) if start > 0 else 0.1
 
 
@@ -370,19 +329,3 @@ def _one_digit(value: float) -> float:
     """Return the largest of 1, 2 and 5 times a power of ten that is not above a value."""
     power = 10.0 ** math.floor(math.log10(value) + 1e-9)
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= value * 1.001))
-
-
-def _hint(field: Any, limits: Mapping[str, Any]) -> str:  # noqa: ANN401
-    unit = str((field.json_schema_extra or {}).get("unit", ""))
-    signs = {"Ge": ">=", "Gt": ">", "Le": "<="}
-    ranges = [
-        f"{sign} {getattr(limits[name], name.lower()):g}"
-        for name, sign in signs.items()
-        if name in limits
-    ]
-    shape = ", ".join([*ranges, *([f"in {unit}"] if unit else [])])
-    return (
-        f"{field.description}"
-        + (f"; {shape}" if shape else "")
-        + (f"; default {_yaml(field.default)}")
-    )

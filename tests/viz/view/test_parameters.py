@@ -7,8 +7,13 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvo.config import Config, describe_configuration, load_configuration
-from gvo.viz.view.controls import Parameter, configuration_of, list_parameters, values_of
+from gvo.config import (
+    Config,
+    describe_configuration,
+    load_configuration,
+    validate_configuration,
+)
+from gvo.viz.view.controls import Parameter, list_parameters
 
 PARAMETERS = [parameter for group in list_parameters().values() for parameter in group]
 
@@ -68,9 +73,9 @@ def test_optional_numbers_start_from_a_value_that_is_taken() -> None:
     optional = [parameter for parameter in PARAMETERS if parameter.is_optional]
     assert {parameter.key for parameter in optional} >= {"size", "gate", "kernel_threshold"}
     for parameter in optional:
-        values = values_of(Config())
+        values = Config().model_dump()
         values[parameter.section][parameter.key] = parameter.start
-        assert configuration_of(values)
+        assert validate_configuration(values)
 
 
 @settings(max_examples=20)
@@ -83,9 +88,9 @@ def test_optional_numbers_start_from_a_value_that_is_taken() -> None:
 def test_values_come_back_as_the_same_configuration(
     min_eigenvalue: float, size: Any, kernel: str, upright: bool
 ) -> None:
-    values = values_of(Config())
+    values = Config().model_dump()
     values["klt"]["min_eigenvalue"] = min_eigenvalue
     values["window"] |= {"size": size, "kernel": kernel}
     values["features"]["upright"] = upright
-    config = configuration_of(values)
+    config = validate_configuration(values)
     assert config == Config.model_validate(values)
