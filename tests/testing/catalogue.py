@@ -227,7 +227,7 @@ MADE: dict[str, list[Fault] | Callable[[Source], list[Fault]]] = {
 
 def _read(page: str) -> Iterator[NamedFault]:
     """Yield the rows of the page's tables."""
-    listed = page.partition("and the run does not tell:")[2].split(".")[0]
+    listed = page.partition("the run does not tell:")[2].split(".")[0]
     silent = re.findall(r"`([\w-]+)`", listed)
     for section in page.split("\n### ")[1:]:
         group = re.split("[:\n]", section)[0]

@@ -123,7 +123,7 @@ class Shuffled(Fault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lagging(Fault):
-    """Images that show what was to be seen some frames before; the first ones the first frame.
+    """Images that show an earlier frame; the first ones show the first frame.
 
     Parameters
     ----------
@@ -172,8 +172,8 @@ class Elsewhere(Fault):
     Parameters
     ----------
     other : Source
-        What it shows then: its frames of the same numbers, with the stamps as they are. Images
-        for which it has none are left as they are.
+        Recording of the other place: frames of the same numbers are shown, with unchanged stamps.
+        Images for which it has none stay as they are.
     """
 
     other: Source
@@ -273,7 +273,7 @@ class StampShift(StampFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StampConstant(StampFault):
-    """A driver that does not stamp: each image gets the same.
+    """A driver that does not stamp: all images have the same stamp.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ class StampConstant(StampFault):
     stamp_ns: int | None = 0
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the stamp of all."""
+        """Return the common stamp."""
         return start_ns if self.stamp_ns is None else self.stamp_ns
 
 
@@ -313,7 +313,7 @@ class StampRate(StampFault):
     Parameters
     ----------
     rate : float
-        Seconds it shows in a second.
+        Seconds of the clock in a second.
     """
 
     rate: float = 1.001
@@ -336,7 +336,7 @@ class StampUnit(StampFault):
     unit_ns: int = 1_000_000_000
 
     def restamp(self, image: FaultyImage, start_ns: int) -> int:
-        """Return the number of whole units."""
+        """Return the stamp in whole units."""
         return image.given.stamp_ns // self.unit_ns
 
 

@@ -47,7 +47,7 @@ class Blurred(PixelFault):
     Parameters
     ----------
     sigma_px : float
-        Of a Gaussian, pixels.
+        Standard deviation of the Gaussian, pixels.
     """
 
     sigma_px: float = 4.0
@@ -64,13 +64,13 @@ class MotionBlurred(PixelFault):
     Parameters
     ----------
     length_px : int
-        Way of a point along a row, pixels.
+        Length of the blur along the rows, pixels.
     """
 
     length_px: int = 15
 
     def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, smeared along its rows."""
+        """Return the image, blurred along its rows."""
         return np.asarray(cv2.blur(pixels, (self.length_px, 1)))
 
 
@@ -81,7 +81,7 @@ class Noisy(PixelFault):
     Parameters
     ----------
     sigma : float
-        Of Gaussian noise, grey values.
+        Standard deviation of Gaussian noise, grey values.
     """
 
     sigma: float = 40.0
@@ -119,7 +119,7 @@ class Exposed(PixelFault):
     Parameters
     ----------
     factor : float
-        Of the grey values.
+        Factor of the grey values.
     """
 
     factor: float = 2.0
@@ -131,7 +131,7 @@ class Exposed(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flickering(PixelFault):
-    """Brightness that swings from frame to frame, as under lamps on mains.
+    """Brightness that oscillates from frame to frame, as under mains lamps.
 
     Parameters
     ----------
@@ -152,16 +152,16 @@ class Flickering(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Banded(PixelFault):
-    """Bands that roll through the image: a rolling shutter under lamps on mains.
+    """Bands that roll through the image: a rolling shutter under mains lamps.
 
     Parameters
     ----------
     amplitude : float
         Share of the brightness.
     period_rows : float
-        Height of a band.
+        Height of a bright and a dark band, rows.
     rows_per_frame : float
-        How far they move.
+        Motion of the bands, rows.
     """
 
     amplitude: float = 0.4
@@ -183,9 +183,9 @@ class Covered(PixelFault):
     Parameters
     ----------
     part : float
-        Share of the image that is covered, about.
+        Approximate share of the image that is covered.
     n_blobs : int
-        So many, placed by the seed, the same in all images of a stream.
+        Number of blobs, the same in all images of a stream.
     """
 
     part: float = 0.25
@@ -213,10 +213,10 @@ def _to_uint8(values: Pixels) -> Pixels:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthFault(PixelFault):
-    """A fault of depth images; grey and colour images are left as they are."""
+    """A fault of depth images; grey and colour images stay as they are."""
 
     def kinds(self) -> tuple[Kind, ...]:
-        """Return that of depth."""
+        """Return "depth"."""
         return ("depth",)
 
 
@@ -279,14 +279,14 @@ class DepthHoles(DepthFault):
     part : float
         Share of the pixels.
     size_px : int
-        Of a hole, about.
+        Approximate size of a hole.
     """
 
     part: float = 0.9
     size_px: int = 8
 
     def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth with holes, elsewhere in each image."""
+        """Return the depth with holes, at random in each image."""
         height, width = pixels.shape[:2]
         cells = rng.random((height // self.size_px + 1, width // self.size_px + 1))
         is_hole = cells < self.part
@@ -300,7 +300,7 @@ class DepthHoles(DepthFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthSaturated(DepthFault):
-    """Depth that ends at the sensor's range, where unknown pixels have that value too.
+    """Depth that ends at the sensor's range, also at unknown pixels.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ class DepthSaturated(DepthFault):
     depth_m: float = 2.0
 
     def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the depth, nowhere larger nor unknown."""
+        """Return the depth, limited and known everywhere."""
         return np.asarray(np.fmin(pixels, self.depth_m), dtype=pixels.dtype)
 
 
@@ -322,7 +322,7 @@ class DepthNoisy(DepthFault):
     Parameters
     ----------
     sigma_m : float
-        At one metre.
+        Standard deviation at one metre.
     """
 
     sigma_m: float = 0.05

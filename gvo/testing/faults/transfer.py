@@ -16,7 +16,7 @@ PixelType: TypeAlias = Literal["float64", "float32", "uint16", "int32", "bool", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _AnyImageFault(PixelFault):
-    """A fault that depth images may have as well; they do where `streams` holds them."""
+    """A fault of images of all kinds."""
 
     def kinds(self) -> tuple[Kind, ...]:
         """Return all kinds."""
@@ -25,14 +25,14 @@ class _AnyImageFault(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HalfWritten(PixelFault):
-    """Images whose transfer broke off.
+    """Images whose transfer was interrupted.
 
     Parameters
     ----------
     part : float
-        Share of the rows that came.
+        Share of the rows that arrived.
     fill : {"grey", "garbage", "former"}
-        What is in the others: one value, noise, or the upper rows once more.
+        Content of the others: one value, noise, or the upper rows again.
     """
 
     part: float = 0.5
@@ -54,12 +54,12 @@ class HalfWritten(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowsShifted(PixelFault):
-    """Rows that lost their place: bytes missing in the transfer.
+    """Rows out of place: bytes missing in the transfer.
 
     Parameters
     ----------
     most_px : int
-        Each of eight bands of rows is rolled by up to so many pixels.
+        Limit of the random shift of each of eight bands of rows, pixels.
     """
 
     most_px: int = 40
@@ -74,12 +74,12 @@ class RowsShifted(PixelFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turned(_AnyImageFault):
-    """Images turned or mirrored: a camera mounted otherwise, a setting of the driver.
+    """Images turned or mirrored by the mounting of the camera or a setting of the driver.
 
     Parameters
     ----------
     how : {"upside down", "mirrored", "half turn", "transposed"}
-        Rows in the opposite order, columns, both, or rows for columns.
+        Rows in opposite order, columns in opposite order, both, or rows and columns exchanged.
     """
 
     how: Turn = "upside down"
@@ -97,7 +97,7 @@ class Turned(_AnyImageFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resized(_AnyImageFault):
-    """Images of another size than the calibration's.
+    """Images of another size than that of the calibration.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class Resized(_AnyImageFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfType(_AnyImageFault):
-    """Pixels of another type or shape than a source may give.
+    """Pixels of a type or shape that a source must not give.
 
     Parameters
     ----------
@@ -137,19 +137,19 @@ class OfType(_AnyImageFault):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shifted(_AnyImageFault):
-    """Images moved against those of the other stream: a knock on the rig, a wrong registration.
+    """Images shifted against those of the other stream: a knock on the rig, a wrong registration.
 
     Parameters
     ----------
     rows, columns : int
-        Pixels, down and to the right; what comes in is the border, of depth NaN.
+        Pixels, down and to the right; filled by the border, in depth by NaN.
     """
 
     rows: int = 0
     columns: int = 0
 
     def spoil(self, pixels: Pixels, rng: np.random.Generator, image: FaultyImage) -> Pixels:
-        """Return the image, moved."""
+        """Return the image, shifted."""
         pad = [(abs(self.rows),) * 2, (abs(self.columns),) * 2, *[(0, 0)] * (pixels.ndim - 2)]
         if pixels.dtype.kind == "f":
             padded = np.pad(pixels, pad, constant_values=np.nan)
