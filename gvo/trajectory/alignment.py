@@ -1,4 +1,4 @@
-"""Two trajectories side by side: which poses belong together, and what moves one onto the other."""
+"""Association of two trajectories by their stamps, and alignment of one to the other."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from gvo.types import FloatArray, IntArray
 AlignMode = Literal["none", "origin", "se3", "sim3"]
 
 MAX_DIFFERENCE_NS = 10_000_000
-"""Largest difference of associated stamps, nanoseconds: the 10 ms of the TUM tools and evo."""
+"""Largest difference of associated stamps, nanoseconds: 10 ms as in the TUM tools and evo."""
 
 MAX_GAP_NS = 250_000_000
-"""Poses are interpolated between neighbours at most so far apart, nanoseconds.
+"""Largest gap between poses that is interpolated, nanoseconds.
 
-At an acceleration of 2 m/s^2 the straight line between them is then off by at most 16 mm.
+At an acceleration of 2 m/s^2 linear interpolation is then wrong by at most 16 mm.
 """
 
 
@@ -35,29 +35,28 @@ def pair(
 ) -> tuple[Trajectory, Trajectory]:
     """Return the reference and the estimate at common stamps.
 
-    Files of a data set are associated pose by pose, as the field's tools do; see `associate`.
-    Where the stamps of either come from a topic (`stamps_from="topic"`), rates and phases differ
-    by nature: then the trajectory of the shorter steps is interpolated at the stamps of the
-    other, between neighbours at most `MAX_GAP_NS` apart; stamps in longer gaps are left out.
+    Poses of files are associated one to one, see `associate`. If the stamps of either come from a
+    topic (`stamps_from="topic"`), rates and phases differ by nature: the trajectory of the higher
+    rate is interpolated at the stamps of the other, except in gaps longer than `MAX_GAP_NS`.
 
     Parameters
     ----------
     reference, estimate : Trajectory
         With at least one pose each.
     max_difference_ns : int
-        Largest difference of associated stamps, nanoseconds; of no account in interpolation.
+        Largest difference of associated stamps, nanoseconds; unused in interpolation.
     name : str
         Of the estimate, for messages.
 
     Returns
     -------
     tuple of two Trajectory
-        Of n poses each, n >= 1. An interpolated one holds no covariances.
+        Of n poses each, n >= 1. An interpolated one has no covariances.
 
     Raises
     ------
     TrajectoryError
-        Where nothing can be associated.
+        If nothing can be associated.
     """
     origins = {reference.stamps_from, estimate.stamps_from}
     if "topic" not in origins or "rows" in origins or 0 in (len(reference), len(estimate)):
@@ -80,12 +79,12 @@ def pair(
 
 
 def _step(trajectory: Trajectory) -> float:
-    """Return the usual step between stamps, nanoseconds; infinite where there is none."""
+    """Return the median step between stamps, nanoseconds; infinite for a single pose."""
     return float(np.median(np.diff(trajectory.stamps_ns))) if len(trajectory) > 1 else np.inf
 
 
 def _interpolated(dense: Trajectory, sparse: Trajectory) -> tuple[Trajectory, Trajectory]:
-    """Return both at those stamps of the sparse one that the dense one has close neighbours of."""
+    """Return both at the stamps of the sparse one that lie in no long gap of the dense one."""
     stamps_ns = sparse.stamps_ns
     after = np.clip(np.searchsorted(dense.stamps_ns, stamps_ns), 0, len(dense) - 1)
     before = np.maximum(after - 1, 0)
@@ -103,9 +102,9 @@ def associate(
     max_difference_ns: int = MAX_DIFFERENCE_NS,
     name: str = "estimate",
 ) -> tuple[IntArray, IntArray]:
-    """Find the poses of two trajectories that belong together.
+    """Associate the poses of two trajectories by their stamps.
 
-    Each pose of the shorter trajectory takes the nearest one of the longer. Where two take
+    Each pose of the shorter trajectory is matched to the nearest one of the longer; if two match
     the same one, the nearer keeps it. Trajectories without stamps (`stamps_from="rows"`) are
     associated row by row.
 
@@ -126,7 +125,7 @@ def associate(
     Raises
     ------
     TrajectoryError
-        Where nothing can be associated.
+        If nothing can be associated.
     """
     if len(reference) == 0 or len(estimate) == 0:
         empty = "the reference" if len(reference) == 0 else name
@@ -189,7 +188,7 @@ def _range(trajectory: Trajectory) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Similarity:
-    """A rigid motion with a scale: p_a = scale * R_a_b @ p_b + t_a_b.
+    """A similarity transform: p_a = scale * R_a_b @ p_b + t_a_b.
 
     Parameters
     ----------
@@ -203,18 +202,7 @@ class Similarity:
     scale: float = 1.0
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
-        """Move a trajectory from world b to world a.
-
-        Parameters
-        ----------
-        trajectory : Trajectory
-            In world b.
-
-        Returns
-        -------
-        Trajectory
-            In world a, with scaled covariances where it has some.
-        """
+        """Transform a trajectory, with its covariances if any, from world b to world a."""
         scaled = np.array(trajectory.T_world_cam)
         scaled[:, :3, 3] *= self.scale
         covariances = trajectory.covariances
@@ -225,15 +213,15 @@ class Similarity:
 
 
 def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> Similarity:
-    """Return what moves an estimate onto its reference, pose i onto pose i.
+    """Return the transform that aligns an estimate to its associated reference.
 
     Parameters
     ----------
     reference, estimate : Trajectory
-        Associated: of one length, at least one pose.
+        Associated: of equal length, at least one pose.
     mode : {"none", "origin", "se3", "sim3"}
-        Nothing; the first pose onto the first; least squares over the positions by a rigid
-        motion; the same with a scale. The last two need no rotations.
+        No alignment; first pose to first pose; least squares over the positions by a rigid
+        transform; the same with a scale. The last two need no rotations.
 
     Returns
     -------
@@ -243,10 +231,9 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
     Raises
     ------
     ValueError
-        Where the lengths differ or the mode is unknown.
+        If the lengths differ or the mode is unknown.
     TrajectoryError
-        Where a scale is asked for and the estimate does not move, or the first poses are to be
-        laid onto each other and one of them is a position alone.
+        If `sim3` finds no positive scale, or `origin` lacks a rotation.
 
     References
     ----------
@@ -288,11 +275,10 @@ def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Simi
 
 
 def _best_rotation(vectors_a: FloatArray, vectors_b: FloatArray) -> FloatArray:
-    """Return R_a_b of least squares (eq. 40), one of the best where the vectors lie on a line.
+    """Return the least-squares R_a_b (eq. 40); any optimum if the vectors lie on a line.
 
-    `geometry.umeyama` refuses such points, and nearly such points: there a rotation is measured,
-    and one about the line would be noise. Here any of the best will do, as only the aligned
-    positions count; a camera may have driven straight on, or have two poses.
+    `geometry.umeyama` refuses points on a line, where the rotation about it would be noise. Here
+    only the aligned positions count, and a camera may drive straight or have two poses.
     """
     if len(vectors_a) == 1:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from its reference: ATE, RPE, KITTI segment errors."""
+"""Errors of a trajectory against a reference: ATE, RPE, KITTI segment errors, and their table."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from gvo.types import FloatArray, IntArray
 KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI odometry benchmark, metres."""
 KITTI_STEP = 10
-"""Poses between two starts of segments in the KITTI odometry benchmark."""
+"""Poses between the starts of segments in the KITTI odometry benchmark."""
 SHORT_SEGMENTS_M = (20.0, 50.0)
-"""Segment lengths where the path is shorter than the longest of KITTI's, metres."""
+"""Segment lengths for paths shorter than KITTI's longest segment, metres."""
 SHORT_STEP = 1
-"""Poses between two starts of segments there: every pose starts one."""
+"""Poses between the starts of those segments."""
 
 _MIN_PATH_M = 1e-6
 _HEADER = (
@@ -42,8 +42,8 @@ _HEADER = (
 class Evaluation:
     """The errors of one estimate against a reference, over the associated poses.
 
-    Against positions without rotations (GNSS) only the position errors, the coverage and the path
-    ratio are measured: all others compare motions in the frame of a pose.
+    Against positions without rotations (GNSS) only position errors, coverage and path ratio are
+    measured.
 
     Parameters
     ----------
@@ -54,23 +54,21 @@ class Evaluation:
     errors_m : ndarray of float64, shape (n,)
         Distance of each aligned position from the reference, metres.
     rpe_m, rpe_deg : float or None
-        Relative pose error: RMSE of translation and rotation; None where no pair fits or
-        there are no rotations.
+        Relative pose error: RMSE of translation and rotation; None without pairs or rotations.
     t_pct : float or None
-        Mean translation error of KITTI's segments, % of their length; None where none fits or
-        there are no rotations.
+        Mean translation error of KITTI's segments, % of their length; None without segments or
+        rotations.
     r_deg_per_100m : float or None
         Mean rotation error of the same segments, degrees per 100 m.
     n_segments : int
-        Segments that fit.
+        Segments evaluated.
     segments_m : tuple of float
         Their nominal lengths, metres.
     coverage : float
-        Share of the time between the first and the last reference pose that lies between the
-        first and the last associated one, 0 to 1.
+        Time from the first to the last associated pose over that of the whole reference, 0 to 1.
     path_ratio : float or None
-        Path length of the estimate, before any scaling, over that of the reference; None where
-        the reference does not move.
+        Path length of the estimate, before scaling, over that of the reference; None if the
+        reference does not move.
     """
 
     name: str
@@ -127,20 +125,20 @@ def evaluate(
     Parameters
     ----------
     reference, estimate : Trajectory
-        Of the same frame: `Trajectory.transformed` changes it.
+        Poses of the same frame, see `Trajectory.transformed`.
     name : str
         Of the estimate.
     align : {"none", "origin", "se3", "sim3"}
-        What moves the estimate before all errors are taken; see `alignment`.
+        How the estimate is aligned first, see `alignment`.
     segments : sequence of float, optional
-        Segment lengths in metres; KITTI's 100 to 800 m where the associated part of the
-        reference is at least 800 m long, 20 and 50 m where it is shorter.
+        Segment lengths in metres; by default KITTI's 100 to 800 m if the associated reference is
+        at least 800 m long, else 20 and 50 m.
     segment_step : int, optional
-        Poses between two starts of segments; 10 as in KITTI's, or every pose, likewise.
+        Poses between the starts of segments; by default 10 as in KITTI, or 1, likewise.
     max_difference_ns : int
         Largest difference of associated stamps, nanoseconds; see `pair`.
     rpe_delta : int
-        Poses between the two of a pair of the relative pose error.
+        Distance of the two poses of a relative pose error, in poses.
 
     Returns
     -------
@@ -149,10 +147,9 @@ def evaluate(
     Raises
     ------
     TrajectoryError
-        Where nothing can be associated, no scale be found for `sim3`, or `origin` lacks a
-        rotation.
+        If nothing can be associated, `sim3` finds no scale, or `origin` lacks a rotation.
     ValueError
-        Where a segment length, the step or the delta is not positive.
+        If a segment length, the step or the delta is not positive.
     """
     ref, est = pair(reference, estimate, max_difference_ns=max_difference_ns, name=name)
     aligned = alignment(ref, est, align).apply(est)
@@ -186,16 +183,16 @@ def relative_errors(
     Parameters
     ----------
     reference, estimate : Trajectory
-        Associated: of one length.
+        Associated: of equal length.
     delta : int
-        Poses between the two of a pair.
+        Distance of the two poses, in poses.
 
     Returns
     -------
     translations : ndarray of float64, shape (m,)
         Metres.
     rotations : ndarray of float64, shape (m,)
-        Radians; both are empty where one of the trajectories holds positions alone.
+        Radians; both are empty if one of the trajectories has no rotations.
 
     References
     ----------
@@ -212,27 +209,26 @@ def relative_errors(
 def segment_errors(
     reference: Trajectory, estimate: Trajectory, *, lengths_m: Sequence[float], step: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors over segments of given path lengths, as KITTI's devkit takes them.
+    """Return the errors over segments of given path lengths, as KITTI's devkit does.
 
-    A segment ends at the first pose whose path from the start is longer than the length;
-    segments that the trajectory ends before are left out.
+    A segment ends at the first pose whose path from its start exceeds the length.
 
     Parameters
     ----------
     reference, estimate : Trajectory
-        Associated: of one length. The path is the reference's.
+        Associated: of equal length. The path is the reference's.
     lengths_m : sequence of float
         Metres.
     step : int
-        Poses between two starts.
+        Poses between the starts of segments.
 
     Returns
     -------
     translations : ndarray of float64, shape (m,)
         Translation error over the length of the segment.
     rotations : ndarray of float64, shape (m,)
-        Rotation error over the length of the segment, radians per metre; both are empty where one
-        of the trajectories holds positions alone.
+        Rotation error over the length of the segment, radians per metre; both are empty if one of
+        the trajectories has no rotations.
 
     References
     ----------
@@ -289,36 +285,14 @@ def _coverage(reference: Trajectory, associated: Trajectory) -> float:
 
 
 def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
-    """Return a table with a row per evaluation, columns aligned by blanks.
-
-    Parameters
-    ----------
-    evaluations : sequence of Evaluation
-
-    Returns
-    -------
-    str
-        Lines ended by line feeds; "-" where there is no value, as for rotations against
-        positions alone.
-    """
+    """Return a table of text with a row per evaluation; "-" for missing values."""
     return format_table(_HEADER, [_cells(evaluation) for evaluation in evaluations])
 
 
 def evaluations_json(
     evaluations: Sequence[Evaluation],
 ) -> dict[str, list[dict[str, str | int | float | None]]]:
-    """Return the measures as plain values.
-
-    Parameters
-    ----------
-    evaluations : sequence of Evaluation
-
-    Returns
-    -------
-    dict
-        `{"estimates": [{"name", "n", "ate_m", "rpe_m", "rpe_deg", "t_pct",
-        "r_deg_per_100m"}]}`; None where no pair or no segment fits, or there are no rotations.
-    """
+    """Return the errors as plain values, `{"estimates": [{"name", "n", "ate_m", ...}, ...]}`."""
     return {
         "estimates": [
             {

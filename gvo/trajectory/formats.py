@@ -1,4 +1,4 @@
-"""Trajectory files: read TUM, KITTI and EuRoC, write TUM and KITTI; covariances, both ways."""
+"""Trajectory files: TUM, KITTI and EuRoC, and covariances as CSV, read and written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, pars
 from gvo.types import BoolArray, FloatArray, IntArray
 
 MAX_POSITION_M = 1e12
-"""Metres: a hundred times as far as the planets; farther, and squares would overflow."""
+"""Largest coordinate, metres: a hundred times the distance of the planets."""
 
 _MAX_REASON = 300  # characters
 _FORMATS = (
@@ -29,7 +29,7 @@ _FORMATS = (
 _SCALAR_FIRST = re.compile(r"q\w*w\b.*q\w*x\b")
 _MAX_HEADER = 2000  # characters; the search takes the square of it
 _AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
-# text files round: four decimals in TUM's ground truths, seven digits in KITTI's
+# rounding of published files: four decimals in TUM's ground truths, seven digits in KITTI's
 _ROUNDING = 1e-2
 
 _EUROC_HEADER = (
@@ -44,20 +44,20 @@ COVARIANCE_HEADER = "stamp_ns," + ",".join(
 
 
 def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory:
-    """Read a file of poses; TUM, KITTI or EuRoC by its columns and header.
+    """Read poses from a TUM, KITTI or EuRoC file, recognised by its columns and header.
 
-    A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside the
-    file (or `sequences/NN/times.txt` for `poses/NN.txt`); without one, row n gets n seconds
-    and the trajectory says so in `stamps_from`. Of neighbouring rows of a TUM file with one
-    stamp the last is kept.
+    A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside it (or
+    `sequences/NN/times.txt` for `poses/NN.txt`); without one, row n gets n seconds, and
+    `stamps_from` is "rows". Of successive rows of a TUM file with the same stamp the last is
+    kept.
 
     Parameters
     ----------
     path : str or Path
-        Text; fields separated by blanks or commas, comments start with #.
+        Text; fields are separated by blanks or commas, comments start with #.
     is_growing : bool
-        A TUM file that a run still writes: it may be empty, end within a line, which is left
-        out, and hold its rows in any order.
+        A TUM file that is still being written: it may be missing or empty, its rows may be in any
+        order, and an incomplete last line is ignored.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     Raises
     ------
     TrajectoryError
-        Naming file and line, where the file is missing, empty or malformed.
+        If the file is missing, empty or malformed; names file and line.
     """
     path = Path(path)
     header, rows = read_rows(path, of="poses", is_growing=is_growing)
@@ -93,7 +93,8 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
     path : str or Path
         CSV with `COVARIANCE_HEADER` as its first line.
     is_growing : bool
-        A run still writes it: it may be empty, or end within a line, which is left out.
+        It is still being written: it may be missing or empty, and an incomplete last line is
+        ignored.
 
     Returns
     -------
@@ -104,7 +105,7 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
     Raises
     ------
     TrajectoryError
-        Where the file is missing or malformed.
+        If the file is missing or malformed.
     """
     path = Path(path)
     _, rows = read_rows(path, of="covariances", is_growing=is_growing)
@@ -143,14 +144,14 @@ def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
     Parameters
     ----------
     stamp_ns : int
-        Nanoseconds; written in seconds with nine decimals.
+        Nanoseconds; written as seconds with nine decimals.
     T_world_cam : ndarray of float64, shape (4, 4)
         Metres.
 
     Returns
     -------
     str
-        `stamp tx ty tz qx qy qz qw` with qw >= 0; nanometres, and twelve decimals of the
+        `stamp tx ty tz qx qy qz qw` with qw >= 0; nine decimals of the position, twelve of the
         quaternion.
     """
     # adding zero turns -0.0 into 0.0
@@ -178,16 +179,16 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     Parameters
     ----------
     path : str or Path
-        Replaced where it exists.
+        Overwritten if it exists.
     trajectory : Trajectory
         Its covariances are not written.
 
     Raises
     ------
     ValueError
-        Where it holds positions without rotations.
+        If it holds positions without rotations.
     TrajectoryError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     _check_rotations(trajectory)
     poses = zip(trajectory.stamps_ns, trajectory.T_world_cam, strict=True)
@@ -200,16 +201,16 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     Parameters
     ----------
     path : str or Path
-        Replaced where it exists.
+        Overwritten if it exists.
     trajectory : Trajectory
         Its stamps and covariances are not written.
 
     Raises
     ------
     ValueError
-        Where it holds positions without rotations.
+        If it holds positions without rotations.
     TrajectoryError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     _check_rotations(trajectory)
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12)
@@ -229,9 +230,9 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     Raises
     ------
     ValueError
-        Where it holds positions without rotations.
+        If it holds positions without rotations.
     TrajectoryError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     _check_rotations(trajectory)
     quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat()
@@ -249,16 +250,16 @@ def write_covariances(path: str | Path, trajectory: Trajectory) -> None:
     Parameters
     ----------
     path : str or Path
-        Replaced where it exists.
+        Overwritten if it exists.
     trajectory : Trajectory
         With covariances.
 
     Raises
     ------
     ValueError
-        Where the trajectory holds none.
+        If it holds none.
     TrajectoryError
-        Where the file cannot be written.
+        If the file cannot be written.
     """
     if trajectory.covariances is None:
         raise ValueError("the trajectory holds no covariances")
@@ -347,7 +348,7 @@ class Row:
     path : Path
         The file.
     number : int
-        Of the line, counted from one.
+        Line number, from one.
     fields : list of str
         At least one.
     """
@@ -357,7 +358,7 @@ class Row:
     fields: list[str]
 
     def error(self, text: str) -> TrajectoryError:
-        """Return an error of this text that names the line."""
+        """Return an error with this text that names file and line."""
         return TrajectoryError(f"{self.path}:{self.number}: {cut(text, _MAX_REASON)}")
 
 
@@ -371,19 +372,19 @@ def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, li
     of : str
         What its rows hold, in the plural, for messages.
     is_growing : bool
-        Whether it may be missing yet, or end within a line, which is left out.
+        It may be missing, and an incomplete last line is ignored.
 
     Returns
     -------
     header : str
         The comments before the first row.
     rows : list of Row
-        Lines that hold anything.
+        Lines with at least one field.
 
     Raises
     ------
     TrajectoryError
-        When the file cannot be read.
+        If the file cannot be read.
     """
     if is_growing and not path.exists():
         return "", []
@@ -410,7 +411,7 @@ def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, li
 
 
 def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArray:
-    """Return some columns of rows that all have the same number of them.
+    """Return some columns of rows as numbers.
 
     Parameters
     ----------
@@ -419,7 +420,7 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
     columns : slice
         Which to return.
     n_columns : int
-        How many each row must have.
+        Required in each row.
 
     Returns
     -------
@@ -429,7 +430,7 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
     Raises
     ------
     TrajectoryError
-        Naming the row that has more or fewer, or something else than a finite number.
+        If a row has more or fewer columns, or a number is not finite; names the line.
     """
     values = []
     for row in rows:
@@ -449,7 +450,7 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
 
 
 def read_stamps(rows: list[Row], *, unit_ns: int) -> IntArray:
-    """Return the first column in nanoseconds, in decimal arithmetic: without loss.
+    """Return the first column in nanoseconds, without loss (decimal arithmetic).
 
     Parameters
     ----------
@@ -465,7 +466,7 @@ def read_stamps(rows: list[Row], *, unit_ns: int) -> IntArray:
     Raises
     ------
     TrajectoryError
-        Naming the row whose stamp is no number or out of range.
+        If a stamp is no number or out of range; names the line.
     """
     return np.array([_stamp(row, unit_ns) for row in rows], dtype=np.int64)
 
@@ -478,13 +479,7 @@ def _stamp(row: Row, unit_ns: int) -> int:
 
 
 def check_increasing(rows: list[Row], stamps_ns: IntArray) -> IntArray:
-    """Return stamps, shape (len(rows),), nanoseconds; refuse those that do not increase strictly.
-
-    Raises
-    ------
-    TrajectoryError
-        Naming the first row whose stamp is not after that of the row before.
-    """
+    """Return the stamps; raise `TrajectoryError` if they do not increase strictly."""
     falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if len(falls) > 0:
         before, row = rows[falls[0]], rows[falls[0] + 1]
@@ -496,6 +491,6 @@ def check_increasing(rows: list[Row], stamps_ns: IntArray) -> IntArray:
 
 
 def refuse(rows: list[Row], is_wrong: BoolArray, text: str) -> None:
-    """Raise `TrajectoryError` of the first row of a mask, shape (len(rows),), if there is one."""
+    """Raise `TrajectoryError` for the first row of a mask, shape (len(rows),), if any."""
     if np.any(is_wrong):
         raise rows[int(np.argmax(is_wrong))].error(text)

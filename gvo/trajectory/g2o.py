@@ -1,4 +1,4 @@
-"""Pose graphs in the text format of g2o: lines read and written, one at a time.
+"""Pose graphs in g2o's text format: lines parsed and formatted, one at a time.
 
 Poses are `VERTEX_SE3:QUAT id x y z qx qy qz qw`, measurements `EDGE_SE3:QUAT a b x y z qx qy qz
 qw` with the upper triangle of the information matrix, and `FIX id ...` names poses that hold
@@ -37,9 +37,9 @@ _QUATERNION_TAGS = ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT")
 _ANGLE_TAGS = ("VERTEX3", "EDGE3")
 
 MEASUREMENT_TAGS = ("EDGE_SE3:QUAT", "EDGE3")
-"""Tags of the measurements that are understood."""
+"""Supported tags of measurements."""
 TAGS = (*_QUATERNION_TAGS, *_ANGLE_TAGS, "FIX")
-"""All tags that are understood."""
+"""All supported tags."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,17 +52,17 @@ class Vertex:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measurement:
-    """A relative pose between two poses, as it stands in the file.
+    """A relative pose between two poses, as in the file.
 
     Parameters
     ----------
     reference_id, frame_id : int
-        The first and the second id of the line.
+        First and second id of the line.
     T_reference_frame : ndarray of float64, shape (4, 4)
         Maps coordinates of the frame to the reference, metres.
     covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; not a number where the
-        information matrix has no inverse.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame; NaN if the information
+        matrix is singular.
     """
 
     reference_id: int
@@ -73,7 +73,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """Poses that hold the world."""
+    """Poses that are held fixed."""
 
     frame_ids: tuple[int, ...]
 
@@ -82,7 +82,7 @@ Line: TypeAlias = Vertex | Measurement | Fix
 
 
 def parse_line(text: str) -> Line | None:
-    """Return what one line says.
+    """Parse one line.
 
     Parameters
     ----------
@@ -92,12 +92,12 @@ def parse_line(text: str) -> Line | None:
     Returns
     -------
     Vertex, Measurement, Fix or None
-        None for an empty line, a comment, and a tag that is not one of `TAGS`.
+        None for an empty line, a comment, or a tag that is not in `TAGS`.
 
     Raises
     ------
     ValueError
-        Where the tag is understood and the rest of the line is not what belongs to it.
+        If a line with a supported tag is malformed.
 
     Examples
     --------
@@ -164,21 +164,14 @@ def _covariance(upper: FloatArray, *, is_swapped: bool) -> FloatArray:
 
 
 def format_vertex(frame_id: int | str, T_world_frame: FloatArray) -> str:
-    """Return a line `VERTEX_SE3:QUAT`, without its line end and without loss.
-
-    Parameters
-    ----------
-    frame_id : int or str
-    T_world_frame : ndarray of float64, shape (4, 4)
-        Metres.
-    """
+    """Return a line `VERTEX_SE3:QUAT` of T_world_frame (4, 4), without line end or loss."""
     return f"VERTEX_SE3:QUAT {frame_id} {_pose_fields(T_world_frame)}"
 
 
 def format_edge(
     reference_id: int | str, frame_id: int | str, T: FloatArray, covariance: FloatArray
 ) -> str:
-    """Return a line `EDGE_SE3:QUAT`, without its line end.
+    """Return a line `EDGE_SE3:QUAT`, without line end.
 
     Parameters
     ----------
@@ -195,31 +188,24 @@ def format_edge(
 
 
 def convert_line(text: str) -> str:
-    """Return a measurement's line in the newer form: `EDGE3` becomes `EDGE_SE3:QUAT`.
-
-    Parameters
-    ----------
-    text : str
-        A line that `parse_line` understands; what is no `EDGE3` is returned as it is.
-    """
+    """Return a line with `EDGE3` converted to `EDGE_SE3:QUAT`; other lines are returned as is."""
     text = text.strip()
     line = parse_line(text)
     if not isinstance(line, Measurement) or text.split()[0] != "EDGE3":
         return text
     numbers = text.partition("#")[0].split()[9:] or _UNIT_INFORMATION
     order = from_upper_triangle(np.arange(21.0))[np.ix_(_SWAPPED, _SWAPPED)]
-    # The numbers themselves, in the other order: nothing is rounded.
+    # The numbers as written, reordered: nothing is rounded.
     upper = " ".join(numbers[int(i)] for i in upper_triangle(order))
     T = line.T_reference_frame
     return f"EDGE_SE3:QUAT {line.reference_id} {line.frame_id} {_pose_fields(T)} {upper}"
 
 
 def g2o_lines(poses: Mapping[FrameId, FloatArray], graph: Sequence[GraphEdge]) -> Iterator[str]:
-    """Yield vertices and edges, without line ends.
+    """Yield the lines of a pose graph: vertices and edges, without line ends.
 
-    Frames that are named by whole numbers keep them; others are numbered in their order, the
-    name behind the vertex as a comment. Priors, for which the format has no line that all
-    readers know, are left out.
+    Frames with non-negative integer ids keep them; others are numbered in order, with their id as
+    a comment behind the vertex. Priors are left out: the format has no common line for them.
 
     Parameters
     ----------

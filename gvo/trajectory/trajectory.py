@@ -35,18 +35,17 @@ class Trajectory:
     covariances : ndarray of float64, shape (n, 6, 6), optional
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
     stamps_from : {"file", "times", "rows", "topic"}
-        Where the stamps come from: measured with the poses; a list of stamps beside rows of
-        poses; made up of the row numbers, a second each; headers of messages, whose rate and
-        phase are those of another device.
+        Origin of the stamps: a column of the file; a separate list of stamps; row numbers, one
+        second each; message headers, with the rate and phase of another device.
     has_rotations : bool
-        False where positions alone were measured, as by GNSS: the rotations are then identities
-        that mean nothing, and there are no covariances.
+        False if only positions were measured, as by GNSS: the rotations are identities without
+        meaning, and there are no covariances.
 
     Raises
     ------
     ValueError
-        Where shapes do not fit, values are not finite, stamps do not increase, a pose is
-        no rigid transform, or positions alone come with rotations or covariances.
+        If shapes do not match, values are not finite, stamps do not increase, a pose is no rigid
+        transform, or positions alone come with rotations or covariances.
     """
 
     stamps_ns: IntArray
@@ -56,7 +55,7 @@ class Trajectory:
     has_rotations: bool = True
 
     def __post_init__(self) -> None:
-        """Check once, then keep copies that nobody can write to."""
+        """Check the arrays and keep read-only copies."""
         if self.stamps_from not in get_args(StampsFrom):
             raise ValueError(f"stamps_from must be one of {get_args(StampsFrom)}")
         stamps_ns = _checked_stamps(self.stamps_ns)
@@ -73,13 +72,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> Trajectory:
-        """Collect estimates, in any order, into a trajectory with covariances.
-
-        Parameters
-        ----------
-        estimates : iterable of Estimate
-            Of different stamps.
-        """
+        """Collect estimates of different stamps, in any order, with their covariances."""
         ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
         return cls(
             stamps_ns=np.array([estimate.stamp_ns for estimate in ordered], dtype=np.int64),
@@ -91,7 +84,7 @@ class Trajectory:
     def of_positions(
         cls, stamps_ns: IntArray, positions: FloatArray, *, stamps_from: StampsFrom = "file"
     ) -> Trajectory:
-        """Return the trajectory of a point of which no rotations are known.
+        """Return a trajectory of positions without rotations.
 
         Parameters
         ----------
@@ -160,7 +153,7 @@ class Trajectory:
         Returns
         -------
         Trajectory
-            With their covariances, where there are some.
+            With their covariances, if any.
         """
         chosen = indices if isinstance(indices, slice) else np.asarray(indices)
         if not isinstance(chosen, slice) and chosen.size == 0:
@@ -174,7 +167,7 @@ class Trajectory:
         )
 
     def transformed(self, T_cam_body: FloatArray) -> Trajectory:
-        """Return the trajectory of another frame that is fixed to the camera.
+        """Return the trajectory of another frame, rigidly attached to the present one.
 
         Parameters
         ----------
@@ -189,7 +182,7 @@ class Trajectory:
         Raises
         ------
         ValueError
-            Where positions alone are known, and the new frame lies elsewhere.
+            If rotations are unknown and the new frame has another origin.
         """
         T_cam_body = np.asarray(T_cam_body, dtype=np.float64)
         if not self.has_rotations:
@@ -204,7 +197,7 @@ class Trajectory:
         return replace(self, T_world_cam=self.T_world_cam @ T_cam_body, covariances=covariances)
 
     def moved(self, T_map_world: FloatArray) -> Trajectory:
-        """Return the same motion in another world.
+        """Return the trajectory in another world frame.
 
         Parameters
         ----------
@@ -214,7 +207,7 @@ class Trajectory:
         Returns
         -------
         Trajectory
-            T_map_world @ T_world_cam; the covariances, of the camera's own frame, are the same.
+            T_map_world @ T_world_cam; the covariances, in the pose's own frame, stay the same.
         """
         T_map_cam = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_cam
         if not self.has_rotations:
@@ -222,15 +215,13 @@ class Trajectory:
         return replace(self, T_world_cam=T_map_cam)
 
     def interpolate(self, stamps_ns: IntArray) -> Trajectory:
-        """Return the poses between the neighbours of given stamps.
-
-        Positions are interpolated linearly, rotations along the shortest arc (SLERP).
+        """Interpolate poses at given stamps: positions linearly, rotations by SLERP.
 
         Parameters
         ----------
         stamps_ns : ndarray of int64, shape (m,)
-            Strictly increasing, nanoseconds. Those before the first or after the last pose
-            are left out: nothing is extrapolated.
+            Strictly increasing, nanoseconds. Those before the first or after the last pose are
+            dropped: nothing is extrapolated.
 
         Returns
         -------
@@ -320,12 +311,12 @@ def format_stamp(stamp_ns: int) -> str:
 
 
 def parse_stamp(text: str, *, unit_ns: int) -> int:
-    """Return the nanoseconds of a decimal number, without passing through a float.
+    """Return the nanoseconds of a decimal number, without rounding to a float.
 
     Parameters
     ----------
     text : str
-        A number, in any notation.
+        A number in any notation.
     unit_ns : int
         Nanoseconds of a unit: 1_000_000_000 for seconds, 1 for nanoseconds.
 
@@ -337,7 +328,7 @@ def parse_stamp(text: str, *, unit_ns: int) -> int:
     Raises
     ------
     ValueError
-        Where the text is no number, or no int64 can hold it.
+        If the text is no number, or does not fit into int64.
 
     Examples
     --------
