@@ -44,13 +44,13 @@ class PictureSink(Protocol):
 
 
 def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
-    """Choose by its name what a path becomes.
+    """Open a film or a folder of pictures, by the name of the path.
 
     Parameters
     ----------
     path : Path
-        Ends in `.webm` or `.mp4`: a film. Without a suffix, or a folder that is there: a folder
-        of PNG files, as where OpenCV has no encoder, beside the path.
+        Ends in `.webm` or `.mp4`: a film, or PNG files in a folder beside it where OpenCV has no
+        encoder. Without a suffix, or an existing folder: a folder of PNG files.
     rate_hz : float, optional
         Pictures per second; by the stamps of the first ones where omitted.
 
@@ -79,7 +79,7 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
 
 
 class Film:
-    """A film file, written under another name in its folder until it is closed.
+    """A film, written under another name in its folder until it is closed.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Film:
         self._waiting: list[ImageArray] = []
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
-        self._size = (0, 0)
+        self._n, self._size = 0, (0, 0)
         with _refused_on_error(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
@@ -127,13 +127,12 @@ class Film:
         """
         picture = _even(picture)
         size = (picture.shape[1], picture.shape[0])
-        if self._size in ((0, 0), size):
-            self._size = size
-        else:
+        if self._n > 0 and size != self._size:
             raise ValueError(f"expected a picture of {self._size}, got {size}")
+        self._size = size
+        self._n += 1
         if self._writer is not None:
             self._writer.write(picture)
-            self._n += 1
             return
         self._waiting.append(picture)
         self._stamps_ns.append(stamp_ns)
@@ -163,7 +162,6 @@ class Film:
         self._writer = self._open(self._part, _VP8_HZ if self._is_vp8 else self._rate_hz)
         for picture in self._waiting:
             self._writer.write(picture)
-        self._n = len(self._waiting)
         self._waiting.clear()
 
     def _open(self, path: Path, rate_hz: float, *, is_encoded: bool = False) -> cv2.VideoWriter:
@@ -174,7 +172,7 @@ class Film:
         return writer
 
     def _retime(self) -> None:
-        """Copy what was encoded, at the rate of the film, as WebM."""
+        """Copy the encoded pictures to WebM at the rate of the film."""
         encoded, self._part = self._part, self._part.with_stem("timed")
         packets = cv2.VideoCapture(str(encoded), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         writer = self._open(self._part, self._rate_hz, is_encoded=True)
@@ -231,7 +229,7 @@ class PngFolder:
         self._n += 1
 
     def close(self) -> None:
-        """Leave an empty folder to nobody."""
+        """Remove the folder where it is empty."""
         if self._n == 0:
             with _refused_on_error(self.path):
                 self.path.rmdir()
@@ -258,7 +256,7 @@ def rate_of(stamps_ns: Sequence[int]) -> float:
 
 
 def _even(picture: ImageArray) -> ImageArray:
-    """Return a picture without an odd last row or column; encoders halve colours."""
+    """Cut off an odd last row or column: encoders subsample colours by two."""
     height, width = picture.shape[:2]
     return np.ascontiguousarray(picture[: height & ~1, : width & ~1])
 
@@ -275,7 +273,7 @@ def _open_writer(
 
 @contextmanager
 def _quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV from telling on the error stream what is told by a value."""
+    """Keep OpenCV from printing errors that are returned as values."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

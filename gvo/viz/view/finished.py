@@ -233,7 +233,6 @@ class RunPlayer:
         self._speed: float | None = 1.0
         self._ahead_ns = 0.0
         self._is_closing = threading.Event()
-        self._is_due = threading.Event()
         self._thread = threading.Thread(target=self._run, name="gvo run player", daemon=True)
         self._thread.start()
 
@@ -259,7 +258,6 @@ class RunPlayer:
                 self.seek(0)
             self._ahead_ns = 0.0
             self._is_playing = True
-        self._is_due.set()
 
     def pause(self) -> None:
         """Stop that."""
@@ -305,17 +303,11 @@ class RunPlayer:
     def close(self) -> None:
         """End the thread."""
         self._is_closing.set()
-        self._is_due.set()
         self._thread.join()
 
     def _run(self) -> None:
         before = time.monotonic()
-        while not self._is_closing.is_set():
-            if not self._is_playing:
-                self._is_due.wait()
-                self._is_due.clear()
-                before = time.monotonic()
-            elif not self._is_closing.wait(self._period_s):
-                now = time.monotonic()
-                self.advance(now - before)
-                before = now
+        while not self._is_closing.wait(self._period_s):
+            now = time.monotonic()
+            self.advance(now - before)
+            before = now
