@@ -1,7 +1,7 @@
-"""Text: files and YAML read within bounds, values shortened for messages, tables aligned.
+"""Text: files and YAML read within bounds, values shortened for messages, aligned tables.
 
-A few lines of YAML can stand for gigabytes: aliases of aliases, merged keys, numbers of a million
-digits. What is read here is bounded before any value is made of it.
+A few lines of YAML can expand to gigabytes by aliases of aliases, merged keys, or numbers of a
+million digits: `load_yaml` checks the size before any value is constructed.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from typing import Any, cast
 import yaml
 
 MAX_TEXT_BYTES = 1 << 28
-"""Of a table: poses of a day at 30 a second."""
+"""Largest text file, bytes: poses of a day at 30 Hz."""
 
 MAX_SHOWN = 80
-"""Characters of a value in a message."""
+"""Largest length of a value in a message, characters."""
 
 MAX_CHARACTERS = 1 << 18
-"""Of a text; a configuration with all its comments has a thirtieth."""
+"""Largest YAML text, characters; a configuration with all comments has a thirtieth."""
 
 MAX_VALUES = 100_000
-"""Values, keys and lists, each counted as often as aliases repeat it."""
+"""Largest number of YAML values and keys, with aliases expanded."""
 
-_MAX_NUMBER = 250  # characters; in any notation a float can hold it
+_MAX_NUMBER = 250  # characters; no float needs more
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 
-# Dates that are none, numbers too long and tags that do not fit their values come as these.
+# Raised by PyYAML for invalid dates, numbers that are too long, and tags of other types.
 _VALUE_FAULTS = (
     ArithmeticError,
     AttributeError,
@@ -40,14 +40,14 @@ _VALUE_FAULTS = (
 
 
 def shortened(value: object) -> str:
-    """Return a value of a file on one line of a message, cut where it is long."""
+    """Return a value for a message: its repr on one line, cut to `MAX_SHOWN` characters."""
     return cut(repr(value), MAX_SHOWN)
 
 
 def cut(text: str, n_characters: int) -> str:
-    r"""Return a text on one line, cut where it is longer, as it can be written everywhere.
+    r"""Return a text on one line, cut to a length, with unprintable characters escaped.
 
-    What is no character to be seen is escaped: a topic's name shall not steer a terminal.
+    So a topic's name cannot control a terminal.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def cut(text: str, n_characters: int) -> str:
 
 
 def exists(path: Path) -> bool:
-    """Tell whether there is such a file or folder that can be looked at; a name can be none."""
+    """Tell whether a path exists and can be accessed; False for an invalid name."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -71,28 +71,23 @@ def exists(path: Path) -> bool:
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
-    """Read a text file that is not larger than it may be.
+    r"""Read a text file of limited size, with line ends as \n.
 
     Parameters
     ----------
     path : Path
-        File; also a pipe, or a device that never ends.
+        File, pipe or device.
     max_bytes : int
-        More are not read.
+        Largest size.
     encoding : str
-        "utf-8", or "utf-8-sig" where a mark at the start is to be left out.
-
-    Returns
-    -------
-    str
-        With the line ends as Python reads them.
+        "utf-8", or "utf-8-sig" to skip a byte order mark.
 
     Raises
     ------
     OSError
-        When it cannot be read, or holds more; `strerror` says so.
+        If it cannot be read or is larger; `strerror` says so.
     UnicodeDecodeError
-        When it is no text.
+        If it is no text.
     """
     with path.open("rb") as file:
         data = file.read(max_bytes + 1)
@@ -108,7 +103,7 @@ def format_table(
     is_text: bool = False,
     measured: Sequence[Sequence[str]] | None = None,
 ) -> str:
-    """Return lines, each with its line end, whose columns are aligned by blanks.
+    """Return a table of text, its columns aligned by blanks, each line with its line end.
 
     Parameters
     ----------
@@ -117,9 +112,9 @@ def format_table(
     rows : sequence of sequences of str
         Of k cells each.
     is_text : bool
-        All columns to the left; else names to the left, numbers to the right, below a rule.
+        Align all columns left; else the first left, numbers right, and a rule below the header.
     measured : sequence of sequences of str, optional
-        Rows that the widths of the columns follow; all of them where omitted.
+        Rows that determine the widths of the columns; by default all.
 
     Examples
     --------
@@ -143,7 +138,7 @@ def format_table(
 
 
 class YamlError(Exception):
-    """A text that is no YAML, or more than is read; its one line says where or why."""
+    """Invalid or too large YAML; its one line says where or why."""
 
 
 def load_yaml(
@@ -152,27 +147,27 @@ def load_yaml(
     *,
     max_characters: int = MAX_CHARACTERS,
 ) -> Any:  # noqa: ANN401 - YAML
-    """Return what a YAML text holds.
+    """Load YAML within bounds.
 
     Parameters
     ----------
     text : str
-        Of several documents the first that holds anything counts.
+        Of several documents the first that is not empty is loaded.
     loader_class : type
-        Which tags are known.
+        Defines the known tags.
     max_characters : int
-        Of the text; a number has at most 250.
+        Largest length of the text.
 
     Returns
     -------
     object
-        Dictionaries, lists, numbers, texts; None where there is nothing.
+        Dictionaries, lists, numbers, strings; None for an empty text.
 
     Raises
     ------
     YamlError
-        When it is no YAML, longer than `max_characters`, or more than `MAX_VALUES` once its
-        aliases are followed.
+        If it is no YAML, longer than `max_characters`, holds more than `MAX_VALUES` values with
+        its aliases expanded, or a number of more than 250 characters.
     """
     if len(text) > max_characters:
         raise YamlError(f"{len(text)} characters, expected at most {max_characters}")
@@ -191,7 +186,7 @@ def load_yaml(
 
 def _first_document(loader: yaml.SafeLoader) -> Any:  # noqa: ANN401 - YAML
     while loader.check_node():
-        node = cast(yaml.Node, loader.get_node())  # there is one, as was asked
+        node = cast(yaml.Node, loader.get_node())  # check_node found one
         _count_values(node, {})
         document = loader.construct_document(node)
         if document is not None:
@@ -200,7 +195,7 @@ def _first_document(loader: yaml.SafeLoader) -> Any:  # noqa: ANN401 - YAML
 
 
 def _count_values(node: yaml.Node, counted: dict[int, int | None]) -> int:
-    """Return how many values a node stands for; by their ids those that were counted."""
+    """Return the number of values of a node with aliases expanded; `counted` is by node id."""
     key = id(node)
     if key in counted:
         known = counted[key]
