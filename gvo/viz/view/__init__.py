@@ -1,6 +1,6 @@
-"""A page in the browser: a recording that is tracked while one looks, or a finished run.
+"""The page in the browser: a recording that is tracked live, or a finished run.
 
-Everything here needs viser (`pip install 'gvo[view]'`), which is loaded when a page is asked for.
+It needs viser (`pip install 'gvo[view]'`), which is imported when a page is served.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gvo.viz.view.player import Player
     from gvo.viz.view.server import ViewServer
 
-__all__ = ["serve", "serve_run"]
+__all__ = ["serve"]
 
 
 def serve(
@@ -31,13 +31,13 @@ def serve(
     Parameters
     ----------
     source : Player or Path
-        The player stays the caller's: closing the page does not close it. Or a run folder.
+        A player, which closing the page does not close, or a run folder.
     host : str
         Address to bind to; 0.0.0.0 lets everyone on the network steer the page.
     port : int
-        Where it is taken, the next free one is used (`ViewServer.note` says so); 0: any.
+        Where it is taken, the next free one is used (see `ViewServer.note`); 0: any.
     truth : Trajectory, optional
-        Is drawn beside the estimates of a player; a run folder brings its own.
+        Drawn beside the estimates of a player; a run folder has its own.
     name : str
         Title of the panel.
 
@@ -48,26 +48,14 @@ def serve(
     GvoError
         Where the folder holds no run.
     """
-    if isinstance(source, str | Path):
-        return serve_run(Path(source), host=host, port=port, name=name)
-    _need_viser()
-    from gvo.viz.view.page import serve_player
-
-    return serve_player(source, host=host, port=port, truth=truth, name=name)
-
-
-def serve_run(
-    folder: Path, *, host: str = "127.0.0.1", port: int = 8080, name: str = ""
-) -> ViewServer:
-    """Serve the page of a finished run; see `serve`."""
-    _need_viser()
-    from gvo.viz.view.finished import serve_record
-
-    return serve_record(folder, host=host, port=port, name=name)
-
-
-def _need_viser() -> None:
     try:
         import viser  # noqa: F401 - only whether it is there
     except ImportError as error:
         raise ConfigurationError("gvo view needs viser: pip install 'gvo[view]'") from error
+    if isinstance(source, str | Path):
+        from gvo.viz.view.finished import serve_record
+
+        return serve_record(Path(source), host=host, port=port, name=name)
+    from gvo.viz.view.page import serve_player
+
+    return serve_player(source, host=host, port=port, truth=truth, name=name)

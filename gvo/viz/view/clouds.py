@@ -1,4 +1,4 @@
-"""Coloured points of single frames, and their sum, thinned to what a page can show."""
+"""Coloured points of frames, accumulated and thinned to what a page can show."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def empty_cloud() -> Cloud:
 def frame_cloud(
     frame: Frame, registration: RelativePose | None, camera: PinholeCamera, config: DepthConfig
 ) -> Cloud:
-    """Return what a frame measured in 3-D, in the `cam` frame.
+    """Return the points that a frame measured, in the `cam` frame.
 
     Parameters
     ----------
@@ -82,10 +82,7 @@ def _as_colours(greys: ImageArray) -> NDArray[np.uint8]:
 
 
 class KeyframeClouds:
-    """The clouds of keyframes, in bounded memory.
-
-    When there are too many points, every second one of each cloud goes.
-    """
+    """The clouds of keyframes, in bounded memory: halved when there are too many points."""
 
     def __init__(self) -> None:
         self._clouds: dict[int, Cloud] = {}
@@ -106,11 +103,11 @@ class KeyframeClouds:
             self._n_points = sum(len(points) for points, _ in self._clouds.values())
 
     def select(self, T_world_cams: Mapping[int, FloatArray]) -> list[tuple[FloatArray, Cloud]]:
-        """Return the clouds of frames with the frames' poses, which are given by index."""
+        """Pair poses, by index of the frame, with the clouds of the frames."""
         return [(T, self._clouds[index]) for index, T in T_world_cams.items()]
 
 
-def put_together(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
+def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
     """Place clouds in the world and thin them to at most 200,000 points.
 
     Parameters

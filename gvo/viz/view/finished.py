@@ -43,7 +43,7 @@ _NOT_RECORDED = {"keyframes", "links", "image", "points", "cloud"}
 
 
 def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewServer:
-    """Serve the page of a run folder; see `gvo.viz.view.serve_run`."""
+    """Serve the page of a run folder; see `gvo.viz.view.serve`."""
     record = read_run(folder)
     if len(record.frames.stamps_ns) == 0:
         raise RecordingError(f"{folder}: holds no frames: there is nothing to show; run again")
@@ -260,7 +260,7 @@ class RunPlayer:
             self._is_playing = True
 
     def pause(self) -> None:
-        """Stop that."""
+        """Stay at the frame."""
         self._is_playing = False
 
     def step(self) -> None:

@@ -1,4 +1,4 @@
-"""What was done, kept so that any frame can be shown again."""
+"""The frames that were tracked, kept so that any can be shown again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, ImageArray, IntArray, Status
-from gvo.viz.view.clouds import Cloud, KeyframeClouds, put_together
+from gvo.viz.view.clouds import Cloud, KeyframeClouds, accumulate
 from gvo.viz.view.disk_list import DiskList
 
 # Stamps (n,) in nanoseconds, ascending, and positions (n, 3) in the world, metres.
@@ -151,7 +151,7 @@ class History:
                 self._clouds.add(index, record.cloud)
 
     def finish(self, estimates: Iterable[Estimate]) -> None:
-        """Take the smoothed poses that are known with the last frame."""
+        """Add the smoothed poses that are known with the last frame."""
         with self._lock:
             self._note_finished(self.n_done - 1, estimates)
 
@@ -161,7 +161,7 @@ class History:
             self._finished.append(estimate.T_world_cam.ravel())
 
     def show(self, index: int) -> None:
-        """Let the paths go up to a frame that is done.
+        """Set the frame shown, up to which the paths go.
 
         Raises
         ------
@@ -177,14 +177,14 @@ class History:
         return self._told[index - self.first_index][0]
 
     def frame_view(self, index: int | None = None, *, fault: str = "") -> FrameView:
-        """Return all that is known of a frame.
+        """Return what a page shows of a frame.
 
         Parameters
         ----------
         index : int, optional
             The one that is shown where omitted.
         fault : str
-            Handed through.
+            As of `FrameView`.
 
         Raises
         ------
@@ -212,7 +212,7 @@ class History:
         return self._path(self._causal)
 
     def smoothed_path(self) -> Path:
-        """Return stamps (n,) and positions (n, 3) as they are known with the frame shown."""
+        """Return stamps (n,) and positions (n, 3) as of the frame shown."""
         with self._lock:
             stamps_ns, T_world_cam = self._smoothed()
             return stamps_ns, T_world_cam[:, :3, 3]
@@ -220,15 +220,14 @@ class History:
     def accumulated_cloud(self) -> Cloud:
         """Return the points of all keyframes in the world, metres, and their colours, RGB.
 
-        They stand where the smoothed poses known with the frame shown put them, thinned to at
-        most 200,000.
+        Placed by the smoothed poses as of the frame shown; thinned to at most 200,000.
         """
         with self._lock:
             _, T_world_cam = self._smoothed()
             keyframes = self._keyframes[: bisect_right(self._keyframes, self._shown)]
             rows = np.searchsorted(self._tracked.rows[: len(T_world_cam), 0], keyframes)
             clouds = self._clouds.select(dict(zip(keyframes, T_world_cam[rows], strict=True)))
-        return put_together(clouds)
+        return accumulate(clouds)
 
     def _check(self, index: int) -> None:
         if not self.first_index <= index < self.n_done:
@@ -254,10 +253,7 @@ class History:
             return stamps_ns, poses.rows[:n].reshape(-1, 4, 4)[:, :3, 3].copy()
 
     def _smoothed(self) -> tuple[IntArray, FloatArray]:
-        """Return stamps and the best poses known with the frame shown.
-
-        Those that are final, else those of the window then, else the causal ones.
-        """
+        """Return stamps and the best poses as of the frame shown: final, of the window, or causal."""
         n = self._n_tracked(self._shown)
         stamps_ns = self._tracked.rows[:n, 1].copy()
         poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()

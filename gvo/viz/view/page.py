@@ -1,4 +1,4 @@
-"""The page of a recording that is tracked while one looks, with the truth in it."""
+"""The page of a recording that is tracked live."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def serve_player(
 
 
 class Page:
-    """Shows what a player does, and steers it.
+    """Shows what a player does, and controls it.
 
     Parameters
     ----------
@@ -277,10 +277,10 @@ def _rgb(image: ImageArray) -> ImageArray:
 
 
 class TruthPath:
-    """Lays the truth onto a growing estimate.
+    """Aligns the truth with a growing estimate.
 
-    Where the truth has a rotation for the first frame, its pose there is laid onto the estimate's,
-    so that drift shows; else the positions are fitted by a rigid motion.
+    Where the truth has a rotation at the first frame, the first poses are aligned, so that drift
+    shows; else all positions are, by a rigid motion.
 
     Parameters
     ----------
@@ -307,14 +307,14 @@ class TruthPath:
             return _NOTHING
         if self._first_ns != int(stamps_ns[0]):
             self._first_ns = int(stamps_ns[0])
-            self._moved = self._laid_by_first(stamps_ns[:1])
+            self._moved = self._aligned_at_first(stamps_ns[:1])
         moved = self._moved or self._fitted(stamps_ns, positions_world)
         if moved is None:
             return _NOTHING
         is_in = (moved.stamps_ns >= stamps_ns[0]) & (moved.stamps_ns <= stamps_ns[-1])
         return np.asarray(moved.positions[is_in])
 
-    def _laid_by_first(self, first_ns: IntArray) -> Trajectory | None:
+    def _aligned_at_first(self, first_ns: IntArray) -> Trajectory | None:
         stamps_ns = self._truth.stamps_ns
         if not self._truth.has_rotations or len(stamps_ns) == 0:
             return None

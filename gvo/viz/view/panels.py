@@ -175,7 +175,7 @@ class ViewPoint:
             client.camera.position, client.camera.look_at = position, target
 
     def _catch_up(self, client: viser.ClientHandle) -> None:
-        """Show a browser that comes later what the first one saw at first, at the camera."""
+        """Give a browser that connects later the first view, at the camera."""
         if self._start is not None and self.follow.value:
             # Its report may be older than the view that it was given.
             position, target = (self._last + offset for offset in self._start)
@@ -291,7 +291,7 @@ class Playable(Protocol):
         """Let frames follow by themselves."""
 
     def pause(self) -> None:
-        """Stop that."""
+        """Stay at the frame."""
 
     def step(self) -> None:
         """Go to the next frame."""
@@ -386,13 +386,13 @@ class Painter:
         self._thread.start()
 
     def offer(self) -> None:
-        """Have drawn what is new."""
+        """Ask for drawing."""
         with self._state:
             self._n_offered += 1
             self._state.notify_all()
 
     def settle(self) -> None:
-        """Wait until what was offered last is drawn."""
+        """Wait until all that was offered is drawn."""
         with self._state:
             wanted = self._n_offered
             self._state.wait_for(lambda: self._n_drawn >= wanted or self._is_closed)

@@ -128,7 +128,7 @@ class Scene:
         self._paths[name].show(positions_world)
 
     def show_pose(self, T_world_cam: FloatArray) -> None:
-        """Move the camera with all that hangs on it."""
+        """Move the camera, with its image and points."""
         self._camera.wxyz = quaternions_wxyz(T_world_cam[np.newaxis, :3, :3])[0]
         self._camera.position = _position(T_world_cam[:3, 3])
 
@@ -204,7 +204,7 @@ def _position(position: FloatArray) -> tuple[float, float, float]:
 
 
 def _frustum_scale(fov: float, aspect: float, depth: float) -> float:
-    """Return viser's scale of a frustum that is `depth` metres deep: it asks for the volume."""
+    """Return viser's scale, by the volume, of a frustum that is `depth` metres deep."""
     return float(depth * np.cbrt(aspect * np.tan(0.5 * fov) ** 2 / 3.0))
 
 

@@ -1,4 +1,4 @@
-"""Odometry over a recording for a view, a frame at a time."""
+"""Odometry over a recording for a page, a frame at a time."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from gvo.viz.view.clouds import empty_cloud, frame_cloud
 from gvo.viz.view.history import FrameRecord
 
 OpenSource: TypeAlias = Callable[[Config], Source]
-# Newest poses of the window that are written down with each frame; it may keep all there are.
+# Newest poses of the window that are kept with each frame; the window may hold all.
 _N_POSES = 24
-_RATE_SHARE = 0.1  # of the newest frame in the rate that is told
+_RATE_SHARE = 0.1  # of the newest frame in the mean rate
 _SECTIONS = ("sync", "images", "runtime")
 
 MAX_WIDTH_PX = 480
 
 
 class Tracking:
-    """Reads frames, tracks them, and gathers what a view shows of each.
+    """Reads frames, tracks them, and gathers what a page shows of each.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ class Tracking:
         return self._next
 
     def reconfigure(self, config: Config) -> None:
-        """Take another configuration for the next frame; open the recording again if it must be.
+        """Change the configuration of the next frame; where needed, open the recording again.
 
         Raises
         ------
         GvoError
-            When that fails; the configuration is the former one then.
+            When that fails; the former configuration stays.
         """
         if is_read_differently(self.config, config) and not self.is_finished:
             self._reopen(config)
@@ -125,12 +125,12 @@ class Tracking:
         self.is_finished = following is None
 
     def advance(self, index: int) -> FrameRecord | None:
-        """Track the next frame and return what there is to show of it; None at the end.
+        """Track the next frame; None at the end.
 
         Parameters
         ----------
         index : int
-            Of the frame, to be told in the overlay.
+            Of the frame, for the overlay.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class Tracking:
         return self._odometry.finish()
 
     def close(self) -> None:
-        """Give threads and files of the reading back."""
+        """Close threads and files of the reading."""
         if isinstance(self._items, Generator):
             self._items.close()
 
@@ -206,7 +206,7 @@ class Tracking:
 
 
 def is_read_differently(former: Config, config: Config) -> bool:
-    """Tell whether a recording must be opened again for another configuration to matter."""
+    """Tell whether another configuration asks for reading the recording anew."""
     return former.depth.scale != config.depth.scale or any(
         getattr(former, name) != getattr(config, name) for name in _SECTIONS
     )
@@ -215,7 +215,7 @@ def is_read_differently(former: Config, config: Config) -> bool:
 def read_frames(
     source: Source, config: Config, excerpt: Excerpt, *, from_ns: int | None = None
 ) -> Iterator[Frame | FaultyFrame]:
-    """Read the frames of a recording that a run counts.
+    """Read the frames of a recording that odometry tracks.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def read_frames(
     excerpt : Excerpt
         The part that is wanted.
     from_ns : int, optional
-        Stamp of the frame of it to start with; the others are found, but not decoded.
+        Stamp of the first frame; those before are not decoded.
 
     Yields
     ------
@@ -241,7 +241,7 @@ def read_frames(
 
 
 def _excerpt_from(from_ns: int, source: Source, config: Config, excerpt: Excerpt) -> Excerpt:
-    """Return what is left of an excerpt from a frame of it on."""
+    """Return the rest of an excerpt from one of its frames on."""
     first = next(paired(source.images(), source.info.sensor, config.sync))
     first_ns = first.stamp_ns if isinstance(first, FaultyFrame) else first[0].stamp_ns
     start_s = max(1e-9 * (from_ns - first_ns), 0.0)

@@ -15,7 +15,7 @@ from gvo.io.run_folder.reader import RunRecord, read_run
 from gvo.io.run_folder.writer import RunFolder
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
-from gvo.viz.view import serve, serve_run
+from gvo.viz.view import serve
 from gvo.viz.view.finished import FinishedPage, aligned_truth, start_sigmas, world_up
 from gvo.viz.view.server import ViewServer
 from tests.viz.view.fakes import pose_of, result_of, stamps_of
@@ -112,15 +112,14 @@ def test_the_world_of_the_first_camera_has_its_up_against_y(record: RunRecord) -
     assert world_up(record) == "+z"
 
 
-def test_a_folder_is_served_by_either_name(folder: Path) -> None:
-    for start in (serve, serve_run):
-        with start(folder, port=0) as view:
-            assert view.url.startswith("http://127.0.0.1:")
+def test_a_folder_is_served(folder: Path) -> None:
+    with serve(folder, port=0) as view:
+        assert view.url.startswith("http://127.0.0.1:")
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GvoError, match="is no run folder"):
-        serve_run(tmp_path, port=0)
+        serve(tmp_path, port=0)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz.view import clouds
-from gvo.viz.view.clouds import Cloud, KeyframeClouds, frame_cloud, put_together, thin
+from gvo.viz.view.clouds import Cloud, KeyframeClouds, accumulate, frame_cloud, thin
 from gvo.viz.view.disk_list import DiskList
 from gvo.viz.view.history import FrameRecord, History
 
@@ -245,7 +245,7 @@ def test_the_clouds_of_many_keyframes_are_bounded(monkeypatch: pytest.MonkeyPatc
     sizes = [len(points) for _, (points, _) in placed]
     assert min(sizes) >= 1
     assert sum(sizes) == len(kept)
-    assert len(put_together(placed)[0]) <= len(kept)
+    assert len(accumulate(placed)[0]) <= len(kept)
 
 
 named_arrays = st.dictionaries(

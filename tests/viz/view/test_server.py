@@ -3,14 +3,13 @@
 import socket
 import sys
 import threading
-from collections.abc import Callable
 from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
 
 from gvo.errors import ConfigurationError
-from gvo.viz.view import serve, serve_run
+from gvo.viz.view import serve
 from gvo.viz.view.server import ViewServer, find_port, is_own_page, open_server
 
 
@@ -121,10 +120,9 @@ def test_no_client_gets_a_tunnel_to_a_public_address(view: ViewServer) -> None:
     assert view.viser.request_share_url() is None
 
 
-@pytest.mark.parametrize("start", [lambda path: serve(path), serve_run])
 def test_without_viser_it_says_what_to_install(
-    start: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ConfigurationError, match=r"pip install 'gvo\[view\]'"):
-        start(tmp_path)
+        serve(tmp_path)
