@@ -26,6 +26,17 @@ _LINE_PX: Final = 16
 _MARGIN_PX: Final = 5
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _FONT_SCALE: Final = 0.45
+LABEL: Final = "depth [m]"
+HEIGHT_PX: Final = 28
+"""Of the bar with its numbers."""
+_DARKEST = 64  # of viridis: what is darker does not stand out of a dark image
+_FAR_DISPARITY_PX = 2.0
+_NEAR_SHARE = 8.0  # of the width of the image, as disparity of the nearest
+_RGBD_M = (0.4, 8.0)
+_UNKNOWN = (16, 16, 16)
+_N_STEPS: Final = 4000  # of 2 mm where the far end is 8 m
+_BAR_MARGIN_PX = 8
+_BAR_PX = 9
 
 
 def bgr(colour: str) -> Colour:
@@ -106,20 +117,6 @@ def _disc(radius: float) -> IntArray:
     n = int(radius)
     v, u = np.mgrid[-n : n + 1, -n : n + 1]
     return np.asarray(np.argwhere(u**2 + v**2 <= radius**2)[:, ::-1] - n, dtype=np.int64)
-
-
-LABEL: Final = "depth [m]"
-HEIGHT_PX: Final = 28
-"""Of the bar with its numbers."""
-
-_DARKEST = 64  # of viridis: what is darker does not stand out of a dark image
-_FAR_DISPARITY_PX = 2.0
-_NEAR_SHARE = 8.0  # of the width of the image, as disparity of the nearest
-_RGBD_M = (0.4, 8.0)
-_UNKNOWN = (16, 16, 16)
-_N_STEPS: Final = 4000  # of 2 mm where the far end is 8 m
-_DEPTH_COLOURS_MARGIN_PX = 8
-_BAR_PX = 9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,10 +203,10 @@ def colour_bar(scale: DepthScale, width: int) -> ImageArray:
     """Return the bar of a scale with its numbers, shape (HEIGHT_PX, width, 3), near at the left."""
     bar = np.zeros((HEIGHT_PX, width, 3), dtype=np.uint8)
     left = (
-        write(bar, LABEL, (_DEPTH_COLOURS_MARGIN_PX, HEIGHT_PX - 10))[0]
-        + 2 * _DEPTH_COLOURS_MARGIN_PX
+        write(bar, LABEL, (_BAR_MARGIN_PX, HEIGHT_PX - 10))[0]
+        + 2 * _BAR_MARGIN_PX
     )
-    right = width - 3 * _DEPTH_COLOURS_MARGIN_PX
+    right = width - 3 * _BAR_MARGIN_PX
     columns = np.linspace(255, 0, right - left).round().astype(np.int64)
     bar[2 : 2 + _BAR_PX, left:right] = table()[columns]
     is_free_from = 0
@@ -220,7 +217,7 @@ def colour_bar(scale: DepthScale, width: int) -> ImageArray:
         if start < is_free_from or start + text_width(text) > width:
             continue
         bar[2 : 5 + _BAR_PX, u] = WHITE
-        is_free_from = write(bar, text, (start, HEIGHT_PX - 4))[0] + _DEPTH_COLOURS_MARGIN_PX
+        is_free_from = write(bar, text, (start, HEIGHT_PX - 4))[0] + _BAR_MARGIN_PX
     bar.setflags(write=False)
     return bar
 

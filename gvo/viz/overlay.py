@@ -52,6 +52,13 @@ _MARGIN_PX = 8
 _GAP_PX = 18
 _ROWS_PX = (17, 37)
 _DARK_TEXT = frozenset({Status.OK, Status.COASTING})
+INLIER_COLOUR: Final = bgr(INLIERS)
+OUTLIER_COLOUR: Final = bgr(OUTLIERS)
+MAX_WIDTH_PX: Final = 1280
+"""Of a composed picture, where nothing else is asked for."""
+_CHARACTER_PX = 10  # wider than the mean
+_DIMMED = 0.4  # of the grey image below coloured lines
+_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,16 +182,6 @@ def _rate_text(result: FrameResult, rate_hz: float | None) -> str:
     parts = [f"{elapsed_ms:.1f} ms"] if elapsed_ms > 0.0 else []
     parts += [] if rate_hz is None else [f"{rate_hz:.1f} Hz"]
     return "   ".join(parts)
-
-
-INLIER_COLOUR: Final = bgr(INLIERS)
-OUTLIER_COLOUR: Final = bgr(OUTLIERS)
-MAX_WIDTH_PX: Final = 1280
-"""Of a composed picture, where nothing else is asked for."""
-
-_CHARACTER_PX = 10  # wider than the mean
-_DIMMED = 0.4  # of the grey image below coloured lines
-_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 def draw_matches(

@@ -32,6 +32,10 @@ METADATA: dict[str, dict[str, str | None]] = {
 _FLAT = 0.05
 # a line ends where the next pose is later than so many median steps
 _GAP = 10.0
+_SIZE_INCHES = (11.0, 5.5)
+_LEGEND_CHARACTERS = 135
+_VIEW_SIZE_INCHES = (11.0, 6.2)
+_MAX_POINTS = 4000
 
 
 def gaps_before(seconds: FloatArray) -> IntArray:
@@ -100,10 +104,6 @@ def save_figure(figure: Figure, path: Path) -> None:
             figure.savefig(path, format=suffix[1:], dpi=150, metadata=METADATA[suffix])
     except OSError as error:
         raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-_SIZE_INCHES = (11.0, 5.5)
-_LEGEND_CHARACTERS = 135
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -278,10 +278,6 @@ def _add_legend(figure: Figure, view: Axes) -> None:
     )
 
 
-_SHUTTLE_PLOT_SIZE_INCHES = (11.0, 6.2)
-_MAX_POINTS = 4000
-
-
 def plot_shuttle(path: str | Path, closings: Mapping[str, Closing]) -> None:
     """Draw the ways there (solid) and back (dashed) from above, and their distance by frame.
 
@@ -316,7 +312,7 @@ def _draw_shuttle_plot(closings: Mapping[str, Closing]) -> Figure:
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     figure = Figure(
-        figsize=_SHUTTLE_PLOT_SIZE_INCHES, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
+        figsize=_VIEW_SIZE_INCHES, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
     )
     axes = figure.subplot_mosaic(
         [["view", "end", "metres"], ["view", "end", "degrees"]], width_ratios=[1.15, 1.0, 1.15]

@@ -35,6 +35,13 @@ if TYPE_CHECKING:
 
 _ROW_HEIGHT = 2.1
 _MANY = 8
+_N_COLUMNS = 350
+_SIGMAS = 3.0
+# below it a value is drawn on the floor of the logarithmic axis
+_FLOOR = 0.01
+# rows of the figure: translations, then rotations
+_PANELS = ((3, "x", "m"), (4, "y", "m"), (5, "z", "m"), (0, "x", "deg"), (1, "y", "deg"))
+_ALL_PANELS = (*_PANELS, (2, "z", "deg"))
 
 
 def error_plots(comparisons: Sequence[Comparison], align: str) -> list[Plot]:
@@ -162,15 +169,6 @@ def _draw_drift(panels: Any, name: str, item: Drift, style: Style, *, marker: st
     looks = {"color": style.color, "linestyle": style.linestyle, "marker": marker, "ms": 4.5}
     panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
     panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
-
-
-_N_COLUMNS = 350
-_SIGMAS = 3.0
-# below it a value is drawn on the floor of the logarithmic axis
-_FLOOR = 0.01
-# rows of the figure: translations, then rotations
-_PANELS = ((3, "x", "m"), (4, "y", "m"), (5, "z", "m"), (0, "x", "deg"), (1, "y", "deg"))
-_ALL_PANELS = (*_PANELS, (2, "z", "deg"))
 
 
 def covariance_plots(found: Sequence[Consistency], first_ns: int) -> list[Plot]:

@@ -31,6 +31,15 @@ if TYPE_CHECKING:
 # the ribbon's columns: a single frame is to be seen
 _N_RIBBON = 400
 _UNKNOWN = "#999999"
+# below it a value is drawn on the floor of the logarithmic axis
+_FLOOR = 1e-3
+_N_COLUMNS, _N_ROWS = 300, 60
+_MARKERS = {"step": "o", "keyframe": "s", "standstill": "D"}
+_HATCHES = {"step": "", "keyframe": "////", "standstill": "...."}
+# of the histogram: powers of ten
+_DECADES = (-3.0, 3.0)
+_N_BINS = 60
+_NONE = "Not drawn: the run wrote no edges whose residuals are known."
 
 
 def status_plot(frames: FrameTable) -> Plot:
@@ -162,17 +171,6 @@ def _rate_words(timings: TimingTable, total: FloatArray) -> str:
         f"A good run stays below the time between two frames, {period_ms:.1f} ms; {share:.1f} % "
         "of the frames took longer."
     )
-
-
-# below it a value is drawn on the floor of the logarithmic axis
-_FLOOR = 1e-3
-_N_COLUMNS, _N_ROWS = 300, 60
-_MARKERS = {"step": "o", "keyframe": "s", "standstill": "D"}
-_HATCHES = {"step": "", "keyframe": "////", "standstill": "...."}
-# of the histogram: powers of ten
-_DECADES = (-3.0, 3.0)
-_N_BINS = 60
-_NONE = "Not drawn: the run wrote no edges whose residuals are known."
 
 
 def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None) -> list[Plot]:

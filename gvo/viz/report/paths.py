@@ -24,6 +24,7 @@ _MAX_SHOWN_M = 1e4
 # a long box, seen from a corner, must not leave its axes
 _SPACE_LABEL_PAD = 9.0  # points; numbers of four signs stand between the axis and its label
 _SPACE_ZOOM = 0.78
+_DASHES = {"-": [], "--": [7, 5], "-.": [7, 4, 2, 4], ":": [2, 4]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,9 +217,6 @@ def scene_json(lines: Sequence[Line], world: World) -> str:
         ],
     }
     return json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-_DASHES = {"-": [], "--": [7, 5], "-.": [7, 4, 2, 4], ":": [2, 4]}
 
 
 def _pieces(points: FloatArray, n_decimals: int) -> list[list[list[float]]]:

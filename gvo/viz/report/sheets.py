@@ -30,6 +30,35 @@ _MAX_PATH_POINTS = 3000
 _PATH_TOLERANCE = 1.0 / 3000.0
 # of the diagonal in space: no view is taken for smaller, as that along a straight line is
 _MIN_VIEW = 0.02
+WIDE = 11.0
+"""Inches of a plot over the whole page."""
+HALF = 6.4
+"""Inches of a plot of which two stand side by side."""
+_MARGINS_INCHES = {"left": 0.78, "right": 0.2, "bottom": 0.52, "top": 0.12}
+_LEGEND_ROW_INCHES = 0.24
+_INCHES_PER_CHARACTER = 0.072
+_LABEL_INCHES = 0.34
+_INCHES_PER_DIGIT = 0.08
+_MAX_LABEL = 60
+_SETTINGS: dict[str, Any] = {
+    "font.family": ["sans-serif"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "path.simplify": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "gvo",
+}
+_NUMBER = re.compile(r"-?\d+\.\d{3,}")
+_TAG = re.compile("<[^>]*>")
+_ID = re.compile(r' id="([^"]*)"')
+_REFERENCE = re.compile(r'(?:url\(#|href="#)([^)"]+)')
+_FAMILY = re.compile(r"font(?:-family)?: ?(?:(\d[\d.]*px) )?'[^;\"]*")
 
 
 def kept_of_curve(x: FloatArray, y: FloatArray, *, n_columns: int = N_COLUMNS) -> IntArray:
@@ -199,39 +228,6 @@ def _first(columns: IntArray, indices: IntArray) -> IntArray:
 
 def _last(columns: IntArray, indices: IntArray) -> IntArray:
     return _first(columns, indices[::-1])
-
-
-WIDE = 11.0
-"""Inches of a plot over the whole page."""
-HALF = 6.4
-"""Inches of a plot of which two stand side by side."""
-
-_MARGINS_INCHES = {"left": 0.78, "right": 0.2, "bottom": 0.52, "top": 0.12}
-_LEGEND_ROW_INCHES = 0.24
-_INCHES_PER_CHARACTER = 0.072
-_LABEL_INCHES = 0.34
-_INCHES_PER_DIGIT = 0.08
-_MAX_LABEL = 60
-_SETTINGS: dict[str, Any] = {
-    "font.family": ["sans-serif"],
-    "font.size": 9.0,
-    "axes.titlesize": 9.0,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "grid.alpha": 0.3,
-    "grid.linewidth": 0.6,
-    "hatch.linewidth": 0.6,
-    "path.simplify": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "gvo",
-}
-
-_NUMBER = re.compile(r"-?\d+\.\d{3,}")
-_TAG = re.compile("<[^>]*>")
-_ID = re.compile(r' id="([^"]*)"')
-_REFERENCE = re.compile(r'(?:url\(#|href="#)([^)"]+)')
-_FAMILY = re.compile(r"font(?:-family)?: ?(?:(\d[\d.]*px) )?'[^;\"]*")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
