@@ -253,7 +253,7 @@ class History:
             return stamps_ns, poses.rows[:n].reshape(-1, 4, 4)[:, :3, 3].copy()
 
     def _smoothed(self) -> tuple[IntArray, FloatArray]:
-        """Return stamps and the best poses as of the frame shown: final, of the window, or causal."""
+        """Return stamps and the best poses as of the frame shown: final, window or causal."""
         n = self._n_tracked(self._shown)
         stamps_ns = self._tracked.rows[:n, 1].copy()
         poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()
