@@ -54,7 +54,7 @@ OUTLIER, GAP, LOOP, PRIOR, INVALID = 0.02, 0.005, 0.03, 0.002, 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Arrival:
+class StreamedPose:
     """A pose of a stream, the keyframes to release, and a late edge."""
 
     frame: int
@@ -99,11 +99,11 @@ class Walk:
         ]
 
 
-def regular_stream(n: int, links: Links) -> Iterator[Arrival]:
+def regular_stream(n: int, links: Links) -> Iterator[StreamedPose]:
     """Yield poses tied to their predecessor and two keyframes; every tenth becomes one."""
     rng = np.random.default_rng(0)
     walk, kept = Walk(rng), [0]
-    yield Arrival(frame=0, is_kept=True)
+    yield StreamedPose(frame=0, is_kept=True)
     for frame in range(1, n):
         walk.advance(frame, {*kept, frame - 1})
         chosen = {
@@ -114,7 +114,7 @@ def regular_stream(n: int, links: Links) -> Iterator[Arrival]:
         references = list(dict.fromkeys([frame - 1, *chosen]))
         edges = walk.measure(references, frame)
         kept += [frame] if frame % 10 == 0 else []
-        yield Arrival(
+        yield StreamedPose(
             frame=frame,
             references=references,
             edges=edges,
@@ -123,11 +123,11 @@ def regular_stream(n: int, links: Links) -> Iterator[Arrival]:
         )
 
 
-def long_life(n: int, seed: int = 0) -> Iterator[Arrival]:
+def long_life(n: int, seed: int = 0) -> Iterator[StreamedPose]:
     """Yield poses whose keyframes come and go at random, with all that can go wrong."""
     rng = np.random.default_rng(seed)
     walk, kept, recent = Walk(rng), [0], deque([0], maxlen=SIZE - 1)
-    yield Arrival(frame=0, is_kept=True)
+    yield StreamedPose(frame=0, is_kept=True)
     for frame in range(1, n):
         walk.advance(frame, {*kept, *recent})
         others = [key for key in dict.fromkeys([*kept, *recent]) if key != frame - 1]
@@ -139,7 +139,7 @@ def long_life(n: int, seed: int = 0) -> Iterator[Arrival]:
             loop = (end, walk.measure([frame - 1], end)[0])
         is_kept = rng.random() < 0.12
         released = _release(kept, rng)
-        yield Arrival(
+        yield StreamedPose(
             frame=frame,
             references=references,
             edges=_spoil(edges, rng),
@@ -189,7 +189,7 @@ def _spoil(edges: list[Edge], rng: np.random.Generator) -> list[Edge]:
 class Smoother(Protocol):
     """What takes the poses of a stream."""
 
-    def add(self, arrival: Arrival) -> Sequence[object]:
+    def add(self, arrival: StreamedPose) -> Sequence[object]:
         """Add a pose; return what came of it."""
 
 
@@ -209,7 +209,7 @@ class DirectSmoother:
         self._alive: list[int] = []
         self._kept: set[int] = set()
 
-    def add(self, arrival: Arrival) -> list[FloatArray]:
+    def add(self, arrival: StreamedPose) -> list[FloatArray]:
         """Add a pose; return it with its covariance, and the poses that left."""
         factors, values = self._factors(arrival)
         n_old = max(len(self._alive) + 1 - SIZE, 0)
@@ -237,7 +237,7 @@ class DirectSmoother:
         self._kept -= set(arrival.released)
         return found
 
-    def _factors(self, arrival: Arrival) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    def _factors(self, arrival: StreamedPose) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if not arrival.edges:
             sure = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
@@ -261,7 +261,7 @@ class WindowSmoother:
     def __init__(self) -> None:
         self.window = gvo.SlidingWindow(WindowConfig(size=SIZE))
 
-    def add(self, arrival: Arrival) -> list[gvo.Estimate]:
+    def add(self, arrival: StreamedPose) -> list[gvo.Estimate]:
         """Add a pose; return it, and the poses that left."""
         stamp_ns = arrival.frame * STEP_NS
         edges = [  # what it costs to make them, too

@@ -1,1 +1,1 @@
-"""The sliding window of poses; the only room that imports GTSAM."""
+"""The sliding window of poses; the only package that imports gtsam."""

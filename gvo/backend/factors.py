@@ -12,9 +12,9 @@ from gvo.config import Kernel, WindowConfig
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, FrameId, GraphEdge, PosePrior, Prior
 
-# A kernel acts on the norm of the whitened 6-vector, 2.45 for a good edge: the constants known
-# for scalars would cut most good ones. Huber's is the 95 % quantile of chi with six degrees of
-# freedom; the others lose as little of good data as it does, 0.2 % of asymptotic efficiency.
+# A kernel acts on the norm of the whitened 6-vector, typically 2.45: the usual constants, for
+# scalars, would down-weight most inliers. Huber's is the 95 % quantile of chi with six degrees of
+# freedom; the others lose as much asymptotic efficiency as it does, 0.2 %.
 _CONSTANTS: dict[Kernel, float] = {
     "huber": 3.55,
     "cauchy": 9.4,
@@ -30,7 +30,7 @@ _KERNELS: dict[Kernel, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
 
 
 class Measurement(NamedTuple):
-    """An edge, and what GTSAM needs of it: made once, for the gate and the factor."""
+    """An edge and its GTSAM objects, made once for the gate and the factor."""
 
     edge: Edge
     T_reference_frame: gtsam.Pose3
@@ -47,7 +47,7 @@ class Measurement(NamedTuple):
 
 
 class Factors:
-    """Makes factors, with the kernels made once.
+    """Makes factors with robust kernels.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Factors:
         T_world_reference: FloatArray,
         T_world_frame: FloatArray,
     ) -> GraphEdge:
-        """Return how well two poses fit an edge."""
+        """Return the whitened residual and the weight of an edge between two poses."""
         predicted = T_world_reference @ edge.T_reference_frame
         error = se3.log(se3.invert(predicted) @ T_world_frame)
         residual = _whiten(error, edge.covariance)
@@ -112,7 +112,7 @@ class Factors:
     def residual_of_prior(
         self, prior: Prior, frame_id: FrameId, T_world_frame: FloatArray
     ) -> GraphEdge:
-        """Return how well a pose fits a prior."""
+        """Return the whitened residual and the weight of a prior of a pose."""
         if isinstance(prior, PosePrior):
             measured = prior.T_world_frame
             error = se3.log(se3.invert(measured) @ T_world_frame)
@@ -142,7 +142,7 @@ class Factors:
 
 
 def _whiten(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the error in units of its covariance: R e with R^T R its inverse, R upper."""
-    # L of the covariance with its axes reversed gives R = L^-1 reversed, without inverting first.
+    """Return R e, where R is upper triangular and R^T R the inverse of the covariance."""
+    # The Cholesky factor L of the covariance with reversed axes: R = L^-1, reversed.
     L = np.linalg.cholesky(covariance[::-1, ::-1])
     return np.asarray(np.linalg.solve(L, error[::-1])[::-1])

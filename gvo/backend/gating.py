@@ -1,7 +1,7 @@
-"""Which edges of a new pose agree: where to start, and which one to refuse.
+"""Which measurements of a new pose go in, where it starts, what is refused.
 
-No robust kernel leaves the wrong side of a gross outlier, so a single bad edge must not decide
-where the optimization starts, and is better not let in at all.
+No robust kernel recovers from a start value at a gross outlier, so a single bad edge must not
+determine the start, and is better refused.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from gvo.types import (
     Rejected,
 )
 
-# Sigmas of the difference of two edges, a 6-vector: all but a thousandth of good ones.
+# Sigmas of the difference of two edges, a 6-vector: 99.9 % of correct ones are below.
 _AGREEMENT = 5.0
 _TRACE = 1e-9 * np.eye(6)
 _ZERO = np.zeros(6)
@@ -43,14 +43,14 @@ _UNKNOWN_COVARIANCE = np.diag(np.repeat([1.0, 1e4], 3) ** 2)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GateResult:
-    """What the edges of one pose say together.
+    """The start value of a pose, and which of its edges are refused.
 
     Parameters
     ----------
     T_world_start : gtsam.Pose3
-        Mean of the predictions that agree with the one most agree with, their medoid.
+        Weighted mean of the predictions that agree with their medoid.
     reasons : list of str
-        For each edge why it is refused; empty where it is not.
+        For each edge why it is refused; empty if it is not.
     """
 
     T_world_start: gtsam.Pose3
@@ -65,24 +65,24 @@ def gate_edges(
     motion: Callable[[], Edge | None],
     gate: float | None,
 ) -> GateResult:
-    """Find where the edges of a new pose agree, and which of them do not.
+    """Gate the edges of a new pose against each other, and find its start value.
 
-    An edge is refused when it disagrees with the medoid by more than the gate, and more of the
-    edges (and of the motion so far) agree with the medoid than with it. What the references
-    themselves are uncertain of counts as agreement: a loop that closes after a long drift
-    disagrees with the drift, and is right.
+    Each edge predicts the pose. An edge is refused if it disagrees with the medoid of the
+    predictions by more than the gate, and if more of the edges (and the predicted motion) agree
+    with the medoid than with it. The uncertainty between the references is taken into account: a
+    loop that closes after a long drift disagrees with the drift, and is right.
 
     Parameters
     ----------
     measurements : sequence of Measurement
         At least one, of valid edges.
     pose_of : callable
-        Returns the present pose of a reference, T_world_reference.
+        Returns the current pose of a reference, T_world_reference.
     relative_covariance : callable
         Returns the covariance (6, 6) of the pose of the second reference in the first. Called
         only when edges disagree.
     motion : callable
-        Returns the edge that the motion so far predicts, or None. Called only when edges
+        Returns the edge that the last velocity predicts, or None. Called only when edges
         disagree.
     gate : float or None
         In sigmas of the difference of two predictions; None refuses nothing.
@@ -117,13 +117,13 @@ def gate_edges(
 def disagreement(
     edge: Edge, T_reference_frame: FloatArray, covariance: FloatArray, *, gate: float
 ) -> str:
-    """Return why an edge contradicts what is known of its two poses; empty where it does not.
+    """Say why an edge contradicts the known relative pose; empty if it does not.
 
     Parameters
     ----------
     edge : Edge
     T_reference_frame : ndarray of float64, shape (4, 4)
-        As known.
+        The known one.
     covariance : ndarray of float64, shape (6, 6)
         Of T_reference_frame.
     gate : float
@@ -143,12 +143,13 @@ def _predict(measurement: Measurement, pose_of: Callable[[FrameId], gtsam.Pose3]
 def _outvoted(
     measurements: Sequence[Measurement], distances: FloatArray, *, gate: float
 ) -> list[str]:
-    """Return for each edge why the others outvote it; empty where they do not.
+    """Say for each edge why the others outvote it; empty if they do not.
 
-    Where two edges disagree, the motion so far, behind them, has the casting vote.
+    The distances may hold a row and a column more than the edges, of the predicted motion: it
+    has the casting vote between two edges.
     """
     n = len(measurements)
-    # Capped: how far off an outlier is must not weigh more than that it is one.
+    # Capped, so that a far outlier weighs no more than a near one.
     medoid = int(np.minimum(distances, gate).sum(axis=1)[:n].argmin())
     n_agreeing = np.count_nonzero(distances <= gate, axis=1)
     is_out = (distances[medoid, :n] > gate) & (n_agreeing[:n] < n_agreeing[medoid])
@@ -166,7 +167,7 @@ def _true_distances(
     pose_of: Callable[[FrameId], gtsam.Pose3],
     relative_covariance: Callable[[FrameId, FrameId], FloatArray],
 ) -> FloatArray:
-    """Return Mahalanobis distances, shape (n, n), that know how sure the references are."""
+    """Return Mahalanobis distances, shape (n, n), with the uncertainty of the references."""
     predictions = [_predict(measurement, pose_of) for measurement in measurements]
     edges = [measurement.edge for measurement in measurements]
     distances = np.zeros((len(edges), len(edges)))
@@ -180,7 +181,7 @@ def _true_distances(
 
 
 def _are_near_medoid(distances: FloatArray) -> BoolArray:
-    """Tell which predictions, shape (n,), agree with the one that most agree with."""
+    """Return a mask, shape (n,), of the predictions that agree with their medoid."""
     medoid = int(np.minimum(distances, _AGREEMENT).sum(axis=1).argmin())
     return np.asarray(distances[medoid] <= _AGREEMENT)
 
@@ -188,13 +189,13 @@ def _are_near_medoid(distances: FloatArray) -> BoolArray:
 def _mean(
     twists: Sequence[FloatArray], informations: Sequence[FloatArray]
 ) -> tuple[FloatArray, float]:
-    """Return the weighted mean, shape (6,), of twists (6,), and how far they lie around it.
+    """Return the weighted mean, shape (6,), of twists (6,), and their spread around it.
 
-    By such a start a robust kernel weighs each edge near where it will be, not from where one of
-    them was. The spread is the sum of the squared lengths of the deviations, in sigmas. No two of
-    the twists are farther apart, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
+    From the mean, a robust kernel weighs each edge close to its final residual. The spread is the
+    sum of the squared Mahalanobis lengths of the deviations. It bounds the squared distance of any
+    two twists, as (x - y)' (A + B)^-1 (x - y) <= x' A^-1 x + y' B^-1 y.
     """
-    # One by one: for a few edges that takes half the time of stacking them.
+    # For a few edges a loop takes half the time of stacked arrays.
     weighted = [information @ x for information, x in zip(informations, twists, strict=True)]
     total = sum(weighted, _ZERO)
     mean = dposv(sum(informations, _NOTHING), total)[1]
@@ -217,7 +218,7 @@ def _twists(predictions: Sequence[gtsam.Pose3]) -> list[FloatArray]:
 def _distances(twists: Sequence[FloatArray], covariances: Sequence[FloatArray]) -> FloatArray:
     """Return Mahalanobis distances, shape (n, n), between predictions of one pose.
 
-    Differences of twists about one of them are exact where they agree, large where they do not.
+    Differences of twists about one of them are exact if they agree, and large if they do not.
     """
     rows, columns = _pairs(len(twists))
     stacked, spreads = np.array(twists), np.array(covariances)
@@ -229,7 +230,7 @@ def _distances(twists: Sequence[FloatArray], covariances: Sequence[FloatArray]) 
 
 def _mahalanobis(differences: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return the lengths, shape (...), of differences (..., 6) in sigmas."""
-    # In units of the sigmas, and a trace wider than they: never singular.
+    # In units of the sigmas, and slightly inflated: never singular.
     sigmas = np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
     correlations = covariances / (sigmas[..., :, np.newaxis] * sigmas[..., np.newaxis, :])
     squares = se3.mahalanobis(differences / sigmas, correlations + _TRACE)
@@ -305,7 +306,7 @@ class WindowCounter:
 
 
 class Admission:
-    """Chooses the usable measurements of a new pose, and its start value.
+    """Selects the usable measurements of a new pose, and finds its start value.
 
     Parameters
     ----------
@@ -328,7 +329,7 @@ class Admission:
         *,
         gate: float | None,
     ) -> NewPose:
-        """Return the pose with its valid measurements that the others do not contradict.
+        """Return the pose with its valid measurements that pass the gate.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The pose graph in iSAM2: what GTSAM needs, and nothing of frames or statuses.
+"""A pose graph in iSAM2, by integer keys: update, marginalize, restore.
 
 References
 ----------
@@ -20,18 +20,18 @@ from gvo.errors import SmoothingError
 from gvo.geometry.se3 import is_definite
 from gvo.types import FloatArray
 
-# Radians and metres: a pose that an update moved farther than the first is updated again, until
-# it moves less than the second.
+# Radians and metres: if an update moves a pose by more than the first, it is repeated until the
+# pose moves by less than the second.
 _FAR = 0.02
 _STILL = 1e-4
 _MAX_STEPS = 10
-# What was done to a graph since it was copied, and may have to be done again: the function, its
-# arguments, and a pose whose estimate was asked for afterwards.
+# A call since the last copy of the graph, replayed to restore it: the function, its arguments, and
+# the key of a pose whose estimate was asked for afterwards.
 _Step: TypeAlias = tuple[Callable[..., object], tuple[Any, ...], int | None]
 _UPDATE, _MARGINALIZE = gtsam.ISAM2.update, gtsam.ISAM2.marginalizeLeaves
-# A graph is copied again after so many steps, a large one after one for so many poses: a copy then
-# costs an update the same at any size.
-_N_REDONE = 16
+# Number of steps between copies of the graph: at least the first, and one for so many poses of the
+# second, so that copying costs an update the same at any size.
+_N_REPLAYED = 16
 _POSES_PER_STEP = 32
 _MIN_EIGENVALUE = 1e-10
 _MAX_ROUNDING = 1e-6
@@ -45,15 +45,15 @@ class PoseGraph:
     is_whole : bool
         Nothing will be marginalized, and the graph may grow large.
     is_hardened : bool
-        Of a whole graph: slower, and safe where sigmas are many orders apart.
+        Of a whole graph: slower, but works with sigmas many orders of magnitude apart.
     """
 
     def __init__(self, *, is_whole: bool = False, is_hardened: bool = False) -> None:
         parameters = gtsam.ISAM2Params()
         self._is_whole, self._is_hardened = is_whole, is_hardened
         if is_whole:
-            # GTSAM's own trade of accuracy for time, which grows with the graph: the end is
-            # polished. Nothing is marginalized, so Cholesky holds, but for odd inputs.
+            # GTSAM's defaults, which trade accuracy for time: the batch optimization at the end
+            # makes up for it. Nothing is marginalized, so Cholesky works for all but odd inputs.
             parameters.setRelinearizeThreshold(0.1)
             parameters.relinearizeSkip = 10
             parameters.setFactorization("QR" if is_hardened else "CHOLESKY")
@@ -64,8 +64,8 @@ class PoseGraph:
             parameters.setRelinearizeThreshold(0.001)
             parameters.relinearizeSkip = 1
             parameters.findUnusedFactorSlots = True
-            # Carry every change through to the oldest pose: by default small ones are left out,
-            # which costs what smoothing gains where edges are good to a tenth of a millimetre.
+            # Propagate every change to the oldest pose: by default small ones are ignored, which
+            # loses what smoothing gains with edges accurate to a tenth of a millimetre.
             parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         self._isam = gtsam.ISAM2(parameters)
         self._n_poses = 0
@@ -75,15 +75,15 @@ class PoseGraph:
 
     @property
     def can_be_hardened(self) -> bool:
-        """Tell whether there is a way that takes worse conditioned factors."""
+        """Tell whether a graph for worse conditioned factors is left to try."""
         return self._is_whole and not self._is_hardened
 
     def hardened(self) -> PoseGraph:
-        """Return a whole graph of the same factors that takes worse conditioned ones."""
+        """Return a whole graph of the same factors that takes worse conditioned ones too."""
         return self._remade(self.values(), is_hardened=True)
 
     def moved(self, values: gtsam.Values) -> PoseGraph:
-        """Return a graph of the same factors, linearized at other poses."""
+        """Return a graph of the same factors, linearized at other values."""
         return self._remade(values, is_hardened=self._is_hardened)
 
     def _remade(self, values: gtsam.Values, *, is_hardened: bool) -> PoseGraph:
@@ -94,18 +94,18 @@ class PoseGraph:
 
     @contextmanager
     def restored_on_error(self) -> Iterator[None]:
-        """Put the graph back as it was when an update fails or is interrupted.
+        """Restore the graph if an update inside the context fails or is interrupted.
 
-        It is not copied before each update: that takes as long as the graph is large. From the
-        last copy on, what was done is done again.
+        The time of a copy grows with the graph, so there is none before each update: the steps
+        since the last copy are replayed.
 
         Raises
         ------
         SmoothingError
-            In place of what GTSAM throws.
+            In place of GTSAM's exceptions.
         """
-        n_redone = max(_N_REDONE, self._n_poses // _POSES_PER_STEP)
-        if self._saved is None or len(self._done) >= n_redone:
+        n_replayed = max(_N_REPLAYED, self._n_poses // _POSES_PER_STEP)
+        if self._saved is None or len(self._done) >= n_replayed:
             self._saved, self._done = gtsam.ISAM2(self._isam), []
         before = self._saved, len(self._done), self._n_poses
         self._is_guarded = True
@@ -129,7 +129,7 @@ class PoseGraph:
         self._isam, self._n_poses = isam, n_poses
 
     def _note(self, step: _Step) -> None:
-        """Remember what was done to the graph, or that nobody will want it back."""
+        """Record a step for replay; outside of `restored_on_error` nothing is restored."""
         if self._is_guarded:
             self._done.append(step)
         else:
@@ -151,26 +151,26 @@ class PoseGraph:
         values : gtsam.Values
             Start values of new poses, which the factors tie.
         alive : collection of int
-            All keys that are in the graph; needed where some are leaving.
+            All keys in the graph; needed if some are leaving.
         leaving : sequence of int
-            Keys to eliminate first, each in a group of its own: only so do they become leaves
-            of the Bayes tree, which can be marginalized.
+            Keys to eliminate first, each in a group of its own, so that they become leaves of
+            the Bayes tree: only these can be marginalized.
         """
         constraints = self._constraints(factors, alive, leaving) if leaving else ()
         self._isam.update(factors, values, *constraints)
         self._n_poses += values.size()
-        # A whole graph carries small changes on where estimates are asked for.
+        # Asking a whole graph for estimates propagates small changes.
         key = next(iter(factors.keyVector()), None) if self._is_whole else None
         self._note((_UPDATE, (factors, values, *constraints), key))
 
     def _constraints(
         self, factors: gtsam.NonlinearFactorGraph, alive: Collection[int], leaving: Sequence[int]
     ) -> tuple[Any, ...]:
-        """Return what an update is told so that leaving poses become leaves of the Bayes tree."""
+        """Return the arguments that make leaving poses leaves of the Bayes tree."""
         n_leaving = len(leaving)
         groups = dict.fromkeys(alive, n_leaving)
-        # Last comes what the factors tie, the new poses among them: its covariances are cheap
-        # then, and as a rule the next pose is tied to the same.
+        # The poses that the factors constrain come last: their covariances are cheap then, and
+        # the next pose usually has edges to the same ones.
         groups |= dict.fromkeys(factors.keyVector(), n_leaving + 1)
         groups |= {key: group for group, key in enumerate(leaving)}
         constrained, reeliminate = gtsam.KeyGroupMap(), gtsam.KeyList()
@@ -217,7 +217,7 @@ class PoseGraph:
         return True
 
     def marginalize(self, keys: Sequence[int]) -> None:
-        """Take out poses that the last update made ready; what they knew stays."""
+        """Marginalize poses that the last update made leaves."""
         for key in keys:
             leaf = gtsam.KeyList()
             leaf.push_back(key)
@@ -238,7 +238,7 @@ class PoseGraph:
         return definite(self._isam.marginalCovariance(key))
 
     def covariances(self, keys: Sequence[int]) -> list[FloatArray]:
-        """Return the marginal covariances of poses; of several at once, they share their work."""
+        """Return the marginal covariances of poses, computed jointly."""
         if len(keys) == 1:
             return [self.covariance(keys[0])]
         joint = _symmetric(self._isam.jointMarginalCovariance(keys).fullMatrix())
@@ -268,8 +268,8 @@ def _converged(
     before: Mapping[int, gtsam.Pose3], after: Mapping[int, gtsam.Pose3], limit: float
 ) -> bool:
     """Tell whether each element of the twists between poses before and after is below a limit."""
-    # Where no element of two transforms differs by more than 0.4 of it, no twist can: an angle is
-    # at most 3 / sqrt(2), a distance sqrt(3) times the largest difference. GTSAM tells so quickly.
+    # If no element of the transforms differs by more than 0.4 of the limit, no twist exceeds it:
+    # an angle is at most 3 / sqrt(2), a distance sqrt(3) times the largest difference.
     if all(before[key].equals(after[key], 0.4 * limit) for key in before):
         return True
     moves = [before[key].localCoordinates(after[key]).tolist() for key in before]
@@ -277,14 +277,14 @@ def _converged(
 
 
 def first_line(error: BaseException) -> str:
-    """Return what GTSAM says in a paragraph, in one line."""
+    """Return the first line of an error message, or the name of its type."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def definite(covariance: FloatArray) -> FloatArray:
-    """Return the covariance without the traces of rounding.
+    """Return the covariance, symmetric positive definite in spite of rounding.
 
-    Where sigmas lie many orders apart, rounding may leave the smallest eigenvalue of the
+    With sigmas many orders of magnitude apart, rounding may leave the smallest eigenvalue of the
     correlations at or below zero.
     """
     symmetric = _symmetric(covariance)
@@ -299,7 +299,7 @@ def _symmetric(covariance: FloatArray) -> FloatArray:
 
 
 def _repaired(symmetric: FloatArray) -> FloatArray:
-    """Return a covariance that rounding made indefinite, definite again."""
+    """Clip the eigenvalues of the correlations that rounding made too small."""
     variances = np.diag(symmetric)
     if variances.min() <= 0.0:
         raise SmoothingError("GTSAM: a variance is not positive")

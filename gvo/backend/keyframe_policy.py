@@ -1,7 +1,7 @@
-"""Which frames are kept, linked and released, decided by scores of nearness alone.
+"""Which frames become keyframes, are linked and released, by scores alone.
 
-A score tells how much the current frame has in common with a kept one: 1 at the same place, 0
-far away. It is the share of the view that they have in common where points are known
+A score tells how much the current frame has in common with a keyframe: 1 at the same place, 0
+far away. It is the overlap of their views if points are known
 (`gvo.odometry.keyframes`), else `proximity`. All scores come by frame, the oldest first.
 """
 
@@ -20,7 +20,7 @@ _Id = TypeVar("_Id", bound=Hashable)
 
 
 def proximity(T_a_b: FloatArray, config: WindowConfig) -> float:
-    """Score how near two poses are, where nothing is known of what is seen from them.
+    """Score how near two poses are, without knowledge of the view.
 
     Parameters
     ----------
@@ -32,8 +32,8 @@ def proximity(T_a_b: FloatArray, config: WindowConfig) -> float:
     Returns
     -------
     float
-        1 at the same place; `keyframe_overlap` at the distance or the turn of a keyframe, the
-        larger of the two ratios counting; falling linearly, not below 0.
+        1 at the same place, falling linearly to `keyframe_overlap` at the distance or the angle
+        of a keyframe, whichever is reached first, and on to 0.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def proximity(T_a_b: FloatArray, config: WindowConfig) -> float:
 
 
 def is_needed(scores: Mapping[_Id, float], config: WindowConfig) -> bool:
-    """Tell whether the current frame holds so much new that it should be kept."""
+    """Tell whether the current frame should become a keyframe."""
     return max(scores.values(), default=0.0) < config.keyframe_overlap
 
 
@@ -60,12 +60,12 @@ def choose_links(
     n_steps: Mapping[_Id, int],
     exclude: Hashable = None,
 ) -> tuple[list[_Id], list[_Id]]:
-    """Choose the kept frames to register the current frame against.
+    """Choose the keyframes to register the current frame against.
 
-    Of those that are worth it, half are the oldest, which hold the drift, and the others have the
-    most in common with it. What a link tells beyond the steps, which are known already, grows
-    with the number of these, whose errors add up, and with the points that both frames see: the
-    product has to be at least `link_gain`.
+    Half of the chosen ones are the oldest, which limit the drift, the others those with the
+    highest score. The information of a link beyond the chain of steps grows with their number,
+    because their errors accumulate, and with the overlap: the product has to be at least
+    `link_gain`.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def choose_links(
     -------
     chosen : list of frames
     spare : list of frames
-        Those that fill up the number, nearest first, for where the steps are in doubt.
+        More of them up to `n_links`, highest score first, to check doubtful steps.
     """
     n = config.n_links - 1
     usable = [
@@ -100,7 +100,7 @@ def _nearest_first(frames: list[_Id], scores: Mapping[_Id, float]) -> list[_Id]:
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:
-    """Choose the kept frames to let go: too far off, and the farthest beyond the limit.
+    """Choose the keyframes to release: too little overlap, and the lowest scores above the number.
 
     Parameters
     ----------
@@ -109,8 +109,8 @@ def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept
     config : WindowConfig
         `n_keyframes` and `min_overlap`.
     n_kept : int
-        Number of kept frames, the current one included where it is kept: it has no score, and
-        is not let go.
+        Number of keyframes, including the current one if it is one: it has no score, and is not
+        released.
     """
     far = [frame for frame, score in scores.items() if score < config.min_overlap]
     near = [frame for frame, score in scores.items() if score >= config.min_overlap]

@@ -1,4 +1,4 @@
-"""Going on without a measurement: at the last velocity, less sure with every second."""
+"""Constant velocity with a covariance that grows with the time without a measurement."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray, FrameId, Status
 
-# After a longer gap the last velocity says nothing about where the camera is.
+# After a longer gap the last velocity is no longer extrapolated.
 MAX_EXTRAPOLATION_S = 1.0
 _MIN_ELAPSED_S = 1e-3
-# Sigma of an angle that is not known at all, and of a place.
+# Upper bounds of the sigmas: a uniformly distributed angle, and an unknown position.
 _ANY_TURN = np.pi / np.sqrt(3.0)
 _ANYWHERE_M = 1e5
 
@@ -19,25 +19,25 @@ _ANYWHERE_M = 1e5
 def predict_step(
     velocity: FloatArray | None, elapsed_s: float, config: WindowConfig, *, coasted_s: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Continue the last velocity.
+    """Predict the next relative pose at the last velocity.
 
     Parameters
     ----------
     velocity : ndarray of float64, shape (6,), or None
-        Twist per second (rad/s, m/s); None: standing still.
+        Twist per second (rad/s, m/s); None for zero.
     elapsed_s : float
         Seconds since the last pose.
     config : WindowConfig
-        Sigmas of a second without a measurement.
+        Sigmas per second without a measurement.
     coasted_s : float
-        Seconds that went by without a measurement before.
+        Seconds without a measurement before the last pose.
 
     Returns
     -------
     T_last_frame : ndarray of float64, shape (4, 4)
     covariance : ndarray of float64, shape (6, 6)
-        Steps of it add up to sigmas in proportion to the whole time without a measurement,
-        however short they are: a velocity that is wrong stays wrong.
+        Over several steps the sigmas grow in proportion to the whole time without a
+        measurement, however short the steps are: the error of a velocity is systematic.
     """
     T = np.eye(4) if velocity is None else se3.exp(velocity * min(elapsed_s, MAX_EXTRAPOLATION_S))
     elapsed_s = max(elapsed_s, _MIN_ELAPSED_S)
@@ -48,40 +48,40 @@ def predict_step(
 
 
 class StatusClock:
-    """Tells a frame's status from how long there was no measurement.
+    """Derives the status of a frame from the time without a measurement.
 
     Parameters
     ----------
     lost_after_s : float
-        Without a measurement for longer the camera is lost, be it that frames cannot be
-        registered or that there are none.
+        The camera is lost after a longer time, whether frames cannot be registered or are
+        missing.
     """
 
     def __init__(self, lost_after_s: float) -> None:
         self._lost_after_s = lost_after_s
-        self._tied_ns: int | None = None
-        self._is_loose = False
+        self._measured_ns: int | None = None
+        self._has_none = False
 
     def reconfigure(self, lost_after_s: float) -> None:
-        """Take another limit from the next frame on."""
+        """Set another limit."""
         self._lost_after_s = lost_after_s
 
-    def next(self, stamp_ns: int, *, is_tied: bool) -> Status:
+    def next(self, stamp_ns: int, *, is_measured: bool) -> Status:
         """Return the status of the next frame.
 
         Parameters
         ----------
         stamp_ns : int
             Its stamp, nanoseconds.
-        is_tied : bool
-            Whether a measurement ties it to earlier frames or to the world.
+        is_measured : bool
+            Whether a measurement constrains it.
         """
-        was_loose, self._is_loose = self._is_loose, not is_tied
-        if is_tied:
-            self._tied_ns = stamp_ns
-            return Status.RESUMED if was_loose else Status.OK
-        self._tied_ns = stamp_ns if self._tied_ns is None else self._tied_ns
-        coasting_s = 1e-9 * (stamp_ns - self._tied_ns)
+        had_none, self._has_none = self._has_none, not is_measured
+        if is_measured:
+            self._measured_ns = stamp_ns
+            return Status.RESUMED if had_none else Status.OK
+        self._measured_ns = stamp_ns if self._measured_ns is None else self._measured_ns
+        coasting_s = 1e-9 * (stamp_ns - self._measured_ns)
         return Status.LOST if coasting_s > self._lost_after_s else Status.COASTING
 
 
@@ -91,7 +91,7 @@ class ConstantVelocity:
     Parameters
     ----------
     config : WindowConfig
-        Sigmas of a second without a measurement.
+        Sigmas per second without a measurement.
     """
 
     def __init__(self, config: WindowConfig) -> None:
@@ -105,27 +105,27 @@ class ConstantVelocity:
         self.last: Estimate | None = None
 
     def reconfigure(self, config: WindowConfig) -> None:
-        """Take other sigmas; the motion goes on."""
+        """Set other sigmas."""
         self._config = config
 
     @property
     def measured_id(self) -> FrameId:
-        """The last frame that a measurement tied; None before the first."""
+        """The last frame with a measurement; None before the first."""
         return None if self._measured is None else self._measured.frame_id
 
     def append(
         self, estimate: Estimate, *, is_measured: bool, T_world_measured: FloatArray | None = None
     ) -> None:
-        """Take the pose of the next frame.
+        """Add the pose of the next frame.
 
         Parameters
         ----------
         estimate : Estimate
         is_measured : bool
-            Whether a measurement ties it.
+            Whether a measurement constrains it.
         T_world_measured : ndarray of float64, shape (4, 4), optional
-            Present pose of `measured_id`, where the new one is tied to the same graph: between
-            estimates of different moments a correction would look like a motion.
+            Current pose of `measured_id` in the same graph: its causal estimate would make a
+            correction look like a motion. The velocity is unknown without it.
         """
         self.last = estimate
         if not is_measured:
@@ -159,7 +159,7 @@ class ConstantVelocity:
         )
 
     def _velocity(self) -> FloatArray | None:
-        """Return the twist per second, computed only where it is asked for, which is rare."""
+        """Return the twist per second; None if unknown."""
         if self._step is None:
             return None
         T_world_before, T_world_last, elapsed_s = self._step

@@ -1,7 +1,7 @@
-"""What an edge or a prior must be, so that GTSAM survives it.
+"""Validation of edges and priors before GTSAM gets them.
 
-GTSAM takes a matrix that is no rotation, or a covariance that is none, without a word, and dies
-of it in a later update, naming a neighbour.
+GTSAM accepts a matrix that is no rotation, or an invalid covariance, silently, and fails in a
+later update, naming a neighbour.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
 
-# Beyond, squared ratios leave the range of doubles. Coordinates of the whole Earth fit in.
+# Beyond these, squared ratios leave the range of doubles. Coordinates on Earth fit in.
 _MAX_COORDINATE_M = 1e8
 _MIN_SIGMA = 1e-8
 _MAX_SIGMA = 1e6
-# Of a covariance that has to be made up.
+# Bounds of the sigmas of a replaced covariance.
 _MIN_SANE_SIGMA = 1e-5
 _MAX_SANE_SIGMA = 1e3
 
 
 def find_faults(edges: Sequence[Edge]) -> list[str]:
-    """Return for each edge what is wrong with its values; empty where nothing is."""
+    """Say for each edge why it is invalid; empty if it is valid."""
     return [
         transform_fault(edge.T_reference_frame) or covariance_fault(edge.covariance)
         for edge in edges
@@ -32,12 +32,12 @@ def find_faults(edges: Sequence[Edge]) -> list[str]:
 
 
 def place_fault(positions_world: FloatArray) -> str:
-    """Return why positions, shape (..., 3), cannot be right; empty where they may be."""
+    """Say why optimized positions, shape (..., 3), are invalid; empty if they are valid."""
     return _divergence(float(np.abs(positions_world).max()))
 
 
 def pose_fault(T_world_frame: FloatArray) -> str:
-    """Return why a pose that came out cannot be right; empty where it may be."""
+    """Say why an optimized pose is invalid; empty if it is valid."""
     rows = T_world_frame.tolist()
     if not math.isfinite(sum(map(sum, rows))):
         return "a pose is not finite"
@@ -45,12 +45,12 @@ def pose_fault(T_world_frame: FloatArray) -> str:
 
 
 def _divergence(largest: float) -> str:
-    is_far = not largest <= 2.0 * _MAX_COORDINATE_M  # nor is what is not a number near
+    is_far = not largest <= 2.0 * _MAX_COORDINATE_M  # NaN too
     return f"a pose diverged to {largest:.3g} m" if is_far else ""
 
 
 def sane_covariance(covariance: FloatArray) -> FloatArray:
-    """Return the covariance, or one of the same sigmas, bounded, where it is none to work with."""
+    """Return the covariance; if invalid, a diagonal one of its sigmas within bounds."""
     if not covariance_fault(covariance):
         return np.asarray(0.5 * (covariance + covariance.T))
     variances = np.nan_to_num(
@@ -60,7 +60,7 @@ def sane_covariance(covariance: FloatArray) -> FloatArray:
 
 
 def prior_fault(prior: Prior) -> str:
-    """Return what is wrong with a prior; empty where nothing is."""
+    """Say why a prior is invalid; empty if it is valid."""
     if isinstance(prior, PosePrior):
         return transform_fault(prior.T_world_frame) or covariance_fault(prior.covariance)
     return _position_fault(prior) or covariance_fault(prior.covariance)

@@ -39,23 +39,23 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class SlidingWindow:
-    """Recent poses and kept keyframes, tied by relative poses of any origin.
+    """Recent poses and keyframes, smoothed over relative poses of any origin.
 
-    A pose leaves when it is neither recent nor kept; what was known of it stays as a marginal on
-    the poses it was tied to. It is then handed over by `pop_finished`. With `window.size: null`
-    nothing leaves, and `finish` polishes the result by Levenberg-Marquardt.
+    A pose that is neither recent nor kept is marginalized, and `pop_finished` returns its smoothed
+    estimate. With `window.size: null` none is marginalized, and `finish` ends with a batch
+    optimization by Levenberg-Marquardt.
 
-    Whatever the measurements hold, the window goes on: an edge or a prior that GTSAM could not
-    live with, or that the others contradict, is refused with a reason (`Rejected`), and a pose
-    without a usable edge continues the last velocity.
+    No measurement stops the window: an edge or a prior that is invalid, or that others
+    contradict, is refused with a reason (`Rejected`), and a pose without a usable edge continues
+    the last velocity.
 
     Parameters
     ----------
     config : WindowConfig, optional
         Number of recent poses, robust kernel, gate.
     keyframes : {"manual", "distance"}
-        Who keeps poses: the caller by `keep` and `release`, or the window, by distance and angle
-        (`window.keyframe_distance_m`, `window.keyframe_angle_deg`, `window.n_keyframes`).
+        Who chooses keyframes: the caller by `keep` and `release`, or the window by distance and
+        angle (`window.keyframe_distance_m`, `window.keyframe_angle_deg`, `window.n_keyframes`).
 
     Examples
     --------
@@ -110,28 +110,28 @@ class SlidingWindow:
 
     @property
     def counts(self) -> WindowCounts:
-        """What was taken and refused so far."""
+        """What was accepted and refused so far."""
         return self._counter.counts
 
     @property
     def polish(self) -> BatchResult | None:
-        """What `finish` gained by Levenberg-Marquardt, where the window kept everything."""
+        """The batch optimization in `finish`, if the window kept everything; else None."""
         return self._polish
 
     def reconfigure(self, config: WindowConfig) -> None:
-        """Go on with another configuration; what is in the window stays as it went in.
+        """Use another configuration from now on; measurements keep their kernels.
 
         Parameters
         ----------
         config : WindowConfig
-            Kernel and gate are those of what comes from now on. With a smaller size poses leave
-            with the next updates, up to 32 at a time. With `size: null` nothing leaves from now
-            on; what left before stays where it is, so that `finish` has nothing to polish.
+            With a smaller size poses leave with the next updates, up to 32 at a time. With
+            `size: null` no more poses leave; if some left before, `finish` does no batch
+            optimization.
 
         Raises
         ------
         ValueError
-            When it is no WindowConfig.
+            If it is no WindowConfig.
         """
         _check_config(config)
         if config == self._config:
@@ -160,30 +160,29 @@ class SlidingWindow:
             Nanoseconds, later than that of the pose before.
         edges : sequence of Edge
             Relative poses to poses in the window; none for the very first one. They are gated
-            against each other. Where none is usable the pose continues the last velocity.
+            against each other. If none is usable, the pose continues the last velocity.
         prior : PosePrior or PositionPrior, optional
-            What is known of the pose in the world. The very first pose is the identity where it
-            has none; of a position alone its rotation starts there, free to turn.
+            A measurement of the pose in the world. Without one the very first pose is the
+            identity; with a position alone its rotation starts at the identity, nearly free.
         status : Status, optional
-            Handed through to the estimates; found by the window where omitted.
+            Of the estimates, if the pose is measured; found by the window if omitted.
 
         Returns
         -------
         Estimate
-            The causal pose: the best at this moment, with its marginal covariance, and what was
-            refused.
+            The causal pose with its marginal covariance, and what was refused.
 
         Raises
         ------
         ValueError
-            A name that is in the window already, a stamp that does not advance, edges of the
-            very first pose. The window stands as before.
+            For a name that is in the window already, a stamp that does not advance, or edges of
+            the very first pose. The window is unchanged.
         """
         edges = _as_edges(frame_id, edges)
         self._check_new(frame_id, stamp_ns, edges, prior)
         pose = self._admission.admit(frame_id, int(stamp_ns), edges, prior, gate=self._config.gate)
         pose, T_world_frame, covariance = self._insert(pose)
-        found = self._clock.next(pose.stamp_ns, is_tied=pose.is_measured)
+        found = self._clock.next(pose.stamp_ns, is_measured=pose.is_measured)
         estimate = Estimate(
             frame_id=frame_id,
             stamp_ns=pose.stamp_ns,
@@ -200,7 +199,7 @@ class SlidingWindow:
         return estimate
 
     def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate | Rejected:
-        """Tie two poses that are both in the window, as a loop does.
+        """Add an edge between two poses of the window, such as a loop.
 
         Parameters
         ----------
@@ -211,7 +210,7 @@ class SlidingWindow:
         Returns
         -------
         Estimate or Rejected
-            The frame's pose with the edge; falsy where the edge was refused.
+            The new estimate of the frame; falsy if the edge was refused.
         """
         self._poses.find(frame_id)
         _as_edges(frame_id, [edge])
@@ -224,7 +223,7 @@ class SlidingWindow:
         return answer
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
-        """Tie a pose of the window to the world.
+        """Add a measurement of a pose of the window in the world.
 
         Parameters
         ----------
@@ -234,7 +233,7 @@ class SlidingWindow:
         Returns
         -------
         Estimate or Rejected
-            The frame's pose with the prior; falsy where the prior was refused.
+            The new estimate of the frame; falsy if the prior was refused.
         """
         _check_prior(frame_id, prior)
         is_there = self._poses.find(frame_id) is not None
@@ -246,11 +245,11 @@ class SlidingWindow:
         return answer
 
     def keep(self, frame_id: FrameId) -> None:
-        """Keep a pose of the window as a keyframe until it is released."""
+        """Keep a pose in the window until it is released."""
         self._poses.require(frame_id).is_kept = True
 
     def release(self, frame_id: FrameId) -> None:
-        """Let a kept pose leave, with the next update after it is no longer recent."""
+        """Let a kept pose leave with the next update, unless it is recent."""
         self._poses.require(frame_id).is_kept = False
 
     def kept(self) -> list[FrameId]:
@@ -267,10 +266,7 @@ class SlidingWindow:
         return {frame_id: self._graph.pose(frame_id) for frame_id in self._poses}
 
     def edges(self, frame_id: FrameId) -> tuple[Edge, ...]:
-        """Return the edges from earlier frames that were accepted for a frame.
-
-        Empty where it is not in the window.
-        """
+        """Return the accepted edges of a frame to poses of the window; empty if it has left."""
         pose = self._poses.get(frame_id)
         if pose is None:
             return ()
@@ -281,7 +277,7 @@ class SlidingWindow:
         return self._poses.require(frame_id).stamp_ns
 
     def estimate(self, frame_id: FrameId) -> Estimate:
-        """Return what is known now of a pose of the window."""
+        """Return the current estimate of a pose of the window."""
         self._poses.require(frame_id)
         return self._graph.estimate(frame_id)
 
@@ -300,8 +296,8 @@ class SlidingWindow:
         Returns
         -------
         Edge
-            T_reference_frame; its covariance comes of the joint one of both poses, so that what
-            they do not know together does not count.
+            T_reference_frame, with a covariance from the joint one of both poses: their common
+            uncertainty cancels.
         """
         return Edge(
             reference_id=reference_id,
@@ -310,9 +306,9 @@ class SlidingWindow:
         )
 
     def graph(self) -> list[GraphEdge]:
-        """Return the measurements between poses of the window, and how the poses fit them.
+        """Return the measurements of the poses of the window, with residuals and weights.
 
-        What poses that left knew is in the marginals and not listed.
+        Marginals of poses that left are not listed.
         """
         return self._graph.measurements()
 
@@ -322,13 +318,13 @@ class SlidingWindow:
         Parameters
         ----------
         path : str or Path
-            Whole-number ids are kept, others numbered with their names as comments; priors are
-            left out. Rotations of the information matrix are in radians, as GTSAM reads them.
+            Whole-number ids are kept, others are numbered, with their names as comments; priors
+            are left out. Rotations of the information matrix are in radians, as GTSAM reads them.
 
         Raises
         ------
         SmoothingError
-            When the file cannot be written.
+            If the file cannot be written.
         """
         text = "".join(f"{line}\n" for line in g2o_lines(self.poses(), self.graph()))
         try:
@@ -337,14 +333,13 @@ class SlidingWindow:
             raise SmoothingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def pop_finished(self) -> list[Estimate]:
-        """Hand over the smoothed estimates of the poses that left since the last call."""
+        """Return the smoothed estimates of the poses that left since the last call."""
         return self._graph.pop_finished()
 
     def finish(self) -> list[Estimate]:
-        """Hand over all estimates that were not popped yet, in the order of their stamps.
+        """Return all estimates that were not popped yet, by stamp, and empty the window.
 
-        Where the window kept everything they are polished first. It is empty afterwards, ready
-        for another first pose.
+        If no pose left before, they are optimized in a batch first.
         """
         self._polish = self._graph.finish()
         self._motion.restart()
@@ -359,7 +354,9 @@ class SlidingWindow:
         is_known = self._poses.find(frame_id) is not None
         if frame_id is None or is_known:
             raise ValueError(
-                f"{frame_id!r} is in the window already" if is_known else "no frame_id"
+                f"{frame_id!r} is in the window already"
+                if is_known
+                else "a frame_id must not be None"
             )
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
             raise ValueError(f"stamp_ns of {frame_id!r} must be an int, got {stamp_ns!r}")
@@ -374,7 +371,7 @@ class SlidingWindow:
             raise ValueError(f"{frame_id!r} is the first pose and can have no edges, only a prior")
 
     def _gate_loop(self, frame_id: FrameId, edge: Edge) -> str:
-        """Return why an edge between known poses is refused; empty where it fits them."""
+        """Say why an edge between known poses is refused; empty if it is not."""
         if self._config.gate is None:
             return ""
         known = self.relative_pose(edge.reference_id, frame_id)
@@ -413,8 +410,8 @@ class SlidingWindow:
             except SmoothingError as error:
                 self._counter.add(n_restored=1)
                 place = f"{pose.frame_id!r} at {pose.stamp_ns} ns"
-                _LOGGER.warning("%s: %s; the window stands as before", place, error)
-        # Not even alone: it is handed over as predicted, and never in the window.
+                _LOGGER.warning("%s: %s; the window is restored", place, error)
+        # Not even alone: it is returned as predicted, and never in the window.
         prediction = self._motion.predict_pose(pose.stamp_ns)
         return pose, *(prediction or (ORIGIN.T_world_frame, ORIGIN.covariance))
 
@@ -433,19 +430,19 @@ class SlidingWindow:
     def _try(
         self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
     ) -> Estimate | Rejected:
-        """Return a pose with another measurement, or why GTSAM gave it up."""
+        """Return the estimate after another measurement, or why GTSAM failed."""
         while True:
             try:
                 return extend()
             except SmoothingError as error:
                 self._counter.add(n_restored=1)
-                _LOGGER.warning("%r: %s; the window stands as before", frame_id, error)
+                _LOGGER.warning("%r: %s; the window is restored", frame_id, error)
                 if not self._harden():
                     reason = f"GTSAM gave up on the update: {error}"
                     return self._reject(frame_id, reason, edge=edge)
 
     def _harden(self) -> bool:
-        """Go on with a graph that takes worse conditioned factors; False where there is none."""
+        """Move to a graph for worse conditioned factors; False if there is none."""
         if not self._graph.can_be_hardened:
             return False
         try:

@@ -373,7 +373,7 @@ class WindowGraph:
         except (RuntimeError, SmoothingError) as error:
             pose = self.poses[frame_id]
             place = f"{frame_id!r} at {pose.stamp_ns} ns"
-            _LOGGER.warning("%s: %s; its causal pose stands", place, first_line(error))
+            _LOGGER.warning("%s: %s; its causal pose is returned", place, first_line(error))
             if pose.causal is None:
                 raise
             return replace(pose.causal, rejected=())
@@ -444,7 +444,9 @@ class WindowGraph:
                 optimized, result = optimize_batch(self._isam.factors(), self._isam.values())
                 self._isam = self._isam.moved(optimized)
             except (RuntimeError, SmoothingError) as error:
-                _LOGGER.warning("the poses stand as iSAM2 left them: %s", first_line(error))
+                _LOGGER.warning(
+                    "no batch optimization, the poses are those of iSAM2: %s", first_line(error)
+                )
         self._finished += [self.estimate(frame_id) for frame_id in self.poses]
         self._begin()
         return result

@@ -401,7 +401,7 @@ class EdgeChain:
             self._chain, is_tied = PoseChain(self._config, first), True
         else:
             is_tied = self._advance(self._chain, first.stamp_ns, edges, prior)
-        status = self._status.next(first.stamp_ns, is_tied=is_tied)
+        status = self._status.next(first.stamp_ns, is_measured=is_tied)
         newest = self._chain.newest
         estimate = replace(newest, status=status, frame_id=first.frame_id, rejected=())
         self._poses[first.frame_id] = estimate

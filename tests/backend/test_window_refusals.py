@@ -361,7 +361,7 @@ def test_a_stamp_may_be_a_number_of_numpy_but_no_truth_value() -> None:
     for wrong in (True, np.True_, 8.0):
         with pytest.raises(ValueError, match="stamp_ns of 'b' must be an int"):
             window.add_pose("b", wrong, [])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="no frame_id"):
+    with pytest.raises(ValueError, match="must not be None"):
         window.add_pose(None, 8, [])
     with pytest.raises(ValueError, match="'a' is in the window already"):
         window.add_pose("a", 8, [])
