@@ -202,10 +202,7 @@ def _colours_of_steps(scale: DepthScale) -> ImageArray:
 def colour_bar(scale: DepthScale, width: int) -> ImageArray:
     """Return the bar of a scale with its numbers, shape (HEIGHT_PX, width, 3), near at the left."""
     bar = np.zeros((HEIGHT_PX, width, 3), dtype=np.uint8)
-    left = (
-        write(bar, LABEL, (_BAR_MARGIN_PX, HEIGHT_PX - 10))[0]
-        + 2 * _BAR_MARGIN_PX
-    )
+    left = write(bar, LABEL, (_BAR_MARGIN_PX, HEIGHT_PX - 10))[0] + 2 * _BAR_MARGIN_PX
     right = width - 3 * _BAR_MARGIN_PX
     columns = np.linspace(255, 0, right - left).round().astype(np.int64)
     bar[2 : 2 + _BAR_PX, left:right] = table()[columns]

@@ -28,7 +28,7 @@ _N_POSES = 24
 _RATE_SHARE = 0.1  # of the newest frame in the mean rate
 _SECTIONS = ("sync", "images", "runtime")
 
-MAX_WIDTH_PX = 480
+_MAX_WIDTH_PX = 480
 
 
 class Tracking:
@@ -73,9 +73,7 @@ class Tracking:
         self.info = source.info
         self.camera = source.info.camera
         self._odometry = Odometry(self.camera, config)
-        self._items: Iterator[Frame | FaultyFrame] = read_frames(
-            source, config, excerpt, from_ns=from_ns
-        )
+        self._items: Iterator[Frame | FaultyFrame] = self._read(source, config, from_ns)
         self._from_ns = from_ns
         self._last_ns: int | None = None
         self._next: Frame | FaultyFrame | None = None
@@ -108,7 +106,7 @@ class Tracking:
         GvoError
             When that fails; the former configuration stays.
         """
-        if is_read_differently(self.config, config) and not self.is_finished:
+        if _is_read_differently(self.config, config) and not self.is_finished:
             self._reopen(config)
         self._odometry.reconfigure(config)
         self.config = config
@@ -117,12 +115,21 @@ class Tracking:
         last_ns = self._last_ns
         source = self._open_source(config)
         from_ns = self._from_ns if last_ns is None else last_ns
-        items = read_frames(source, config, self._excerpt, from_ns=from_ns)
+        items = self._read(source, config, from_ns)
         coming = (item for item in items if last_ns is None or item.stamp_ns > last_ns)
         following = next(coming, None)
         self.close()
         self._items, self._next = coming, following
         self.is_finished = following is None
+
+    def _read(
+        self, source: Source, config: Config, from_ns: int | None
+    ) -> Iterator[Frame | FaultyFrame]:
+        """Read frames from a stamp on; those before are not decoded."""
+        excerpt = self._excerpt
+        if from_ns is not None:
+            excerpt = _excerpt_from(from_ns, source, config, excerpt)
+        yield from frames(source, config, excerpt, with_unpaired=False)
 
     def advance(self, index: int) -> FrameRecord | None:
         """Track the next frame; None at the end.
@@ -155,13 +162,13 @@ class Tracking:
             self._items.close()
 
     def _faulty(self, frame: FaultyFrame) -> FrameRecord:
-        picture = draw_fault(self.camera, frame.reason)
+        picture = _draw_fault(self.camera, frame.reason)
         poses, covariances = self._window()
         return FrameRecord(
             stamp_ns=frame.stamp_ns,
             result=None,
             reason=frame.reason,
-            image=small_picture(picture),
+            image=_small_picture(picture),
             overlay=picture,
             cloud=empty_cloud(),
             window_poses=poses,
@@ -179,7 +186,7 @@ class Tracking:
             stamp_ns=frame.stamp_ns,
             result=result,
             reason=result.reason,
-            image=small_picture(image),
+            image=_small_picture(image),
             overlay=compose_overlay(
                 frame, result, self.camera, index=index, rate_hz=self._rate_hz(result)
             ),
@@ -205,39 +212,11 @@ class Tracking:
         return 1e3 / max(self._frame_ms, 1e-3)
 
 
-def is_read_differently(former: Config, config: Config) -> bool:
+def _is_read_differently(former: Config, config: Config) -> bool:
     """Tell whether another configuration asks for reading the recording anew."""
     return former.depth.scale != config.depth.scale or any(
         getattr(former, name) != getattr(config, name) for name in _SECTIONS
     )
-
-
-def read_frames(
-    source: Source, config: Config, excerpt: Excerpt, *, from_ns: int | None = None
-) -> Iterator[Frame | FaultyFrame]:
-    """Read the frames of a recording that odometry tracks.
-
-    Parameters
-    ----------
-    source : Source
-    config : Config
-    excerpt : Excerpt
-        The part that is wanted.
-    from_ns : int, optional
-        Stamp of the first frame; those before are not decoded.
-
-    Yields
-    ------
-    StereoFrame, RgbdFrame or FaultyFrame
-
-    Raises
-    ------
-    RecordingError
-        When the recording cannot be read on.
-    """
-    if from_ns is not None:
-        excerpt = _excerpt_from(from_ns, source, config, excerpt)
-    yield from frames(source, config, excerpt, with_unpaired=False)
 
 
 def _excerpt_from(from_ns: int, source: Source, config: Config, excerpt: Excerpt) -> Excerpt:
@@ -251,7 +230,7 @@ def _excerpt_from(from_ns: int, source: Source, config: Config, excerpt: Excerpt
     return replace(excerpt, start_s=start_s, duration_s=duration_s)
 
 
-def draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
+def _draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
     """Return a dark picture that tells why there is no frame, BGR."""
     none = np.zeros((0, 2))
     dark = np.full((camera.height, camera.width), 40, dtype=np.uint8)
@@ -260,11 +239,11 @@ def draw_fault(camera: PinholeCamera, reason: str) -> ImageArray:
     )
 
 
-def small_picture(image: ImageArray) -> ImageArray:
+def _small_picture(image: ImageArray) -> ImageArray:
     """Return a grey or BGR image as BGR, at most 480 pixels wide."""
     height, width = image.shape[:2]
-    if width > MAX_WIDTH_PX:
-        size = MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1)
+    if width > _MAX_WIDTH_PX:
+        size = _MAX_WIDTH_PX, max(round(height * _MAX_WIDTH_PX / width), 1)
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if image.ndim == 2:
         image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
