@@ -1,4 +1,4 @@
-"""The commands that show: one frame explained, the page in the browser, there and back."""
+"""The commands that look into a recording: explain, view, round-trip."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SIGNALS_S = 0.1
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands to the `gvo` command."""
-    for command in (explain, view, shuttle):
+    for command in (explain, view, round_trip):
         app.command()(command)
 
 
@@ -152,7 +152,7 @@ def _find_truth(source: Source) -> Trajectory | None:
     return None if isinstance(truth, Failure) else truth.trajectory
 
 
-def shuttle(
+def round_trip(
     recordings: Recordings,
     out: Out,
     start: Start = 0.0,
@@ -166,10 +166,10 @@ def shuttle(
     color: Color = None,
     depth: Depth = None,
 ) -> None:
-    """Drive a recording there and back: the drift without a ground truth."""
+    """Run forward, then backward: the drift without a ground truth."""
     from gvo.io.excerpt import make_excerpt
-    from gvo.runs.round_trip import shuttle as run_shuttle
-    from gvo.trajectory.round_trip import format_closings
+    from gvo.runs.round_trip import run_round_trip
+    from gvo.trajectory.round_trip import format_round_trip_errors
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)
@@ -178,10 +178,10 @@ def shuttle(
     for line in source.info.decisions:
         typer.echo(line)
     with interruptible() as check, progress(source.info.name) as show:
-        result = run_shuttle(
+        result = run_round_trip(
             source, out, config=parameters, excerpt=excerpt, on_progress=both(show, check)
         )
-    typer.echo(format_closings(result.closings), nl=False)
-    typer.echo(out / "shuttle.png")
+    typer.echo(format_round_trip_errors(result.errors), nl=False)
+    typer.echo(out / "round_trip.png")
     warn(result.warnings)
     raise typer.Exit(result.exit_code)

@@ -1,4 +1,4 @@
-"""A drive there and back: the drift without a ground truth."""
+"""Round trips: a recording run forward, then backward, shows drift without a ground truth."""
 
 from __future__ import annotations
 
@@ -16,40 +16,39 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, pair_limit_key
 from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.io.run_folder.writer import SHUTTLE_PICTURE, TRAJECTORIES, RunFolder
+from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder
 from gvo.runs.loop import RunLoop
 from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 from gvo.runs.summary import summarize
 from gvo.trajectory.formats import read_covariances, read_trajectory
-from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.round_trip import RoundTripError, round_trip_error
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FaultyFrame, Frame, Progress, StereoFrame
-from gvo.viz.plots import plot_shuttle
+from gvo.viz.plots import plot_round_trip
 
 MAX_PIECE_BYTES = 256_000_000
 
 
-class ThereAndBack:
-    """The frames of a recording in their order, then in the opposite one with mirrored stamps.
+class RoundTripFrames:
+    """Yields the frames of a recording forward, then backward with mirrored stamps.
 
-    The frame at the turn, the last sound one, is given once. What is faulty on the way there is
-    faulty on the way back.
+    The frame at the turn, the last sound one, comes once. Faulty frames are faulty both ways.
 
     Parameters
     ----------
     source : Source
-        The recording; is read again, piece by piece from its end, where it is long.
+        The recording; a long one is read again, piece by piece from its end.
     config : Config
         As of `frames`.
     excerpt : Excerpt, optional
-        The part that is wanted; the whole where omitted.
+        Which frames are read; all where omitted.
     max_bytes : int
-        Of images that are held at a time; at least one frame is.
+        Of images in memory; at least one frame is held.
 
     Attributes
     ----------
     turn_ns : int or None
-        Stamp of the frame at the turn, known when that is passed; None where no frame is sound.
+        Stamp of the frame at the turn, once it is passed; None where no frame is sound.
 
     Notes
     -----
@@ -83,8 +82,7 @@ class ThereAndBack:
         Raises
         ------
         RecordingError
-            When the recording cannot be read on; what was read before is yielded first, there
-            and back.
+            When the recording cannot be read on; what was read before is yielded first, both ways.
         """
         log = _Log(self._max_bytes)
         fault: RecordingError | None = None
@@ -136,7 +134,7 @@ class _Piece:
 
 @dataclass(slots=True)
 class _Log:
-    """What was read on the way there, in pieces; the frames of the last one are held."""
+    """What was read forward, in pieces; the frames of the last one are held."""
 
     max_bytes: int
     pieces: list[_Piece] = field(default_factory=lambda: [_Piece(first=0, end=0)])
@@ -197,14 +195,14 @@ def _size(item: Frame | FaultyFrame) -> int:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ShuttleResult:
-    """What a drive there and back left.
+class RoundTripResult:
+    """What a round trip gave.
 
     Parameters
     ----------
     summary : dict
-        As written to `summary.json`; `shuttle` holds the closing errors.
-    closings : dict of str to Closing
+        As written to `summary.json`; `round_trip` holds the errors.
+    errors : dict of str to RoundTripError
         Of raw, causal and smoothed.
     turn_ns : int
         Stamp of the frame at the turn, nanoseconds.
@@ -215,24 +213,24 @@ class ShuttleResult:
     """
 
     summary: dict[str, Any]
-    closings: dict[str, Closing]
+    errors: dict[str, RoundTripError]
     turn_ns: int
     exit_code: int
     warnings: tuple[str, ...]
 
 
-def shuttle(
+def run_round_trip(
     source: Source,
     out: str | Path,
     *,
     config: Config | None = None,
     excerpt: Excerpt | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-) -> ShuttleResult:
-    """Drive a recording forward, then backward, and tell how far it ends from its start.
+) -> RoundTripResult:
+    """Run odometry over a recording forward, then backward, and measure how far it ends off.
 
-    The sequence of frames is given to odometry as one recording of twice the length, and a run
-    folder is written as `run_recording` does, with `shuttle.png` beside it.
+    Odometry takes the frames as one recording of twice the length. A run folder is written as by
+    `run_recording`, with `round_trip.png` beside it.
 
     Parameters
     ----------
@@ -248,27 +246,28 @@ def shuttle(
 
     Returns
     -------
-    ShuttleResult
+    RoundTripResult
 
     Raises
     ------
     RecordingError
-        When fewer than two frames are usable, the recording cannot be read on the way back, or
-        what is to be written cannot be.
+        When fewer than two frames are usable, or the recording cannot be read again.
+    OutputError
+        When something cannot be written.
 
     Notes
     -----
-    A closing error is a lower bound of the drift. Both ways rest on the same images: noise of
-    the images, and whatever reverses with the motion (a wrong baseline, depths that are all too
-    large, a tilted rectification), gives opposite errors there and back, and cancels. So a large
-    closing error shows that something is wrong, and a small one does not show that all is well.
-    What it measures is what depends on the direction of the drive: bias of the estimator, lost
-    tracks, chance.
+    The error of a round trip is a lower bound of the drift. Both ways use the same images: noise
+    of the images, and whatever reverses with the motion (a wrong baseline, depths that are all too
+    large, a tilted rectification), gives opposite errors forward and backward, and cancels. So a
+    large error shows that something is wrong, and a small one does not show that all is well. It
+    measures what depends on the direction of the motion: bias of the estimator, lost tracks,
+    chance.
 
-    The raw chain has no memory, its closing error is that of the registrations. The window has:
-    near the turn it still holds keyframes of the way there, and where the camera never loses sight
-    of its start, the way back is tied to the way there directly. Then the closing error of causal
-    and smoothed says how well keyframes are found again, nothing of their drift.
+    The raw chain has no memory: its error is that of the registrations. The window still holds
+    keyframes of the way there when the way back begins; where the camera never loses sight of its
+    start, these tie both ways together. Then the error of causal and smoothed says how well
+    keyframes are found again, nothing of their drift.
 
     References
     ----------
@@ -276,7 +275,7 @@ def shuttle(
     Failures", ICPR 2010, doi:10.1109/ICPR.2010.675.
     """
     config = config or Config()
-    way = ThereAndBack(source, config, excerpt)
+    way = RoundTripFrames(source, config, excerpt)
     frame = OutputFrame(source.info.frame_id)
     loop = RunLoop(source, config, frame, excerpt=excerpt, items=way)
     with RunFolder(Path(out)) as folder:
@@ -284,14 +283,14 @@ def shuttle(
     turn_ns = way.turn_ns
     if turn_ns is None:
         raise RecordingError(f"{source.info.name}: no usable frame: {loop.statistics.reason()}")
-    closings = _close(folder.path, turn_ns, source.info.name)
+    errors = _read_errors(folder.path, turn_ns, source.info.name)
     warnings = loop.statistics.warnings()
-    summary = _summary(loop, warnings, turn_ns, closings)
+    summary = _summary(loop, warnings, turn_ns, errors)
     folder.write_summary(summary)
-    plot_shuttle(folder.path / SHUTTLE_PICTURE, closings)
-    return ShuttleResult(
+    plot_round_trip(folder.path / ROUND_TRIP_PICTURE, errors)
+    return RoundTripResult(
         summary=summary,
-        closings=closings,
+        errors=errors,
         turn_ns=turn_ns,
         exit_code=EXIT_PARTLY if loop.statistics.is_partly else EXIT_COMPLETE,
         warnings=tuple(warnings),
@@ -307,16 +306,16 @@ def _doubled(on_progress: Callable[[Progress], None]) -> Callable[[Progress], No
     return tell
 
 
-def _close(folder: Path, turn_ns: int, name: str) -> dict[str, Closing]:
+def _read_errors(folder: Path, turn_ns: int, name: str) -> dict[str, RoundTripError]:
     trajectories = {name: _read(folder, name) for name in TRAJECTORIES}
     path_m = float(trajectories["smoothed"].distances()[-1])
-    closings: dict[str, Closing] = {}
+    errors: dict[str, RoundTripError] = {}
     for label, trajectory in trajectories.items():
-        closing = close(trajectory, turn_ns, path_m=path_m)
-        if isinstance(closing, Failure):
-            raise RecordingError(f"{name}: cannot be driven there and back: {closing.reason}")
-        closings[label] = closing
-    return closings
+        error = round_trip_error(trajectory, turn_ns, path_m=path_m)
+        if isinstance(error, Failure):
+            raise RecordingError(f"{name}: no round trip: {error.reason}")
+        errors[label] = error
+    return errors
 
 
 def _read(folder: Path, name: str) -> Trajectory:
@@ -326,13 +325,13 @@ def _read(folder: Path, name: str) -> Trajectory:
 
 
 def _summary(
-    loop: RunLoop, warnings: list[str], turn_ns: int, closings: dict[str, Closing]
+    loop: RunLoop, warnings: list[str], turn_ns: int, errors: dict[str, RoundTripError]
 ) -> dict[str, Any]:
-    summary = summarize(loop, Failure(reason="driven there and back"), warnings)
-    summary["recording"] = f"{loop.source.info.name}, there and back"
-    summary["shuttle"] = {
+    summary = summarize(loop, Failure(reason="a round trip needs none"), warnings)
+    summary["recording"] = f"{loop.source.info.name}, round trip"
+    summary["round_trip"] = {
         "turn_ns": turn_ns,
-        "path_m": closings["smoothed"].path_m,
-        "estimates": {name: closing.as_json() for name, closing in closings.items()},
+        "path_m": errors["smoothed"].path_m,
+        "estimates": {name: error.as_json() for name, error in errors.items()},
     }
     return summary

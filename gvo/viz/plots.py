@@ -12,7 +12,7 @@ import numpy as np
 
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.trajectory.alignment import AlignMode, alignment, pair
-from gvo.trajectory.round_trip import Closing
+from gvo.trajectory.round_trip import RoundTripError
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.palette import ESTIMATES, OTHERS, REFERENCE_STYLE, Style, styles_of
@@ -278,8 +278,8 @@ def _add_legend(figure: Figure, view: Axes) -> None:
     )
 
 
-def plot_shuttle(path: str | Path, closings: Mapping[str, Closing]) -> None:
-    """Draw the ways there (solid) and back (dashed) from above, and their distance by frame.
+def plot_round_trip(path: str | Path, errors: Mapping[str, RoundTripError]) -> None:
+    """Draw a round trip from above, forward solid and backward dashed, and its errors by frame.
 
     The world is that of the first camera: x to the right, z ahead. Equal input gives equal files.
 
@@ -287,7 +287,7 @@ def plot_shuttle(path: str | Path, closings: Mapping[str, Closing]) -> None:
     ----------
     path : str or Path
         PNG file.
-    closings : mapping of str to Closing
+    errors : mapping of str to RoundTripError
         By the names of the trajectories, at least one; "raw", "causal" and "smoothed" have
         colours of their own.
 
@@ -298,16 +298,16 @@ def plot_shuttle(path: str | Path, closings: Mapping[str, Closing]) -> None:
     ValueError
         Where there is no trajectory.
     """
-    if not closings:
+    if not errors:
         raise ValueError("expected at least one trajectory")
-    figure = _draw_shuttle_plot(closings)
+    figure = _draw_round_trip(errors)
     try:
         figure.savefig(path, format="png", dpi=150, metadata={"Software": None})
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _draw_shuttle_plot(closings: Mapping[str, Closing]) -> Figure:
+def _draw_round_trip(errors: Mapping[str, RoundTripError]) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -317,49 +317,49 @@ def _draw_shuttle_plot(closings: Mapping[str, Closing]) -> Figure:
     axes = figure.subplot_mosaic(
         [["view", "end", "metres"], ["view", "end", "degrees"]], width_ratios=[1.15, 1.0, 1.15]
     )
-    for name, closing in closings.items():
+    for name, error in errors.items():
         colour = ESTIMATES.get(name, OTHERS[0])
-        _draw_ways(axes["view"], closing, colour)
-        _draw_gap(axes["end"], closing, colour, name)
-        _draw_errors(axes["metres"], closing, closing.errors_m, colour)
-        _draw_errors(axes["degrees"], closing, closing.errors_deg, colour)
-    first = next(iter(closings.values()))
-    _finish_view_shuttle_plot(axes["view"], first)
-    _finish_end(axes["end"], closings)
+        _draw_ways(axes["view"], error, colour)
+        _draw_gap(axes["end"], error, colour, name)
+        _draw_errors(axes["metres"], error, error.errors_m, colour)
+        _draw_errors(axes["degrees"], error, error.errors_deg, colour)
+    first = next(iter(errors.values()))
+    _finish_round_trip_view(axes["view"], first)
+    _finish_end(axes["end"], errors)
     _finish_errors(axes["metres"], axes["degrees"])
     handles, labels = axes["end"].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
-def _draw_ways(view: Axes, closing: Closing, colour: str) -> None:
-    for trajectory, linestyle in ((closing.there, "-"), (closing.back, "--")):
+def _draw_ways(view: Axes, error: RoundTripError, colour: str) -> None:
+    for trajectory, linestyle in ((error.forward, "-"), (error.backward, "--")):
         shown = _decimated(trajectory.positions[:, [0, 2]])
         view.plot(*shown.T, color=colour, linestyle=linestyle, linewidth=1.2)
 
 
-def _draw_gap(end: Axes, closing: Closing, colour: str, name: str) -> None:
+def _draw_gap(end: Axes, error: RoundTripError, colour: str, name: str) -> None:
     """Draw where the way back ends, as seen from the start, and the way to it."""
-    gap = closing.errors[0, :3, 3]
-    share = "" if closing.closing_pct is None else f", {closing.closing_pct:.3g} % of the path"
-    label = f"{name}: {closing.closing_m:.3g} m{share}, {closing.closing_deg:.3g} deg"
+    gap = error.errors[0, :3, 3]
+    share = "" if error.error_pct is None else f", {error.error_pct:.3g} % of the path"
+    label = f"{name}: {error.error_m:.3g} m{share}, {error.error_deg:.3g} deg"
     end.plot([0.0, gap[0]], [0.0, gap[2]], color=colour, linewidth=1.2)
     # causal and smoothed end in the same pose: the larger mark is hollow, and seen around the other
     size, face = (13.0, "none") if name == "causal" else (7.0, colour)
     end.plot(gap[0], gap[2], "s", mec=colour, mfc=face, mew=1.5, markersize=size, label=label)
 
 
-def _draw_errors(panel: Axes, closing: Closing, values: FloatArray, colour: str) -> None:
-    stamps_ns = closing.there.stamps_ns
+def _draw_errors(panel: Axes, error: RoundTripError, values: FloatArray, colour: str) -> None:
+    stamps_ns = error.forward.stamps_ns
     to_turn_s = (stamps_ns - stamps_ns[-1]) / 1e9
     panel.plot(*_decimated(np.column_stack([to_turn_s, values])).T, color=colour, linewidth=1.2)
 
 
-def _finish_view_shuttle_plot(view: Axes, closing: Closing) -> None:
+def _finish_round_trip_view(view: Axes, error: RoundTripError) -> None:
     from matplotlib.lines import Line2D
 
     view.plot(0.0, 0.0, "o", mfc="white", mec="black", zorder=4.0)
-    turn = closing.there.positions[-1, [0, 2]]
+    turn = error.forward.positions[-1, [0, 2]]
     view.plot(*turn, "^", mfc="white", mec="black", zorder=4.0)
     view.set(xlabel="x [m]", ylabel="z [m]", title="from above")
     view.set_aspect("equal", adjustable="datalim")
@@ -367,29 +367,27 @@ def _finish_view_shuttle_plot(view: Axes, closing: Closing) -> None:
     view.grid(alpha=0.3)
     grey = "#555555"
     keys = [
-        Line2D([], [], color=grey, linestyle="-", label="there"),
-        Line2D([], [], color=grey, linestyle="--", label="back"),
+        Line2D([], [], color=grey, linestyle="-", label="forward"),
+        Line2D([], [], color=grey, linestyle="--", label="backward"),
         Line2D([], [], color="none", marker="o", mfc="white", mec="black", label="start"),
         Line2D([], [], color="none", marker="^", mfc="white", mec="black", label="turn"),
     ]
     view.legend(handles=keys, loc="best", fontsize="small")
 
 
-def _finish_end(end: Axes, closings: Mapping[str, Closing]) -> None:
+def _finish_end(end: Axes, errors: Mapping[str, RoundTripError]) -> None:
     end.plot(0.0, 0.0, "o", mfc="white", mec="black", zorder=4.0)
-    largest = max(
-        float(np.abs(closing.errors[0, [0, 2], 3]).max()) for closing in closings.values()
-    )
+    largest = max(float(np.abs(error.errors[0, [0, 2], 3]).max()) for error in errors.values())
     limit = 1.25 * max(largest, 1e-6)
     end.set(xlim=(-limit, limit), ylim=(-limit, limit))
-    end.set(xlabel="x [m]", ylabel="z [m]", title="closing error, from above")
+    end.set(xlabel="x [m]", ylabel="z [m]", title="round-trip error, from above")
     end.set_aspect("equal", adjustable="box")
     end.locator_params(nbins=5)
     end.grid(alpha=0.3)
 
 
 def _finish_errors(metres: Axes, degrees: Axes) -> None:
-    metres.set(ylabel="distance [m]", title="between there and back")
+    metres.set(ylabel="distance [m]", title="between forward and backward")
     degrees.set(ylabel="angle [deg]", xlabel="frame, before the turn [s]")
     metres.tick_params(labelbottom=False)
     for panel in (metres, degrees):

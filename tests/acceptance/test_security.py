@@ -248,7 +248,7 @@ def test_commands_write_nothing_but_what_they_are_told_to(
             ["convert", bag, f"{out}/drive.db3"],
             ["convert", bag, f"{out}/kitti", "--layout", "kitti"],
             ["explain", bag, "--frame", "3", "--out", f"{out}/explained"],
-            ["shuttle", bag, "--out", f"{out}/shuttle"],
+            ["round-trip", bag, "--out", f"{out}/round-trip"],
         ]
     )
     watched.assert_nothing_elsewhere(deeds)

@@ -24,7 +24,7 @@ Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
-    *("batch", "explain", "view", "shuttle"),
+    *("batch", "explain", "view", "round-trip"),
 )
 TABLES = (
     *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
@@ -68,7 +68,7 @@ def film_frames(path: Path) -> list[np.ndarray[Any, Any]]:
 def test_help_names_all_commands_on_a_screen(command: Command) -> None:
     answer = command("--help")
     assert len(answer.out.splitlines()) <= 24
-    listed = re.findall(r"^│ ([a-z]+) +[A-Z]", answer.out, re.MULTILINE)
+    listed = re.findall(r"^│ ([a-z-]+) +[A-Z]", answer.out, re.MULTILINE)
     assert sorted(listed) == sorted(COMMANDS)
 
 
@@ -293,25 +293,25 @@ def test_a_frame_with_depth_is_explained_by_its_depth(
     assert numbers["stereo"] is None
 
 
-# gvo shuttle
+# gvo round-trip
 
 
-def test_a_shuttle_closes_by_the_poses_that_it_writes(
+def test_a_round_trip_is_measured_by_the_poses_that_it_writes(
     command: Command, room_bag: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    answer = command("shuttle", room_bag, "--out", out, "--duration", "0.19")
+    answer = command("round-trip", room_bag, "--out", out, "--duration", "0.19")
     assert (answer.code, answer.err) == (0, "")
-    assert starts_rightly(out / "shuttle.png")
+    assert starts_rightly(out / "round_trip.png")
     assert set(TABLES) < names_of(out)
-    told = json.loads((out / "summary.json").read_text())["shuttle"]["estimates"]
+    told = json.loads((out / "summary.json").read_text())["round_trip"]["estimates"]
     for name in ("raw", "causal", "smoothed"):
         rows = np.loadtxt(out / f"{name}.txt")
         assert len(rows) == 2 * 6 - 1
-        closing_m = np.linalg.norm(rows[-1, 1:4] - rows[0, 1:4])
-        assert told[name]["closing_m"] == pytest.approx(closing_m, rel=1e-3, abs=1e-8)
-        assert np.isfinite([told[name][key] for key in ("closing_pct", "closing_deg")]).all()
-        assert f"{closing_m:.4f}" in answer.out
+        error_m = np.linalg.norm(rows[-1, 1:4] - rows[0, 1:4])
+        assert told[name]["error_m"] == pytest.approx(error_m, rel=1e-3, abs=1e-8)
+        assert np.isfinite([told[name][key] for key in ("error_pct", "error_deg")]).all()
+        assert f"{error_m:.4f}" in answer.out
 
 
 def test_a_recording_that_breaks_off_is_driven_back_from_there(
@@ -319,7 +319,7 @@ def test_a_recording_that_breaks_off_is_driven_back_from_there(
 ) -> None:
     cut = tmp_path / "cut.bag"
     cut.write_bytes(room_bag.read_bytes()[: room_bag.stat().st_size // 3])
-    answer = command("shuttle", cut, "--out", tmp_path / "out")
+    answer = command("round-trip", cut, "--out", tmp_path / "out")
     assert answer.code == 3
     assert answer.err.startswith("gvo: warning: ")
     assert "cut.bag" in answer.err
@@ -437,9 +437,9 @@ def test_a_run_is_served_beside_a_taken_port_until_it_is_ended(
         (["explain", "{bag}", "--frame", "0", "--out", "text.txt"], ["text.txt"]),
         (["explain", "{bag}", "--frame", "1", "--out", "o", "--every", "0"], ["--every"]),
         (["explain", "{bag}", "--frame", "1", "--out", "o", "--set", "klt.x=1"], ["klt.x"]),
-        (["shuttle", "missing.bag", "--out", "out"], ["missing.bag"]),
-        (["shuttle", "{bag}", "--out", "text.txt"], ["text.txt"]),
-        (["shuttle", "{bag}", "--out", "out", "--duration", "0.02"], ["2 or more"]),
+        (["round-trip", "missing.bag", "--out", "out"], ["missing.bag"]),
+        (["round-trip", "{bag}", "--out", "text.txt"], ["text.txt"]),
+        (["round-trip", "{bag}", "--out", "out", "--duration", "0.02"], ["2 or more"]),
         (["view", "missing.bag"], ["missing.bag"]),
         (["view", "."], ["recording"]),
         (["view", "text.txt"], ["text.txt"]),
@@ -480,7 +480,7 @@ def test_wrong_use_gets_one_line_and_exit_code_2(
         ["explain", "{bag}", "--frame", "one", "--out", "out"],
         ["explain", "{bag}", "--out", "out"],
         ["explain", "{bag}", "--frame", "1"],
-        ["shuttle", "{bag}"],
+        ["round-trip", "{bag}"],
         ["view"],
         ["view", "{bag}", "--port", "70000"],
     ],

@@ -98,8 +98,8 @@ def test_the_tracked_share_is_that_of_the_run(room_bag: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_shuttle_counts_the_way_there_and_the_way_back(room_bag: Path, tmp_path: Path) -> None:
-    shown = on_terminal("shuttle", room_bag, "--out", tmp_path, columns=100)
+def test_a_round_trip_counts_the_way_there_and_the_way_back(room_bag: Path, tmp_path: Path) -> None:
+    shown = on_terminal("round-trip", room_bag, "--out", tmp_path, columns=100)
     assert shown.code == 0
     check_order(shown)
     n_frames = (tmp_path / "frames.csv").read_text().count("\n") - 1

@@ -29,7 +29,7 @@ SUMMARY = "summary.json"
 LOCK = "run.lock"
 PICTURE = "trajectories.png"
 REPORT = "report.html"
-SHUTTLE_PICTURE = "shuttle.png"
+ROUND_TRIP_PICTURE = "round_trip.png"
 TRUTH = "ground_truth.txt"
 TRUE_POSITIONS = "ground_truth_positions.csv"
 POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
@@ -54,7 +54,7 @@ _OF_EARLIER_RUNS = (
     "timings.csv",
     PICTURE,
     REPORT,
-    SHUTTLE_PICTURE,
+    ROUND_TRIP_PICTURE,
     TRUTH,
     TRUE_POSITIONS,
 )

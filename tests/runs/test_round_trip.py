@@ -1,4 +1,4 @@
-"""Recordings driven there and back."""
+"""Recordings run forward, then backward."""
 
 import json
 from collections.abc import Iterator
@@ -18,10 +18,10 @@ from gvo.geometry.camera import StereoCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.opening import open_recording
 from gvo.io.recording import RecordingInfo, StampedImage
-from gvo.runs.round_trip import ShuttleResult, shuttle
+from gvo.runs.round_trip import RoundTripResult, run_round_trip
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import read_trajectory
-from gvo.trajectory.round_trip import format_closings
+from gvo.trajectory.round_trip import format_round_trip_errors
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress
 
@@ -85,13 +85,13 @@ def drive(rendered: Rendered) -> Iterator[Rendered]:
 @pytest.fixture(scope="module")
 def driven(
     rendered: Rendered, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[ShuttleResult, Path]:
-    out = tmp_path_factory.mktemp("shuttle")
-    return shuttle(rendered, out), out
+) -> tuple[RoundTripResult, Path]:
+    out = tmp_path_factory.mktemp("round_trip")
+    return run_round_trip(rendered, out), out
 
 
 def test_both_ways_are_in_the_run_folder(
-    driven: tuple[ShuttleResult, Path], rendered: Rendered
+    driven: tuple[RoundTripResult, Path], rendered: Rendered
 ) -> None:
     result, out = driven
     assert (result.exit_code, result.warnings) == (0, ())
@@ -108,48 +108,48 @@ def test_both_ways_are_in_the_run_folder(
         for part, reference in ((there, truth), (back, expected)):
             assert evaluate(reference, part, name=name, align="none").ate_max_m < 0.1
     assert float(np.ptp(truth.positions[:, 2])) > 2.0
-    assert (out / "shuttle.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "round_trip.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_summary_tells_the_closing_errors(driven: tuple[ShuttleResult, Path]) -> None:
+def test_the_summary_holds_the_errors(driven: tuple[RoundTripResult, Path]) -> None:
     result, out = driven
     summary = json.loads((out / "summary.json").read_text())
-    told = summary["shuttle"]["estimates"]
+    told = summary["round_trip"]["estimates"]
     assert list(told) == ["raw", "causal", "smoothed"]
     for name, numbers in told.items():
         ends = read_trajectory(out / f"{name}.txt").positions[[0, -1]]
-        assert numbers["closing_m"] == pytest.approx(np.linalg.norm(ends[1] - ends[0]), abs=1e-6)
-        assert 0.0 < numbers["closing_pct"] < 1.0
+        assert numbers["error_m"] == pytest.approx(np.linalg.norm(ends[1] - ends[0]), abs=1e-6)
+        assert 0.0 < numbers["error_pct"] < 1.0
     assert summary["frames"] == summary["tracked"] == 2 * _N_FRAMES - 1
-    table = format_closings(result.closings).splitlines()
+    table = format_round_trip_errors(result.errors).splitlines()
     assert [line.split()[0] for line in table[2:]] == ["raw", "causal", "smoothed"]
     assert len({len(line) for line in table}) == 1
 
 
-def test_a_scale_that_is_wrong_leaves_no_closing_error(drive: Rendered, tmp_path: Path) -> None:
+def test_a_wrong_scale_leaves_no_error(drive: Rendered, tmp_path: Path) -> None:
     info, (left, right) = drive.info, drive.info.calibrations
     assert isinstance(info.camera, StereoCamera)
     try:
         wide = type(right).from_camera(right.pinhole(), baseline=1.2 * info.camera.baseline)
         drive.info = replace(info, calibrations=(left, wide))
-        result = shuttle(drive, tmp_path)
+        result = run_round_trip(drive, tmp_path)
     finally:
         drive.info = info
     path_m = float(np.linalg.norm(drive.truth.positions[-1]))
-    travelled_m = float(np.linalg.norm(result.closings["raw"].there.positions[-1]))
+    travelled_m = float(np.linalg.norm(result.errors["raw"].forward.positions[-1]))
     assert travelled_m / path_m == pytest.approx(1.2, abs=0.02)
-    closing_pct = result.closings["raw"].closing_pct
-    assert closing_pct is not None
-    assert closing_pct < 1.0
+    error_pct = result.errors["raw"].error_pct
+    assert error_pct is not None
+    assert error_pct < 1.0
 
 
 def test_faulty_frames_are_faulty_both_ways(drive: Rendered, tmp_path: Path) -> None:
     drive.faulty = {2, _N_FRAMES - 1}
-    result = shuttle(drive, tmp_path)
+    result = run_round_trip(drive, tmp_path)
     assert result.exit_code == 3
     # the last frame lies behind the turn
     assert result.summary["status_counts"]["skipped"] == 3
-    assert len(result.closings["raw"].there) == _N_FRAMES - 2
+    assert len(result.errors["raw"].forward) == _N_FRAMES - 2
     assert result.turn_ns == drive.truth.stamps_ns[-2]
 
 
@@ -157,16 +157,16 @@ def test_a_recording_that_breaks_off_is_driven_back_from_there(
     drive: Rendered, tmp_path: Path
 ) -> None:
     drive.breaks_off_after = 4
-    result = shuttle(drive, tmp_path)
+    result = run_round_trip(drive, tmp_path)
     assert result.exit_code == 3
     assert "the file ends" in result.warnings[0]
     assert result.turn_ns == drive.truth.stamps_ns[3]
-    assert len(result.closings["raw"].there) == 4
+    assert len(result.errors["raw"].forward) == 4
 
 
-def test_black_images_give_no_closing_error_to_trust(drive: Rendered, tmp_path: Path) -> None:
+def test_black_images_give_no_error_to_trust(drive: Rendered, tmp_path: Path) -> None:
     drive.is_black = True
-    result = shuttle(drive, tmp_path)
+    result = run_round_trip(drive, tmp_path)
     assert result.exit_code == 3
     assert "no frame could be registered" in result.warnings[0]
 
@@ -175,16 +175,18 @@ def test_black_images_give_no_closing_error_to_trust(drive: Rendered, tmp_path: 
 def test_fewer_than_two_frames_cannot_be_driven(
     drive: Rendered, tmp_path: Path, n_sound: int
 ) -> None:
-    (tmp_path / "shuttle.png").write_text("of an earlier drive")
+    (tmp_path / "round_trip.png").write_text("of an earlier drive")
     drive.faulty = set(range(n_sound, _N_FRAMES))
     with pytest.raises(RecordingError, match="cut off" if n_sound == 0 else "pose both ways: 1,"):
-        shuttle(drive, tmp_path)
-    assert not (tmp_path / "shuttle.png").exists()
+        run_round_trip(drive, tmp_path)
+    assert not (tmp_path / "round_trip.png").exists()
 
 
 def test_progress_counts_both_ways(drive: Rendered, tmp_path: Path) -> None:
     told: list[Progress] = []
     config = Config.model_validate({"runtime": {"threads": 1}})
-    shuttle(drive, tmp_path, config=config, excerpt=Excerpt(every=2), on_progress=told.append)
+    run_round_trip(
+        drive, tmp_path, config=config, excerpt=Excerpt(every=2), on_progress=told.append
+    )
     assert [progress.n_done for progress in told] == list(range(1, 6))
     assert {progress.n_total for progress in told} == {5}

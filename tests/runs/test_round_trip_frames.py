@@ -1,4 +1,4 @@
-"""Recordings there and back: nothing but the order and the stamps may change."""
+"""Frames of a round trip: only the order and the stamps change on the way back."""
 
 import itertools
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames
 from gvo.io.recording import RecordingInfo, StampedImage
-from gvo.runs.round_trip import ThereAndBack
+from gvo.runs.round_trip import RoundTripFrames
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, Frame, StereoFrame
 
@@ -127,26 +127,26 @@ def test_pieces_of_any_size_give_the_reversed_list(
     kinds: list[str], n_held: int, excerpt: Excerpt, threads: int, breaks_off: bool
 ) -> None:
     source, config = Numbered(kinds, breaks_off), _CONFIGS[threads]
-    shuttle = ThereAndBack(source, config, excerpt, max_bytes=n_held * _FRAME_BYTES)
-    found, _, fault = read(iter(shuttle))
+    round_trip = RoundTripFrames(source, config, excerpt, max_bytes=n_held * _FRAME_BYTES)
+    found, _, fault = read(iter(round_trip))
     assert (found, fault) == expected(source, config, excerpt)
 
 
 def test_a_frame_is_given_with_mirrored_stamp_and_the_turning_one_once() -> None:
     source = Numbered(["sound"] * 4 + ["broken"])
-    shuttle = ThereAndBack(source, _CONFIGS[1])
-    found, is_sound, _ = read(iter(shuttle))
+    round_trip = RoundTripFrames(source, _CONFIGS[1])
+    found, is_sound, _ = read(iter(round_trip))
     sound = list(itertools.compress(found, is_sound))
     steps = [(stamp_ns - _FIRST_NS) // _STEP_NS for stamp_ns, _ in sound]
     assert steps == [0, 1, 2, 3, 4, 5, 6]
     assert [held[0] for _, held in sound] == ["0", "1", "2", "3", "2", "1", "0"]
-    assert shuttle.turn_ns == _FIRST_NS + 3 * _STEP_NS
+    assert round_trip.turn_ns == _FIRST_NS + 3 * _STEP_NS
 
 
 def test_an_image_is_decoded_once_there_and_once_back_however_many_the_pieces() -> None:
     source = Numbered(["sound"] * 12)
-    shuttle = ThereAndBack(source, _CONFIGS[1], max_bytes=3 * _FRAME_BYTES)
-    assert len(read(iter(shuttle))[0]) == 23
+    round_trip = RoundTripFrames(source, _CONFIGS[1], max_bytes=3 * _FRAME_BYTES)
+    assert len(read(iter(round_trip))[0]) == 23
     # both images of each; those of the last piece are held
     assert sorted(source.n_loaded) == sorted([*range(9)] * 4 + [9, 10, 11] * 2)
 
@@ -167,13 +167,13 @@ def test_images_of_no_more_than_the_limit_are_held(monkeypatch: pytest.MonkeyPat
             alive.append(-1)
 
     monkeypatch.setattr("gvo.io.frames.StereoFrame", Counted)
-    shuttle = ThereAndBack(Numbered(["sound"] * 30), _CONFIGS[1], max_bytes=5 * _FRAME_BYTES)
-    assert sum(1 for _ in shuttle) == 59
+    round_trip = RoundTripFrames(Numbered(["sound"] * 30), _CONFIGS[1], max_bytes=5 * _FRAME_BYTES)
+    assert sum(1 for _ in round_trip) == 59
     # five of the piece, and those on their way: one read, one mirrored, one with the reader
     assert max(greatest) <= 8
 
 
 def test_a_recording_without_a_sound_frame_has_no_way_back() -> None:
-    shuttle = ThereAndBack(Numbered(["broken", "no right"]), _CONFIGS[1])
-    assert read(iter(shuttle))[1] == [False, False]
-    assert shuttle.turn_ns is None
+    round_trip = RoundTripFrames(Numbered(["broken", "no right"]), _CONFIGS[1])
+    assert read(iter(round_trip))[1] == [False, False]
+    assert round_trip.turn_ns is None

@@ -1,4 +1,4 @@
-"""The picture of a drive there and back: what is in it, not how it looks."""
+"""The picture of a round trip: what is in it, not how it looks."""
 
 from pathlib import Path
 
@@ -6,31 +6,31 @@ import numpy as np
 import pytest
 
 from gvo.errors import RecordingError
-from gvo.trajectory.round_trip import Closing, close
+from gvo.trajectory.round_trip import RoundTripError, round_trip_error
 from gvo.trajectory.trajectory import Trajectory
-from gvo.viz import plots as shuttle_plot
-from gvo.viz.plots import plot_shuttle
+from gvo.viz import plots
+from gvo.viz.plots import plot_round_trip
 
 _N = 9000
 
 
-def closing(gap_m: float, n: int = _N) -> Closing:
+def round_trip(gap_m: float, n: int = _N) -> RoundTripError:
     poses = np.tile(np.eye(4), (2 * n - 1, 1, 1))
     poses[:, 2, 3] = [*range(n), *range(n - 2, -1, -1)]
     poses[n:, 0, 3] = gap_m
     stamps_ns = 100_000_000 * np.arange(1 - n, n)
-    found = close(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses), 0)
-    assert isinstance(found, Closing)
+    found = round_trip_error(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses), 0)
+    assert isinstance(found, RoundTripError)
     return found
 
 
 @pytest.fixture
-def closings() -> dict[str, Closing]:
-    return {"raw": closing(0.5), "causal": closing(0.25), "smoothed": closing(0.25)}
+def errors() -> dict[str, RoundTripError]:
+    return {"raw": round_trip(0.5), "causal": round_trip(0.25), "smoothed": round_trip(0.25)}
 
 
-def test_the_picture_holds_both_ways_and_the_gap(closings: dict[str, Closing]) -> None:
-    figure = shuttle_plot._draw_shuttle_plot(closings)
+def test_the_picture_holds_both_ways_and_the_gap(errors: dict[str, RoundTripError]) -> None:
+    figure = plots._draw_round_trip(errors)
     view, end, metres, degrees = figure.axes
     solid = [line for line in view.lines if line.get_linestyle() == "-"]
     dashed = [line for line in view.lines if line.get_linestyle() == "--"]
@@ -51,20 +51,22 @@ def test_the_picture_holds_both_ways_and_the_gap(closings: dict[str, Closing]) -
         assert axes.get_ylabel().endswith("]")
 
 
-def test_equal_input_gives_equal_files(closings: dict[str, Closing], tmp_path: Path) -> None:
+def test_equal_input_gives_equal_files(errors: dict[str, RoundTripError], tmp_path: Path) -> None:
     for name in "ab":
-        plot_shuttle(tmp_path / f"{name}.png", closings)
+        plot_round_trip(tmp_path / f"{name}.png", errors)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_a_drive_that_goes_nowhere_can_be_drawn(tmp_path: Path) -> None:
-    still = closing(0.0, n=2)
-    plot_shuttle(tmp_path / "still.png", {"of another name": still})
+    still = round_trip(0.0, n=2)
+    plot_round_trip(tmp_path / "still.png", {"of another name": still})
     assert (tmp_path / "still.png").stat().st_size > 0
 
 
-def test_a_folder_that_is_missing_is_named(closings: dict[str, Closing], tmp_path: Path) -> None:
+def test_a_folder_that_is_missing_is_named(
+    errors: dict[str, RoundTripError], tmp_path: Path
+) -> None:
     with pytest.raises(RecordingError, match=r"nowhere/a\.png: cannot be written"):
-        plot_shuttle(tmp_path / "nowhere/a.png", closings)
+        plot_round_trip(tmp_path / "nowhere/a.png", errors)
     with pytest.raises(ValueError, match="at least one trajectory"):
-        plot_shuttle(tmp_path / "a.png", {})
+        plot_round_trip(tmp_path / "a.png", {})
