@@ -18,13 +18,15 @@ from gvo.errors import ConfigurationError
 if TYPE_CHECKING:
     from gvo.batch.engine import BatchProgress, ClusterError, connected
     from gvo.batch.recordings import NamedRecording, find_recordings
-    from gvo.batch.running import BatchOptions, run, run_batch
+    from gvo.batch.running import run, run_batch
+    from gvo.batch.tasks import BatchOptions
     from gvo.batch.variants import Variant, make_variants
 
 _MODULES = {
     "gvo.batch.engine": ("BatchProgress", "ClusterError", "connected"),
     "gvo.batch.recordings": ("NamedRecording", "find_recordings"),
-    "gvo.batch.running": ("BatchOptions", "run", "run_batch"),
+    "gvo.batch.running": ("run", "run_batch"),
+    "gvo.batch.tasks": ("BatchOptions",),
     "gvo.batch.variants": ("Variant", "make_variants"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

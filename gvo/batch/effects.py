@@ -11,6 +11,7 @@ ERROR = "ate_smoothed_m"
 TIME = "frame_ms"
 MIN_SHARE_OF_POSES = 0.95
 """Of the most poses that any run of a recording has; with fewer a run is not compared."""
+_MEASURES = {"error": ERROR, "time": TIME}
 _QUANTILES = {"low": 0.25, "median": 0.5, "high": 0.75}
 
 
@@ -59,32 +60,26 @@ def value_medians(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
         `("runs", kind)` of the kinds `compared`, `set aside` (too short, or not measured) and
         `failed`.
     """
-    is_used = {"error": comparable(table, ERROR), "time": comparable(table, TIME)}
+    is_used = {name: comparable(table, column) for name, column in _MEASURES.items()}
     ratios = pd.DataFrame(
-        {
-            name: relative(table, column).where(is_used[name])
-            for name, column in (("error", ERROR), ("time", TIME))
-        }
+        {name: relative(table, each).where(is_used[name]) for name, each in _MEASURES.items()}
     )
     main = "error" if is_used["error"].any() else "time"
     is_failed = table["status"] == "failed"
-    counts = pd.DataFrame(
-        {
-            "compared": is_used[main],
-            "set aside": ~is_used[main] & ~is_failed,
-            "failed": is_failed,
-        }
-    )
-    effects = {}
-    for name in swept(table):
-        is_number = is_numeric_dtype(table[name])
-        by_value = ratios.groupby(table[name], dropna=False, sort=is_number)
-        parts = {name: by_value.quantile(share) for name, share in _QUANTILES.items()}
-        quantiles = pd.concat(parts, axis=1).swaplevel(axis=1)
-        n_runs = counts.groupby(table[name], dropna=False, sort=is_number).sum()
-        effects[name] = pd.concat([quantiles, pd.concat({"runs": n_runs}, axis=1)], axis=1)
-    order = sorted(effects, key=lambda name: -span(effects[name], main))
-    return {name: effects[name] for name in order}
+    is_set_aside = ~is_used[main] & ~is_failed
+    counts = {"compared": is_used[main], "set aside": is_set_aside, "failed": is_failed}
+    runs = pd.DataFrame(counts)
+    effects = {name: _by_value(table[name], ratios, runs) for name in swept(table)}
+    return dict(sorted(effects.items(), key=lambda effect: -span(effect[1], main)))
+
+
+def _by_value(values: pd.Series, ratios: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    is_number = is_numeric_dtype(values)
+    grouped = ratios.groupby(values, dropna=False, sort=is_number)
+    parts = {name: grouped.quantile(share) for name, share in _QUANTILES.items()}
+    quantiles = pd.concat(parts, axis=1).swaplevel(axis=1)
+    n_runs = runs.groupby(values, dropna=False, sort=is_number).sum()
+    return pd.concat([quantiles, pd.concat({"runs": n_runs}, axis=1)], axis=1)
 
 
 def span(effect: pd.DataFrame, measure: str) -> float:

@@ -8,7 +8,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
@@ -20,42 +19,15 @@ from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.results import to_frame, write_results
 from gvo.batch.rows import BatchRow
 from gvo.batch.storage import is_url, store
-from gvo.batch.tasks import MARK, Task, TaskOptions
+from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions
 from gvo.batch.variants import Variant, differences, name_variants
 from gvo.config import Config
 from gvo.errors import OutputError
-from gvo.io.excerpt import Excerpt
-from gvo.io.opening import RecordingOptions
 from gvo.io.run_folder.line_file import replace_text
 from gvo.io.run_folder.writer import REPORT
 
 # How often the table is written while the batch runs.
 _EVERY_S = 10.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BatchOptions:
-    """What all runs of a batch have in common.
-
-    Parameters
-    ----------
-    recording : RecordingOptions
-        Topics and calibration.
-    excerpt : Excerpt, optional
-        Which frames are read; all if omitted.
-    report : bool
-        Draw the picture and the page of each run; those of the batch are always drawn.
-    force : bool
-        Run what an earlier batch has finished again.
-    plots : Path, optional
-        Folder for each plot of the batch's report as PNG and PDF.
-    """
-
-    recording: RecordingOptions = field(default_factory=RecordingOptions)
-    excerpt: Excerpt | None = None
-    report: bool = True
-    force: bool = False
-    plots: Path | None = None
 
 
 def run(
@@ -127,14 +99,7 @@ def run_batch(
     """Run recordings with named configurations; see `run`."""
     tasks = make_tasks(recordings, variants)
     table = _Table(out, tasks, options.plots)
-    shared = TaskOptions(
-        out=table.location,
-        mark=table.mark,
-        recording=options.recording,
-        excerpt=options.excerpt,
-        report=options.report,
-        force=options.force,
-    )
+    shared = TaskOptions(out=table.location, mark=table.mark, batch=options)
     with ExitStack() as stack:
         stack.enter_context(table.written())
         client = client or stack.enter_context(connected(None, None))

@@ -33,6 +33,31 @@ _BUSY_TICK_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BatchOptions:
+    """What all runs of a batch have in common.
+
+    Parameters
+    ----------
+    recording : RecordingOptions
+        Topics and calibration.
+    excerpt : Excerpt, optional
+        Which frames are read; all if omitted.
+    report : bool
+        Draw the picture and the page of each run; those of the batch are always drawn.
+    force : bool
+        Run what an earlier batch has finished again.
+    plots : Path, optional
+        Folder for each plot of the batch's report as PNG and PDF.
+    """
+
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    excerpt: Excerpt | None = None
+    report: bool = True
+    force: bool = False
+    plots: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TaskOptions:
     """What all tasks of a batch have in common.
 
@@ -42,23 +67,14 @@ class TaskOptions:
         Folder of the batch, as an absolute path or a URL.
     mark : str
         Token in its `batch.json`: a worker that does not read it there has another disk.
-    recording : RecordingOptions
-        Topics and calibration.
-    excerpt : Excerpt, optional
-    report : bool
-        Draw the picture and the report of each run.
-    force : bool
-        Run finished runs again.
+    batch : BatchOptions
     gvo_version : str
         Of the client; a worker with another version refuses the task.
     """
 
     out: str
     mark: str
-    recording: RecordingOptions = field(default_factory=RecordingOptions)
-    excerpt: Excerpt | None = None
-    report: bool = True
-    force: bool = False
+    batch: BatchOptions = field(default_factory=BatchOptions)
     gvo_version: str = __version__
 
 
@@ -156,35 +172,45 @@ def _run(
     copies: Path,
     on_progress: Callable[[Progress], None] | None,
 ) -> tuple[RunResult, bool]:
-    """Return the run, and whether its folder held it."""
+    """Return the run, and whether it was found finished."""
     path = fetch(task.source, copies) if is_url(task.source) else Path(task.source)
-    source = open_recording(path, config=task.config, options=options.recording)
-
-    def run(folder: Path) -> tuple[RunResult, bool]:
-        found = None if options.force else _find_finished(folder, source, task, options)
-        if found is not None:
-            return found, True
-        result = run_recording(
-            source,
-            folder,
-            config=task.config,
-            excerpt=options.excerpt,
-            outputs=RunOutputs(report=options.report),
-            on_progress=on_progress,
-        )
-        return result, False
+    source = open_recording(path, config=task.config, options=options.batch.recording)
 
     if not is_url(options.out):
         out = Path(options.out)
         _check_same_disk(out, options.mark)
-        return _when_free(lambda: run(out / task.folder))
+        return _when_free(
+            lambda: _find_or_run(out / task.folder, source, task, options, on_progress)
+        )
     folder, url = copies / "run", f"{options.out.rstrip('/')}/{task.folder}"
     folder.mkdir()
     fetch_file(f"{url}/{SUMMARY}", folder / SUMMARY)
-    result, is_found = run(folder)
+    result, is_found = _find_or_run(folder, source, task, options, on_progress)
     if not is_found:
         store(folder, url)
     return result, is_found
+
+
+def _find_or_run(
+    folder: Path,
+    source: Source,
+    task: Task,
+    options: TaskOptions,
+    on_progress: Callable[[Progress], None] | None,
+) -> tuple[RunResult, bool]:
+    found = None if options.batch.force else _find_finished(folder, source, task, options)
+    if found is not None:
+        return found, True
+    outputs = RunOutputs(report=options.batch.report)
+    result = run_recording(
+        source,
+        folder,
+        config=task.config,
+        excerpt=options.batch.excerpt,
+        outputs=outputs,
+        on_progress=on_progress,
+    )
+    return result, False
 
 
 def _find_finished(
@@ -197,7 +223,7 @@ def _find_finished(
         return None
     if not isinstance(summary, dict) or summary.get("state") != "complete":
         return None
-    identity = run_identity(source, OutputFrame(source.info.frame_id), options.excerpt)
+    identity = run_identity(source, OutputFrame(source.info.frame_id), options.batch.excerpt)
     there = summary.get("run"), summary.get("configuration")
     if there != (identity, task.config.model_dump(mode="json")):
         return None
@@ -231,6 +257,6 @@ def _check_same_disk(out: Path, mark: str) -> None:
         is_there = False
     if not is_there:
         raise OutputError(
-            f"{out}: the worker does not see there what the client does; give --out on a disk "
-            "that both share, or a URL; and one batch at a time"
+            f"{out}: the worker does not see the client's folder there; give --out on a disk that "
+            "both share, or a URL; and run one batch at a time in it"
         )

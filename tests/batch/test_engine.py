@@ -21,7 +21,7 @@ from gvo.batch.rows import BatchRow
 from gvo.batch.running import make_tasks
 from gvo.batch.tasks import MARK, Task, TaskOptions
 from gvo.batch.variants import make_variants
-from tests.batch.conftest import is_complete, wait_until
+from tests.batch.conftest import NO_REPORT, is_complete, wait_until
 
 N_MANY = 300
 
@@ -30,7 +30,7 @@ N_MANY = 300
 def options(tmp_path: Path) -> TaskOptions:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / MARK).write_text(json.dumps({"mark": "x"}))
-    return TaskOptions(out=str(tmp_path / "out"), mark="x", report=False)
+    return TaskOptions(out=str(tmp_path / "out"), mark="x", batch=NO_REPORT)
 
 
 def tasks_of(*sources: object) -> list[Task]:

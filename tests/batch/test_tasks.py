@@ -13,11 +13,11 @@ import pytest
 
 import gvo
 from gvo.batch.rows import BatchRow
-from gvo.batch.tasks import MARK, Task, TaskOptions, digest, run_task
+from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions, digest, run_task
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import written_alone
 from gvo.types import Progress
-from tests.batch.conftest import N_FRAMES, assert_same_run, copy_of, state_of
+from tests.batch.conftest import N_FRAMES, NO_REPORT, assert_same_run, copy_of, state_of
 
 CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])
 
@@ -32,7 +32,7 @@ def options(tmp_path: Path) -> TaskOptions:
     out = tmp_path / "out"
     out.mkdir()
     (out / MARK).write_text('{"mark": "x"}')
-    return TaskOptions(out=str(out), mark="x", report=False)
+    return TaskOptions(out=str(out), mark="x", batch=NO_REPORT)
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_a_task_writes_what_a_run_writes(
 
 
 def test_a_report_is_drawn_where_it_is_wanted(bag: Path, options: TaskOptions) -> None:
-    run_task(task_of(bag), replace(options, report=True))
+    run_task(task_of(bag), replace(options, batch=BatchOptions()))
     assert (Path(options.out) / "a" / "report.html").exists()
 
 
@@ -90,7 +90,9 @@ def test_a_finished_run_is_made_again_where_that_is_wanted(bag: Path, options: T
     run_task(task_of(bag), options)
     out = Path(options.out) / "a"
     (out / "raw.txt").write_text("")
-    assert not run_task(task_of(bag), replace(options, force=True)).is_found
+    assert not run_task(
+        task_of(bag), replace(options, batch=BatchOptions(report=False, force=True))
+    ).is_found
     assert (out / "raw.txt").read_text().count("\n") == N_FRAMES
 
 
@@ -107,7 +109,8 @@ def test_another_run_in_the_folder_is_replaced(
     elif change == "recording":
         copy_of(bags / "walk1.mcap", bag.parent, bag.name)
     elif change == "excerpt":
-        options, fresh = (replace(each, excerpt=Excerpt(every=2)) for each in (options, fresh))
+        part = BatchOptions(report=False, excerpt=Excerpt(every=2))
+        options, fresh = (replace(each, batch=part) for each in (options, fresh))
     else:
         (Path(options.out) / "a" / "summary.json").write_text("{")
     row = run_task(task, options)
@@ -169,7 +172,7 @@ def test_a_disk_that_is_not_the_clients_is_refused(
         mark.write_text(content, encoding="latin-1")
     row = run_task(task_of(bag), options)
     assert row.status == "failed"
-    assert "does not see there what the client does" in row.reason
+    assert "does not see the client's folder" in row.reason
     assert not (Path(options.out) / "a").exists()
 
 
@@ -195,7 +198,7 @@ def test_a_folder_that_another_process_writes_is_waited_for(
             other.close()
 
     monkeypatch.setattr("gvo.batch.tasks.time.sleep", wait)
-    row = run_task(task_of(bag), replace(options, force=force))
+    row = run_task(task_of(bag), replace(options, batch=BatchOptions(report=False, force=force)))
     assert (row.status, len(waited)) == ("complete", 3)
 
 
@@ -219,7 +222,7 @@ def test_recordings_and_results_may_lie_behind_urls(
 ) -> None:
     files: Any = fsspec.filesystem("memory")
     files.pipe("/place/walk.mcap", bag.read_bytes())
-    options = TaskOptions(out=f"{memory}/out", mark="x", report=False)
+    options = TaskOptions(out=f"{memory}/out", mark="x", batch=NO_REPORT)
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     row = run_task(task_of(f"{memory}/walk.mcap"), options, scratch=scratch)
