@@ -36,6 +36,7 @@ _HEADER = (
     "r_err [deg/100 m]",
     "path ratio",
 )
+_JSON_NAMES = ("name", "n", "ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -293,20 +294,8 @@ def evaluations_json(
     evaluations: Sequence[Evaluation],
 ) -> dict[str, list[dict[str, str | int | float | None]]]:
     """Return the errors as plain values, `{"estimates": [{"name", "n", "ate_m", ...}, ...]}`."""
-    return {
-        "estimates": [
-            {
-                "name": evaluation.name,
-                "n": evaluation.n,
-                "ate_m": evaluation.ate_m,
-                "rpe_m": evaluation.rpe_m,
-                "rpe_deg": evaluation.rpe_deg,
-                "t_pct": evaluation.t_pct,
-                "r_deg_per_100m": evaluation.r_deg_per_100m,
-            }
-            for evaluation in evaluations
-        ]
-    }
+    rows = [{name: getattr(each, name) for name in _JSON_NAMES} for each in evaluations]
+    return {"estimates": rows}
 
 
 def _cells(evaluation: Evaluation) -> tuple[str, ...]:
