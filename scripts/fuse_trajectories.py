@@ -36,7 +36,7 @@ def main() -> int:
     print(gvo.format_evaluations([*evaluations, *fused]), end="")
     for warning in result.warnings:
         print(f"fuse_trajectories: warning: {warning}", file=sys.stderr)
-    return result.exit_code
+    return 0 if result.is_complete else 3
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def main() -> int:
         print(gvo.format_evaluations(result.evaluations), end="")
     for warning in result.warnings:
         print(f"run_bag: warning: {warning}", file=sys.stderr)
-    return result.exit_code
+    return 0 if result.is_complete else 3
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.run import EXIT_COMPLETE, RunResult, run_recording
+from gvo.runs.run import RunResult, run_recording
 from gvo.runs.summary import run_identity
 from gvo.types import Progress
 
@@ -150,7 +150,7 @@ def run_task(
             result, is_found = _run(task, options, Path(copies), on_progress)
     except GvoError as error:
         return task.row("failed", str(error))
-    status: RunStatus = "complete" if result.exit_code == EXIT_COMPLETE else "partly"
+    status: RunStatus = "complete" if result.is_complete else "partly"
     return replace(
         task.row(status, "" if status == "complete" else "; ".join(result.warnings)),
         **measures_of(result.summary),
@@ -230,7 +230,7 @@ def _find_finished(
     return RunResult(
         summary=summary,
         evaluations=(),
-        exit_code=int(summary.get("exit_code", EXIT_COMPLETE)),
+        is_complete=bool(summary.get("is_complete", True)),
         warnings=tuple(summary.get("warnings", ())),
     )
 

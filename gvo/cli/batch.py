@@ -23,7 +23,7 @@ from gvo.cli.options import (
     Start,
     recording_options,
 )
-from gvo.cli.terminal import both, interruptible, told_where_it_stands, warn
+from gvo.cli.terminal import both, exit_code, interruptible, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -174,7 +174,6 @@ def _clock(seconds: float) -> str:
 def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn:
     """Print the outcome of a batch, and end with its exit code."""
     from gvo.io.run_folder.writer import REPORT
-    from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 
     warn(reasons[:_MAX_WARNINGS])
     if len(reasons) > _MAX_WARNINGS:
@@ -184,4 +183,4 @@ def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn
     typer.echo(f"{_count(n_runs, 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
     if counts.get("failed") == n_runs:
         raise ConfigurationError("all runs failed")
-    raise typer.Exit(EXIT_PARTLY if reasons else EXIT_COMPLETE)
+    raise typer.Exit(exit_code(not reasons))

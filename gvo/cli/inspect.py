@@ -26,7 +26,7 @@ from gvo.cli.options import (
     open_source,
     recording_options,
 )
-from gvo.cli.terminal import both, interruptible, progress, warn
+from gvo.cli.terminal import both, exit_code, interruptible, progress, warn
 from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
@@ -184,4 +184,4 @@ def round_trip(
     typer.echo(format_round_trip_errors(result.errors), nl=False)
     typer.echo(out / "round_trip.png")
     warn(result.warnings)
-    raise typer.Exit(result.exit_code)
+    raise typer.Exit(exit_code(result.is_complete))

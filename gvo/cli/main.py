@@ -31,7 +31,10 @@ from gvo.cli.options import (
     recording_options,
 )
 from gvo.cli.terminal import (
+    EXIT_FAULTS,
+    EXIT_UNUSABLE,
     both,
+    exit_code,
     interruptible,
     progress,
     report,
@@ -54,8 +57,6 @@ app = typer.Typer(
 )
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-EXIT_FAULTS = 1
-EXIT_UNUSABLE = 2
 
 
 class _KeyframePolicy(StrEnum):
@@ -397,7 +398,6 @@ def convert_(
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.io.convert.convert import convert
-    from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 
     options = recording_options(calibration, left, right, color, depth)
     settings = load(config, set_)
@@ -414,7 +414,7 @@ def convert_(
         )
     typer.echo(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
     warn(written.skipped)
-    raise typer.Exit(EXIT_PARTLY if written.skipped else EXIT_COMPLETE)
+    raise typer.Exit(exit_code(not written.skipped))
 
 
 @app.command("config")
@@ -447,12 +447,5 @@ def main() -> None:
         app()
     except GvoError as error:
         typer.echo(f"gvo: error: {error}", err=True)
-        raise SystemExit(_exit_code(error)) from None
-
-
-def _exit_code(error: GvoError) -> int:
-    if not (isinstance(error, OutputError) and error.is_partly):
-        return EXIT_UNUSABLE
-    from gvo.runs.run import EXIT_PARTLY
-
-    return EXIT_PARTLY
+        is_partly = isinstance(error, OutputError) and error.is_partly
+        raise SystemExit(exit_code(False) if is_partly else EXIT_UNUSABLE) from None

@@ -18,7 +18,14 @@ if TYPE_CHECKING:
 ProgressT = TypeVar("ProgressT")
 # By how much the total of a progress bar may be off.
 _MAX_OFF = 0.02
-_EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+_EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+EXIT_FAULTS = 1
+EXIT_UNUSABLE = 2
+
+
+def exit_code(is_complete: bool) -> int:
+    """Return 0 for a complete result, 3 for a part of it."""
+    return 0 if is_complete else 3
 
 
 def report(result: RunResult, out: Path) -> NoReturn:
@@ -42,7 +49,7 @@ def report(result: RunResult, out: Path) -> NoReturn:
     segments = _segment_words(result.summary["segments"])
     typer.echo(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
     warn(result.warnings)
-    raise typer.Exit(result.exit_code)
+    raise typer.Exit(exit_code(result.is_complete))
 
 
 def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
@@ -68,7 +75,7 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
     typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
-    raise typer.Exit(result.exit_code)
+    raise typer.Exit(exit_code(result.is_complete))
 
 
 def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
@@ -151,11 +158,11 @@ def interruptible() -> Iterator[Callable[[object], None]]:
         if received:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, receive) for number in _EXIT_CODES}
+    before = {number: signal.signal(number, receive) for number in _EXIT_CODES_OF_SIGNALS}
     try:
         yield check
     except KeyboardInterrupt:
-        raise SystemExit(_EXIT_CODES[received[0]] if received else 130) from None
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

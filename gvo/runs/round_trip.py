@@ -18,7 +18,6 @@ from gvo.io.poses.base_frame import OutputFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder
 from gvo.runs.loop import RunLoop
-from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY
 from gvo.runs.summary import summarize
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.round_trip import RoundTripError, round_trip_error
@@ -206,8 +205,8 @@ class RoundTripResult:
         Of raw, causal and smoothed.
     turn_ns : int
         Stamp of the frame at the turn, nanoseconds.
-    exit_code : int
-        0 complete, 3 partly.
+    is_complete : bool
+        As of `RunResult`.
     warnings : tuple of str
         What was skipped or broke off, a line each.
     """
@@ -215,7 +214,7 @@ class RoundTripResult:
     summary: dict[str, Any]
     errors: dict[str, RoundTripError]
     turn_ns: int
-    exit_code: int
+    is_complete: bool
     warnings: tuple[str, ...]
 
 
@@ -292,7 +291,7 @@ def run_round_trip(
         summary=summary,
         errors=errors,
         turn_ns=turn_ns,
-        exit_code=EXIT_PARTLY if loop.statistics.is_partly else EXIT_COMPLETE,
+        is_complete=loop.statistics.is_complete,
         warnings=tuple(warnings),
     )
 

@@ -35,9 +35,6 @@ from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
 
-EXIT_COMPLETE = 0
-EXIT_PARTLY = 3
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunResult:
@@ -49,8 +46,8 @@ class RunResult:
         As written to `summary.json`.
     evaluations : tuple of Evaluation
         Of raw, causal and smoothed; empty without ground truth.
-    exit_code : int
-        0 complete, 3 partly.
+    is_complete : bool
+        Whether no frame is missing, all are tracked, and all was compared and drawn as asked.
     warnings : tuple of str
         What was skipped or broke off, a line each.
     report : Path or None
@@ -59,7 +56,7 @@ class RunResult:
 
     summary: dict[str, Any]
     evaluations: tuple[Evaluation, ...]
-    exit_code: int
+    is_complete: bool
     warnings: tuple[str, ...]
     report: Path | None = None
 
@@ -206,14 +203,13 @@ def _conclude(
     summary = summarize(loop, compared, warnings)
     if found is not None:
         folder.write_truth(found.truth.trajectory)
-    is_partly = loop.statistics.is_partly or (is_asked and found is None)
-    exit_code = EXIT_PARTLY if is_partly else EXIT_COMPLETE
-    summary |= {"exit_code": exit_code, "run": identity}
+    is_complete = loop.statistics.is_complete and not (is_asked and found is None)
+    summary |= {"is_complete": is_complete, "run": identity}
     folder.write_summary(summary)
     return RunResult(
         summary=summary,
         evaluations=() if found is None else found.evaluations,
-        exit_code=exit_code,
+        is_complete=is_complete,
         warnings=tuple(warnings),
     )
 
@@ -231,7 +227,7 @@ def _drawn(
         _draw(folder, compared, estimates, plots=plots)
     except (GvoError, OSError) as error:
         warnings = (*result.warnings, f"not all was drawn: {error}")
-        result = replace(result, exit_code=EXIT_PARTLY, warnings=warnings)
+        result = replace(result, is_complete=False, warnings=warnings)
     page = folder.path / REPORT
     return replace(result, report=page if page.exists() else None)
 

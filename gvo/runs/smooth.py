@@ -27,7 +27,7 @@ from gvo.io.edges.lines import (
 from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
 from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder
 from gvo.odometry.chain import EdgeChain
-from gvo.runs.run import EXIT_COMPLETE, EXIT_PARTLY, RunResult
+from gvo.runs.run import RunResult
 from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
@@ -269,14 +269,14 @@ def conclude(
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     warnings = [*_warnings(smoother, notes), *notes.warnings]
     counts = smoother.window.counts
-    is_partly = bool(notes.warnings or notes.broken_off or counts.n_coasting or counts.n_rejected)
+    is_complete = not (notes.warnings or notes.broken_off or counts.n_coasting or counts.n_rejected)
     evaluations: tuple[Evaluation, ...] = ()
     if truth is not None:
         try:
             evaluations = tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
         except GvoError as error:
             warnings.append(f"not compared with the ground truth: {error}")
-            is_partly = True
+            is_complete = False
     summary = _summary(name, smoother, notes)
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     folder.write_summary(summary | {"configuration": config.model_dump()})
@@ -284,7 +284,7 @@ def conclude(
     return RunResult(
         summary=summary | {"configuration": config.model_dump()},
         evaluations=evaluations,
-        exit_code=EXIT_PARTLY if is_partly else EXIT_COMPLETE,
+        is_complete=is_complete,
         warnings=tuple(warnings),
     )
 
@@ -354,7 +354,7 @@ def smooth_lines(
     Returns
     -------
     RunResult
-        Exit code 3 where a line was malformed.
+        Not complete where a line was malformed.
 
     Raises
     ------

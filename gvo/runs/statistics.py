@@ -15,7 +15,7 @@ from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
 # With more poses that only continue a velocity, a trajectory is in parts made up.
-_MAX_UNTIED_SHARE = 0.1
+_MAX_UNTRACKED_SHARE = 0.1
 # A head that turns on a robot moves its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
 
@@ -122,11 +122,13 @@ class RunStatistics:
         return [asdict(segment) for segment in self.segments.values()]
 
     @property
-    def is_partly(self) -> bool:
-        """Tell whether frames are missing, or poses not tied to the others."""
-        is_loose = self.n_with_pose > 1 and self.n_tracked < 2
-        is_loose |= self.n_with_pose - self.n_tracked > _MAX_UNTIED_SHARE * self.n_with_pose
-        return bool(self.n_faulty or self.broken_off or self.statuses[Status.LOST] or is_loose)
+    def is_complete(self) -> bool:
+        """Tell whether no frame is missing, and all but a few are tracked."""
+        n_untracked = self.n_with_pose - self.n_tracked
+        is_tracked = n_untracked <= _MAX_UNTRACKED_SHARE * self.n_with_pose
+        is_tracked &= self.n_with_pose < 2 or self.n_tracked >= 2
+        is_whole = not (self.n_faulty or self.broken_off or self.statuses[Status.LOST])
+        return is_whole and is_tracked
 
     def progress(self, n_images: int) -> Progress:
         """Return how far the run is, of so many images."""

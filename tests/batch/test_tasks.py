@@ -155,7 +155,7 @@ def test_a_run_with_faults_is_partly(
         outputs=gvo.RunOutputs(report=False),
     )
     partly = gvo.RunResult(
-        summary=result.summary, evaluations=(), exit_code=3, warnings=("one", "two")
+        summary=result.summary, evaluations=(), is_complete=False, warnings=("one", "two")
     )
     monkeypatch.setattr("gvo.batch.tasks.run_recording", lambda *_, **__: partly)
     row = run_task(task_of(bag), options)

@@ -148,7 +148,7 @@ def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(
     kept, loop = run(walk)
     assert len(kept.frames) == len(kept.smoothed) == 4
     assert loop.statistics.broken_off == "the last 3 frames are missing"
-    assert loop.statistics.is_partly
+    assert not loop.statistics.is_complete
 
 
 @pytest.mark.parametrize(("sensor", "n_lost"), [("stereo", 1), ("rgbd", 0)])
@@ -159,7 +159,7 @@ def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lo
     assert len(kept.frames) == _N_FRAMES - 1
     assert [frame.stamp_ns for frame in kept.faulty] == [source.items[6].stamp_ns] * n_lost
     assert loop.statistics.n_faulty == n_lost
-    assert loop.statistics.is_partly == bool(n_lost)
+    assert loop.statistics.is_complete == (n_lost == 0)
 
 
 def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Rendered) -> None:

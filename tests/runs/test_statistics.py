@@ -15,13 +15,13 @@ def counted(n_ok: int, n_coasting: int) -> RunStatistics:
 
 
 @pytest.mark.parametrize(
-    ("n_ok", "n_coasting", "is_partly"), [(30, 0, False), (27, 3, False), (26, 4, True)]
+    ("n_ok", "n_coasting", "is_complete"), [(30, 0, True), (27, 3, True), (26, 4, False)]
 )
 def test_a_run_of_which_a_tenth_is_made_up_is_not_complete(
-    n_ok: int, n_coasting: int, is_partly: bool
+    n_ok: int, n_coasting: int, is_complete: bool
 ) -> None:
     statistics = counted(n_ok, n_coasting)
-    assert statistics.is_partly == is_partly
+    assert statistics.is_complete == is_complete
     assert len(statistics.warnings()) == (n_coasting > 0)
 
 
@@ -37,9 +37,9 @@ def test_a_camera_that_moves_far_in_the_frame_asked_for_is_told() -> None:
 def test_images_without_partner_count_as_frames_only_where_they_are_a_loss() -> None:
     statistics = counted(5, 0)
     statistics.add_faulty(FaultyFrame(stamp_ns=7, reason="alone", is_unpaired=True), is_loss=False)
-    assert (statistics.n_frames, statistics.is_partly) == (5, False)
+    assert (statistics.n_frames, statistics.is_complete) == (5, True)
     statistics.add_faulty(FaultyFrame(stamp_ns=8, reason="dark"), is_loss=True)
-    assert (statistics.n_frames, statistics.is_partly) == (6, True)
+    assert (statistics.n_frames, statistics.is_complete) == (6, False)
     assert statistics.progress(10).n_done == 7
 
 
@@ -90,7 +90,7 @@ def test_segments_are_told_with_their_frames_and_what_they_are_joined_to() -> No
     assert statistics.coverage_percent == pytest.approx(100 * 4 / 6, abs=1e-3)
     assert statistics.unjoined == [statistics.segments[0]]
     assert any("joined (1 to 0)" in warning for warning in statistics.warnings())
-    assert statistics.is_partly
+    assert not statistics.is_complete
 
 
 def test_segments_that_nothing_ties_to_others_are_a_warning() -> None:
