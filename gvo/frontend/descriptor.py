@@ -49,7 +49,7 @@ class DescriptorFrontend:
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
 
     def extract(self, frame: Frame) -> Observations:
-        """Return the points of a frame that are seen and measured in 3-D.
+        """Return the keypoints of a frame that are measured in 3-D.
 
         Parameters
         ----------
@@ -61,20 +61,11 @@ class DescriptorFrontend:
         return self._extract_rgbd(frame)
 
     def _extract_stereo(self, frame: StereoFrame) -> Observations:
-        first, second = self._extractors
-        if self._pool is not None:
-            pending = self._pool.submit(second.extract, frame.right)
-            left, right = first.extract(frame.left), pending.result()
-        else:
-            left, right = first.extract(frame.left), second.extract(frame.right)
+        left, right = self._extract_both(frame)
         config = self._config.stereo
         pairs = match_stereo(left, right, self.camera, config)
-        disparities, is_valid = refine_disparities(
-            (frame.left, frame.right),
-            left.keypoints[pairs[:, 0]],
-            right.keypoints[pairs[:, 1]],
-            config,
-        )
+        pixels = left.keypoints[pairs[:, 0]], right.keypoints[pairs[:, 1]]
+        disparities, is_valid = refine_disparities((frame.left, frame.right), *pixels, config)
         is_in_range = is_in_depth_range(disparities - self._offset_px(), self.camera, config)
         note(
             "descriptor.stereo",
@@ -86,6 +77,13 @@ class DescriptorFrontend:
         )
         is_valid &= is_in_range
         return self._observe(frame.stamp_ns, left, right, pairs[is_valid], disparities[is_valid])
+
+    def _extract_both(self, frame: StereoFrame) -> tuple[Features, Features]:
+        first, second = self._extractors
+        if self._pool is None:
+            return first.extract(frame.left), second.extract(frame.right)
+        pending = self._pool.submit(second.extract, frame.right)
+        return first.extract(frame.left), pending.result()
 
     def _extract_rgbd(self, frame: RgbdFrame) -> Observations:
         features = self._extractors[0].extract(frame.image)
@@ -163,7 +161,7 @@ class DescriptorFrontend:
     def _check_view(
         self, reference: Observations, current: Observations, rough: RelativePose
     ) -> RelativePose | Failure:
-        """Match again around what a motion predicts; refuse it where too little is there."""
+        """Match again around the pixels that a motion predicts, and check the view."""
         prior = MotionPrior(T_predicted=rough.T_reference_current)
         radius_px = self._config.temporal.radius_px
         result = self._register_within(reference, current, prior, radius_px)
@@ -180,22 +178,7 @@ class DescriptorFrontend:
         radius_px: float,
     ) -> RelativePose | Failure:
         T_predicted = None if prior is None else prior.T_predicted
-        predicted = predict_pixels(reference, T_predicted, self.camera)
-        note(
-            "attempt.matches",
-            prior=T_predicted,
-            radius_px=radius_px,
-            predicted=predicted,
-            pixels=(reference.keypoints, current.keypoints),
-        )
-        matches = match_temporal(
-            reference,
-            current,
-            predicted,
-            radius_px=radius_px,
-            max_distance=self._config.temporal.max_distance,
-            max_ratio=self._config.temporal.max_ratio,
-        )
+        matches = self._match(reference, current, T_predicted, radius_px)
         correspondences = Correspondences.of(reference, current, matches)
         result = register_correspondences(
             correspondences.without_offset(self._offset_px(), self.camera),
@@ -211,6 +194,26 @@ class DescriptorFrontend:
         self.rig_offsets.note(result, current.stamp_ns)
         factor = self._config.registration.sigma_factor
         return replace(result, covariance=factor**2 * result.covariance)
+
+    def _match(
+        self,
+        reference: Observations,
+        current: Observations,
+        T_predicted: FloatArray | None,
+        radius_px: float,
+    ) -> IntArray:
+        predicted = predict_pixels(reference, T_predicted, self.camera)
+        pixels = reference.keypoints, current.keypoints
+        guide = {"prior": T_predicted, "radius_px": radius_px, "predicted": predicted}
+        note("attempt.matches", **guide, pixels=pixels)
+        return match_temporal(
+            reference,
+            current,
+            predicted,
+            radius_px=radius_px,
+            max_distance=self._config.temporal.max_distance,
+            max_ratio=self._config.temporal.max_ratio,
+        )
 
 
 def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCamera:

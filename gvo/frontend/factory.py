@@ -1,4 +1,4 @@
-"""The front-end that the configuration names, and its successor where that changes."""
+"""The front-end that the configuration names, and what a change of it means."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 
-# What a front-end of `make_frontend` reads; `features` and `temporal` also where corners are
-# tracked: where tracks lead to nothing, descriptors are matched.
+# Sections that a front-end reads; KLT too falls back on `features` and `temporal`.
 _SECTIONS = (
     "frontend",
     "klt",
@@ -53,18 +52,18 @@ def make_frontend(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontendChange:
-    """What another configuration means for a front-end and what it keeps of frames.
+    """What another configuration changes of a front-end and its observations.
 
     Parameters
     ----------
     is_any : bool
-        A front-end works differently with it.
+        Anything.
     is_of_extraction : bool
-        Other things are kept of a frame.
+        What is extracted of a frame.
     is_of_kind : bool
-        What was kept cannot be registered with what will be.
+        Old observations cannot be registered with new ones.
     is_of_rig : bool
-        What was learnt of the rig no longer holds.
+        Learnt offsets of the rig no longer hold.
     """
 
     is_any: bool
@@ -74,14 +73,7 @@ class FrontendChange:
 
 
 def find_change(former: Config, config: Config, *, is_stereo: bool) -> FrontendChange:
-    """Tell what a front-end of `make_frontend` makes of another configuration.
-
-    Parameters
-    ----------
-    former, config : Config
-    is_stereo : bool
-        Of a stereo camera the section `depth` plays no role, of others the section `stereo`.
-    """
+    """Compare two configurations; stereo has no section `depth`, others no `stereo`."""
     return FrontendChange(
         is_any=any(getattr(former, name) != getattr(config, name) for name in _SECTIONS),
         is_of_extraction=_extraction(former, is_stereo) != _extraction(config, is_stereo),
@@ -91,19 +83,19 @@ def find_change(former: Config, config: Config, *, is_stereo: bool) -> FrontendC
 
 
 def frame_of(observations: object) -> Frame | None:
-    """Return the frame that observations hold; None where they do not."""
+    """Return the frame of observations that hold it, else None."""
     return observations.frame if isinstance(observations, KltObservations) else None
 
 
 def _extraction(config: Config, is_stereo: bool) -> tuple[Any, ...]:
-    """Return the sections that decide what is kept of a frame."""
+    """Return the sections that decide what is extracted."""
     is_klt = config.frontend.kind == "klt"
     points = config.klt if is_klt else config.features
     return config.frontend, points, config.stereo if is_stereo else config.depth
 
 
 def _kind(config: Config, is_stereo: bool) -> tuple[Any, ...]:
-    """Return what must be equal for two frames' observations to be compared."""
+    """Return what must be equal for two frames to be registered."""
     baseline_m = None if is_stereo else config.depth.virtual_baseline_m
     if config.frontend.kind == "klt":
         return "klt", baseline_m

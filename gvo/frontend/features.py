@@ -18,8 +18,8 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
 # Border that the descriptors' patch needs (31 px with its rotation), at the first octave.
 _BORDER_PX = 19
-# Candidates over budget. ORB cuts its candidates by strength over the whole image, and a tight
-# limit takes them from the road before the grid can: near points, which carry the translation.
+# Ratio of candidates to the budget. ORB limits its candidates by strength over the whole image, and
+# a tight limit drops those on the road: near points, which carry the translation.
 _N_CANDIDATES = 8
 
 
@@ -46,9 +46,7 @@ class Features:
 
 
 class FeatureExtractor:
-    """Detects and describes; holds the OpenCV objects between images.
-
-    Not to be shared between threads: OpenCV's detectors keep state.
+    """Detects and describes keypoints with OpenCV, whose detectors keep state: one per thread.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
-"""The front-end of tracks: corners followed by Lucas-Kanade, measured in 3-D in both frames."""
+"""The KLT front-end: corners tracked by Lucas-Kanade, measured in 3-D in both frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.registration import check_view, register_correspondences, relocalize_observations
 from gvo.frontend.rgbd import check_depths, sample_depth
-from gvo.frontend.stereo.corners import measure_corners
+from gvo.frontend.stereo.corners import CornerDisparities, measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
 from gvo.frontend.stereo.offsets import RigOffsets
@@ -37,9 +38,9 @@ from gvo.types import (
 )
 
 _MIN_DEPTH_M = 1e-3
-# Steps from a prediction to the disparity of a track.
+# Gauss-Newton steps from the predicted disparity of a track.
 _N_TRACK_STEPS = 4
-# Frames whose descriptors are kept, in case that the next one needs them too.
+# Number of frames whose descriptors are cached.
 _N_DESCRIBED = 3
 
 
@@ -48,8 +49,8 @@ class KltFrontend:
 
     Each registration starts from the corners of its reference, so that patches do not drift
     over many frames. The tracked corners are measured in 3-D in the current frame too: in its
-    right image, or in its depth. What a stereo rig gets wrong all the time is learnt on the way
-    (`rig_offsets`) and taken off.
+    right image, or in its depth. Constant offsets of a stereo rig are calibrated online
+    (`rig_offsets`) and subtracted.
 
     Parameters
     ----------
@@ -85,13 +86,7 @@ class KltFrontend:
         corners = detect_corners(image_of(frame), self._config.klt)
         row_shift_px = None
         if isinstance(frame, StereoFrame):
-            measured = measure_corners(
-                (frame.left, frame.right),
-                corners,
-                self._config.stereo,
-                max_disparity=self._max_disparity(),
-                row_offset_px=row_offset_px,
-            )
+            measured = self._measure_corners(frame, corners, row_offset_px)
             disparities, row_shift_px = measured.disparities, measured.row_shift_px
             is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
         else:
@@ -106,8 +101,17 @@ class KltFrontend:
             row_shift_px=row_shift_px,
         )
 
+    def _measure_corners(
+        self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
+    ) -> CornerDisparities:
+        config, images = self._config.stereo, (frame.left, frame.right)
+        limit = float(self.camera.depth_to_disparity(config.min_depth_m))
+        return measure_corners(
+            images, corners, config, max_disparity=limit, row_offset_px=row_offset_px
+        )
+
     def _offsets_px(self) -> tuple[float, float]:
-        """Return what is to be taken off disparities, and added to rows of the right image."""
+        """Return the offsets of disparities and of rows of the right image."""
         return self.rig_offsets.disparity.value_px, self.rig_offsets.row.value_px
 
     def register(
@@ -169,12 +173,10 @@ class KltFrontend:
         self, reference: KltObservations, current: KltObservations
     ) -> RelativePose | Failure:
         """Estimate the motion between frames that may be far apart, by descriptors and tracks."""
+        first, second = self._describe(reference), self._describe(current)
+        offset_px = self._offsets_px()[0]
         rough = relocalize_observations(
-            self._describe(reference),
-            self._describe(current),
-            self.camera,
-            self._config,
-            offset_px=self._offsets_px()[0],
+            first, second, self.camera, self._config, offset_px=offset_px
         )
         self._forget_described()
         if isinstance(rough, Failure):
@@ -199,7 +201,7 @@ class KltFrontend:
     def _register_descriptors(
         self, reference: KltObservations, current: KltObservations
     ) -> RelativePose | Failure:
-        """Register by descriptors, which find corners again that moved too far for a track."""
+        """Register by descriptors, which match corners that moved too far for a track."""
         result = self._descriptors.register(self._describe(reference), self._describe(current))
         self._forget_described()
         return result
@@ -273,12 +275,7 @@ class KltFrontend:
             is_tracked=is_tracked,
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
-        if isinstance(current.frame, RgbdFrame):
-            disparities, is_valid = self._measure_depth(current.frame, pixels)
-        else:
-            disparities, is_valid = self._measure_stereo(
-                current.frame, pixels, predicted[:, 2], is_wide=is_wide
-            )
+        disparities, is_valid = self._measure(current.frame, pixels, predicted[:, 2], is_wide)
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         target_uvd = np.column_stack([pixels, disparities])[is_valid]
         return source_uvd, target_uvd, indices[is_valid]
@@ -313,35 +310,30 @@ class KltFrontend:
             self.camera,
         )
 
+    def _measure(
+        self, frame: Frame, pixels: FloatArray, predicted: FloatArray, is_wide: bool
+    ) -> tuple[FloatArray, BoolArray]:
+        """Measure the disparities of tracks, virtual ones of RGB-D."""
+        if isinstance(frame, RgbdFrame):
+            return self._measure_depth(frame, pixels)
+        return self._measure_stereo(frame, pixels, predicted, is_wide=is_wide)
+
     def _measure_stereo(
         self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks near predicted ones."""
         config, images = self._config.stereo, (frame.left, frame.right)
         offset_px, row_offset_px = self._offsets_px()
-        if is_wide:
-            disparities, is_valid = measure_disparities(
-                images,
-                pixels,
-                predicted,
-                config,
-                reach_px=config.search_radius_px,
-                row_offset_px=row_offset_px,
-            )
-        else:
-            disparities, is_valid = follow_disparities(
-                images,
-                pixels,
-                predicted,
-                config,
-                n_steps=_N_TRACK_STEPS,
-                row_offset_px=row_offset_px,
-            )
+        measure = (
+            partial(measure_disparities, reach_px=config.search_radius_px)
+            if is_wide
+            else partial(follow_disparities, n_steps=_N_TRACK_STEPS)
+        )
+        disparities, is_valid = measure(
+            images, pixels, predicted, config, row_offset_px=row_offset_px
+        )
         note("klt.followed", disparities=disparities, is_at_rest=is_valid)
         return disparities, is_valid & self._is_in_range(disparities, offset_px)
-
-    def _max_disparity(self) -> float:
-        return float(self.camera.depth_to_disparity(self._config.stereo.min_depth_m))
 
     def _is_in_range(self, disparities: FloatArray, offset_px: float) -> BoolArray:
         return is_in_depth_range(disparities - offset_px, self.camera, self._config.stereo)
@@ -362,11 +354,11 @@ class KltCorners:
     disparities : ndarray of float64, shape (n,)
         Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
     points_cam : ndarray of float64, shape (n, 3)
-        Points in the `cam` frame, metres, by what was known of the disparities' offset then.
+        Points in the `cam` frame, metres, the disparities corrected by the offset known then.
     n_keypoints : int
         Corners detected, measured or not.
     row_shift_px : float or None
-        By how much the rows of left and right still differ; None where that is not known.
+        Remaining row offset of the right image; None where not measured.
     """
 
     keypoints: FloatArray
@@ -378,14 +370,14 @@ class KltCorners:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KltObservations:
-    """A frame that others' corners are followed into, and its own corners.
+    """A frame to track corners into, and its own corners.
 
     Parameters
     ----------
     frame : StereoFrame or RgbdFrame
     find_corners : callable
-        Returns its KltCorners. They may still be looked for on another thread: only when the
-        next frame comes are they needed.
+        Returns its KltCorners, which another thread may still be detecting: they are needed
+        only when the next frame comes.
     """
 
     frame: Frame
@@ -398,7 +390,7 @@ class KltObservations:
 
     @property
     def image(self) -> ImageArray:
-        """The image that is tracked in, left or colour."""
+        """The image to track in, left or colour."""
         return image_of(self.frame)
 
     @property
@@ -427,5 +419,5 @@ class KltObservations:
 
 
 def image_of(frame: Frame) -> ImageArray:
-    """Return the image that is tracked in, left or colour."""
+    """Return the image to track in, left or colour."""
     return frame.left if isinstance(frame, StereoFrame) else frame.image

@@ -70,9 +70,7 @@ def mutual_best(pairs: IntArray, distances: FloatArray, n_first: int, n_second: 
 
 
 def best_ratios(members: IntArray, distances: FloatArray, n_members: int) -> FloatArray:
-    """Return how much better the best candidate of each member is than its second best.
-
-    Where both are about as good, nothing tells which of them is the right one.
+    """Return the ratio of the best to the second best distance of each member.
 
     Parameters
     ----------
@@ -179,17 +177,23 @@ def match_temporal(
         return np.zeros((0, 2), dtype=np.int64)
     pairs = _pairs_within(pixels, current.keypoints, radius_px)
     pairs = np.stack([indices[pairs[:, 0]], pairs[:, 1]], axis=1)
-    distances = descriptor_distances(reference.descriptors_left, current.descriptors_left, pairs)
-    if reference.descriptors_right is not None and current.descriptors_right is not None:
-        distances = 0.5 * distances + 0.5 * descriptor_distances(
-            reference.descriptors_right, current.descriptors_right, pairs
-        )
+    distances = _mean_distances(reference, current, pairs)
     is_usable = distances <= max_distance
     note("temporal.candidates", pairs=pairs, distances=distances)
     if max_ratio < 1.0:
         is_usable &= best_ratios(pairs[:, 0], distances, len(reference))[pairs[:, 0]] <= max_ratio
     pairs, distances = pairs[is_usable], distances[is_usable]
     return pairs[mutual_best(pairs, distances, len(reference), len(current))]
+
+
+def _mean_distances(reference: Observations, current: Observations, pairs: IntArray) -> FloatArray:
+    """Return the descriptor distances of pairs, the mean of left and right for stereo."""
+    distances = descriptor_distances(reference.descriptors_left, current.descriptors_left, pairs)
+    if reference.descriptors_right is None or current.descriptors_right is None:
+        return distances
+    return 0.5 * distances + 0.5 * descriptor_distances(
+        reference.descriptors_right, current.descriptors_right, pairs
+    )
 
 
 def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> IntArray:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -28,8 +28,19 @@ from gvo.types import (
     RelativePose,
 )
 
-# Wrong matches never agree in such numbers by chance: samples could only find the same motion.
+# From such a share of inliers on RANSAC would find the same motion again.
 _MIN_KNOWN_SHARE = 0.7
+# Best over second best distance of a match (D. Lowe, 2004, doi:10.1023/B:VISI.0000029664.99615.94).
+_MAX_RATIO = 0.8
+# More RANSAC hypotheses: more matches are wrong than between neighbouring frames.
+_N_HYPOTHESES = 1000
+# By chance few matches agree; of a place seen again most do.
+_MIN_INLIERS_FACTOR = 2
+_MIN_INLIER_SHARE = 0.4
+# Share of the points in view. In rendered streets of repeated facades, places that only look alike
+# reach 0.16 and the same place, seen from 10 m behind, 0.26; in a room it has 0.45.
+_MIN_SHARE_OF_VIEW = 0.25
+_MIN_DEPTH_M = 1e-3
 
 
 def register_correspondences(
@@ -67,35 +78,23 @@ def register_correspondences(
     -------
     RelativePose or Failure
     """
-    note(
-        "registration.begin",
-        correspondences=correspondences,
-        matches=matches,
-        stamps_ns=stamps_ns,
-    )
+    given = {"correspondences": correspondences, "matches": matches, "stamps_ns": stamps_ns}
+    note("registration.begin", **given)
     known = _known_consensus(prior, correspondences, camera, config)
     consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
     note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
         return consensus
-    refined = _refine(
-        *(consensus, correspondences, camera, config),
-        prior=prior,
-        make_rng=lambda: _rng(config, stamps_ns),
-        with_offset=with_offset,
-    )
-    if isinstance(refined, Failure):
-        n_inliers = int(np.count_nonzero(consensus.inliers))
-        return replace(refined, n_matches=len(matches), n_inliers=n_inliers)
-    n_inliers = int(np.count_nonzero(refined.inliers))
-    if n_inliers < config.ransac.min_inliers:
-        return Failure(
-            reason=f"{n_inliers} of {len(matches)} matches fit the refined motion, "
-            f"{config.ransac.min_inliers} are needed (ransac.min_inliers)",
-            n_matches=len(matches),
-            n_inliers=n_inliers,
+    refined = _refine(consensus, correspondences, camera, config, with_offset=with_offset)
+    if isinstance(refined, Refinement) and config.registration.refine != "none":
+        refined = verify_motion(
+            *(refined, correspondences, camera, config),
+            prior=prior,
+            make_rng=partial(_rng, config, stamps_ns),
+            with_offset=with_offset,
         )
-    return _relative_pose(refined, correspondences, matches)
+        note("registration.verified", refined=refined)
+    return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
 
 
 def _known_consensus(
@@ -122,31 +121,37 @@ def _refine(
     camera: StereoCamera,
     config: Config,
     *,
-    prior: MotionPrior | None,
-    make_rng: Callable[[], np.random.Generator],
     with_offset: bool,
 ) -> Refinement | Failure:
-    """Refine the consensus, and verify that its motion is the camera's."""
-    is_refining = config.registration.refine != "none"
-    refined = (refine_pose if is_refining else fit_covariance)(
-        consensus.T_target_source,
-        correspondences,
-        consensus.inliers,
-        camera,
-        config.registration,
+    registration = config.registration
+    refined = (fit_covariance if registration.refine == "none" else refine_pose)(
+        *(consensus.T_target_source, correspondences, consensus.inliers, camera, registration),
         with_offset=with_offset,
     )
     note("registration.refined", refined=refined)
-    if isinstance(refined, Failure) or not is_refining:
-        return refined
-    verified = verify_motion(
-        *(refined, correspondences, camera, config),
-        prior=prior,
-        make_rng=make_rng,
-        with_offset=with_offset,
+    return refined
+
+
+def _conclude(
+    refined: Refinement | Failure,
+    consensus: Consensus,
+    correspondences: Correspondences,
+    matches: IntArray,
+    min_inliers: int,
+) -> RelativePose | Failure:
+    """Return the relative pose, or a failure with the numbers of matches and inliers."""
+    if isinstance(refined, Failure):
+        n_inliers = int(np.count_nonzero(consensus.inliers))
+        return replace(refined, n_matches=len(matches), n_inliers=n_inliers)
+    n_inliers = int(np.count_nonzero(refined.inliers))
+    if n_inliers >= min_inliers:
+        return _relative_pose(refined, correspondences, matches)
+    return Failure(
+        reason=f"{n_inliers} of {len(matches)} matches fit the refined motion, "
+        f"{min_inliers} are needed (ransac.min_inliers)",
+        n_matches=len(matches),
+        n_inliers=n_inliers,
     )
-    note("registration.verified", refined=verified)
-    return verified
 
 
 def search_consensus(
@@ -155,7 +160,7 @@ def search_consensus(
     config: Config,
     stamps_ns: tuple[int, int],
 ) -> Consensus | Failure:
-    """Find the motion that most matches agree with, by samples; as `register_correspondences`."""
+    """Find the consensus of the matches by RANSAC; as `register_correspondences`."""
     return ransac_rigid(
         correspondences,
         camera,
@@ -203,21 +208,8 @@ def _weights(correspondences: Correspondences, config: Config) -> FloatArray | N
     return np.asarray(1.0 / correspondences.target_points[:, 2] ** 2)
 
 
-# Best over second best distance of a match (D. Lowe, 2004, doi:10.1023/B:VISI.0000029664.99615.94).
-_MAX_RATIO = 0.8
-# Of the few matches that are left more may be wrong than between neighbouring frames.
-_N_HYPOTHESES = 1000
-# Chance finds few that agree; a place that is seen again has many, and most of them agree.
-_MIN_INLIERS_FACTOR = 2
-_MIN_INLIER_SHARE = 0.4
-# Of the points that should be in view. In rendered streets of repeated facades, places that only
-# look alike reach 0.16 and the same place, seen from 10 m behind, 0.26; in a room it has 0.45.
-_MIN_SHARE_OF_VIEW = 0.25
-_MIN_DEPTH_M = 1e-3
-
-
 def match_anywhere(reference: Observations, current: Observations) -> IntArray:
-    """Match descriptors wherever they are: ratio test, reciprocal.
+    """Match descriptors of the whole images: ratio test, reciprocal.
 
     Parameters
     ----------
@@ -246,7 +238,7 @@ def relocalize_observations(
     *,
     offset_px: float,
 ) -> RelativePose | Failure:
-    """Estimate the motion between two frames that may be far apart in time and place.
+    """Estimate the motion between two frames far apart, from descriptors of the whole images.
 
     Parameters
     ----------
@@ -272,33 +264,30 @@ def relocalize_observations(
         config.model_copy(update={"ransac": ransac}),
         stamps_ns=(reference.stamp_ns, current.stamp_ns),
     )
-    if isinstance(result, Failure):
-        return result
     n_needed = max(
         _MIN_INLIERS_FACTOR * config.ransac.min_inliers, _MIN_INLIER_SHARE * len(matches)
     )
-    if result.n_inliers < n_needed:
-        return Failure(
-            reason=f"{result.n_inliers} of {len(matches)} matches agree, too few to know a place "
-            f"again: {n_needed:.0f} are needed",
-            n_matches=len(matches),
-            n_inliers=result.n_inliers,
-        )
-    return result
+    if isinstance(result, Failure) or result.n_inliers >= n_needed:
+        return result
+    reason = (
+        f"{result.n_inliers} of {len(matches)} matches agree, too few to know a place again: "
+        f"{n_needed:.0f} are needed"
+    )
+    return Failure(reason=reason, n_matches=len(matches), n_inliers=result.n_inliers)
 
 
 def check_view(
     result: RelativePose | Failure, points_reference: FloatArray, camera: StereoCamera
 ) -> RelativePose | Failure:
-    """Refuse a place that looks alike: most of what should be in view must be there.
+    """Refuse a place that looks alike: enough of the points in view must be inliers.
 
-    Facades, carpets and trees repeat: a part of the image then agrees with another place as well
-    as with its own. What tells them apart is what else should be seen from there.
+    Facades, carpets and trees repeat: a part of the image agrees with another place as well as
+    with its own. The rest of the view tells them apart.
 
     Parameters
     ----------
     result : RelativePose or Failure
-        By matches that were searched all over the view that it predicts.
+        From matches searched all over the view that it predicts.
     points_reference : ndarray of float64, shape (n, 3)
         Points of the reference, in its `cam` frame, metres.
     camera : StereoCamera
@@ -306,7 +295,6 @@ def check_view(
     Returns
     -------
     RelativePose or Failure
-        The same where it is a failure, or stands.
     """
     if isinstance(result, Failure):
         return result
@@ -325,7 +313,7 @@ def check_view(
 
 
 def _best(first: NDArray[Any], second: NDArray[Any]) -> IntArray:
-    """Return for each descriptor the one that nothing rivals, shape (n,); -1: there is none."""
+    """Return the match of each descriptor that passes the ratio test, shape (n,); else -1."""
     norm = cv2.NORM_HAMMING if first.dtype == np.uint8 else cv2.NORM_L2
     nearest = cv2.BFMatcher(norm).knnMatch(first, second, k=2)
     best = np.array([pair[0].trainIdx for pair in nearest], dtype=np.int64)

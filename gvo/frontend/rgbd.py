@@ -18,19 +18,27 @@ from gvo.types import (
     RelativePose,
 )
 
+# Share of known depths in a window that a plane is fitted to.
 _MIN_KNOWN_SHARE = 0.5
-"""Of a window; with less, a plane says more about its noise than about the surface."""
+# Points along each side of the grid that is compared.
+_N_GRID = 24
+# Largest difference of two depths that agree, sigmas.
+_GATE = 3.0
+# Points that both frames measure: with fewer a motion is not contradicted.
+_MIN_POINTS = 100
+# Edges, holes and moving objects contradict right motions too, but never most of the view.
+_MIN_AGREEING = 0.5
 
 
 def sample_depth(
     depth: DepthArray, keypoints: FloatArray, config: DepthConfig
 ) -> tuple[FloatArray, BoolArray]:
-    """Read the depth at keypoints and tell which can be trusted.
+    """Read the depth at keypoints, and check its validity.
 
     The inverse depth of a plane is linear in the pixel, and structured light measures it with
-    the same noise near and far. So the depth is that of the plane fitted to the inverse depths
-    around the keypoint, at its fraction of a pixel; where less than half of them are known, that
-    of the nearest pixel.
+    constant noise. So the depth is that of the plane fitted to the inverse depths around the
+    keypoint, at its sub-pixel position; where less than half of them are known, that of the
+    nearest pixel.
 
     Parameters
     ----------
@@ -46,8 +54,8 @@ def sample_depth(
     depths : ndarray of float64, shape (n,)
         Metres.
     is_valid : ndarray of bool, shape (n,)
-        False where depth is unknown, out of range, or breaks around the keypoint: there a
-        shift of a pixel between colour and depth changes the point by metres.
+        False where depth is unknown, out of range, or discontinuous around the keypoint: there
+        a shift of a pixel between colour and depth changes the point by metres.
     """
     pixels = np.rint(keypoints).astype(np.int64)
     offsets = _offsets(config.edge_radius_px)
@@ -94,9 +102,9 @@ def _fit_planes(
     Returns
     -------
     depths : ndarray of float64, shape (n,)
-        Of the planes at the keypoints, which lie off the centre by the fractions.
+        Of the planes at the keypoints, at fractions from the centre.
     is_fitted : ndarray of bool, shape (n,)
-        False where too little is known.
+        False where too few depths are known.
     """
     is_known = ~np.isnan(windows)
     inverse_depths = np.where(is_known, 1.0 / windows.astype(np.float64), 0.0)
@@ -119,23 +127,13 @@ def _fit_planes(
     return 1.0 / np.where(is_fitted, at_keypoints, 1.0), is_fitted
 
 
-# Points along each side of the grid that is compared.
-_N_GRID = 24
-# In sigmas of the difference of two depths: beyond, it is no noise.
-_GATE = 3.0
-# Fewer points that both frames measure say nothing.
-_MIN_POINTS = 100
-# Edges, holes and what moves by itself contradict right motions too, but never most of the view.
-_MIN_AGREEING = 0.5
-
-
 def check_depths(
     result: RelativePose,
     depths: tuple[DepthArray, DepthArray],
     camera: StereoCamera,
     config: DepthConfig,
 ) -> RelativePose | Failure:
-    """Refuse a motion of which the depth images see through most of the surface.
+    """Refuse a motion that moves most points of the reference into free space.
 
     Parameters
     ----------
@@ -193,16 +191,11 @@ def compare_depths(
         Disparity measured less disparity expected, in sigmas, of the n points that both frames
         measure; negative where the current frame sees farther.
     """
-    height, width = depths[0].shape
-    rows = np.linspace(0.0, height - 1.0, _N_GRID).astype(np.int64)
-    columns = np.linspace(0.0, width - 1.0, _N_GRID).astype(np.int64)
-    grid = depths[0][np.ix_(rows, columns)].astype(np.float64)
-    v, u = np.nonzero((grid >= config.min_depth_m) & (grid <= config.max_depth_m))
-    pixels = np.column_stack([columns[u], rows[v]]).astype(np.float64)
-    points = camera.unproject_stereo(pixels, camera.depth_to_disparity(grid[v, u]))
+    points = _grid_points(depths[0], camera, config)
     points = se3.transform_points(se3.invert(T_reference_current), points)
     points = points[points[:, 2] > config.min_depth_m]
     expected = camera.project_stereo(points)
+    height, width = depths[0].shape
     seen = np.rint(expected[:, :2]).astype(np.int64)
     is_inside = np.all((seen >= 0) & (seen < [width, height]), axis=1)
     measured = depths[1][seen[is_inside, 1], seen[is_inside, 0]].astype(np.float64)
@@ -210,3 +203,14 @@ def compare_depths(
     disparities = camera.depth_to_disparity(measured[is_known])
     sigma = np.sqrt(2.0) * config.sigma_px
     return np.asarray((disparities - expected[is_inside, 2][is_known]) / sigma)
+
+
+def _grid_points(depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> FloatArray:
+    """Return the points of a grid of pixels, metres, shape (n, 3)."""
+    height, width = depth.shape
+    rows = np.linspace(0.0, height - 1.0, _N_GRID).astype(np.int64)
+    columns = np.linspace(0.0, width - 1.0, _N_GRID).astype(np.int64)
+    grid = depth[np.ix_(rows, columns)].astype(np.float64)
+    v, u = np.nonzero((grid >= config.min_depth_m) & (grid <= config.max_depth_m))
+    pixels = np.column_stack([columns[u], rows[v]]).astype(np.float64)
+    return camera.unproject_stereo(pixels, camera.depth_to_disparity(grid[v, u]))

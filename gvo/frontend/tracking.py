@@ -1,4 +1,4 @@
-"""Corners, and pixels followed from one image into another by Lucas-Kanade.
+"""Corners, and tracks of them by Lucas-Kanade.
 
 References
 ----------
@@ -20,11 +20,16 @@ from gvo.config import KltConfig
 from gvo.frontend.features import choose_spread
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
-_MAX_ITERATIONS = 10
-_MIN_STEP_PX = 0.01
-# The way back starts at its goal and needs no pyramid: a track that went astray does not find
-# the first corner in what it sees.
+# At most 10 iterations, or a step of 0.01 pixels.
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
+# The backward track starts at its goal and needs no pyramid: a wrong one does not find the first
+# corner anyway.
 _BACK_LEVELS = 0
+# Corners are detected at half resolution, at a quarter of the cost: a patch need not be centred on
+# its corner exactly, as it is tracked and measured wherever it is.
+_REDUCTION = 2
+# Side of the square over which the gradients are summed, there.
+_BLOCK_PX = 3
 
 
 def track_pixels(
@@ -36,7 +41,7 @@ def track_pixels(
     n_levels: int,
     is_checked: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Follow pixels by pyramidal Lucas-Kanade, and back where they are to be checked.
+    """Track pixels by pyramidal Lucas-Kanade, forward and, where checked, backward.
 
     Parameters
     ----------
@@ -47,19 +52,19 @@ def track_pixels(
     start : ndarray of float64, shape (n, 2)
         Where the search in the second image begins.
     config : KltConfig
-        Window, largest distance between a pixel and where the way back ends.
+        Window, forward-backward error limit.
     n_levels : int
         Levels of the pyramid above the image itself.
     is_checked : bool
-        Drop a track that does not lead back. From a good prediction the residuals of the
-        registration tell wrong tracks as well, for nothing.
+        Drop tracks of a large forward-backward error. From a good prediction the residuals of
+        the registration show wrong tracks as well, at no cost.
 
     Returns
     -------
     tracked : ndarray of float64, shape (n, 2)
         In the second image.
     is_tracked : ndarray of bool, shape (n,)
-        False where the search got lost, left the image, or was checked and does not lead back.
+        False where the search diverged, left the image, or failed the check.
     """
     if len(pixels) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
@@ -75,12 +80,12 @@ def track_pixels(
 
 def _follow(
     images: tuple[ImageArray, ...],
-    pixels: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
-    start: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
+    pixels: NDArray[np.float32],
+    start: NDArray[np.float32],
     config: KltConfig,
     *,
     n_levels: int,
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], BoolArray]:
+) -> tuple[NDArray[np.float32], BoolArray]:
     size = 2 * config.window_radius_px + 1
     tracked, is_found, _ = cv2.calcOpticalFlowPyrLK(
         images[0],
@@ -89,26 +94,15 @@ def _follow(
         start,
         winSize=(size, size),
         maxLevel=n_levels,
-        criteria=(
-            cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
-            _MAX_ITERATIONS,
-            _MIN_STEP_PX,
-        ),
+        criteria=_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     is_finite = np.isfinite(tracked).all(axis=1)
     return np.asarray(tracked, dtype=np.float32), np.asarray(is_found[:, 0] > 0) & is_finite
 
 
-# Corners are looked for in an image of half the size, at a quarter of the cost: where exactly a
-# patch is cut out matters to nobody, as it is tracked and measured wherever that is.
-_REDUCTION = 2
-# Side of the square over which the gradients are summed, there.
-_BLOCK_PX = 3
-
-
 def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
-    """Find the corners of an image, to two pixels.
+    """Detect the corners of an image, to two pixels.
 
     The score of a pixel is the smaller eigenvalue of its gradients' covariance. Each cell of
     `min_distance_px` gives its best local maximum; these share the budget over larger cells.
@@ -127,16 +121,7 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
     border = (config.window_radius_px + 1) // _REDUCTION + 1
     if min(image.shape) // _REDUCTION <= 2 * border:
         return np.zeros((0, 2))
-    reduced = halve(image)
-    scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
-    neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
-    is_corner = (scores == neighbours) & (scores > config.min_eigenvalue)
-    # The indices of a flat array are found several times faster than those of two axes.
-    found = np.flatnonzero(is_corner[border:-border, border:-border])
-    rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)
-    rows, columns = rows + border, columns + border
-    responses = scores[rows, columns]
-    pixels = _REDUCTION * np.column_stack([columns, rows])
+    pixels, responses = _local_maxima(halve(image), config.min_eigenvalue, border)
     best = _best_of_cells(pixels, responses, config.min_distance_px, width=image.shape[1])
     chosen = choose_spread(
         pixels[best],
@@ -146,6 +131,20 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
         n_chosen=config.n_corners,
     )
     return pixels[best[chosen]].astype(np.float64)
+
+
+def _local_maxima(
+    reduced: ImageArray, min_eigenvalue: float, border: int
+) -> tuple[IntArray, NDArray[Any]]:
+    """Return pixels of the full image, shape (n, 2), and their scores, shape (n,)."""
+    scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
+    neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
+    is_corner = (scores == neighbours) & (scores > min_eigenvalue)
+    # The indices of a flat array are found several times faster than those of two axes.
+    found = np.flatnonzero(is_corner[border:-border, border:-border])
+    rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)
+    rows, columns = rows + border, columns + border
+    return _REDUCTION * np.column_stack([columns, rows]), scores[rows, columns]
 
 
 def _best_of_cells(

@@ -293,9 +293,7 @@ class RawChain(Generic[ObservationsT]):
         reference, stamp_ns = node.estimate, current.stamp_ns
         T, covariance = result.T_reference_current, result.covariance
         estimate = poses.append(reference, stamp_ns, T, covariance)
-        elapsed_s = 1e-9 * (stamp_ns - reference.stamp_ns)
-        poses.velocity = se3.log(T) / elapsed_s
-        sigmas = np.sqrt(np.diagonal(covariance)) / elapsed_s
+        is_steady = self._note_velocity(poses, result, 1e-9 * (stamp_ns - reference.stamp_ns))
         n_steps = node.n_steps + 1
         self._nodes = [_Node(observations=current, estimate=estimate, n_steps=n_steps)]
         return RawStep(
@@ -304,9 +302,15 @@ class RawChain(Generic[ObservationsT]):
             T_reference_frame=T,
             covariance=covariance,
             registration=result,
-            is_steady=self._recent.add(stamp_ns, poses.velocity, sigmas),
+            is_steady=is_steady,
             n_steps=n_steps,
         )
+
+    def _note_velocity(self, poses: PoseChain, result: RelativePose, elapsed_s: float) -> bool:
+        """Take over the velocity of a registration; tell whether it is steady."""
+        poses.velocity = se3.log(result.T_reference_current) / elapsed_s
+        sigmas = np.sqrt(np.diagonal(result.covariance)) / elapsed_s
+        return self._recent.add(poses.newest.stamp_ns, poses.velocity, sigmas)
 
     def _coast(self, poses: PoseChain, current: ObservationsT, failure: Failure) -> RawStep:
         predecessor, anchor = self._nodes[0], self._nodes[-1]

@@ -347,9 +347,11 @@ class Odometry:
             self._keyframes.add(observations, n_steps=step.n_steps)
             self._window.keep(causal.stamp_ns)
             self._segments.note_keyframe()
-        unjoined = self._unjoined()
-        n_kept = len(self._keyframes) - len(unjoined)
-        released = choose_released(scores, config, n_kept=n_kept)
+        self._release_keyframes(scores)
+
+    def _release_keyframes(self, scores: dict[int, float]) -> None:
+        config, unjoined = self._config.window, self._unjoined()
+        released = choose_released(scores, config, n_kept=len(self._keyframes) - len(unjoined))
         for stamp_ns in released + unjoined[: max(len(unjoined) - config.n_keyframes, 0)]:
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)

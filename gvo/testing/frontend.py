@@ -279,18 +279,28 @@ def _images_of(frame: StereoFrame | RgbdFrame) -> dict[str, Any]:
 
 def _check_nothing_seen(frontend: Frontend[Any], observations: Stamped, frame: Stamped) -> None:
     stamps = f"{observations.stamp_ns}, {frame.stamp_ns}"
+    for result in _register_nothing(frontend, observations, frame, stamps):
+        _require(
+            isinstance(result, Failure),
+            f"frames without anything in common ({stamps}) are registered",
+        )
+        _require(
+            isinstance(result, Failure) and bool(result.reason.strip()),
+            f"the Failure of frames without anything in common ({stamps}) gives no reason",
+        )
+
+
+def _register_nothing(
+    frontend: Frontend[Any], observations: Stamped, frame: Stamped, stamps: str
+) -> list[RelativePose | Failure]:
     still = np.eye(4)
-    priors = (
-        None,
-        MotionPrior(T_predicted=still),
-        MotionPrior(T_predicted=still, T_recent=still),
-    )
+    expected = MotionPrior(T_predicted=still), MotionPrior(T_predicted=still, T_recent=still)
     try:
         nothing = frontend.extract(frame)
-        results = [
+        return [
             _register(frontend, reference, current, prior)
             for reference, current in ((observations, nothing), (nothing, observations))
-            for prior in priors
+            for prior in (None, *expected)
         ]
     except ContractError:
         raise
@@ -299,13 +309,6 @@ def _check_nothing_seen(frontend: Frontend[Any], observations: Stamped, frame: S
             f"frames without anything in common ({stamps}) raise {type(error).__name__}: {error}; "
             "a Failure is expected"
         ) from error
-    for result in results:
-        is_failure = isinstance(result, Failure) and not result
-        _require(is_failure, f"frames without anything in common ({stamps}) are registered")
-        _require(
-            isinstance(result, Failure) and bool(result.reason.strip()),
-            f"the Failure of frames without anything in common ({stamps}) gives no reason",
-        )
 
 
 def fingerprint(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Disparities of corners, searched for along the whole row, and which of them are reliable."""
+"""Disparities of corners, searched for along the whole row."""
 
 from __future__ import annotations
 
@@ -23,25 +23,38 @@ from gvo.frontend.stereo.patches import (
 from gvo.frontend.tracking import halve
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
-# Steps from the coarse search to the disparity.
+# Gauss-Newton steps from the coarse search to the disparity.
 N_SEARCH_STEPS = 6
-# Fewer say nothing of the rows, more hardly anything new.
+# Number of patches that the row offset is measured with.
 _MIN_ROW_SHIFTS = 50
 _MAX_ROW_SHIFTS = 120
+# The coarse search: images are halved so often, patches have this radius there.
+_N_HALVINGS = 2
+_REDUCTION = 2**_N_HALVINGS
+_COARSE_RADIUS_PX = 2
+_MIN_CORRELATION = 0.7
+# Steps on either side that belong to the same peak of correlation; and how much lower a second
+# peak may be: so much do equal patches differ in the small images.
+_PEAK_STEPS = 2
+_MAX_GAP = 0.25
+# Lower bound of the energy of a patch, grey values squared: flat ones correlate with anything.
+_MIN_ENERGY = 50.0
+# Largest error of the coarse search, in pixels of the full image.
+COARSE_ERROR_PX = _REDUCTION + 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CornerDisparities:
-    """What the right image tells of corners in the left one.
+    """Disparities of corners of the left image.
 
     Parameters
     ----------
     disparities : ndarray of float64, shape (n,)
-        Pixels; not a number where none was measured.
+        Pixels, NaN where not measured.
     are_reliable : ndarray of bool, shape (n,)
-        Left and right show the same there, and nowhere else along the row.
+        Left and right match there, and nowhere else along the row.
     row_shift_px : float or None
-        By how much the rows of left and right still differ; None where too few patches tell.
+        Remaining row offset of the right image; None from too few patches.
     """
 
     disparities: FloatArray
@@ -57,11 +70,11 @@ def measure_corners(
     max_disparity: float,
     row_offset_px: float = 0.0,
 ) -> CornerDisparities:
-    """Search for corners of the left image along the whole row, and measure where they are.
+    """Search for corners of the left image along the whole row, and measure their disparities.
 
-    Patches are cut once: those of the left image, and strips of the right one around what the
-    coarse search found. What that seems to show a second time is measured in the same way, as
-    windows of a house are all alike: where two disparities are as good, either may be wrong.
+    Patches are cut once: those of the left image, and strips of the right one around the result
+    of the coarse search. A second peak of it is measured in the same way, as the windows of a
+    house are all alike: where two disparities match as well, either may be wrong.
 
     Parameters
     ----------
@@ -87,7 +100,7 @@ def measure_corners(
     owners = np.concatenate([np.arange(len(placed)), doubtful])
     starts = np.concatenate([rough[placed], rivals[placed[doubtful]]])
     # One pixel wider on all sides, for the gradients along rows and across them.
-    left = sample_patches(images[0], corners[placed, 0], corners[placed, 1], radius + 1, radius + 1)
+    left = sample_patches(images[0], *corners[placed].T, radius + 1, radius + 1)
     found, right, is_at_rest = _search_strips(
         (left, images[1]), corners[placed], owners, starts, config, row_offset_px=row_offset_px
     )
@@ -101,18 +114,17 @@ def measure_corners(
     is_at_rest = _scatter(is_at_rest[:n], placed, len(corners))
     searched = {"rough": rough, "is_found": is_found, "is_at_rest": is_at_rest}
     note("corners.searched", **searched, are_reliable=are_reliable)
+    row_shift_px = measure_row_shift(left, right, np.flatnonzero(is_reliable))
     return CornerDisparities(
-        disparities=disparities,
-        are_reliable=are_reliable,
-        row_shift_px=measure_row_shift(left, right, np.flatnonzero(is_reliable)),
+        disparities=disparities, are_reliable=are_reliable, row_shift_px=row_shift_px
     )
 
 
 def _are_unrivalled(likeness: Likeness, found: FloatArray, doubtful: IntArray) -> BoolArray:
-    """Tell which of n patches are alike, and unlike the second ones of some, which come after."""
+    """Tell which of n patches match, and match better than the rivals, which come after."""
     n = len(found) - len(doubtful)
     is_rivalled = likeness.select(np.arange(n, len(found))).rivals(likeness.select(doubtful))
-    # Those that come back to the disparity found were none.
+    # A second minimum at the same disparity is no rival.
     is_rivalled &= np.abs(found[n:] - found[doubtful]) > COARSE_ERROR_PX
     is_reliable = likeness.are_alike[:n].copy()
     is_reliable[doubtful[is_rivalled]] = False
@@ -128,10 +140,9 @@ def _search_strips(
     *,
     row_offset_px: float,
 ) -> tuple[FloatArray, NDArray[np.float32], BoolArray]:
-    """Look for left patches in the right image around so many disparities of their owners.
+    """Search for left patches in the right image, around start disparities of their owners.
 
-    Returns the disparities found, the patches of the right image there, and where the search
-    came to rest.
+    Returns the disparities, the patches of the right image there, and which searches converged.
     """
     left, right_image = images
     radius, reach_px = config.patch_radius_px, config.search_radius_px
@@ -153,7 +164,7 @@ def _search_strips(
 def measure_row_shift(
     left: NDArray[np.float32], right: NDArray[np.float32], chosen: IntArray
 ) -> float | None:
-    """Measure by how much the rows of left and right still differ.
+    """Measure the remaining row offset of the right image.
 
     Parameters
     ----------
@@ -162,12 +173,12 @@ def measure_row_shift(
     right : ndarray of float32, shape (m, s, s), m >= n
         At their disparities.
     chosen : ndarray of int64
-        The patches to believe.
+        The reliable patches.
 
     Returns
     -------
     float or None
-        Median of what is left, pixels; None where too few patches show it.
+        Median, pixels; None from too few patches.
     """
     if len(chosen) < _MIN_ROW_SHIFTS:
         return None
@@ -180,25 +191,10 @@ def measure_row_shift(
 
 
 def _scatter(flags: BoolArray, places: IntArray, n: int) -> BoolArray:
-    """Return n flags: those given at their places, and False."""
+    """Return n flags: the given ones at their places, else False."""
     scattered = np.zeros(n, dtype=np.bool_)
     scattered[places] = flags
     return scattered
-
-
-# Images are reduced by this, patches are of this half size there.
-_N_HALVINGS = 2
-_REDUCTION = 2**_N_HALVINGS
-_COARSE_RADIUS_PX = 2
-_MIN_CORRELATION = 0.7
-# Steps on either side that belong to the same peak of correlation; and by how much less another
-# one may correlate and still be looked at: so much do equal things differ in the small images.
-_PEAK_STEPS = 2
-_MAX_GAP = 0.25
-# Grey values squared, over a patch: below this it is flat, and correlates with anything.
-_MIN_ENERGY = 50.0
-# What the search leaves open on either side, in pixels of the full image.
-COARSE_ERROR_PX = _REDUCTION + 1
 
 
 def search_disparities(
@@ -221,7 +217,7 @@ def search_disparities(
         Right to `COARSE_ERROR_PX`.
     is_found : ndarray of bool, shape (n,)
     rivals : ndarray of float64, shape (n,)
-        A disparity farther away that is nearly as good here; not a number where there is none.
+        A disparity farther away that correlates nearly as well, else NaN.
     """
     left, right = (_reduce(image) for image in images)
     n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
@@ -240,7 +236,7 @@ def search_disparities(
 
 
 def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
-    """Return the best steps away from the best where they are nearly as good, else no number."""
+    """Return the best steps outside the peak where they are nearly as good, else NaN."""
     rows = np.arange(len(best))
     elsewhere = correlations.copy()
     for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):

@@ -1,8 +1,4 @@
-"""Disparities of single pixels, found along the row of the right image.
-
-No keypoints of the right image are needed, so that any pixel can be measured, around what
-`gvo.frontend.stereo.corners` or the motion so far predicts.
-"""
+"""Sub-pixel disparities of any pixels, around predicted ones, without keypoints on the right."""
 
 from __future__ import annotations
 
@@ -17,10 +13,10 @@ from gvo.frontend.stereo.matching import parabola_minimum
 from gvo.frontend.stereo.patches import Patches, sample_patches, squared_differences
 from gvo.types import BoolArray, FloatArray, ImageArray
 
-# Steps of the fine search after the parabola: the last moves by less than 0.01 pixels.
+# Gauss-Newton steps after the parabola: the last moves by less than 0.01 pixels.
 _N_STEPS = 3
 _MAX_FINE_STEP_PX = 0.5
-# The same from a prediction: each at most so long, the last one as good as none.
+# Steps from a prediction: largest step, and largest last step of a converged search.
 MAX_STEP_PX = 1.5
 _MAX_LAST_STEP_PX = 0.3
 
@@ -36,10 +32,9 @@ def measure_disparities(
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels near predicted ones, to a fraction of a pixel.
 
-    As `refine_disparities`, but between pixels: patches are interpolated, so that on a slanted
-    surface, such as the road, the disparity is that of the very pixel. After the parabola come
-    Gauss-Newton steps, which end where the patches are alike; the parabola alone leans to the
-    side where the texture is weaker.
+    As `refine_disparities`, but with interpolated patches, so that on a slanted surface, such as
+    the road, the disparity is that of the very pixel. Gauss-Newton steps after the parabola
+    remove its bias towards the weaker texture.
 
     Parameters
     ----------
@@ -54,21 +49,16 @@ def measure_disparities(
     reach_px : int
         How far to search on either side.
     row_offset_px : float
-        By how much rows of the right image are larger.
+        Row offset of the right image.
 
     Returns
     -------
     disparities : ndarray of float64, shape (n,)
     is_valid : ndarray of bool, shape (n,)
-        False where a patch leaves the image or the best step is the last one searched.
+        False where a patch leaves the image or the minimum is at the end of the search.
     """
-    radius = config.patch_radius_px
 
-    def search(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
-        wide = sample_patches(images[0], u, v, radius + 1, radius)
-        strips = Strips.cut(
-            images[1], u, v + row_offset_px, start, radius_px=radius, reach_px=reach_px
-        )
+    def search(wide: NDArray[np.float32], strips: Strips) -> tuple[FloatArray, BoolArray]:
         places, is_minimum = strips.search(wide[:, :, 1:-1])
         if config.subpixel == "none":
             return np.rint(strips.disparities(places)), is_minimum
@@ -77,7 +67,7 @@ def measure_disparities(
         )
         return strips.disparities(places), is_minimum
 
-    return _measure_with_room(images[0].shape, pixels, predicted, radius, search)
+    return _measure(images, pixels, predicted, search, config, reach_px, row_offset_px)
 
 
 def follow_disparities(
@@ -89,49 +79,39 @@ def follow_disparities(
     n_steps: int,
     row_offset_px: float = 0.0,
 ) -> tuple[FloatArray, BoolArray]:
-    """Measure the disparities of pixels from predictions right to a pixel or two.
+    """Measure the disparities of pixels from predictions that are right to a pixel or two.
 
-    As `measure_disparities`, by the Gauss-Newton steps alone, in half the time.
-
-    Parameters and results are those of `measure_disparities`, but for `n_steps`, the number of
-    steps; `is_valid` is False where they do not come to rest.
+    As `measure_disparities`, by `n_steps` Gauss-Newton steps alone, in half the time; `is_valid`
+    is False where they do not converge.
     """
+    reach_px = config.search_radius_px
     if config.subpixel == "none":
+        row = row_offset_px
         return measure_disparities(
-            images,
-            pixels,
-            predicted,
-            config,
-            reach_px=config.search_radius_px,
-            row_offset_px=row_offset_px,
+            images, pixels, predicted, config, reach_px=reach_px, row_offset_px=row
         )
-    radius, reach_px = config.patch_radius_px, config.search_radius_px
 
-    def follow(u: FloatArray, v: FloatArray, start: FloatArray) -> tuple[FloatArray, BoolArray]:
-        left = Patches.of(sample_patches(images[0], u, v, radius + 1, radius))
-        strips = Strips.cut(
-            images[1], u, v + row_offset_px, start, radius_px=radius, reach_px=reach_px
-        )
-        places, is_at_rest = strips.follow(left, n_steps=n_steps)
+    def follow(wide: NDArray[np.float32], strips: Strips) -> tuple[FloatArray, BoolArray]:
+        places, is_at_rest = strips.follow(Patches.of(wide), n_steps=n_steps)
         return strips.disparities(places), is_at_rest
 
-    return _measure_with_room(images[0].shape, pixels, predicted, radius, follow)
+    return _measure(images, pixels, predicted, follow, config, reach_px, row_offset_px)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Strips:
-    """Strips of the right image around the disparities where patches are looked for.
+    """Strips of the right image to search around start disparities.
 
     Parameters
     ----------
     values : ndarray of float32, shape (n, s, m)
-        A patch of side s may lie at m - s + 1 places.
+        With m - s + 1 places for a patch of side s.
     u, columns : ndarray of float64, shape (n,)
         Column of the pixel in the left image, and of the middle place in the right one.
     starts : ndarray of float64, shape (n,)
-        The disparities.
+        The start disparities.
     reach_px : int
-        How far to search on either side of them.
+        Search range on either side.
     """
 
     values: NDArray[np.float32]
@@ -151,7 +131,7 @@ class Strips:
         radius_px: int,
         reach_px: int,
     ) -> Strips:
-        """Cut them out of the right image, for patches of a half size, at rows of it."""
+        """Cut strips out of the right image, at its rows, for patches of a radius."""
         columns = np.floor(u - starts)
         values = sample_patches(image, columns, rows, radius_px + reach_px + 1, radius_px)
         return cls(values=values, u=u, columns=columns, starts=starts, reach_px=reach_px)
@@ -161,15 +141,15 @@ class Strips:
         return self.u - (self.columns + places - (self.reach_px + 1))
 
     def places(self, disparities: FloatArray) -> FloatArray:
-        """Return the places, shape (n,), of disparities; `disparities` the other way round."""
+        """Return the places, shape (n,), of disparities."""
         return self.u - disparities - self.columns + (self.reach_px + 1)
 
     def search(self, patches: NDArray[np.float32]) -> tuple[FloatArray, BoolArray]:
-        """Return where left patches (n, s, s) differ least, and whether that is a minimum."""
+        """Return the places of least difference from left patches, and which are minima."""
         return parabola_minimum(squared_differences(patches, self.values))
 
     def follow(self, patches: Patches, *, n_steps: int) -> tuple[FloatArray, BoolArray]:
-        """Return where steps lead from the start, and whether they come to rest within reach."""
+        """Return the places after steps from the start, and which converged within reach."""
         places, step = patches.descend(
             self.values, self.places(self.starts), n_steps=n_steps, max_step=MAX_STEP_PX
         )
@@ -177,27 +157,33 @@ class Strips:
         return places, is_near & (np.abs(step) < _MAX_LAST_STEP_PX)
 
 
-def _measure_with_room(
-    shape: tuple[int, ...],
+def _measure(
+    images: tuple[ImageArray, ImageArray],
     pixels: FloatArray,
     predicted: FloatArray,
-    radius: int,
-    measure: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, BoolArray]],
+    search: Callable[[NDArray[np.float32], Strips], tuple[FloatArray, BoolArray]],
+    config: StereoConfig,
+    reach_px: int,
+    row_offset_px: float,
 ) -> tuple[FloatArray, BoolArray]:
-    """Measure where patches lie in both images: from (u, v, predicted) disparity and validity."""
+    """Search for left patches, one column wider on either side, in strips of the right image."""
+    radius = config.patch_radius_px
     disparities = np.full(len(pixels), np.nan)
-    is_valid = have_room(shape, pixels, predicted, radius)
+    is_valid = have_room(images[0].shape, pixels, predicted, radius)
     chosen = np.flatnonzero(is_valid)
     if len(chosen) > 0:
-        u, v = pixels[chosen].T
-        disparities[chosen], is_valid[chosen] = measure(u, v, predicted[chosen])
+        (u, v), starts = pixels[chosen].T, predicted[chosen]
+        wide = sample_patches(images[0], u, v, radius + 1, radius)
+        rows = v + row_offset_px
+        strips = Strips.cut(images[1], u, rows, starts, radius_px=radius, reach_px=reach_px)
+        disparities[chosen], is_valid[chosen] = search(wide, strips)
     return disparities, is_valid
 
 
 def have_room(
     shape: tuple[int, ...], pixels: FloatArray, disparities: FloatArray, radius: int
 ) -> BoolArray:
-    """Tell which pixels have room for a patch in the left image, and in the right one.
+    """Tell which pixels have room for a patch in both images.
 
     Parameters
     ----------
@@ -206,7 +192,7 @@ def have_room(
     pixels : ndarray of float64, shape (n, 2)
         In the left image.
     disparities : ndarray of float64, shape (n,)
-        None where not a number.
+        NaN where there is none.
     radius : int
         Of the patch, pixels.
     """

@@ -24,9 +24,8 @@ def candidate_pairs(
 ) -> IntArray:
     """List the pairs that obey the epipolar constraint and the depth limits.
 
-    A row lookup table over the right keypoints, sorted by row and then by column, gives for
-    each left keypoint and each row within the tolerance one range of columns; no descriptor
-    has been looked at yet.
+    A table of the right keypoints, sorted by row and then by column, gives one range of columns
+    for each left keypoint and each row within the tolerance.
 
     Returns
     -------
@@ -114,10 +113,29 @@ def refine_disparities(
         disparities = pixels_left[:, 0] - pixels_right[:, 0]
         return disparities, np.ones(len(disparities), dtype=np.bool_)
     radius, reach = config.patch_radius_px, config.search_radius_px
-    height, width = images[0].shape
+    columns = np.rint(pixels_right[:, 0]).astype(np.int64)
     column_left, row = np.rint(pixels_left).astype(np.int64).T
-    column_right = np.rint(pixels_right[:, 0]).astype(np.int64)
-    is_valid = (
+    is_valid = _have_room(images[0].shape, row, column_left, columns, radius, reach)
+    chosen = np.flatnonzero(is_valid)
+    places = row[chosen], column_left[chosen], columns[chosen]
+    offsets, is_minimum = parabola_minimum(_patch_ssd(images, *places, radius=radius, reach=reach))
+    disparities = np.full(len(row), np.nan)
+    disparities[chosen] = column_left[chosen] - columns[chosen] - (offsets - reach)
+    is_valid[chosen] = is_minimum
+    return disparities, is_valid
+
+
+def _have_room(
+    shape: tuple[int, ...],
+    row: IntArray,
+    column_left: IntArray,
+    column_right: IntArray,
+    radius: int,
+    reach: int,
+) -> BoolArray:
+    """Tell which patches, and the strips to search them in, lie in the images."""
+    height, width = shape
+    return np.asarray(
         (row >= radius)
         & (row < height - radius)
         & (column_left >= radius)
@@ -125,15 +143,6 @@ def refine_disparities(
         & (column_right >= radius + reach)
         & (column_right < width - radius - reach)
     )
-    disparities = np.full(len(row), np.nan)
-    chosen = np.flatnonzero(is_valid)
-    ssd = _patch_ssd(
-        images, row[chosen], column_left[chosen], column_right[chosen], radius=radius, reach=reach
-    )
-    offsets, is_minimum = parabola_minimum(ssd)
-    disparities[chosen] = column_left[chosen] - column_right[chosen] - (offsets - reach)
-    is_valid[chosen] = is_minimum
-    return disparities, is_valid
 
 
 def is_in_depth_range(

@@ -1,10 +1,9 @@
-"""Constant errors of a stereo rig, learnt while it runs.
+"""Online calibration of constant disparity and row offsets of a stereo rig.
 
-A baseline, a principal point or a rectification that is off by a little adds the same fraction of
-a pixel to every disparity. To far points that is a large change of depth, to near ones a small
-one, so that near and far points disagree about the motion; each registration tells by how much.
-One alone knows little, but a second of a recording is enough to know it to a few hundredths of a
-pixel. Where the rows of left and right differ, each match shows it by itself.
+A baseline, a principal point or a rectification that is slightly off adds the same fraction of a
+pixel to every disparity: a large change of depth for far points, a small one for near ones, so
+that they disagree about the motion. Each registration estimates the offset; over a second of a
+recording it is known to a few hundredths of a pixel. A row offset shows in each match.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.types import RelativePose
 
-# Registrations share errors (the same walls, the same lens): their sigmas are too small by this
-# against the spread that they show among each other.
+# Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
+# by this factor.
 _SIGMA_FACTOR = 3.0
-# What the matches of one frame show of the rows, and how large an error of rows may be: pixels.
+# Sigmas of the row offset measured in one frame, and of its prior, pixels.
 _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
-# How far an offset may wander from one frame to the next, pixels: temperature, vibration.
+# Drift of an offset per frame, pixels: temperature, vibration.
 _DRIFT_PX = 5e-4
-# A measurement that is farther off, in sigmas, counts as this far: something else moved it.
+# Innovations are clipped to so many sigmas.
 _MAX_SURPRISE = 3.0
 
 
@@ -33,7 +32,7 @@ class OffsetFilter:
     Parameters
     ----------
     prior_sigma_px : float
-        How large the value may be, pixels.
+        Standard deviation of the prior around zero, pixels.
     """
 
     def __init__(self, prior_sigma_px: float) -> None:
@@ -52,13 +51,7 @@ class OffsetFilter:
         return math.sqrt(self._variance)
 
     def update(self, left_px: float, sigma_px: float) -> None:
-        """Take a measurement of what is left when the present value is taken off.
-
-        Parameters
-        ----------
-        left_px, sigma_px : float
-            Measurement and its standard deviation, pixels.
-        """
+        """Add a measurement of the remaining offset, and its standard deviation, pixels."""
         variance = min(self._variance + _DRIFT_PX**2, self._prior_variance)
         limit = _MAX_SURPRISE * math.sqrt(variance + sigma_px**2)
         gain = variance / (variance + sigma_px**2)
@@ -67,17 +60,16 @@ class OffsetFilter:
 
 
 class RigOffsets:
-    """What is to be taken off the disparities and rows that a rig measures.
+    """Disparity and row offsets of a stereo rig, estimated while it runs.
 
-    What is noted takes effect with `advance`, so that all that is done with one frame sees the
-    same values.
+    Measurements take effect with `advance`, so that all steps of one frame use the same values.
 
     Parameters
     ----------
     config : StereoConfig
-        `estimate_offset`, else all stays at zero; `offset_sigma_px`, how large it may be.
+        `estimate_offset`, else all stays at zero; `offset_sigma_px`, sigma of the prior.
     is_stereo : bool
-        Of other sensors nothing is learnt, and all stays at zero.
+        Of other sensors all stays at zero.
     """
 
     def __init__(self, config: StereoConfig, *, is_stereo: bool = True) -> None:
@@ -90,12 +82,12 @@ class RigOffsets:
         self._last_row_ns: int | None = None
 
     def note(self, result: RelativePose, stamp_ns: int) -> None:
-        """Take what a registration says of disparities; only the first of each frame counts.
+        """Take the remaining offset of a registration; only the first of each frame counts.
 
         Parameters
         ----------
         result : RelativePose
-            With `offset_px`, what is left after the present value was taken off.
+            With `offset_px`, after the present value was subtracted.
         stamp_ns : int
             Of the current frame.
         """
@@ -106,12 +98,12 @@ class RigOffsets:
             self._pending = result.offset_px, _SIGMA_FACTOR * result.offset_sigma_px
 
     def note_rows(self, shift_px: float | None, stamp_ns: int) -> None:
-        """Take by how much the rows of a frame still differ; each frame counts once.
+        """Take the remaining row offset of a frame; each frame counts once.
 
         Parameters
         ----------
         shift_px : float or None
-            Row in the right image less the row in the left, and less the present value.
+            Row in the right image minus row in the left, minus the present value.
         stamp_ns : int
             Of that frame.
         """
@@ -121,7 +113,7 @@ class RigOffsets:
             self._pending_row = shift_px
 
     def advance(self) -> None:
-        """Let what was noted take effect."""
+        """Apply the measurements taken since the last frame."""
         if self._pending is not None:
             self.disparity.update(*self._pending)
             self._pending = None

@@ -1,4 +1,4 @@
-"""Square patches of the left image, and strips of the right one in which they are looked for."""
+"""Square patches of the left image, and strips of the right one to search for them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
-# Grey values squared, over a patch: the gradients of a flat one are no less than noise.
+# Lower bound of the gradient energy of a patch, grey values squared: the noise.
 _MIN_ENERGY = 50.0
-# What left and right may differ by at a point that both see: of the variance of the patch this
-# share, and the noise of the pixels, grey values squared.
+# Largest variance of the difference of matching patches: a share of the patch's variance, plus the
+# noise of the pixels, grey values squared.
 _MAX_UNLIKE = 0.2
 _UNLIKE_NOISE = 18.0
-# A rival disparity counts where the patch differs from it by hardly more than from the one found.
+# A rival disparity counts where its difference is at most so many times that of the one found.
 _MAX_RIVALRY = 2.0
 
 
@@ -30,9 +30,9 @@ def sample_patches(
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width)
-        Beyond its edge its last pixels go on.
+        Its border pixels are replicated.
     u, v : ndarray of float64, shape (n,)
-        Column and row of the middle of each patch.
+        Column and row of the centre of each patch.
     radius_u, radius_v : int
         Pixels on either side.
 
@@ -41,7 +41,7 @@ def sample_patches(
     ndarray of float32, shape (n, 2 * radius_v + 1, 2 * radius_u + 1)
     """
     shape = len(u), 2 * radius_v + 1, 2 * radius_u + 1
-    if len(u) == 0:  # of nothing OpenCV cuts nothing
+    if len(u) == 0:  # refused by OpenCV
         return np.zeros(shape, dtype=np.float32)
     steps_u, steps_v = _steps_around(radius_u, radius_v)
     patches = cv2.remap(
@@ -56,17 +56,17 @@ def sample_patches(
 
 @lru_cache(maxsize=32)
 def _steps_around(radius_u: int, radius_v: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the steps from the middle of a patch to its pixels, row by row."""
+    """Return the offsets from the centre of a patch to its pixels, row by row."""
     v, u = np.mgrid[-radius_v : radius_v + 1, -radius_u : radius_u + 1].astype(np.float32)
     return u.ravel(), v.ravel()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Patches of the left image, ready to be compared with those of the right one.
+    """Patches of the left image, prepared for inverse compositional alignment.
 
-    As in the inverse compositional way, the gradients are those of the patches that stay: they
-    are computed once. Their mean is taken off, so that a difference of exposure has no effect.
+    The gradients are those of the left patches, computed once; their mean is subtracted, so that
+    a difference of exposure has no effect.
 
     References
     ----------
@@ -79,7 +79,7 @@ class Patches:
 
     @classmethod
     def of(cls, wide: NDArray[np.float32]) -> Patches:
-        """Make them of patches (n, s, s + 2) that are one column wider on either side."""
+        """Prepare patches (n, s, s + 2), which are one column wider on either side."""
         gradients = 0.5 * (wide[:, :, 2:] - wide[:, :, :-2])
         gradients -= gradients.mean(axis=(1, 2), keepdims=True)
         energies = np.einsum("nij,nij->n", gradients, gradients)
@@ -88,11 +88,11 @@ class Patches:
         return cls(weights=gradients, at_rest=at_rest)
 
     def take(self, chosen: IntArray) -> Patches:
-        """Return those of some patches, of each as often as it is chosen."""
+        """Select patches by index, with repetitions."""
         return Patches(self.weights[chosen], self.at_rest[chosen])
 
     def curve(self, strips: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return by how much disparities should grow at places in strips of the right image.
+        """Return the disparity steps at all places in strips of the right image.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class Patches:
         Returns
         -------
         ndarray of float32, shape (n, m - s + 1)
-            Between the places, where patches are interpolated, it is linear.
+            Linear between the places, as the patches are.
         """
         products = correlate_rows(self.weights, strips)
         products -= self.at_rest[:, np.newaxis]
@@ -110,9 +110,9 @@ class Patches:
     def descend(
         self, strips: NDArray[np.float32], places: FloatArray, *, n_steps: int, max_step: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the places in strips (n, s, m) where patches are after some steps, and the last.
+        """Return the places in strips (n, s, m) after some steps, and the last steps.
 
-        A step is a growth of the disparity; places end with the strips.
+        A step is a growth of the disparity; places are clipped to the strips.
         """
         curve = self.curve(strips)
         n, n_places = curve.shape
@@ -143,8 +143,8 @@ def correlate_rows(
     ndarray of float32, shape (n, m - s + 1)
     """
     size, n_places = patches.shape[2], strips.shape[2] - patches.shape[2] + 1
-    # Every column of a patch with every column of its strip, of which the diagonals are summed:
-    # a sixth of the time of a loop over the pixels.
+    # Products of all columns of a patch and its strip, summed along diagonals: a sixth of the time
+    # of a loop over the pixels.
     products: NDArray[np.float32] = np.matmul(np.swapaxes(patches, 1, 2), strips)
     sums = products[:, 0, :n_places].copy()
     for column in range(1, size):
@@ -192,14 +192,14 @@ def squared_differences(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Likeness:
-    """How much the patches of left and right are alike at pixels and their disparities.
+    """How well patches of left and right match.
 
     Parameters
     ----------
     unlike : ndarray of float32, shape (n,)
-        Variance of the difference, grey values squared; by `where` infinite where there is none.
+        Variance of the difference, grey values squared; infinite without a disparity.
     limits : ndarray of float32, shape (n,)
-        What it may be at a point that both cameras see.
+        Largest variance of a match.
     """
 
     unlike: NDArray[np.floating]
@@ -213,34 +213,34 @@ class Likeness:
 
     @property
     def are_alike(self) -> BoolArray:
-        """Tell whether left and right show the same.
+        """Whether left and right match.
 
-        Where the depth breaks within a patch, its parts differ by more than one disparity aligns:
-        the disparity is that of neither surface. The error stays with the corner from frame to
-        frame, so that no residual shows it, and motions add it up.
+        At a depth discontinuity within a patch no single disparity aligns both parts: the
+        disparity is that of neither surface. The error stays with the corner from frame to frame,
+        so that no residual shows it, and motions accumulate it.
         """
         return np.asarray(self.unlike <= self.limits)
 
     def where(self, are_there: BoolArray) -> Likeness:
-        """Return it with infinite differences where there is no disparity."""
+        """Set the variance to infinity where there is no disparity."""
         unlike = np.where(are_there, self.unlike, np.float32(np.inf))
         return Likeness(unlike=unlike, limits=self.limits)
 
     def select(self, chosen: IntArray) -> Likeness:
-        """Return that of some pixels."""
+        """Select pixels by index."""
         return Likeness(unlike=self.unlike[chosen], limits=self.limits[chosen])
 
     def rivals(self, found: Likeness) -> BoolArray:
-        """Tell where these disparities show the same as well as those that were found.
+        """Tell where these disparities match as well as those that were found.
 
-        Windows of a house are all alike, and where the rows show one beside the other, nothing
-        tells which one the other camera saw: the depth is any of several, and mostly wrong.
+        The windows of a house are all alike; side by side along a row, the depth is any of
+        several, and mostly wrong.
         """
         return self.are_alike & (self.unlike <= _MAX_RIVALRY * found.unlike + _UNLIKE_NOISE)
 
 
 def _variances(patches: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the variances, shape (n,), of patches; in a third of the time of `ndarray.var`."""
+    """Return the variances of patches, shape (n,), in a third of the time of `ndarray.var`."""
     n, height, width = patches.shape
     flat = patches.reshape(n, height * width)
     centred = flat - (np.add.reduce(flat, axis=1) / flat.shape[1])[:, np.newaxis]
