@@ -7,6 +7,7 @@ million digits: `load_yaml` checks the size before any value is constructed.
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -94,6 +95,11 @@ def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "u
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"it holds more than {max_bytes} bytes")
     return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def number_text(value: float | None, form: str = ".4g") -> str:
+    """Return a number as text; a dash if it is None or NaN."""
+    return "-" if value is None or math.isnan(value) else f"{value:{form}}"
 
 
 def format_table(

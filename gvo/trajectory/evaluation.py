@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gvo._text import format_table
+from gvo._text import format_table, number_text
 from gvo.geometry import se3
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
 from gvo.trajectory.trajectory import Trajectory
@@ -305,17 +305,13 @@ def _cells(evaluation: Evaluation) -> tuple[str, ...]:
         f"{100.0 * evaluation.coverage:.1f}",
         f"{evaluation.ate_m:.4f}",
         f"{evaluation.ate_max_m:.4f}",
-        _number(evaluation.rpe_m, 4),
-        _number(evaluation.rpe_deg, 4),
+        number_text(evaluation.rpe_m, ".4f"),
+        number_text(evaluation.rpe_deg, ".4f"),
         _segments(evaluation),
-        _number(evaluation.t_pct, 3),
-        _number(evaluation.r_deg_per_100m, 3),
-        _number(evaluation.path_ratio, 3),
+        number_text(evaluation.t_pct, ".3f"),
+        number_text(evaluation.r_deg_per_100m, ".3f"),
+        number_text(evaluation.path_ratio, ".3f"),
     )
-
-
-def _number(value: float | None, n_decimals: int) -> str:
-    return "-" if value is None else f"{value:.{n_decimals}f}"
 
 
 def _segments(evaluation: Evaluation) -> str:

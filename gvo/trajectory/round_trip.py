@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo._text import format_table
+from gvo._text import format_table, number_text
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
@@ -73,12 +73,12 @@ class RoundTripError:
 
     @property
     def error_pct(self) -> float | None:
-        """Distance of the end from the start, % of the path; None where nothing moved."""
+        """Distance of the end from the start, % of the path; None without motion."""
         return 100.0 * self.error_m / self.path_m if self.path_m > 0 else None
 
     @property
     def error_deg_per_100m(self) -> float | None:
-        """Rotation from the start to the end, degrees per 100 m; None where nothing moved."""
+        """Rotation from the start to the end, degrees per 100 m; None without motion."""
         return 100.0 * self.error_deg / self.path_m if self.path_m > 0 else None
 
     def as_json(self) -> dict[str, Any]:
@@ -150,18 +150,7 @@ def _chi2(error: FloatArray, covariances: FloatArray | None) -> float | None:
 
 
 def format_round_trip_errors(errors: Mapping[str, RoundTripError]) -> str:
-    """Return a table with a row for each trajectory.
-
-    Parameters
-    ----------
-    errors : mapping of str to RoundTripError
-        By the names of the trajectories.
-
-    Returns
-    -------
-    str
-        Lines with line ends; a dash where there is no number.
-    """
+    """Return a table of text with a row per trajectory, by name; "-" for missing values."""
     return format_table(_HEADER, [_row(name, error) for name, error in errors.items()])
 
 
@@ -170,14 +159,10 @@ def _row(name: str, error: RoundTripError) -> tuple[str, ...]:
     return (
         name,
         f"{error.error_m:.4f}",
-        _optional(error.error_pct, ".3f"),
+        number_text(error.error_pct, ".3f"),
         f"{error.error_deg:.4f}",
-        _optional(error.error_deg_per_100m, ".3f"),
-        _optional(error.chi2, ".2f"),
+        number_text(error.error_deg_per_100m, ".3f"),
+        number_text(error.chi2, ".2f"),
         f"{numbers['mean_m']:.4f}",
         f"{numbers['median_m']:.4f}",
     )
-
-
-def _optional(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
+from gvo._text import number_text
 from gvo.batch.effects import span, value_medians
 from gvo.batch.report.values import (
     N_LABEL,
     Batch,
     logarithmic_axis,
-    number_text,
     printable,
     shown,
     value_text,

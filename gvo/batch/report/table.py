@@ -11,8 +11,9 @@ from urllib.parse import quote, urlsplit
 
 import numpy as np
 
+from gvo._text import number_text
 from gvo.batch.effects import ERROR, relative
-from gvo.batch.report.values import Batch, number_text, printable
+from gvo.batch.report.values import Batch, printable
 from gvo.batch.rows import BatchRow
 from gvo.io.run_folder.writer import REPORT
 from gvo.types import FloatArray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -179,11 +178,6 @@ def value_text(value: object) -> str:
     if isinstance(value, bool | np.bool_):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else printable(str(value))
-
-
-def number_text(value: float | None, form: str = ".4g") -> str:
-    """Return a number as text, a dash for a missing one."""
-    return "-" if value is None or math.isnan(value) else f"{value:{form}}"
 
 
 def logarithmic_axis(

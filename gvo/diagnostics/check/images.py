@@ -143,7 +143,7 @@ def check_frozen(
     name: str, pairs: Sequence[tuple[ImageArray | DepthArray, ...]], check: CheckConfig
 ) -> Finding:
     """Count the images that equal the one before."""
-    n_frozen = sum(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+    n_frozen = sum(np.array_equal(before, now, equal_nan=True) for before, now in pairs)
     return measured(
         f"{name}: frozen images",
         n_frozen / len(pairs),

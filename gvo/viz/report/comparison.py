@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gvo._text import number_text
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.trajectory import Trajectory
@@ -109,5 +110,5 @@ def _row(evaluation: Evaluation) -> list[str]:
         evaluation.r_deg_per_100m,
         evaluation.path_ratio,
     )
-    texts = ["-" if number is None else f"{number:.4g}" for number in numbers]
+    texts = [number_text(number) for number in numbers]
     return [evaluation.name, str(evaluation.n), *texts]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.io.run_folder.reader import RunRecord
@@ -188,7 +189,7 @@ def _head(record: RunRecord) -> list[str]:
 
 def _error_row(row: Mapping[str, Any]) -> list[str]:
     numbers = [row.get(key) for key in _ERROR_KEYS]
-    texts = ["-" if number is None else f"{float(number):.4g}" for number in numbers]
+    texts = [number_text(number) for number in numbers]
     return [str(row.get("name", "")), str(row.get("n", "")), *texts]
 
 
