@@ -202,7 +202,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Poses of": str(summary.get("frame", "")),
         "Frames": str(len(frames.stamps_ns)),
         "Duration": _duration(record),
-        "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames are tied",
+        "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames tracked",
         "Segments": _segment_words(summary.get("segments", ())),
         "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
         "Ground truth": str(summary.get("ground_truth", "")),
