@@ -11,10 +11,23 @@ from hypothesis import settings
 import gvo
 
 # How long an example takes says something of the machine, nothing of the code. The examples are the
-# same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=explore draws others.
-settings.register_profile("gvo", deadline=None, derandomize=True)
+# same each time, so that only a change can break a test; HYPOTHESIS_PROFILE=thorough tries four
+# times as many, HYPOTHESIS_PROFILE=explore draws others.
+settings.register_profile("gvo", deadline=None, derandomize=True, max_examples=25)
+settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gvo"))
+
+# All tests of these folders are left to `pytest -m "acceptance or slow"`.
+_ACCEPTANCE = tuple(Path(__file__).parent / name for name in ("acceptance", "fuzz", "quality"))
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m deselects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of whole folders."""
+    for item in items:
+        if any(folder in item.path.parents for folder in _ACCEPTANCE):
+            item.add_marker("acceptance")
 
 
 class Answer(NamedTuple):

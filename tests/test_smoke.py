@@ -1,0 +1,26 @@
+"""One short way through everything: what a newcomer types first."""
+
+from pathlib import Path
+
+import pytest
+
+import gvo
+from tests.conftest import Command
+
+
+def test_the_demo_its_comparison_and_its_smoothing(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 20)
+    out = tmp_path / "gvo-demo"
+    assert command("demo", "--out", out).code == 0
+    assert {"drive.mcap", "summary.json", "report.html", "trajectories.png"} <= {
+        path.name for path in out.iterdir()
+    }
+    estimates = [out / f"{name}.txt" for name in ("raw", "causal", "smoothed")]
+    answer = command("compare", out / "drive.mcap", *estimates)
+    assert answer.code == 0
+    assert "smoothed" in answer.out
+    assert command("smooth", estimates[0], "--out", tmp_path / "again").code == 0
+    smoothed = gvo.read_trajectory(tmp_path / "again/smoothed.txt")
+    assert len(smoothed) == 20
