@@ -203,9 +203,15 @@ class DescriptorFrontend:
         radius_px: float,
     ) -> IntArray:
         predicted = predict_pixels(reference, T_predicted, self.camera)
-        pixels = reference.keypoints, current.keypoints
-        guide = {"prior": T_predicted, "radius_px": radius_px, "predicted": predicted}
-        note("attempt.matches", **guide, pixels=pixels)
+        note(
+            "attempt",
+            method="descriptors",
+            prior=T_predicted,
+            is_wide=radius_px == self._config.temporal.wide_radius_px,
+            radius_px=float(radius_px),
+            predicted=predicted,
+            pixels=(reference.keypoints, current.keypoints),
+        )
         return match_temporal(
             reference,
             current,

@@ -265,9 +265,11 @@ class KltFrontend:
             is_checked=is_wide,
         )
         note(
-            "attempt.tracks",
+            "attempt",
+            method="tracks",
             prior=T_reference_current,
             is_wide=is_wide,
+            radius_px=float(klt.window_radius_px),
             source_uvd=source_uvd,
             indices=indices,
             predicted=predicted,

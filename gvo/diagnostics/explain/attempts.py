@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from gvo._trace import Trace
 from gvo.types import Failure, RelativePose
-
-_TRACKS = "attempt.tracks"
-_MATCHES = "attempt.matches"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,16 +35,17 @@ def registrations_of(trace: Trace) -> list[Registration]:
         Registration(
             reference_ns=part[0].values["reference"].stamp_ns,
             result=end["result"],
-            attempts=part.before("frontend.end").split(_TRACKS, _MATCHES),
+            attempts=part.before("frontend.end").split("attempt"),
         )
         for part in trace.split("frontend.begin")
         if (end := part.find("frontend.end")) is not None
     ]
 
 
-def is_of_tracks(attempt: Trace) -> bool:
-    """Tell whether corners were tracked; else descriptors were matched."""
-    return attempt[0].name == _TRACKS
+def has_prior(attempt: Trace) -> bool:
+    """Tell whether an attempt started from a predicted motion."""
+    prior = attempt[0].values["prior"]
+    return prior is not None and not np.array_equal(prior, np.eye(4))
 
 
 def describe(registration: Registration, indices: Mapping[int, int]) -> list[str]:
@@ -68,8 +68,8 @@ def describe(registration: Registration, indices: Mapping[int, int]) -> list[str
 
 def _method(attempt: Trace) -> str:
     values = attempt[0].values
-    if not is_of_tracks(attempt):
-        place = "previous" if values["prior"] is None else "predicted"
+    if values["method"] == "descriptors":
+        place = "predicted" if has_prior(attempt) else "previous"
         return f"descriptors within {values['radius_px']:g} px of the {place} pixels"
     if values["is_wide"]:
         return "tracks with the wide pyramid, checked backwards"

@@ -156,12 +156,10 @@ def explain_subpixel(
     trace: Trace, frame: StereoFrame, stereo: Sorting, config: StereoConfig, row_offset_px: float
 ) -> SubpixelStep | None:
     """Follow the match of the median horizontal gradient; None if no match was kept."""
-    kept, images = np.flatnonzero(stereo.are_kept), (frame.left, frame.right)
-    if len(kept) == 0:
+    if not stereo.are_kept.any():
         return None
-    radius = config.patch_radius_px
-    gradients = [_gradient(frame.left, pixel, radius) for pixel in stereo.pixels[kept]]
-    chosen = int(kept[np.argsort(gradients, kind="stable")[len(kept) // 2]])
+    images, radius = (frame.left, frame.right), config.patch_radius_px
+    chosen = _choose(frame.left, stereo, radius)
     pixel, disparity = stereo.pixels[chosen], float(stereo.values[chosen])
     searched, matched = trace.find("corners.searched"), trace.find("descriptor.stereo")
     if searched is not None:
@@ -181,12 +179,20 @@ def explain_subpixel(
         pixel=pixel,
         left=left,
         right=_patch(frame.right, u - disparity, v + row_offset_px, radius),
-        columns=columns,
+        columns_px=columns,
         ssd=np.array([_ssd(left, patch) for patch in patches]),
-        iterates=iterates,
-        disparity=disparity,
+        iterates_px=iterates,
+        disparity_px=disparity,
         method="none" if config.subpixel == "none" else method,
     )
+
+
+def _choose(image: ImageArray, stereo: Sorting, radius: int) -> int:
+    """Return the match whose patch determines its column better than half of the others."""
+    kept = np.flatnonzero(stereo.are_kept)
+    patches = [_patch(image, u, v, radius) for u, v in stereo.pixels[kept]]
+    gradients = [float(np.sum(np.diff(patch, axis=1) ** 2)) for patch in patches]
+    return int(kept[np.argsort(gradients, kind="stable")[len(kept) // 2]])
 
 
 def _partner(matched: Mapping[str, Any], index: int) -> FloatArray:
@@ -210,11 +216,6 @@ def _follow(
         for n in range(1, N_SEARCH_STEPS + 1)
     ]
     return np.concatenate([rough, *ends])
-
-
-def _gradient(image: ImageArray, pixel: FloatArray, radius: int) -> float:
-    """Return how well a patch determines its column: the sum of squared horizontal gradients."""
-    return float(np.sum(np.diff(_patch(image, pixel[0], pixel[1], radius), axis=1) ** 2))
 
 
 def _patch(image: ImageArray, u: float, v: float, radius: int) -> NDArray[np.float32]:

@@ -165,9 +165,11 @@ class _Drive:
     def _motion(self, attempts: Sequence[Trace]) -> dict[str, Any]:
         """Explain the last attempt."""
         if not attempts:
-            return dict.fromkeys(("matches", "consensus", "refinement"))
+            nothing = dict.fromkeys(("matches", "consensus", "refinement"))
+            return {"attempt": Trace(), **nothing}
         last, camera, config = attempts[-1], self._camera, self._config
         return {
+            "attempt": last,
             "matches": explain_matches(last, config),
             "consensus": explain_consensus(last, camera, config),
             "refinement": explain_refinement(last, camera, config),

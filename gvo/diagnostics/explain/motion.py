@@ -6,7 +6,6 @@ import numpy as np
 
 from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.attempts import is_of_tracks
 from gvo.diagnostics.explain.extraction import (
     as_mask,
     best_partners,
@@ -14,7 +13,7 @@ from gvo.diagnostics.explain.extraction import (
     distance_tests,
     no_candidates,
 )
-from gvo.diagnostics.explain.values import ConsensusStep, MatchStep, RefinementStep, Sorting
+from gvo.diagnostics.explain.values import ConsensusStep, RefinementStep, Sorting
 from gvo.frontend.registration import search_consensus
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -27,12 +26,13 @@ from gvo.types import BoolArray, Failure, FloatArray, IntArray
 _MIN_DEPTH_M = 1e-3
 
 
-def explain_matches(attempt: Trace, config: Config) -> MatchStep:
+def explain_matches(attempt: Trace, config: Config) -> Sorting:
     """Sort the points of the reference by the tests of their matches."""
-    return _tracks(attempt, config) if is_of_tracks(attempt) else _descriptors(attempt, config)
+    is_of_tracks = attempt[0].values["method"] == "tracks"
+    return _tracks(attempt, config) if is_of_tracks else _descriptors(attempt, config)
 
 
-def _tracks(attempt: Trace, config: Config) -> MatchStep:
+def _tracks(attempt: Trace, config: Config) -> Sorting:
     begin = attempt[0].values
     pixels, indices = begin["source_uvd"][:, :2], begin["indices"]
     n, tracked = len(pixels), indices[begin["is_tracked"]]
@@ -42,13 +42,7 @@ def _tracks(attempt: Trace, config: Config) -> MatchStep:
     tests = {"out of view": as_mask(indices, n), "track lost": as_mask(tracked, n)}
     for name, passes in _track_tests(attempt, config).items():
         tests[name] = as_mask(tracked[passes], n)
-    return MatchStep(
-        method="tracks",
-        is_wide=begin["is_wide"],
-        has_prior=not np.array_equal(begin["prior"], np.eye(4)),
-        radius_px=float(config.klt.window_radius_px),
-        sorting=Sorting.by(tests, pixels, partners=found, predicted=predicted),
-    )
+    return Sorting.by(tests, pixels, partners=found, predicted=predicted)
 
 
 def _track_tests(attempt: Trace, config: Config) -> dict[str, BoolArray]:
@@ -68,7 +62,7 @@ def _track_tests(attempt: Trace, config: Config) -> dict[str, BoolArray]:
     return depth_tests(sampled["depths"], sampled["is_valid"], config.depth)
 
 
-def _descriptors(attempt: Trace, config: Config) -> MatchStep:
+def _descriptors(attempt: Trace, config: Config) -> Sorting:
     begin, temporal = attempt[0].values, config.temporal
     (reference, current), (expected, indices) = begin["pixels"], begin["predicted"]
     n, candidates = len(reference), attempt.find("temporal.candidates") or no_candidates()
@@ -85,13 +79,7 @@ def _descriptors(attempt: Trace, config: Config) -> MatchStep:
         **distance_tests(candidates, n, **limits),
         "reciprocity": as_mask(matches[:, 0], n),
     }
-    return MatchStep(
-        method="descriptors",
-        is_wide=begin["radius_px"] == temporal.wide_radius_px,
-        has_prior=begin["prior"] is not None,
-        radius_px=float(begin["radius_px"]),
-        sorting=Sorting.by(tests, reference, partners=found, predicted=predicted),
-    )
+    return Sorting.by(tests, reference, partners=found, predicted=predicted)
 
 
 def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> ConsensusStep | None:
@@ -112,13 +100,15 @@ def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> C
         pixels_reference=matches.source_uvd[:, :2],
         pixels_current=matches.target_uvd[:, :2],
         inliers=consensus.inliers if isinstance(consensus, Consensus) else None,
-        n_agreeing=None if known is None else int(np.count_nonzero(known["inliers"])),
+        n_agreeing_with_prediction=None
+        if known is None
+        else int(np.count_nonzero(known["inliers"])),
         n_needed=0.0 if known is None else float(known["n_needed"]),
         is_known=end["is_known"],
         n_planned=len(samples["samples"]),
         n_near=len(samples["near"]),
         counts=_counts(search),
-        share=float(blocks[-1]["share"]) if blocks else 0.0,
+        share_of_near=float(blocks[-1]["share"]) if blocks else 0.0,
         sampled=sampled.inliers if isinstance(sampled, Consensus) else None,
         reason=sampled.reason if isinstance(sampled, Failure) else "",
     )
@@ -156,9 +146,9 @@ def explain_refinement(
         whitened=np.stack([_whiten(each, residuals) for each in residuals_px]),
         inliers=np.stack([each.inliers for each in ends]),
         depths=begin["correspondences"].target_points[:, 2],
-        n_within=None if within is None else int(np.count_nonzero(within)),
+        n_within_gate=None if within is None else int(np.count_nonzero(within)),
         n_steps=len(attempt.before("registration.refined").all("refinement.step")),
-        gate=gate,
+        gate_sigma=gate,
         scale=ends[1].scale,
     )
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo._trace import Trace
 from gvo.config import Config
 from gvo.frontend.klt import image_of
 from gvo.geometry.camera import StereoCamera
@@ -105,47 +106,23 @@ class SubpixelStep:
         In the left image.
     left, right : ndarray of float32, shape (s, s)
         Patches at the pixel and at its disparity.
-    columns, ssd : ndarray of float64, shape (m,)
+    columns_px, ssd : ndarray of float64, shape (m,)
         Disparities, and the sums of squared differences of the patches there, means removed.
-    iterates : ndarray of float64, shape (k,)
+    iterates_px : ndarray of float64, shape (k,)
         Disparities at the start and after each step.
-    disparity : float
-        The result, pixels.
+    disparity_px : float
+        The result.
     method : {"gauss-newton", "parabola", "none"}
     """
 
     pixel: FloatArray
     left: NDArray[np.float32]
     right: NDArray[np.float32]
-    columns: FloatArray
+    columns_px: FloatArray
     ssd: FloatArray
-    iterates: FloatArray
-    disparity: float
+    iterates_px: FloatArray
+    disparity_px: float
     method: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MatchStep:
-    """Points of the reference searched in the current image.
-
-    Parameters
-    ----------
-    method : {"tracks", "descriptors"}
-    is_wide : bool
-        The wider search was used.
-    has_prior : bool
-        A motion was predicted.
-    radius_px : float
-        Of the window of a track, or of the search for descriptors.
-    sorting : Sorting
-        Of the points of the reference.
-    """
-
-    method: str
-    is_wide: bool
-    has_prior: bool
-    radius_px: float
-    sorting: Sorting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,8 +135,8 @@ class ConsensusStep:
         The matches.
     inliers : ndarray of bool, shape (n,), or None
         None where no motion was found.
-    n_agreeing : int or None
-        Matches that agree with the predicted motion; None without one.
+    n_agreeing_with_prediction : int or None
+        None without a prediction.
     n_needed : float
         From how many on no samples are drawn.
     is_known : bool
@@ -168,7 +145,7 @@ class ConsensusStep:
         Samples at most, and points with enough disparity, from which they are drawn.
     counts : ndarray of int64, shape (k,)
         Inliers of each sample drawn; -1 for three points on a line.
-    share : float
+    share_of_near : float
         Inliers of the best sample among the near points.
     sampled : ndarray of bool, shape (n,), or None
         Inliers of the motion refitted to the best sample; None if too few agree.
@@ -179,13 +156,13 @@ class ConsensusStep:
     pixels_reference: FloatArray
     pixels_current: FloatArray
     inliers: BoolArray | None
-    n_agreeing: int | None
+    n_agreeing_with_prediction: int | None
     n_needed: float
     is_known: bool
     n_planned: int
     n_near: int
     counts: IntArray
-    share: float
+    share_of_near: float
     sampled: BoolArray | None
     reason: str
 
@@ -207,12 +184,11 @@ class RefinementStep:
     inliers : ndarray of bool, shape (2, n)
     depths : ndarray of float64, shape (n,)
         Of the matches in the current frame, metres.
-    n_within : int or None
-        Matches within the gate after the first steps; None without a gate.
+    n_within_gate : int or None
+        After the first steps; None without a gate.
     n_steps : int
         Of Gauss-Newton.
-    gate : float
-        Sigmas.
+    gate_sigma : float
     scale : float
         Root mean square of the whitened residuals of the inliers, weighted.
     """
@@ -222,9 +198,9 @@ class RefinementStep:
     whitened: FloatArray
     inliers: BoolArray
     depths: FloatArray
-    n_within: int | None
+    n_within_gate: int | None
     n_steps: int
-    gate: float
+    gate_sigma: float
     scale: float
 
 
@@ -284,8 +260,11 @@ class FrameExplanation:
     depth_pixels : Sorting or None
         All pixels of the depth image, row by row; None for stereo.
     subpixel, matches, consensus, refinement
+        Steps of the last attempt to register the frame; matches are points of the reference.
+    attempt : Trace
+        Its events; empty if there was none.
     attempts : tuple of str
-        How the frame was registered, one attempt a line.
+        All of them, one a line.
     links : tuple of KeyframeLink
         Predecessor first, then the keyframes, oldest first.
     """
@@ -304,9 +283,10 @@ class FrameExplanation:
     measured: Sorting
     depth_pixels: Sorting | None
     subpixel: SubpixelStep | None
-    matches: MatchStep | None
+    matches: Sorting | None
     consensus: ConsensusStep | None
     refinement: RefinementStep | None
+    attempt: Trace
     attempts: tuple[str, ...]
     links: tuple[KeyframeLink, ...]
 

@@ -123,7 +123,9 @@ def draw_stereo(explanation: FrameExplanation) -> Picture:
         0.95 * paired_height(shape),
         image_height(shape, share=0.93 * (1.0 if is_wide(shape) else 0.6)) + 0.5,
     ]
-    sheet = Sheet("02_stereo", "Stereo matches", _stereo_caption(explanation, stereo), sum(heights))
+    sheet = Sheet(
+        "02_stereo", "Stereo matches", _stereo_caption(explanation, stereo), sum(heights) + 0.4
+    )
     upper, lower = sheet.panels.subplots(2, 1, height_ratios=heights)
     canvas, shift = join_images(frame.left, frame.right)
     show_image(upper, canvas, f"left and right: {kept.sum()} matches, by disparity")
@@ -301,7 +303,7 @@ def draw_subpixel(explanation: FrameExplanation, step: SubpixelStep) -> Picture:
     axes = sheet.panels.subplots(1, 4, width_ratios=[1, 1, 1, 2.2])
     low, high = float(step.left.min()), float(step.left.max())
     show_image(axes[0], step.left, "left patch", vmin=low, vmax=high)
-    show_image(axes[1], step.right, f"right, at {step.disparity:.2f} px", vmin=low, vmax=high)
+    show_image(axes[1], step.right, f"right, at {step.disparity_px:.2f} px", vmin=low, vmax=high)
     difference, limit = step.right - step.left, 0.5 * max(high - low, 1.0)
     difference = difference - difference.mean()
     show_image(axes[2], difference, "difference (grey: none)", vmin=-limit, vmax=limit)
@@ -311,15 +313,16 @@ def draw_subpixel(explanation: FrameExplanation, step: SubpixelStep) -> Picture:
 
 def _subpixel_caption(explanation: FrameExplanation, step: SubpixelStep) -> str:
     offset_px, (u, v), size = explanation.offset_px, step.pixel, len(step.left)
-    whole = max(round(step.disparity), 1)
+    whole = max(round(step.disparity_px), 1)
     depth, whole_depth = (
-        float(explanation.camera.disparity_to_depth(d - offset_px)) for d in (step.disparity, whole)
+        float(explanation.camera.disparity_to_depth(d - offset_px))
+        for d in (step.disparity_px, whole)
     )
     return (
         f"Of all matches kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}) in "
         f"the left image: patches of {size} x {size} px and their difference, and the sum of "
         f"squared differences, means removed, over the disparity. {_subpixel_method(step)} It ends "
-        f"at {step.disparity:.3f} px, "
+        f"at {step.disparity_px:.3f} px, "
         + (f"less the learnt {offset_px:+.3f} px " if offset_px else "")
         + f"a depth of {depth:.2f} m; the nearest whole pixel would be {whole} px, "
         f"{whole_depth:.2f} m."
@@ -331,12 +334,12 @@ def _subpixel_method(step: SubpixelStep) -> str:
         return "The sub-pixel fit is off (stereo.subpixel none)."
     if step.method == "parabola":
         return (
-            f"The search starts at the keypoints' whole pixels, {step.iterates[0]:.0f} px; the "
+            f"The search starts at the keypoints' whole pixels, {step.iterates_px[0]:.0f} px; the "
             "vertex of the parabola through the best column and its neighbours gives the fraction."
         )
-    steps = np.diff(step.iterates)
+    steps = np.diff(step.iterates_px)
     return (
-        f"The coarse search gives {step.iterates[0]:.2f} px; {len(steps)} Gauss-Newton steps "
+        f"The coarse search gives {step.iterates_px[0]:.2f} px; {len(steps)} Gauss-Newton steps "
         f"follow ({', '.join(f'{each:+.3f}' for each in steps)} px). They use the gradients of the "
         "left patch: where left and right differ a little, they end beside the minimum of the "
         "curve. Between whole pixels the right image is interpolated, which smooths its noise: "
@@ -345,7 +348,7 @@ def _subpixel_method(step: SubpixelStep) -> str:
 
 
 def _draw_curve(axes: Axes, step: SubpixelStep) -> None:
-    columns, ssd = step.columns, step.ssd
+    columns, ssd = step.columns_px, step.ssd
     is_sampled = step.method == "parabola"
     axes.plot(columns, ssd, "o-" if is_sampled else "-", color=BEFORE, label="SSD of the patches")
     if is_sampled:
@@ -355,10 +358,12 @@ def _draw_curve(axes: Axes, step: SubpixelStep) -> None:
         fitted = np.polyval(np.polyfit(columns[near], ssd[near], 2), shown)
         axes.plot(shown, fitted, color=AFTER, label="parabola")
     elif step.method == "gauss-newton":
-        at_steps = np.interp(step.iterates, columns, ssd)
+        at_steps = np.interp(step.iterates_px, columns, ssd)
         label = "Gauss-Newton steps"
-        axes.plot(step.iterates, at_steps, "o-", color=AFTER, markersize=5, label=label)
-    axes.axvline(step.disparity, color=LIMIT, linestyle="--", label=f"end: {step.disparity:.3f} px")
+        axes.plot(step.iterates_px, at_steps, "o-", color=AFTER, markersize=5, label=label)
+    axes.axvline(
+        step.disparity_px, color=LIMIT, linestyle="--", label=f"end: {step.disparity_px:.3f} px"
+    )
     axes.set_ylim(0.0, 1.4 * float(ssd.max()))
     place = {"loc": "upper center", "ncols": 2}
     finish_axes(axes, "disparity [px]", "squared difference [grey²]", **place)

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gvo.diagnostics.explain.attempts import has_prior
 from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,
-    MatchStep,
     RefinementStep,
+    Sorting,
 )
 from gvo.frontend.klt import image_of
 from gvo.types import FloatArray
@@ -42,54 +43,54 @@ if TYPE_CHECKING:
 _N_CROPS = 6
 
 
-def draw_matches(explanation: FrameExplanation, step: MatchStep) -> Picture:
+def draw_matches(explanation: FrameExplanation, matches: Sorting) -> Picture:
     """Draw the matches as flow, side by side, and some of them enlarged."""
     if explanation.reference is None:
         raise ValueError("matches need a reference frame")
-    image, sorting = explanation.image, step.sorting
+    image = explanation.image
     heights = [
         image_height(image.shape, share=1.0 if is_wide(image.shape) else 0.6) + 0.4,
         paired_height(image.shape),
         2.4,
     ]
     title = f"Matches with frame {explanation.reference_index}"
-    sheet = Sheet("05_matches", title, _matches_caption(explanation, step), sum(heights) + 0.4)
+    sheet = Sheet("05_matches", title, _matches_caption(explanation, matches), sum(heights) + 0.4)
     upper, middle, lower = split(sheet.panels, heights)
-    starts, ends = sorting.pixels[sorting.are_kept], sorting.partners[sorting.are_kept]
+    starts, ends = matches.pixels[matches.are_kept], matches.partners[matches.are_kept]
     flow, pair = upper.subplots(1, 1), middle.subplots(1, 1)
     show_image(flow, image, "flow over the current image: from where a point was to where it is")
     draw_segments(flow, starts, ends, colors=KEPT)
     flow.plot(*ends.T, ".", color=KEPT, markersize=5, label=f"kept: {len(ends)}")
-    draw_reasons(flow, sorting, sorting.predicted)
+    draw_reasons(flow, matches, matches.predicted)
     legend_below(flow, 5)
     canvas, shift = join_images(image_of(explanation.reference), image)
     show_image(pair, canvas, "reference and current image")
     draw_segments(pair, starts, ends + shift, colors=KEPT, linewidths=0.7)
-    _draw_crops(lower.subplots(1, _N_CROPS), explanation, step)
+    _draw_crops(lower.subplots(1, _N_CROPS), explanation, matches)
     return sheet.picture()
 
 
-def _matches_caption(explanation: FrameExplanation, step: MatchStep) -> str:
-    sorting, radius, numbers, crops = step.sorting, step.radius_px, "", ""
-    counts = count_text(sorting.counts())
-    side = 2 * radius + 1
-    if step.method == "tracks":
-        start = "the pixels that the predicted motion gives" if step.has_prior else "their own"
-        wide = ", with the wide pyramid and checked backwards" if step.is_wide else ""
+def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
+    values, numbers, crops = explanation.attempt[0].values, "", ""
+    radius, is_predicted = values["radius_px"], has_prior(explanation.attempt)
+    if values["method"] == "tracks":
+        start = "the pixels that the predicted motion gives" if is_predicted else "their own pixels"
+        wide = ", with the wide pyramid and checked backwards" if values["is_wide"] else ""
+        side = 2 * radius + 1
         how = (
             f"Windows of {side:g} x {side:g} px are tracked by Lucas-Kanade from {start}{wide}, "
             "then measured in 3-D where they end."
         )
         marks = "the window there (dashed) and where it ended (blue)"
     else:
-        place = "predicted" if step.has_prior else "previous"
+        place = "predicted" if is_predicted else "previous"
         how = f"Descriptors are compared within {radius:g} px of the {place} pixels."
         marks = "the search radius (dashed) and the match (blue)"
-    kept = sorting.are_kept
+    kept = matches.are_kept
     if kept.any():
         flow, error = (
-            np.linalg.norm(sorting.partners[kept] - each[kept], axis=1)
-            for each in (sorting.pixels, sorting.predicted)
+            np.linalg.norm(matches.partners[kept] - each[kept], axis=1)
+            for each in (matches.pixels, matches.predicted)
         )
         numbers = (
             f" Points move by {np.median(flow):.1f} px (median, at most {flow.max():.1f}); they "
@@ -98,48 +99,55 @@ def _matches_caption(explanation: FrameExplanation, step: MatchStep) -> str:
         )
         crops = f"Below: six matches enlarged, the predicted pixel (orange-red cross), {marks}.\n"
     return (
-        f"Of {len(sorting)} points of the reference: {counts}. {how}{numbers} "
-        "Dropped points are marked where they were expected; those expected outside of the image "
-        f"are not shown.\n{crops}Attempts: {'; '.join(explanation.attempts)}."
+        f"Of {len(matches)} points of the reference: {count_text(matches.counts())}. {how}"
+        f"{numbers} Dropped points are marked where they were expected; those expected outside of "
+        f"the image are not shown.\n{crops}Attempts: {'; '.join(explanation.attempts)}."
     )
 
 
 def _draw_crops(
     panels: np.ndarray[tuple[int, ...], np.dtype[np.object_]],
     explanation: FrameExplanation,
-    step: MatchStep,
+    matches: Sorting,
 ) -> None:
     """Enlarge matches that spread evenly over the errors of the prediction."""
-    sorting, kept = step.sorting, np.flatnonzero(step.sorting.are_kept)
-    errors = np.linalg.norm(sorting.partners - sorting.predicted, axis=1)
+    values, kept = explanation.attempt[0].values, np.flatnonzero(matches.are_kept)
+    errors = np.linalg.norm(matches.partners - matches.predicted, axis=1)
     order = kept[np.argsort(errors[kept], kind="stable")]
     chosen = order[np.linspace(0, len(order) - 1, _N_CROPS).astype(int)] if len(order) else order
     for axes, index in zip(panels, chosen, strict=False):
-        predicted, found = sorting.predicted[index], sorting.partners[index]
+        (u, v), found = matches.predicted[index], matches.partners[index]
         show_image(axes, explanation.image)
-        _draw_search(axes, step, predicted, found)
-        away = 1.2 * float(np.abs(found - predicted).max()) + 6.0
-        reach = max(2.2 * step.radius_px, 18.0, away)
-        axes.set_xlim(predicted[0] - reach, predicted[0] + reach)
-        axes.set_ylim(predicted[1] + reach, predicted[1] - reach)
+        _draw_search(
+            axes, (u, v), found, values["radius_px"], has_window=values["method"] == "tracks"
+        )
+        away = 1.2 * float(np.abs(found - (u, v)).max()) + 6.0
+        reach = max(2.2 * values["radius_px"], 18.0, away)
+        axes.set_xlim(u - reach, u + reach)
+        axes.set_ylim(v + reach, v - reach)
         axes.set_title(f"{errors[index]:.1f} px off", fontsize=10)
     for axes in panels[len(chosen) :]:
         axes.set_axis_off()
 
 
-def _draw_search(axes: Axes, step: MatchStep, predicted: FloatArray, found: FloatArray) -> None:
+def _draw_search(
+    axes: Axes,
+    predicted: tuple[float, float],
+    found: FloatArray,
+    radius: float,
+    *,
+    has_window: bool,
+) -> None:
     from matplotlib.patches import Circle, Rectangle
 
-    side, (u, v) = 2 * step.radius_px + 1, predicted
-    left, top = found - side / 2
     dashed: dict[str, Any] = {"fill": False, "ec": LIMIT, "linestyle": "--", "linewidth": 1.2}
-    if step.method == "tracks":
+    if has_window:
+        side, (u, v), (left, top) = 2 * radius + 1, predicted, found - radius - 0.5
         axes.add_patch(Rectangle((u - side / 2, v - side / 2), side, side, **dashed))
-        window = Rectangle((left, top), side, side, fill=False, ec=KEPT, linewidth=1.5)
-        axes.add_patch(window)
+        axes.add_patch(Rectangle((left, top), side, side, fill=False, ec=KEPT, linewidth=1.5))
     else:
-        axes.add_patch(Circle((u, v), step.radius_px, **dashed))
-    axes.plot(u, v, "+", color=LIMIT, markersize=11, markeredgewidth=1.6)
+        axes.add_patch(Circle(predicted, radius, **dashed))
+    axes.plot(*predicted, "+", color=LIMIT, markersize=11, markeredgewidth=1.6)
     axes.plot(*found, "o", color=KEPT, markersize=6, markerfacecolor="none", mew=1.6)
 
 
@@ -176,10 +184,10 @@ def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep) -> st
     if ransac.inlier_metric == "distance":
         limit = f"{ransac.inlier_threshold_m:g} m"
     text = f"A match agrees with a motion if its error is less than {limit}. "
-    if step.n_agreeing is not None:
+    if step.n_agreeing_with_prediction is not None:
         text += (
-            f"{step.n_agreeing} of {n} matches agree with the predicted motion; from "
-            f"{int(np.ceil(step.n_needed))} on no samples are drawn. "
+            f"{step.n_agreeing_with_prediction} of {n} matches agree with the predicted motion; "
+            f"from {int(np.ceil(step.n_needed))} on no samples are drawn. "
         )
     if step.is_known:
         text += (
@@ -201,8 +209,8 @@ def _samples_text(step: ConsensusStep) -> str:
     )
     if step.is_stopped_early:
         text += (
-            f"; stopped early, as {100 * step.share:.0f} % of those points agree with it: the "
-            "probability that no sample was without outliers is less than one in a thousand"
+            f"; stopped early, as {100 * step.share_of_near:.0f} % of those points agree with it: "
+            "the probability that all samples held an outlier is less than one in a thousand"
         )
     return f"{text}. It fails: {step.reason}." if step.reason else f"{text}."
 
@@ -228,7 +236,7 @@ def draw_residuals(explanation: FrameExplanation, step: RefinementStep) -> Pictu
     """Draw the residuals before and after the refinement."""
     title = "Residuals before and after the refinement"
     sheet = Sheet("07_residuals", title, _residuals_caption(explanation, step), 6.8)
-    axes, gate = sheet.panels.subplots(2, 3), step.gate
+    axes, gate = sheet.panels.subplots(2, 3), step.gate_sigma
     for column, name in enumerate(("u", "v", "disparity")):
         values = step.residuals_px[:, :, column]
         finite = values[np.isfinite(values)]
@@ -269,7 +277,7 @@ def _draw_after(axes: Axes, x: FloatArray, y: FloatArray, step: RefinementStep) 
     inliers = step.inliers[1]
     axes.plot(x[~inliers], y[~inliers], "x", color=REFUSED, markersize=5, label="outliers")
     axes.plot(x[inliers], y[inliers], ".", color=KEPT, markersize=6, label="inliers")
-    axes.set_ylim(-2.1 * step.gate, 2.9 * step.gate)
+    axes.set_ylim(-2.1 * step.gate_sigma, 2.9 * step.gate_sigma)
 
 
 def _residuals_caption(explanation: FrameExplanation, step: RefinementStep) -> str:
@@ -293,16 +301,16 @@ def _residuals_caption(explanation: FrameExplanation, step: RefinementStep) -> s
 
 def _gate_text(step: RefinementStep) -> str:
     before, after = step.inliers.sum(axis=1).tolist()
-    if step.n_within is None:
+    if step.n_within_gate is None:
         return f"Pose and matches stay as they are, {after} (registration.refine none)."
-    gate = f"The gate of {step.gate:g} sigma (registration.gate)"
-    if step.n_within == after:
+    gate = f"The gate of {step.gate_sigma:g} sigma (registration.gate)"
+    if step.n_within_gate == after:
         return (
             f"{gate} chooses the matches again after the first steps: {before} before, "
             f"{after} after."
         )
     return (
-        f"{gate} would leave {step.n_within} matches after the first steps, less than half: the "
-        f"{before} from before stay, those far off with less weight. The residuals are larger than "
-        "the stated sigmas here."
+        f"{gate} would leave {step.n_within_gate} matches after the first steps, less than half: "
+        f"the {before} from before stay, those far off with less weight. The residuals are larger "
+        "than the stated sigmas here."
     )

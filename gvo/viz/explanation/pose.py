@@ -166,11 +166,11 @@ def _links_caption(explanation: FrameExplanation) -> str:
     window, links = explanation.config.window, explanation.links
     text = (
         f"{sum(link.is_accepted for link in links)} edges connect the frame to earlier ones (blue "
-        f"frames); at most {window.n_links} registrations are tried (window.n_links). Overlap is "
-        f"the share of a keyframe's points in view: below {window.min_overlap:g} the keyframe is "
-        "released (window.min_overlap), times the steps since it must reach "
-        f"{window.link_gain:g} for a link (window.link_gain) unless the step is in doubt, and if "
-        f"all are below {window.keyframe_overlap:g} the frame becomes a keyframe itself "
+        f"frames); at most {window.n_links} keyframes are registered (window.n_links). Overlap is "
+        f"the share of a keyframe's points in view. Below {window.min_overlap:g} the keyframe is "
+        "released (window.min_overlap); it is linked where overlap times the number of steps since "
+        f"reaches {window.link_gain:g} (window.link_gain), or where the step is in doubt. If every "
+        f"overlap is below {window.keyframe_overlap:g}, the frame becomes a keyframe itself "
         "(window.keyframe_overlap), as this one "
         f"{'did' if explanation.became_keyframe else 'did not'}. "
         "Chi2 is the squared Mahalanobis distance of the edge from the window's poses, 6 degrees "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Callable
+from functools import partial
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -12,11 +13,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gvo._trace import Trace
+from gvo.diagnostics.explain.attempts import has_prior
 from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,
     KeyframeLink,
-    MatchStep,
     RefinementStep,
     Sorting,
     SubpixelStep,
@@ -159,7 +161,7 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
     Steps that were not reached are null. Matrices are lists of rows.
     """
     result, keypoints = explanation.result, explanation.keypoints
-    measured, is_stereo = _sorted(explanation.measured), explanation.depth_pixels is None
+    measured, is_stereo = _count(explanation.measured), explanation.depth_pixels is None
     budget, cell_size_px = budget_of(explanation.config)
     return {
         "recording": explanation.recording,
@@ -180,9 +182,9 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
         },
         "stereo": measured if is_stereo else None,
         "depth": None if is_stereo else measured,
-        "depth_pixels": _of(explanation.depth_pixels, _sorted),
+        "depth_pixels": _of(explanation.depth_pixels, _count),
         "subpixel": _of(explanation.subpixel, _subpixel),
-        "matches": _of(explanation.matches, _matches),
+        "matches": _of(explanation.matches, partial(_matches, explanation.attempt)),
         "consensus": _of(explanation.consensus, _consensus),
         "refinement": _of(explanation.refinement, _refinement),
         "relative_pose": _of(result.registration, _relative),
@@ -198,58 +200,51 @@ def _of(step: _T | None, numbers: Callable[[_T], dict[str, Any]]) -> dict[str, A
     return None if step is None else numbers(step)
 
 
-def _sorted(sorting: Sorting) -> dict[str, Any]:
+def _pick(value: object, *names: str) -> dict[str, Any]:
+    """Return attributes as plain values."""
+    picked = {name: getattr(value, name) for name in names}
+    return {
+        name: each.tolist() if isinstance(each, np.ndarray) else each
+        for name, each in picked.items()
+    }
+
+
+def _count(sorting: Sorting) -> dict[str, Any]:
     return {"n": len(sorting), **sorting.counts()}
 
 
 def _subpixel(step: SubpixelStep) -> dict[str, Any]:
-    return {
-        "pixel": step.pixel.tolist(),
-        "method": step.method,
-        "iterates_px": step.iterates.tolist(),
-        "disparity_px": step.disparity,
-        "columns_px": step.columns.tolist(),
-        "ssd": step.ssd.tolist(),
-    }
+    return _pick(step, "pixel", "method", "iterates_px", "disparity_px", "columns_px", "ssd")
 
 
-def _matches(step: MatchStep) -> dict[str, Any]:
-    kept, sorting = step.sorting.are_kept, step.sorting
-    flow = np.linalg.norm(sorting.partners[kept] - sorting.pixels[kept], axis=1)
+def _matches(attempt: Trace, matches: Sorting) -> dict[str, Any]:
+    flow = np.linalg.norm(matches.partners - matches.pixels, axis=1)[matches.are_kept]
+    begin = attempt[0].values
     return {
-        "method": step.method,
-        "is_wide": step.is_wide,
-        "has_prior": step.has_prior,
-        "radius_px": step.radius_px,
+        **{name: begin[name] for name in ("method", "is_wide", "radius_px")},
+        "has_prior": has_prior(attempt),
         "median_flow_px": float(np.median(flow)) if len(flow) else None,
-        **_sorted(sorting),
+        **_count(matches),
     }
 
 
 def _consensus(step: ConsensusStep) -> dict[str, Any]:
     return {
         "n_matches": len(step.pixels_reference),
-        "is_known": step.is_known,
-        "n_agreeing_with_prediction": step.n_agreeing,
+        **_pick(step, "is_known", "n_agreeing_with_prediction"),
         "n_inliers": None if step.inliers is None else int(step.inliers.sum()),
         "samples": {
             "n_drawn": len(step.counts),
-            "n_planned": step.n_planned,
+            **_pick(step, "n_planned", "n_near", "share_of_near", "reason"),
             "inliers": step.counts.tolist(),
-            "n_near": step.n_near,
-            "share_of_near": step.share,
             "n_inliers": None if step.sampled is None else int(step.sampled.sum()),
-            "reason": step.reason,
         },
     }
 
 
 def _refinement(step: RefinementStep) -> dict[str, Any]:
     return {
-        "n_steps": step.n_steps,
-        "n_within_gate": step.n_within,
-        "gate_sigma": step.gate,
-        "scale": step.scale,
+        **_pick(step, "n_steps", "n_within_gate", "gate_sigma", "scale"),
         "n_inliers": step.inliers.sum(axis=1).tolist(),
         "median_abs_residual_px": [_medians(each) for each in step.residuals_px],
         "median_abs_whitened": [_medians(each) for each in step.whitened],
@@ -263,22 +258,12 @@ def _medians(residuals: FloatArray) -> dict[str, float | None]:
 
 
 def _relative(relative: RelativePose) -> dict[str, Any]:
-    return {
-        "T_reference_current": relative.T_reference_current.tolist(),
-        "covariance": relative.covariance.tolist(),
-        "n_matches": relative.n_matches,
-        "n_inliers": relative.n_inliers,
-        "flow_px": relative.flow_px,
-        "offset_px": relative.offset_px,
-    }
+    matrices = "T_reference_current", "covariance"
+    return _pick(relative, *matrices, "n_matches", "n_inliers", "flow_px", "offset_px")
 
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {
-        "status": estimate.status.value,
-        "T_world_cam": estimate.T_world_cam.tolist(),
-        "covariance": estimate.covariance.tolist(),
-    }
+    return {"status": estimate.status.value, **_pick(estimate, "T_world_cam", "covariance")}
 
 
 def _link(link: KeyframeLink) -> dict[str, Any]:
@@ -286,11 +271,7 @@ def _link(link: KeyframeLink) -> dict[str, Any]:
     return {
         "frame": link.index,
         "stamp_ns": link.reference_ns,
-        "kind": link.kind,
-        "overlap": link.overlap,
+        **_pick(link, "kind", "overlap", "chi2", "is_accepted", "reason"),
         "n_matches": 0 if registration is None else registration.n_matches,
         "n_inliers": 0 if registration is None else registration.n_inliers,
-        "chi2": link.chi2,
-        "is_accepted": link.is_accepted,
-        "reason": link.reason,
     }

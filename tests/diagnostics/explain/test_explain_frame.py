@@ -85,7 +85,7 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
     assert refinement is not None
     assert explanation.matches is not None
     assert explanation.consensus is not None
-    matches = explanation.matches.sorting
+    matches = explanation.matches
     kept = matches.are_kept
     T_end = refinement.T_target_source[1]
     assert np.array_equal(se3.invert(T_end), registration.T_reference_current)
@@ -135,14 +135,14 @@ def test_the_keypoints_within_the_budget_are_those_that_were_measured(
 def test_the_steps_to_the_fraction_of_a_pixel_end_where_the_front_end_ended() -> None:
     step = explained("klt", "stereo").subpixel
     assert step is not None
-    assert step.iterates[-1] == step.disparity
-    assert abs(step.columns[step.ssd.argmin()] - step.disparity) < 1.0
+    assert step.iterates_px[-1] == step.disparity_px
+    assert abs(step.columns_px[step.ssd.argmin()] - step.disparity_px) < 1.0
 
 
 def test_the_parabola_s_columns_are_around_the_match() -> None:
     step = explained("descriptor", "stereo").subpixel
     assert step is not None
-    assert abs(step.columns[step.ssd.argmin()] - step.disparity) <= 0.5 + 1e-6
+    assert abs(step.columns_px[step.ssd.argmin()] - step.disparity_px) <= 0.5 + 1e-6
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -179,8 +179,8 @@ def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> N
     assert len(step.counts) > 0
     assert step.sampled is not None
     if step.is_known:
-        assert step.n_agreeing is not None
-        assert step.n_agreeing >= step.n_needed
+        assert step.n_agreeing_with_prediction is not None
+        assert step.n_agreeing_with_prediction >= step.n_needed
 
 
 def test_a_first_frame_is_explained_without_a_motion() -> None:

@@ -94,10 +94,10 @@ def test_the_caption_says_when_the_gate_would_leave_too_few() -> None:
         )
         step = explain_frame(source, 2, config=config).refinement
         assert step is not None
-        assert step.n_within is not None
+        assert step.n_within_gate is not None
         n_before, n_after = (int(each.sum()) for each in step.inliers)
-        is_kept = step.n_within < n_before // 2
-        assert n_after == (n_before if is_kept else step.n_within)
+        is_kept = step.n_within_gate < n_before // 2
+        assert n_after == (n_before if is_kept else step.n_within_gate)
         assert words in draw_residuals(explained("stereo", 2), step).caption
 
 
