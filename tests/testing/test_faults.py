@@ -164,7 +164,7 @@ def test_a_share_of_the_frames_is_dropped_from_both_streams_alike() -> None:
     assert stamps(other) != left
 
 
-def test_one_stream_alone_can_be_struck() -> None:
+def test_one_stream_alone_can_be_affected() -> None:
     source = FaultySource(Small(), Dropped(streams=(1,)), Black(streams=(1,)))
     assert (len(stamps(source, 0)), len(stamps(source, 1))) == (_N, 0)
     assert load(source, 3).any()
@@ -182,14 +182,14 @@ def test_the_same_seed_gives_the_same_bytes_in_any_order(name: str) -> None:
 
 
 @pytest.mark.parametrize("fault", _PLAIN_PIXEL_FAULTS, ids=repr)
-def test_pixels_of_struck_images_change_and_of_no_others(fault: Fault) -> None:
+def test_pixels_of_affected_images_change_and_of_no_others(fault: Fault) -> None:
     sound = Small()
     source = FaultySource(sound, replace(fault, first=2, end=4, streams=(0,)))
     for frame in range(_N):
         for stream in (0, 1):
             now, before = load(source, frame, stream), sound.pixels(frame, stream)
-            is_struck = frame in (2, 3) and stream == 0
-            assert (now.dtype != before.dtype or not np.array_equal(now, before)) == is_struck
+            is_affected = frame in (2, 3) and stream == 0
+            assert (now.dtype != before.dtype or not np.array_equal(now, before)) == is_affected
     assert stamps(source) == list(range(_N))
 
 
