@@ -19,6 +19,7 @@ from gvo.errors import RecordingError
 
 Fault = Callable[[Any], Any]
 _RNG = np.random.default_rng(5)
+WORLDS = [pytest.param("driving", marks=pytest.mark.acceptance), "handheld"]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +99,7 @@ def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
         (darker_right, {"left/right: brightness ratio"}),
     ],
 )
-@pytest.mark.parametrize("world", ["driving", "handheld"])
+@pytest.mark.parametrize("world", WORLDS)
 def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
     bench: Any, world: str, fault: Fault, expected: set[str]
 ) -> None:
@@ -107,7 +108,7 @@ def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
     assert expected <= found <= expected | {"left/right: row offset"}
 
 
-@pytest.mark.parametrize("world", ["driving", "handheld"])
+@pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize(("n_frames", "word"), [(1, "late"), (-1, "early")])
 def test_a_stream_that_lags_by_a_frame_is_found_although_its_stamps_are_right(
     bench: Any, world: str, n_frames: int, word: str
@@ -134,7 +135,7 @@ def test_a_baseline_in_another_unit_is_found(bench: Any, factor: float, verdict:
 
 
 @pytest.mark.parametrize("k1", [-0.3, 0.25])
-@pytest.mark.parametrize("world", ["driving", "handheld"])
+@pytest.mark.parametrize("world", WORLDS)
 def test_a_lens_that_was_not_rectified_is_found_though_rows_hardly_differ(
     bench: Any, world: str, k1: float
 ) -> None:
