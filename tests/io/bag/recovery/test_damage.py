@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.errors import RecordingError
@@ -104,7 +104,6 @@ def test_the_walk_finds_all_messages_in_their_order(bags: dict[str, Path], name:
 
 
 @pytest.mark.parametrize("name", _KINDS)
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_of_a_bag_cut_anywhere_the_start_is_read(
     bags: dict[str, Path], name: str, data: st.DataObject
@@ -137,7 +136,6 @@ def _check_cut(path: Path, n_bytes: int) -> None:
 
 
 @pytest.mark.parametrize("name", [*_KINDS, _DATABASE])
-@settings(max_examples=80, deadline=None)
 @given(data=st.data())
 def test_changed_bytes_are_refused_or_read_around(
     bags: dict[str, Path], name: str, data: st.DataObject
@@ -147,7 +145,6 @@ def test_changed_bytes_are_refused_or_read_around(
 
 
 @pytest.mark.parametrize("name", ["bz2.bag", "none.mcap", "lz4.mcap", "zstd.mcap"])
-@settings(max_examples=80, deadline=None)
 @given(data=st.data())
 def test_of_chunks_with_a_checksum_none_that_was_changed_is_read(
     bags: dict[str, Path], name: str, data: st.DataObject
@@ -251,7 +248,6 @@ def test_a_bag_without_an_index_misses_nothing(bags: dict[str, Path], name: str)
 
 
 @pytest.mark.parametrize("name", _CLOSED[:3])
-@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_a_bag_without_an_index_is_read_up_to_its_last_chunk(
     bags: dict[str, Path], name: str, data: st.DataObject
@@ -317,7 +313,6 @@ def test_a_log_that_is_not_part_of_a_database_is_told(bags: dict[str, Path]) -> 
     path.with_name(f"{path.name}-wal").unlink()
 
 
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_database_cut_anywhere_is_refused(bags: dict[str, Path], data: st.DataObject) -> None:
     n_bytes = data.draw(st.integers(16, bags[_DATABASE].stat().st_size - 1))
