@@ -16,7 +16,7 @@ from pathlib import Path
 import gvo
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import one_opencv_thread
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop
@@ -98,7 +98,7 @@ def time_alone(
 def time_run(source: Source, excerpt: Excerpt, film: Path | None) -> float:
     """Return wall milliseconds per frame of a whole run."""
     loop = RunLoop(
-        source, gvo.load_configuration(), OutputFrame(source.info.frame_id), excerpt=excerpt
+        source, gvo.load_configuration(), BaseFrame(source.info.frame_id), excerpt=excerpt
     )
     start = time.perf_counter()
     if film is None:

@@ -18,7 +18,7 @@ from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, OutputError, RunBusyError
 from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions, open_recording
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
@@ -223,7 +223,7 @@ def _find_finished(
         return None
     if not isinstance(summary, dict) or summary.get("state") != "complete":
         return None
-    identity = run_identity(source, OutputFrame(source.info.frame_id), options.batch.excerpt)
+    identity = run_identity(source, BaseFrame(source.info.frame_id), options.batch.excerpt)
     there = summary.get("run"), summary.get("configuration")
     if there != (identity, task.config.model_dump(mode="json")):
         return None

@@ -141,11 +141,11 @@ def _refuse_for_a_run(folder: Path, given: Mapping[str, object]) -> None:
 
 def _find_truth(source: Source) -> Trajectory | None:
     """Return what the recording itself names its ground truth; it is not needed to watch."""
-    from gvo.io.poses.inputs import own_truth
+    from gvo.io.poses.inputs import recorded_truth
     from gvo.types import Failure
 
     try:
-        truth = own_truth(source)
+        truth = recorded_truth(source)
     except GvoError as error:
         warn([f"no ground truth: {error}"])
         return None

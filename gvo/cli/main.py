@@ -161,7 +161,7 @@ def run(
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.io.excerpt import make_excerpt
     from gvo.io.poses.base_frame import parse_initial_pose
-    from gvo.io.poses.inputs import asked_truth, choose_frame
+    from gvo.io.poses.inputs import find_base_frame, read_truth
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
@@ -173,8 +173,10 @@ def run(
     )
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
-    placed = choose_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
-    truth = None if ground_truth is None else asked_truth(source, ground_truth, frame=placed)
+    base_frame = find_base_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
+    truth = (
+        None if ground_truth is None else read_truth(source, ground_truth, base_frame=base_frame)
+    )
     for line in source.info.decisions:
         typer.echo(line)
     with (
@@ -187,7 +189,7 @@ def run(
             out,
             config=parameters,
             ground_truth=truth,
-            frame=placed,
+            base_frame=base_frame,
             starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
             outputs=outputs,

@@ -32,7 +32,7 @@ def report(result: RunResult, out: Path) -> NoReturn:
     """Print what a run of odometry gave, and end with its exit code."""
     from gvo.trajectory.evaluation import format_evaluations
 
-    for key in ("frame", "ground_truth"):
+    for key in ("base_frame", "ground_truth"):
         typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False)

@@ -11,7 +11,7 @@ from gvo.config import Config
 from gvo.errors import OutputError, RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, is_lost, one_opencv_thread
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
@@ -19,7 +19,7 @@ from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Pro
 
 
 class Output(Protocol):
-    """What writes a run as it goes; all poses are of the frame that was asked for."""
+    """What writes a run as it goes; all poses are of the base frame."""
 
     def add_frame(self, frame: Any, result: FrameResult) -> None:  # noqa: ANN401
         """Write what one frame gave, and the smoothed poses that are final with it."""
@@ -39,12 +39,12 @@ class RunLoop:
     source : Source
         The recording.
     config : Config
-    frame : OutputFrame
+    base_frame : BaseFrame
         Whose poses are written.
     excerpt : Excerpt, optional
         Which frames are read; all where omitted.
     first_pose : callable, optional
-        Returns T_world_frame, shape (4, 4), of the first frame by its stamp.
+        Returns T_world_base, shape (4, 4), of the first frame by its stamp.
     items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
         The frames in another order than that of the recording.
 
@@ -58,7 +58,7 @@ class RunLoop:
         self,
         source: Source,
         config: Config,
-        frame: OutputFrame,
+        base_frame: BaseFrame,
         *,
         excerpt: Excerpt | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
@@ -66,7 +66,7 @@ class RunLoop:
     ) -> None:
         self.source = source
         self.config = config
-        self.frame = frame
+        self.base_frame = base_frame
         self.statistics = RunStatistics()
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
@@ -114,8 +114,8 @@ class RunLoop:
         window = self._odometry.window
         self.statistics.window, self.statistics.polish = window.counts, window.polish
         self.statistics.rig_offsets = self._odometry.rig_offsets
-        self.statistics.n_guessed = self.frame.n_guessed
-        self.statistics.mount_travel_m = self.frame.mount_travel_m
+        self.statistics.n_guessed = self.base_frame.n_guessed
+        self.statistics.mount_travel_m = self.base_frame.mount_travel_m
 
     def _n_expected(self, stamp_ns: int) -> int:
         """Estimate how many images are to come in all, from the stamps so far."""
@@ -147,17 +147,17 @@ class RunLoop:
             yield item
 
     def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
-        """Count a frame, and give the outputs its poses as those of the frame asked for."""
+        """Count a frame, and give the outputs its poses as those of the base frame."""
         if isinstance(item, FaultyFrame):
             self._take_faulty(item, outputs)
             return
-        if self._first_pose is not None and self.frame.first_stamp_ns is None:
-            self.frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
+        if self._first_pose is not None and self.base_frame.first_stamp_ns is None:
+            self.base_frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
         result = self._odometry.track(item)
         placed = replace(
             result,
-            raw=self.frame.apply(result.raw),
-            causal=self.frame.apply(result.causal),
+            raw=self.base_frame.apply(result.raw),
+            causal=self.base_frame.apply(result.causal),
             finished=self._placed(result.finished),
             stage_ms={"read": self._read_ms, **result.stage_ms},
         )
@@ -173,4 +173,4 @@ class RunLoop:
             output.add_faulty(item)
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
-        return tuple(self.frame.apply(estimate) for estimate in estimates)
+        return tuple(self.base_frame.apply(estimate) for estimate in estimates)

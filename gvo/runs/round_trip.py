@@ -14,7 +14,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, pair_limit_key
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder
 from gvo.runs.loop import RunLoop
@@ -275,8 +275,8 @@ def run_round_trip(
     """
     config = config or Config()
     way = RoundTripFrames(source, config, excerpt)
-    frame = OutputFrame(source.info.frame_id)
-    loop = RunLoop(source, config, frame, excerpt=excerpt, items=way)
+    base_frame = BaseFrame(source.info.frame_id)
+    loop = RunLoop(source, config, base_frame, excerpt=excerpt, items=way)
     with RunFolder(Path(out)) as folder:
         loop.run([folder], None if on_progress is None else _doubled(on_progress))
     turn_ns = way.turn_ns

@@ -14,9 +14,9 @@ import numpy as np
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.io.excerpt import Excerpt
-from gvo.io.poses.base_frame import OutputFrame
-from gvo.io.poses.inputs import initial_pose, own_truth
-from gvo.io.poses.truth import FramedTruth, TruthComparison
+from gvo.io.poses.base_frame import BaseFrame
+from gvo.io.poses.inputs import initial_pose, recorded_truth
+from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.writer import (
     PICTURE,
@@ -66,8 +66,8 @@ def run_recording(
     out: str | Path,
     *,
     config: Config | None = None,
-    ground_truth: Trajectory | FramedTruth | None = None,
-    frame: OutputFrame | None = None,
+    ground_truth: Trajectory | Truth | None = None,
+    base_frame: BaseFrame | None = None,
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
@@ -83,9 +83,9 @@ def run_recording(
         Folder for the trajectories, covariances, tables, summary and report; a run that is there
         is replaced.
     config : Config, optional
-    ground_truth : Trajectory or FramedTruth, optional
-        Poses of the frame asked for; the recording's own where omitted.
-    frame : OutputFrame, optional
+    ground_truth : Trajectory or Truth, optional
+        Poses of the base frame; the recording's own where omitted.
+    base_frame : BaseFrame, optional
         Whose poses are written, and where they start; the camera's, from the identity, where
         omitted.
     starts_at_truth : bool
@@ -111,20 +111,20 @@ def run_recording(
         When another process is writing a run into the folder.
     """
     config = config or Config()
-    frame = frame or OutputFrame(source.info.frame_id)
-    truth = _find_truth(source, ground_truth, frame)
+    base_frame = base_frame or BaseFrame(source.info.frame_id)
+    truth = _find_truth(source, ground_truth, base_frame)
     outputs = outputs or RunOutputs()
-    start = truth.trajectory if starts_at_truth and isinstance(truth, FramedTruth) else None
-    identity = run_identity(source, frame, excerpt, start=start)
+    start = truth.trajectory if starts_at_truth and isinstance(truth, Truth) else None
+    identity = run_identity(source, base_frame, excerpt, start=start)
     with ExitStack() as stack, ExitStack() as files:
-        is_placed = frame.is_placed or starts_at_truth
-        others, notes = outputs.open(source, frame, files, config=config, is_placed=is_placed)
+        is_placed = base_frame.is_placed or starts_at_truth
+        others, notes = outputs.open(source, base_frame, files, config=config, is_placed=is_placed)
         stack.enter_context(written_alone(Path(out)))
         folder = files.enter_context(RunFolder(Path(out)))
         loop = RunLoop(
             source,
             config,
-            frame,
+            base_frame,
             excerpt=excerpt,
             first_pose=partial(initial_pose, truth) if starts_at_truth else None,
         )
@@ -157,21 +157,21 @@ class _Fault(Failure):
 
 
 def _find_truth(
-    source: Source, given: Trajectory | FramedTruth | None, frame: OutputFrame
-) -> FramedTruth | Failure:
+    source: Source, given: Trajectory | Truth | None, base_frame: BaseFrame
+) -> Truth | Failure:
     if isinstance(given, Trajectory):
-        return FramedTruth(trajectory=given, decision="given")
+        return Truth(trajectory=given, decision="given")
     if given is not None:
         return given
     try:
-        return own_truth(source, frame=frame)
+        return recorded_truth(source, base_frame=base_frame)
     except GvoError as error:
         # What was not asked for must not keep the run from being made.
         return _Fault(reason=str(error))
 
 
 def _compare(
-    truth: FramedTruth | Failure,
+    truth: Truth | Failure,
     folder: RunFolder,
     loop: RunLoop,
     estimates: dict[str, Trajectory],
@@ -251,7 +251,7 @@ def _draw(
     write_run_report(folder.path / REPORT, read_run(folder.path), plots=plots)
 
 
-def _within(truth: FramedTruth, folder: RunFolder, loop: RunLoop) -> FramedTruth:
+def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
     """Give poses without stamps, one for each frame, their stamps; cut the truth to an excerpt."""
     stamps_ns = folder.frame_stamps_ns()
     trajectory = truth.trajectory

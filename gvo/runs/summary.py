@@ -18,7 +18,7 @@ from gvo._version import __version__
 from gvo.errors import GvoError, OutputError
 from gvo.geometry.camera import Calibration
 from gvo.io.excerpt import Excerpt
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.truth import TruthComparison
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import RunFolder
@@ -70,7 +70,7 @@ def summarize(
         "recording": info.name,
         "sensor": info.sensor,
         "decisions": list(info.decisions),
-        "frame": _frame_text(loop.frame),
+        "base_frame": _frame_text(loop.base_frame),
         "ground_truth": truth,
         "T_frame_truth": point,
         "ground_truth_stamps_from": stamps_from,
@@ -98,13 +98,13 @@ def peak_memory_mb() -> float:
     return peak * unit / 1e6
 
 
-def _frame_text(frame: OutputFrame) -> str:
-    return ", ".join(text for text in (frame.name or "camera", frame.origin) if text)
+def _frame_text(base_frame: BaseFrame) -> str:
+    return ", ".join(text for text in (base_frame.name or "camera", base_frame.origin) if text)
 
 
 def run_identity(
     source: Source,
-    frame: OutputFrame,
+    base_frame: BaseFrame,
     excerpt: Excerpt | None,
     *,
     start: Trajectory | None = None,
@@ -115,7 +115,7 @@ def run_identity(
     ----------
     source : Source
         Of its images the first one of either stream is read.
-    frame : OutputFrame
+    base_frame : BaseFrame
         Before the first frame.
     excerpt : Excerpt or None
     start : Trajectory, optional
@@ -131,9 +131,9 @@ def run_identity(
         "recording": _describe_recording(source),
         "excerpt": asdict(excerpt or Excerpt()),
         "output": {
-            "frame": frame.name,
-            "mount": _digest_of(frame.fixed_mount),
-            "initial pose": _digest_of(frame.T_initial),
+            "frame": base_frame.name,
+            "mount": _digest_of(base_frame.fixed_mount),
+            "initial pose": _digest_of(base_frame.T_initial),
             "true start": "" if start is None else _digest_of(start.T_world_cam),
         },
     }

@@ -114,7 +114,7 @@ def test_wheel_odometry_is_no_truth(command: Command, robot_bag: Path, tmp_path:
     assert json.loads((tmp_path / "summary.json").read_text())["errors"] == []
 
 
-def test_an_obvious_truth_is_found_and_told(
+def test_a_named_truth_is_found_and_told(
     command: Command, walk_bag: Path, walk_run: Path, tmp_path: Path
 ) -> None:
     bag = PoseBag(tmp_path / "vicon.mcap")

@@ -13,7 +13,7 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.excerpt import Excerpt
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.loop import RunLoop
@@ -84,11 +84,11 @@ def walk() -> Rendered:
     return Rendered()
 
 
-def loop_over(source: Rendered, frame: OutputFrame | None = None, **options: Any) -> RunLoop:
-    return RunLoop(source, Config(), frame or OutputFrame(CAMERA), **options)
+def loop_over(source: Rendered, frame: BaseFrame | None = None, **options: Any) -> RunLoop:
+    return RunLoop(source, Config(), frame or BaseFrame(CAMERA), **options)
 
 
-def run(source: Rendered, frame: OutputFrame | None = None, **options: Any) -> tuple[Kept, RunLoop]:
+def run(source: Rendered, frame: BaseFrame | None = None, **options: Any) -> tuple[Kept, RunLoop]:
     kept, loop = Kept(), loop_over(source, frame, **options)
     loop.run([kept], None)
     return kept, loop
@@ -107,9 +107,9 @@ def test_all_outputs_are_given_all_frames_and_each_smoothed_pose_once(walk: Rend
 
 def test_all_poses_are_of_the_frame_asked_for(walk: Rendered) -> None:
     camera = run(walk)[0].poses()
-    base = run(walk, OutputFrame("base_link", T_BASE_CAM))[0].poses()
+    base = run(walk, BaseFrame("base_link", T_BASE_CAM))[0].poses()
     T_initial = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
-    placed = run(walk, OutputFrame("base_link", T_BASE_CAM, T_initial=T_initial))[0].poses()
+    placed = run(walk, BaseFrame("base_link", T_BASE_CAM, T_initial=T_initial))[0].poses()
     for name, poses in camera.items():
         expected = moved_by_hand(poses, T_BASE_CAM)
         np.testing.assert_allclose(base[name], expected, atol=1e-12)

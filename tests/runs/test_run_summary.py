@@ -14,7 +14,7 @@ import gvo
 from gvo.errors import RecordingError
 from gvo.geometry.se3 import make_transform
 from gvo.io.excerpt import Excerpt
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.summary import run_identity
@@ -46,7 +46,7 @@ class Recording:
 
 
 def identity(recording: Recording | None = None, **options: Any) -> dict[str, Any]:
-    asked: dict[str, Any] = {"frame": OutputFrame("camera"), "excerpt": None}
+    asked: dict[str, Any] = {"base_frame": BaseFrame("camera"), "excerpt": None}
     return run_identity(recording or Recording(), **(asked | options))
 
 
@@ -77,9 +77,9 @@ def test_the_same_run_is_the_same_as_a_file_gives_it_back() -> None:
         {"recording": other_calibration(Recording())},
         {"excerpt": Excerpt(every=2)},
         {"excerpt": Excerpt(duration_s=5.0)},
-        {"frame": OutputFrame("base_link")},
-        {"frame": OutputFrame("camera", MOVED)},
-        {"frame": OutputFrame("camera", T_initial=MOVED)},
+        {"base_frame": BaseFrame("base_link")},
+        {"base_frame": BaseFrame("camera", MOVED)},
+        {"base_frame": BaseFrame("camera", T_initial=MOVED)},
         {"start": Trajectory(stamps_ns=np.array([1]), T_world_cam=np.eye(4)[np.newaxis])},
     ],
 )

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.inputs import asked_truth, choose_frame
+from gvo.io.poses.inputs import find_base_frame, read_truth
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_covariances, write_kitti
@@ -340,9 +340,9 @@ def test_poses_and_covariances_of_the_base_follow_from_those_of_the_camera(
 ) -> None:
     source = gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
     result = gvo.run_recording(
-        source, tmp_path / "out", outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+        source, tmp_path / "out", outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
     )
-    assert result.summary["frame"] == "base_link"
+    assert result.summary["base_frame"] == "base_link"
     assert result.is_complete
     _assert_moved(tmp_path / "out", walk_run, T_BASE_CAM)
 
@@ -370,7 +370,7 @@ def test_a_camera_on_a_head_that_turns_is_placed_at_each_stamp(
     source = gvo.open_recording([walk_bag, bag.write()])
     out = tmp_path / "out"
     result = gvo.run_recording(
-        source, out, outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+        source, out, outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
     )
     assert result.warnings == ()
     _assert_moved(out, walk_run, _panned(STAMPS_NS))
@@ -383,7 +383,7 @@ def test_a_head_of_which_tf_tells_too_late_is_guessed_with_a_warning(
     source = gvo.open_recording([walk_bag, bag.write()])
     out = tmp_path / "out"
     result = gvo.run_recording(
-        source, out, outputs=NO_REPORT, frame=choose_frame(source, "base_link")
+        source, out, outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
     )
     assert result.warnings[0].startswith("tf does not say where the camera is")
     assert "at 3 stamps" in result.warnings[0]
@@ -400,10 +400,10 @@ def test_a_run_that_starts_at_the_truth_lies_on_it_without_alignment(
     for stamp_ns, T in zip(stamps_ns.tolist(), T_map_base, strict=True):
         bag.tf(stamp_ns, "map", "base_link", T)
     source = gvo.open_recording([walk_bag, bag.write()])
-    frame = choose_frame(source, "base_link")
-    truth = asked_truth(source, "tf:map:base_link", frame=frame)
+    base_frame = find_base_frame(source, "base_link")
+    truth = read_truth(source, "tf:map:base_link", base_frame=base_frame)
     result = gvo.run_recording(
-        source, tmp_path / "out", ground_truth=truth, frame=frame, starts_at_truth=True
+        source, tmp_path / "out", ground_truth=truth, base_frame=base_frame, starts_at_truth=True
     )
     exact = T_map_world @ true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
     for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):
@@ -427,7 +427,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
     for stamp_ns, place in zip(stamps_ns.tolist(), geodetic(antenna), strict=True):
         bag.fix(stamp_ns, place)
     source = gvo.open_recording([walk_bag, bag.write()])
-    truth = asked_truth(source, "/fix")
+    truth = read_truth(source, "/fix")
     result = gvo.run_recording(source, tmp_path / "out", outputs=NO_REPORT, ground_truth=truth)
     assert result.warnings == ()
     exact = true_poses(STAMPS_NS)

@@ -33,7 +33,7 @@ from gvo.io.calibration.files import CalibrationPaths, paths_of
 from gvo.io.images import MILLIMETRES, GreyRange
 from gvo.io.poses.ground_truth import TRUTH_FRAMES, BagTruthSpec
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import FramedTruth, find_framed_truth
+from gvo.io.poses.truth import Truth, find_truth
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
@@ -167,7 +167,7 @@ class BagSource:
         *,
         frame: str = "",
         T_frame_cam: FloatArray | None = None,
-    ) -> FramedTruth | Failure:
+    ) -> Truth | Failure:
         """Return true poses of a frame.
 
         Parameters
@@ -181,7 +181,7 @@ class BagSource:
 
         Returns
         -------
-        FramedTruth or Failure
+        Truth or Failure
             The failure says why there is none, or why it cannot be compared.
 
         Raises
@@ -190,7 +190,7 @@ class BagSource:
             When the bag does not hold what was asked for.
         """
         whole = self.transforms((TRUTH_FRAMES.parent, TRUTH_FRAMES.child))
-        return find_framed_truth(
+        return find_truth(
             self._reader,
             spec,
             buffer=whole if whole.is_whole else None,
@@ -209,7 +209,7 @@ class BagSource:
             When the bag cannot be read.
         """
         found = self.truth()
-        return found.trajectory if isinstance(found, FramedTruth) else None
+        return found.trajectory if isinstance(found, Truth) else None
 
     def _choose_topics(self, choice: TopicChoice) -> CameraTopics:
         try:

@@ -28,7 +28,7 @@ _NORM_TOLERANCE = 1e-2
 _ROTATION_TOLERANCE = 1e-3
 
 
-class OutputFrame:
+class BaseFrame:
     """Turns poses of the camera into poses of the frame asked for.
 
     The world is chosen so that the first pose is the initial pose. The first estimate given to
@@ -91,7 +91,7 @@ class OutputFrame:
         *,
         T_initial: FloatArray | None = None,
         where: str = "the recording",
-    ) -> OutputFrame:
+    ) -> BaseFrame:
         """Take the camera's place in a frame from `/tf`.
 
         Parameters

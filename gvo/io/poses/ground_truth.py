@@ -276,7 +276,7 @@ def is_named_truth(topic: str) -> bool:
     return _IS_TRUTH.search(topic.lower()) is not None
 
 
-def find_obvious_truth(
+def find_named_truth(
     reader: BagReader, buffer: TfBuffer | None = None, *, where: str
 ) -> BagTruth | Failure:
     """Find the ground truth that names itself: `world` -> `ground_truth` in tf, or one topic.

@@ -14,18 +14,18 @@ from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.bag.reader import BagReader
 from gvo.io.bag.source import BagSource
 from gvo.io.opening import is_bag, open_recording
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.ground_truth import (
     TRUTH_TYPES,
     BagTruth,
     FileTruth,
-    find_obvious_truth,
+    find_named_truth,
     parse_bag_truth,
     parse_truth,
     read_bag_truth,
 )
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import FramedTruth, in_frame
+from gvo.io.poses.truth import Truth, in_frame
 from gvo.io.recording import Source
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
@@ -125,7 +125,7 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
 def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     if what:
         return read_bag_truth(reader, parse_bag_truth(what), where=path)
-    truth = find_obvious_truth(reader, where=path)
+    truth = find_named_truth(reader, where=path)
     if not isinstance(truth, Failure):
         return truth
     held = [f"{path}{_MARK}{topic.name}" for topic in reader.topics if topic.type in TRUTH_TYPES]
@@ -152,9 +152,9 @@ def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -
     return replace(found, warning="; ".join(filter(None, [found.warning, apart])))
 
 
-def choose_frame(
+def find_base_frame(
     source: Source, name: str | None = None, *, T_initial: FloatArray | None = None
-) -> OutputFrame:
+) -> BaseFrame:
     """Find how the camera sits in the frame whose poses are asked for.
 
     Parameters
@@ -174,12 +174,12 @@ def choose_frame(
     """
     info = source.info
     if name is None:
-        return OutputFrame(info.frame_id, T_initial=T_initial)
+        return BaseFrame(info.frame_id, T_initial=T_initial)
     name = name.strip("/")
     if isinstance(source, BagSource):
         buffer = source.transforms((name, info.frame_id))
         if info.T_body_cam is None or name in buffer.frames:
-            return OutputFrame.from_tf(
+            return BaseFrame.from_tf(
                 buffer, name, info.frame_id, T_initial=T_initial, where=info.name
             )
     if info.T_body_cam is None:
@@ -187,12 +187,12 @@ def choose_frame(
             f"{info.name}: --frame {name}: the recording does not say where the camera is on it; "
             "give a calibration with the camera's pose on the body by --calibration FILE"
         )
-    placed = OutputFrame(name, info.T_body_cam, T_initial=T_initial)
+    placed = BaseFrame(name, info.T_body_cam, T_initial=T_initial)
     placed.origin = "the body on which the calibration places the camera"
     return placed
 
 
-def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) -> FramedTruth:
+def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None) -> Truth:
     """Read the true poses that were asked for.
 
     Parameters
@@ -202,7 +202,7 @@ def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) 
     text : str
         `tf:PARENT:CHILD` or a topic of the recording, which must be a bag; or a file of poses,
         or another recording, of the frame that is asked for.
-    frame : OutputFrame, optional
+    base_frame : BaseFrame, optional
         Whose poses are asked for; the camera's where omitted.
 
     Raises
@@ -210,33 +210,33 @@ def asked_truth(source: Source, text: str, *, frame: OutputFrame | None = None) 
     RecordingError, TrajectoryError
         When it cannot be read, or tf does not bring it to the frame.
     """
-    frame = frame or OutputFrame()
+    base_frame = base_frame or BaseFrame()
     spec = parse_truth(text)
     if isinstance(spec, FileTruth):
-        return FramedTruth(trajectory=read_ground_truth(spec.path), decision=str(spec.path))
+        return Truth(trajectory=read_ground_truth(spec.path), decision=str(spec.path))
     if not isinstance(source, BagSource):
         raise TrajectoryError(
             f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
         )
-    truth = source.truth(spec, frame=_name_in_tf(frame), T_frame_cam=frame.fixed_mount)
+    truth = source.truth(spec, frame=_name_in_tf(base_frame), T_frame_cam=base_frame.fixed_mount)
     if isinstance(truth, Failure):
         raise TrajectoryError(f"--ground-truth {text}: {truth.reason}")
     return truth
 
 
-def own_truth(source: Source, *, frame: OutputFrame | None = None) -> FramedTruth | Failure:
+def recorded_truth(source: Source, *, base_frame: BaseFrame | None = None) -> Truth | Failure:
     """Read what a recording itself names its ground truth.
 
     Parameters
     ----------
     source : Source
         The recording.
-    frame : OutputFrame, optional
+    base_frame : BaseFrame, optional
         Whose poses are asked for; the camera's where omitted.
 
     Returns
     -------
-    FramedTruth or Failure
+    Truth or Failure
         The failure says why there is none, or why it cannot be compared.
 
     Raises
@@ -244,13 +244,13 @@ def own_truth(source: Source, *, frame: OutputFrame | None = None) -> FramedTrut
     RecordingError, TrajectoryError
         When it cannot be read.
     """
-    frame = frame or OutputFrame()
+    base_frame = base_frame or BaseFrame()
     if isinstance(source, BagSource):
-        return source.truth(frame=_name_in_tf(frame), T_frame_cam=frame.fixed_mount)
+        return source.truth(frame=_name_in_tf(base_frame), T_frame_cam=base_frame.fixed_mount)
     truth = source.ground_truth()
     if truth is None:
         return Failure(reason="the recording holds none")
-    return FramedTruth(trajectory=frame.convert(truth), decision="of the recording")
+    return Truth(trajectory=base_frame.convert(truth), decision="of the recording")
 
 
 def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
@@ -335,12 +335,12 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     return truth
 
 
-def initial_pose(truth: FramedTruth | Failure, stamp_ns: int) -> FloatArray:
+def initial_pose(truth: Truth | Failure, stamp_ns: int) -> FloatArray:
     """Return the true pose of the first frame.
 
     Parameters
     ----------
-    truth : FramedTruth or Failure
+    truth : Truth or Failure
         In the frame that is asked for.
     stamp_ns : int
         Of the first frame, nanoseconds.
@@ -368,8 +368,8 @@ def initial_pose(truth: FramedTruth | Failure, stamp_ns: int) -> FloatArray:
     return first
 
 
-def _name_in_tf(frame: OutputFrame) -> str:
-    return "" if frame.is_camera else frame.name
+def _name_in_tf(base_frame: BaseFrame) -> str:
+    return "" if base_frame.is_camera else base_frame.name
 
 
 def _short_names(texts: Sequence[str], names: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.io.bag.reader import BagReader
-from gvo.io.poses.ground_truth import BagTruth, BagTruthSpec, find_obvious_truth, read_bag_truth
+from gvo.io.poses.ground_truth import BagTruth, BagTruthSpec, find_named_truth, read_bag_truth
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.poses.tf_paths import bare
 from gvo.trajectory.evaluation import Evaluation, evaluate
@@ -18,7 +18,7 @@ from gvo.types import BoolArray, Failure, FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FramedTruth:
+class Truth:
     """True poses to be compared with the estimates of one frame.
 
     Parameters
@@ -56,7 +56,7 @@ class _Place:
         return self.name or "the camera, whose frame the recording does not name"
 
 
-def find_framed_truth(
+def find_truth(
     reader: BagReader,
     spec: BagTruthSpec | None = None,
     *,
@@ -65,14 +65,14 @@ def find_framed_truth(
     camera_frame: str = "",
     T_frame_cam: FloatArray | None = None,
     buffer: TfBuffer | None = None,
-) -> FramedTruth | Failure:
-    """Read the truth that was asked for, or the obvious one, in the frame that is estimated.
+) -> Truth | Failure:
+    """Read the truth that was asked for, or the named one, in the frame that is estimated.
 
     Parameters
     ----------
     reader : BagReader
     spec : TfTruth or TopicTruth, optional
-        What to read; omitted: what names itself ground truth, see `find_obvious_truth`.
+        What to read; omitted: what names itself ground truth, see `find_named_truth`.
     where : str
         The bag, for messages.
     frame, camera_frame, T_frame_cam
@@ -82,7 +82,7 @@ def find_framed_truth(
 
     Returns
     -------
-    FramedTruth or Failure
+    Truth or Failure
         The failure says why there is none, or why it cannot be compared.
 
     Raises
@@ -92,7 +92,7 @@ def find_framed_truth(
     """
     truth: BagTruth | Failure
     if spec is None:
-        truth = find_obvious_truth(reader, buffer, where=where)
+        truth = find_named_truth(reader, buffer, where=where)
         if isinstance(truth, Failure):
             return truth
     else:
@@ -110,12 +110,12 @@ def in_frame(
     frame: str = "",
     camera_frame: str = "",
     T_frame_cam: FloatArray | None = None,
-) -> FramedTruth | Failure:
+) -> Truth | Failure:
     """Bring true poses into the frame that is estimated: T_parent_child @ T_child_frame.
 
     Where the messages name no child frame, they are taken for poses of the frame itself.
     Positions without rotations stay: estimates are moved to the point instead, by
-    `FramedTruth.comparable`; where the place of the point in the frame is not known it is taken
+    `Truth.comparable`; where the place of the point in the frame is not known it is taken
     for the frame's origin, with a warning.
 
     Parameters
@@ -132,7 +132,7 @@ def in_frame(
 
     Returns
     -------
-    FramedTruth or Failure
+    Truth or Failure
         The failure says why tf does not bring the child frame of poses to the frame.
     """
     camera = _Place(name=bare(camera_frame))
@@ -151,9 +151,7 @@ def in_frame(
     return _moved(truth, buffer, child, asked)
 
 
-def _moved(
-    truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place
-) -> FramedTruth | Failure:
+def _moved(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> Truth | Failure:
     trajectory = truth.trajectory
     T_child_asked, is_known, reason = _between(buffer, child, asked, trajectory)
     if not np.any(is_known):
@@ -169,7 +167,7 @@ def _moved(
     return replace(framed, trajectory=replace(trajectory.select(is_known), T_world_cam=poses))
 
 
-def _at_point(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> FramedTruth:
+def _at_point(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> Truth:
     T_asked_child, is_known, reason = _between(buffer, asked, child, truth.trajectory)
     framed = _framed(truth, "")
     points = T_asked_child[is_known, :3, 3]
@@ -204,8 +202,8 @@ def _between(
     return se3.invert(target.T_name_frame) @ T @ source.T_name_frame, is_known, reason
 
 
-def _framed(truth: BagTruth, how: str) -> FramedTruth:
-    return FramedTruth(trajectory=truth.trajectory, decision=f"{truth.decision}{how}")
+def _framed(truth: BagTruth, how: str) -> Truth:
+    return Truth(trajectory=truth.trajectory, decision=f"{truth.decision}{how}")
 
 
 # A truth that stands while the estimate moves is none of it.
@@ -219,24 +217,24 @@ class TruthComparison:
 
     Parameters
     ----------
-    truth : FramedTruth
+    truth : Truth
     estimates : dict of str to Trajectory
         By name; of the point that the truth measured, where that holds positions only.
     evaluations : tuple of Evaluation
         In the same order.
     """
 
-    truth: FramedTruth
+    truth: Truth
     estimates: dict[str, Trajectory]
     evaluations: tuple[Evaluation, ...]
 
     @classmethod
-    def of(cls, truth: FramedTruth, estimates: Mapping[str, Trajectory]) -> TruthComparison:
+    def of(cls, truth: Truth, estimates: Mapping[str, Trajectory]) -> TruthComparison:
         """Compare estimates of the frame that was asked for.
 
         Parameters
         ----------
-        truth : FramedTruth
+        truth : Truth
         estimates : mapping of str to Trajectory
 
         Raises

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gvo.config import Config
 from gvo.errors import ConfigurationError, RecordingError
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.runs.loop import Output
 from gvo.runs.outputs.frames import RunFrames
@@ -49,7 +49,7 @@ class RunOutputs:
     def open(
         self,
         source: Source,
-        frame: OutputFrame,
+        base_frame: BaseFrame,
         stack: ExitStack,
         *,
         config: Config,
@@ -61,7 +61,7 @@ class RunOutputs:
         ----------
         source : Source
             The recording.
-        frame : OutputFrame
+        base_frame : BaseFrame
             Whose poses are written.
         stack : ExitStack
             Closes what is opened.
@@ -88,7 +88,7 @@ class RunOutputs:
         if self.plots is not None:
             _make_folder(self.plots)
         if self.bag is not None or self.rerun is not None:
-            names = name_frames(source, frame, is_placed=is_placed, world=self.world)
+            names = name_frames(source, base_frame, is_placed=is_placed, world=self.world)
         if self.bag is not None:
             from gvo.runs.outputs.bag import RunBag
 
@@ -115,14 +115,14 @@ def _make_folder(path: Path) -> None:
         raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
+def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str) -> RunFrames:
     """Name the frames of a run for a bag.
 
     Parameters
     ----------
     source : Source
         The recording.
-    frame : OutputFrame
+    base_frame : BaseFrame
         Whose poses are written.
     is_placed : bool
         The first pose was asked for: the world is not that of the first frame.
@@ -135,14 +135,15 @@ def name_frames(source: Source, frame: OutputFrame, *, is_placed: bool, world: s
         When a name cannot be one.
     """
     try:
-        return _named(source, frame, is_placed=is_placed, world=world)
+        return _named(source, base_frame, is_placed=is_placed, world=world)
     except ValueError as error:
         raise ConfigurationError(f"--world {world}: {error}") from error
 
 
-def _named(source: Source, frame: OutputFrame, *, is_placed: bool, world: str) -> RunFrames:
+def _named(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str) -> RunFrames:
     camera = source.info.frame_id
-    if frame.is_camera:
+    if base_frame.is_camera:
         return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
-    mount = frame.T_frame_cam if frame.fixed_mount is None else frame.fixed_mount
-    return RunFrames(world=world, camera=camera, tracked=frame.name, T_tracked_cam=mount)
+    fixed = base_frame.fixed_mount
+    mount = base_frame.T_frame_cam if fixed is None else fixed
+    return RunFrames(world=world, camera=camera, tracked=base_frame.name, T_tracked_cam=mount)

@@ -199,7 +199,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
     coverage, memory = summary.get("coverage_percent"), summary.get("peak_memory_mb")
     return {
         "Sensor": str(summary.get("sensor", "")),
-        "Poses of": str(summary.get("frame", "")),
+        "Poses of": str(summary.get("base_frame", "")),
         "Frames": str(len(frames.stamps_ns)),
         "Duration": _duration(record),
         "Coverage": "" if coverage is None else f"{float(coverage):.1f} % of the frames tracked",

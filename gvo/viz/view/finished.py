@@ -57,7 +57,7 @@ def world_up(record: RunRecord) -> Up:
     """Return which axis points up: -y where the world is the first camera, else +z."""
     causal = record.trajectories["causal"]
     is_first = len(causal) == 0 or np.allclose(causal.T_world_cam[0], np.eye(4), atol=1e-6)
-    return "-y" if is_first and record.summary.get("frame", "camera") == "camera" else "+z"
+    return "-y" if is_first and record.summary.get("base_frame", "camera") == "camera" else "+z"
 
 
 def aligned_truth(record: RunRecord) -> Trajectory | None:

@@ -8,17 +8,17 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.errors import RecordingError, TrajectoryError
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.inputs import (
-    asked_truth,
-    choose_frame,
+    find_base_frame,
     initial_pose,
-    own_truth,
     read_compared,
     read_ground_truth,
     read_transforms,
+    read_truth,
+    recorded_truth,
 )
-from gvo.io.poses.truth import FramedTruth
+from gvo.io.poses.truth import Truth
 from gvo.io.recording import Source
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
@@ -43,15 +43,15 @@ def robot(walk_bag: Path, tmp_path: Path) -> Source:
 
 
 def test_the_camera_is_the_frame_that_nobody_asked_for(robot: Source) -> None:
-    frame = choose_frame(robot)
+    frame = find_base_frame(robot)
     assert frame.is_camera
     assert frame.name == CAMERA
-    assert choose_frame(Walk()).is_camera
+    assert find_base_frame(Walk()).is_camera
 
 
 @pytest.mark.parametrize("name", ["base_link", "/base_link"])
 def test_the_place_of_the_camera_comes_from_the_chain_of_tf(robot: Source, name: str) -> None:
-    frame = choose_frame(robot, name)
+    frame = find_base_frame(robot, name)
     assert frame.name == "base_link"
     assert frame.fixed_mount is not None
     np.testing.assert_allclose(frame.fixed_mount, T_BASE_CAM, atol=1e-12)
@@ -59,11 +59,11 @@ def test_the_place_of_the_camera_comes_from_the_chain_of_tf(robot: Source, name:
 
 def test_a_frame_that_nothing_connects_is_refused(robot: Source, walk_bag: Path) -> None:
     with pytest.raises(RecordingError, match=f"--frame gripper: no transform from .* {CAMERA}"):
-        choose_frame(robot, "gripper")
+        find_base_frame(robot, "gripper")
     with pytest.raises(RecordingError, match=r"walk: --frame base_link: .*--calibration FILE"):
-        choose_frame(gvo.open_recording(walk_bag), "base_link")
+        find_base_frame(gvo.open_recording(walk_bag), "base_link")
     with pytest.raises(RecordingError, match=r"walk: --frame body: .*--calibration FILE"):
-        choose_frame(Walk(), "body")
+        find_base_frame(Walk(), "body")
 
 
 def test_transforms_are_there_where_a_bag_holds_them(
@@ -93,10 +93,10 @@ def test_poses_of_the_base_are_brought_to_the_frame_asked_for(
         bag.pose("/robot", type_, stamp_ns, T, child="base_link")
         bag.tf(stamp_ns, "map", "base_link", T)
     source = gvo.open_recording([walk_bag, bag.write()])
-    frame = choose_frame(source, frame_name)
+    frame = find_base_frame(source, frame_name)
     expected = T_map_cam if frame_name is None else T_map_cam @ np.linalg.inv(T_BASE_CAM)
     for text in ("/robot", "topic:/robot", "tf:map:base_link"):
-        truth = asked_truth(source, text, frame=frame).trajectory
+        truth = read_truth(source, text, base_frame=frame).trajectory
         np.testing.assert_array_equal(truth.stamps_ns, stamps_ns)
         np.testing.assert_allclose(truth.T_world_cam, expected, atol=1e-9)
 
@@ -110,7 +110,7 @@ def test_poses_that_name_no_frame_are_of_the_frame_asked_for(
     for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
         bag.pose("/true/base", type_, stamp_ns, T)
     source = gvo.open_recording([walk_bag, bag.write()])
-    truth = asked_truth(source, "/true/base", frame=choose_frame(source, "base_link"))
+    truth = read_truth(source, "/true/base", base_frame=find_base_frame(source, "base_link"))
     np.testing.assert_allclose(truth.trajectory.T_world_cam, poses, atol=1e-12)
     assert "taken for base_link" in truth.decision
 
@@ -122,39 +122,39 @@ def test_poses_of_a_frame_that_nothing_connects_are_refused_where_asked_for(
     bag.pose("/robot", ODOMETRY, START_NS, np.eye(4), child="base_link")
     source = gvo.open_recording([walk_bag, bag.write()])
     with pytest.raises(TrajectoryError, match=r"--ground-truth /robot: it is of base_link"):
-        asked_truth(source, "/robot")
+        read_truth(source, "/robot")
 
 
 def test_what_is_in_a_bag_cannot_be_asked_of_a_folder(tmp_path: Path) -> None:
     with pytest.raises(TrajectoryError, match=r"/robot: names what is in a bag, and walk is none"):
-        asked_truth(Walk(), "/robot")
+        read_truth(Walk(), "/robot")
     write_tum(tmp_path / "poses.txt", Walk().true_poses())
-    truth = asked_truth(Walk(), str(tmp_path / "poses.txt"))
+    truth = read_truth(Walk(), str(tmp_path / "poses.txt"))
     np.testing.assert_allclose(truth.trajectory.T_world_cam, true_poses(STAMPS_NS), atol=1e-8)
 
 
 def test_the_truth_of_a_folder_follows_the_frame_asked_for() -> None:
-    found = own_truth(Walk(has_truth=True), frame=OutputFrame("body", T_BASE_CAM))
-    assert isinstance(found, FramedTruth)
+    found = recorded_truth(Walk(has_truth=True), base_frame=BaseFrame("body", T_BASE_CAM))
+    assert isinstance(found, Truth)
     expected = true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
     np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-12)
-    assert not own_truth(Walk())
+    assert not recorded_truth(Walk())
 
 
-def test_a_name_decides_what_is_the_obvious_truth(walk_bag: Path, tmp_path: Path) -> None:
+def test_a_name_decides_what_is_the_named_truth(walk_bag: Path, tmp_path: Path) -> None:
     poses = true_poses(STAMPS_NS)
     for topic, is_truth in (("/mocap/pose", True), ("/odom", False), ("/wheel/odometry", False)):
         bag = PoseBag(tmp_path / f"{topic.replace('/', '_')}.mcap")
         for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
             bag.pose(topic, ODOMETRY, stamp_ns, T, child=CAMERA)
-        found = own_truth(gvo.open_recording([walk_bag, bag.write()]))
-        assert isinstance(found, FramedTruth) is is_truth
-        if isinstance(found, FramedTruth):
+        found = recorded_truth(gvo.open_recording([walk_bag, bag.write()]))
+        assert isinstance(found, Truth) is is_truth
+        if isinstance(found, Truth):
             np.testing.assert_allclose(found.trajectory.T_world_cam, poses, atol=1e-12)
 
 
-def framed(trajectory: Trajectory) -> FramedTruth:
-    return FramedTruth(trajectory=trajectory, T_frame_point=np.eye(4), decision="")
+def framed(trajectory: Trajectory) -> Truth:
+    return Truth(trajectory=trajectory, T_frame_point=np.eye(4), decision="")
 
 
 def test_the_initial_pose_lies_between_the_true_ones_around_the_first_frame() -> None:

@@ -13,8 +13,8 @@ import gvo
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.geometry.se3 import make_transform
-from gvo.io.poses.inputs import asked_truth, choose_frame
-from gvo.io.poses.truth import FramedTruth, TruthComparison
+from gvo.io.poses.inputs import find_base_frame, read_truth
+from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
@@ -46,7 +46,7 @@ def spoilt(poses: FloatArray, seed: int = 0) -> FloatArray:
 @given(seeds)
 def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed: int) -> None:
     poses = Walk().true_poses().T_world_cam
-    truth = FramedTruth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
+    truth = Truth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
     elsewhere = se3.exp(np.random.default_rng(seed).normal(size=6))
     wrong = spoilt(poses, seed)
     found = TruthComparison.of(
@@ -63,7 +63,7 @@ def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed:
 def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> None:
     poses = Walk().true_poses().T_world_cam
     points = poses[:, :3, :3] @ LEVER + poses[:, :3, 3]
-    truth = FramedTruth(
+    truth = Truth(
         trajectory=Trajectory.of_positions(STAMPS_NS, points),
         T_frame_point=make_transform(np.eye(3), LEVER),
         decision="",
@@ -82,7 +82,7 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
 
 def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
     poses = Walk().true_poses().T_world_cam
-    standing = FramedTruth(
+    standing = Truth(
         trajectory=estimate(np.tile(np.eye(4), (len(poses), 1, 1))),
         T_frame_point=np.eye(4),
         decision="",
@@ -91,14 +91,14 @@ def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
     assert found.evaluations[0].path_ratio is None
     (warning,) = found.warnings()
     assert "exchanged?" in warning
-    moving = FramedTruth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
+    moving = Truth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
     assert TruthComparison.of(moving, {"raw": estimate(poses)}).warnings() == []
 
 
 def test_nothing_of_another_time_is_compared() -> None:
     poses = Walk().true_poses()
     late = Trajectory(stamps_ns=poses.stamps_ns + 10**12, T_world_cam=poses.T_world_cam)
-    truth = FramedTruth(trajectory=late, T_frame_point=np.eye(4), decision="")
+    truth = Truth(trajectory=late, T_frame_point=np.eye(4), decision="")
     with pytest.raises(TrajectoryError, match="share no stamps"):
         TruthComparison.of(truth, {"raw": poses})
 
@@ -134,11 +134,11 @@ def test_a_truth_of_its_own_rate_form_and_frame_gives_the_errors_of_the_exact_on
     walk_bag: Path, truth_bag: Path, asked: str | None, text: str
 ) -> None:
     source = gvo.open_recording([walk_bag, truth_bag])
-    frame = choose_frame(source, asked)
+    frame = find_base_frame(source, asked)
     T_cam_frame = np.eye(4) if asked is None else np.linalg.inv(T_BASE_CAM)
     poses = true_poses(STAMPS_NS) @ T_cam_frame
     wrong = spoilt(poses)
-    truth = asked_truth(source, text, frame=frame)
+    truth = read_truth(source, text, base_frame=frame)
     assert truth.warning == ""
     right, mistaken = TruthComparison.of(
         truth, {"right": estimate(poses), "wrong": estimate(wrong)}
@@ -160,5 +160,5 @@ def test_an_antenna_whose_place_is_unknown_is_compared_with_a_warning(
     bag = PoseBag(tmp_path / "fix.mcap")
     for stamp_ns, place in zip(STAMPS_NS.tolist(), geodetic(np.zeros((16, 3))), strict=True):
         bag.fix(stamp_ns, place)
-    truth = asked_truth(gvo.open_recording([walk_bag, bag.write()]), "/fix")
+    truth = read_truth(gvo.open_recording([walk_bag, bag.write()]), "/fix")
     assert "the errors hold its lever arm" in truth.warning

@@ -11,7 +11,7 @@ from gvo.geometry import se3
 from gvo.io.bag.reader import BagReader
 from gvo.io.poses.ground_truth import BagTruth, TfTruth, TopicTruth
 from gvo.io.poses.tf import TfBuffer, read_tf
-from gvo.io.poses.truth import FramedTruth, find_framed_truth, in_frame
+from gvo.io.poses.truth import Truth, find_truth, in_frame
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
@@ -53,9 +53,9 @@ def mounted() -> TfBuffer:
     return buffer
 
 
-def framed(*arguments: BagTruth | TfBuffer, **options: object) -> FramedTruth:
+def framed(*arguments: BagTruth | TfBuffer, **options: object) -> Truth:
     found = in_frame(*arguments, **options)  # type: ignore[arg-type]
-    assert isinstance(found, FramedTruth)
+    assert isinstance(found, Truth)
     return found
 
 
@@ -192,30 +192,30 @@ def robot(path: Path, *, truth: str) -> BagReader:
     "spec", [None, TopicTruth(name="/gt"), TfTruth(parent="odom", child="base")]
 )
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
-def test_what_is_asked_for_or_obvious_comes_in_the_frame_of_the_camera(
+def test_what_is_asked_for_or_named_comes_in_the_frame_of_the_camera(
     tmp_path: Path, spec: TopicTruth | TfTruth | None, name: str
 ) -> None:
     reader = robot(tmp_path / name, truth="/gt")
     for buffer in (None, read_tf(reader)):
-        found = find_framed_truth(reader, spec, where=name, camera_frame="cam", buffer=buffer)
-        assert isinstance(found, FramedTruth)
+        found = find_truth(reader, spec, where=name, camera_frame="cam", buffer=buffer)
+        assert isinstance(found, Truth)
         expected = motion() @ T_BASE_CAM
         np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
-    as_it_is = find_framed_truth(reader, spec, where=name, frame="base", camera_frame="cam")
-    assert isinstance(as_it_is, FramedTruth)
+    as_it_is = find_truth(reader, spec, where=name, frame="base", camera_frame="cam")
+    assert isinstance(as_it_is, Truth)
     np.testing.assert_allclose(as_it_is.trajectory.T_world_cam, motion(), atol=1e-9)
 
 
 def test_odometry_has_to_be_asked_for(tmp_path: Path) -> None:
     reader = robot(tmp_path / "a.bag", truth="/odom")
-    assert not find_framed_truth(reader, where="a.bag", camera_frame="cam")
+    assert not find_truth(reader, where="a.bag", camera_frame="cam")
     spec = TopicTruth(name="/odom")
-    assert find_framed_truth(reader, spec, where="a.bag", camera_frame="cam")
+    assert find_truth(reader, spec, where="a.bag", camera_frame="cam")
 
 
 def test_a_bag_without_frames_is_compared_as_far_as_it_goes(tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "a.bag")
     bag.pose("/gt", STAMPED, 1, np.eye(4))
-    found = find_framed_truth(BagReader(bag.write()), where="a.bag")
-    assert isinstance(found, FramedTruth)
+    found = find_truth(BagReader(bag.write()), where="a.bag")
+    assert isinstance(found, Truth)
     assert found.decision.endswith("1 poses; it names no frame, taken for the camera")

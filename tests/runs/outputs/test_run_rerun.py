@@ -28,7 +28,7 @@ from gvo.config import Config
 from gvo.errors import ConfigurationError, GvoError, RecordingError
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import exp, make_transform
-from gvo.io.poses.base_frame import OutputFrame
+from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.run_folder.writer import RunFolder
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.loop import RunLoop
@@ -163,7 +163,7 @@ class _Kept:
 
 
 def _run(folder: Path, source: SyntheticRecording, names: RunFrames) -> _Run:
-    frame = OutputFrame() if names.is_camera else OutputFrame("base_link", names.mount(0))
+    frame = BaseFrame() if names.is_camera else BaseFrame("base_link", names.mount(0))
     loop, kept = RunLoop(source, Config(), frame), _Kept()
     path = folder / "run.rrd"
     with (

@@ -42,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         written.write_truth(
             Trajectory(stamps_ns=stamps_of(N_FRAMES), T_world_cam=T_map_world @ poses)
         )
-        written.write_summary({"recording": "drive", "frame": "camera"})
+        written.write_summary({"recording": "drive", "base_frame": "camera"})
     return out
 
 
@@ -108,7 +108,7 @@ def test_the_truth_lies_on_the_estimate(record: RunRecord) -> None:
 
 def test_the_world_of_the_first_camera_has_its_up_against_y(record: RunRecord) -> None:
     assert world_up(record) == "-y"
-    record.summary["frame"] = "base_link"
+    record.summary["base_frame"] = "base_link"
     assert world_up(record) == "+z"
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.poses.base_frame import OutputFrame, parse_initial_pose
+from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FloatArray, Status
@@ -43,7 +43,7 @@ def camera_drive(rng: np.random.Generator) -> list[Estimate]:
     ]
 
 
-def apply_all(frame: OutputFrame, estimates: Sequence[Estimate]) -> list[Estimate]:
+def apply_all(frame: BaseFrame, estimates: Sequence[Estimate]) -> list[Estimate]:
     return [frame.apply(estimate) for estimate in estimates]
 
 
@@ -61,7 +61,7 @@ def mounted(rng: np.random.Generator, stamps_ns: Sequence[int]) -> tuple[TfBuffe
 
 def test_the_camera_itself_comes_back_untouched() -> None:
     drive = camera_drive(np.random.default_rng(0))
-    for frame in (OutputFrame(), OutputFrame.from_tf(TfBuffer(), "/cam", "cam")):
+    for frame in (BaseFrame(), BaseFrame.from_tf(TfBuffer(), "/cam", "cam")):
         assert all(out is given for out, given in zip(apply_all(frame, drive), drive, strict=True))
         assert frame.first_stamp_ns == STAMPS_NS[0]
 
@@ -71,7 +71,7 @@ def test_the_camera_itself_comes_back_untouched() -> None:
 def test_a_static_mount_is_composed_as_by_hand(seed: int) -> None:
     rng = np.random.default_rng(seed)
     drive, T_body_cam, T_initial = camera_drive(rng), random_transform(rng), random_transform(rng)
-    frame = OutputFrame("body", T_body_cam, T_initial=T_initial)
+    frame = BaseFrame("body", T_body_cam, T_initial=T_initial)
     outs = apply_all(frame, drive)
     np.testing.assert_allclose(outs[0].T_world_cam, T_initial, rtol=0, atol=1e-12)
     for out, given_ in zip(outs, drive, strict=True):
@@ -85,7 +85,7 @@ def test_a_static_mount_is_composed_as_by_hand(seed: int) -> None:
 def test_a_camera_that_looks_forward_moves_the_base_along_its_x_axis() -> None:
     rng = np.random.default_rng(0)
     T_base_cam = se3.make_transform(R_BODY_OPTICAL, np.array([0.3, 0.0, 1.2]))
-    frame = OutputFrame("base_link", T_base_cam)
+    frame = BaseFrame("base_link", T_base_cam)
     first, second = camera_drive(rng)[:2]
     forward = se3.make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
     frame.apply(first)
@@ -104,7 +104,7 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
     rng = np.random.default_rng(seed)
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    frame = OutputFrame.from_tf(buffer, "base", "/cam")
+    frame = BaseFrame.from_tf(buffer, "base", "/cam")
     frame.start(STAMPS_NS[0])
     for n in rng.permutation(len(drive)):
         expected = T_base_cam[0] @ drive[n].T_world_cam @ np.linalg.inv(T_base_cam[n])
@@ -118,7 +118,7 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
 def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: int) -> None:
     rng = np.random.default_rng(seed)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    frame = OutputFrame.from_tf(buffer, "base", "cam", T_initial=random_transform(rng))
+    frame = BaseFrame.from_tf(buffer, "base", "cam", T_initial=random_transform(rng))
     outs = [
         frame.apply(
             Estimate(
@@ -138,8 +138,8 @@ def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: in
 def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
     rng = np.random.default_rng(3)
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
-    mount = OutputFrame.from_tf(buffer, "base", "cam")
-    frame = mount if is_moving else OutputFrame("base", T_base_cam[0])
+    mount = BaseFrame.from_tf(buffer, "base", "cam")
+    frame = mount if is_moving else BaseFrame("base", T_base_cam[0])
     frame.start(STAMPS_NS[0])
     T, covariance = random_transform(rng), random_covariance(rng, scale=1e-4)
 
@@ -168,7 +168,7 @@ def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_
     rng = np.random.default_rng(1)
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS[2:5])
-    frame = OutputFrame.from_tf(buffer, "base", "cam")
+    frame = BaseFrame.from_tf(buffer, "base", "cam")
     for _ in range(2):  # raw and causal, say
         outs = apply_all(frame, drive)
     rows = [0, 0, 0, 1, 2, 2]
@@ -184,7 +184,7 @@ def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_take
         at = np.array([float(stamp_ns), 0.0, 0.0])
         buffer.add("base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
     buffer.add("shelf", "cam", 30, np.eye(4))
-    frame = OutputFrame.from_tf(buffer, "base", "cam")
+    frame = BaseFrame.from_tf(buffer, "base", "cam")
     xs = [float(frame.T_frame_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
     np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
     assert frame.n_guessed == 2
@@ -193,7 +193,7 @@ def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_take
 def test_the_first_frame_may_be_named_and_its_pose_given_late() -> None:
     rng = np.random.default_rng(2)
     drive, T_truth = camera_drive(rng), random_transform(rng)
-    frame = OutputFrame()
+    frame = BaseFrame()
     frame.start(STAMPS_NS[0], T_truth)
     np.testing.assert_allclose(
         frame.apply(drive[3]).T_world_cam, T_truth @ drive[3].T_world_cam, atol=1e-12
@@ -222,7 +222,7 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
     buffer.add("base_link", "rider", 1, np.eye(4))
     buffer.add("rider", "late", 2, np.eye(4))
     with pytest.raises(RecordingError) as caught:
-        OutputFrame.from_tf(buffer, frame, camera, where="drive.bag")
+        BaseFrame.from_tf(buffer, frame, camera, where="drive.bag")
     text = str(caught.value)
     assert "\n" not in text
     for word in ("drive.bag", f"--frame {frame}", "--calibration", camera, *words):
@@ -231,15 +231,15 @@ def test_frames_that_tf_does_not_connect_are_refused_in_one_line(
 
 def test_without_any_tf_the_line_says_so() -> None:
     with pytest.raises(RecordingError, match="tf holds no frame base: it is empty"):
-        OutputFrame.from_tf(TfBuffer(), "base", "cam")
+        BaseFrame.from_tf(TfBuffer(), "base", "cam")
 
 
 def test_what_is_no_rigid_transform_is_refused() -> None:
     for T in (np.eye(3), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan), 2 * np.eye(4)):
         with pytest.raises(ValueError, match="T_frame_cam"):
-            OutputFrame("body", T)
+            BaseFrame("body", T)
         with pytest.raises(ValueError, match="T_initial"):
-            OutputFrame(T_initial=T)
+            BaseFrame(T_initial=T)
 
 
 @pytest.mark.parametrize("is_moving", [False, True])
@@ -249,8 +249,8 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_their_own_world(
     rng = np.random.default_rng(4)
     drive = camera_drive(rng)
     buffer, T_base_cam = mounted(rng, STAMPS_NS[1:])
-    static = OutputFrame("base", T_base_cam[0], T_initial=random_transform(rng))
-    frame = OutputFrame.from_tf(buffer, "base", "cam") if is_moving else static
+    static = BaseFrame("base", T_base_cam[0], T_initial=random_transform(rng))
+    frame = BaseFrame.from_tf(buffer, "base", "cam") if is_moving else static
     truth = frame.convert(Trajectory.of(drive))
     first = 1 if is_moving else 0  # tf says nothing of the first stamp
     assert truth.stamps_ns.tolist() == STAMPS_NS[first:]
@@ -261,9 +261,9 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_their_own_world(
 
 def test_positions_alone_are_not_moved_to_another_frame() -> None:
     positions = Trajectory.of_positions(np.arange(3), np.zeros((3, 3)))
-    assert OutputFrame().convert(positions) is positions
+    assert BaseFrame().convert(positions) is positions
     with pytest.raises(TrajectoryError, match="positions of base_link"):
-        OutputFrame("base_link", np.eye(4)).convert(positions)
+        BaseFrame("base_link", np.eye(4)).convert(positions)
 
 
 def test_the_initial_pose_is_read_with_and_without_a_rotation() -> None:

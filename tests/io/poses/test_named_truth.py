@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gvo.io.bag.reader import BagReader
-from gvo.io.poses.ground_truth import BagTruth, find_obvious_truth, is_named_truth
+from gvo.io.poses.ground_truth import BagTruth, find_named_truth, is_named_truth
 from gvo.io.poses.tf import read_tf
 from gvo.types import Failure
 from tests.io.pose_bags import FIX, ODOMETRY, STAMPED, TRANSFORM, PoseBag
@@ -16,7 +16,7 @@ POSE = np.eye(4)
 
 def find(path: Path) -> BagTruth | Failure:
     reader = BagReader(path)
-    return find_obvious_truth(reader, read_tf(reader), where=path.name)
+    return find_named_truth(reader, read_tf(reader), where=path.name)
 
 
 @pytest.mark.parametrize(
