@@ -11,18 +11,21 @@ from gvo._version import __version__
 if TYPE_CHECKING:
     from gvo.backend.window import SlidingWindow
     from gvo.config import Config, WindowConfig, load_configuration
+    from gvo.diagnostics.check.recording import check_recording
     from gvo.errors import GvoError
     from gvo.frontend.protocol import Frontend
     from gvo.geometry.camera import PinholeCamera, StereoCamera
     from gvo.io.convert.convert import convert
+    from gvo.io.edges.opening import open_edges
     from gvo.io.excerpt import Excerpt
     from gvo.io.frames import frames
     from gvo.io.opening import RecordingOptions, open_recording
-    from gvo.io.poses.inputs import asked_truth, choose_frame, read_ground_truth
+    from gvo.io.poses.inputs import read_ground_truth
     from gvo.io.synthetic.recording import SyntheticRecording
     from gvo.odometry.odometry import Odometry
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import RunResult, run_recording
+    from gvo.runs.smooth import smooth_edges
     from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
     from gvo.trajectory.formats import read_trajectory
     from gvo.trajectory.trajectory import Trajectory
@@ -47,15 +50,18 @@ if TYPE_CHECKING:
 _MODULES = {
     "gvo.backend.window": ("SlidingWindow",),
     "gvo.config": ("Config", "WindowConfig", "load_configuration"),
+    "gvo.diagnostics.check.recording": ("check_recording",),
     "gvo.errors": ("GvoError",),
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
     "gvo.odometry.odometry": ("Odometry",),
     "gvo.io.convert.convert": ("convert",),
     "gvo.viz.plots": ("plot_trajectories",),
-    "gvo.io.poses.inputs": ("asked_truth", "choose_frame", "read_ground_truth"),
+    "gvo.io.poses.inputs": ("read_ground_truth",),
     "gvo.runs.outputs.options": ("RunOutputs",),
     "gvo.runs.run": ("RunResult", "run_recording"),
+    "gvo.runs.smooth": ("smooth_edges",),
+    "gvo.io.edges.opening": ("open_edges",),
     "gvo.io.excerpt": ("Excerpt",),
     "gvo.io.frames": ("frames",),
     "gvo.io.opening": ("RecordingOptions", "open_recording"),
@@ -113,18 +119,19 @@ __all__ = [
     "Trajectory",
     "WindowConfig",
     "__version__",
-    "asked_truth",
-    "choose_frame",
+    "check_recording",
     "convert",
     "evaluate",
     "format_evaluations",
     "frames",
     "load_configuration",
+    "open_edges",
     "open_recording",
     "plot_trajectories",
     "read_ground_truth",
     "read_trajectory",
     "run_recording",
+    "smooth_edges",
 ]
 
 

@@ -13,8 +13,7 @@ import sys
 from pathlib import Path
 
 import gvo
-from gvo.io.edges.opening import open_edges, parse_sigma
-from gvo.runs.smooth import smooth_edges
+from gvo.io.edges.opening import parse_sigma
 
 
 def main() -> int:
@@ -28,8 +27,8 @@ def main() -> int:
 
     truth = gvo.read_trajectory(arguments.reference)
     sigmas = [parse_sigma(text) for text in arguments.sigma]
-    source = open_edges(arguments.estimates, sigmas=sigmas)
-    result = smooth_edges(source, arguments.out, ground_truth=truth)
+    source = gvo.open_edges(arguments.estimates, sigmas=sigmas)
+    result = gvo.smooth_edges(source, arguments.out, ground_truth=truth)
     inputs = {path.stem: gvo.read_trajectory(path) for path in arguments.estimates}
     evaluations = [gvo.evaluate(truth, poses, name=name) for name, poses in inputs.items()]
     fused = [evaluation for evaluation in result.evaluations if evaluation.name == "smoothed"]

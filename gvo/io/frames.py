@@ -119,7 +119,7 @@ def _is_same(first: ImageArray, second: ImageArray) -> bool:
 
 def frames(
     source: Source,
-    config: Config,
+    config: Config | None = None,
     excerpt: Excerpt | None = None,
     *,
     with_unpaired: bool = True,
@@ -130,7 +130,7 @@ def frames(
     ----------
     source : Source
         The recording.
-    config : Config
+    config : Config, optional
         `sync` decides which images make one frame; with `runtime.threads` above one the images
         of a frame are decoded side by side, two frames ahead. The result does not depend on the
         number of threads.
@@ -149,6 +149,7 @@ def frames(
     RecordingError
         When the recording cannot be read on; the frames before are yielded first.
     """
+    config = config or Config()
     pairs = paired(source.images(), source.info.sensor, config.sync)
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)

@@ -26,7 +26,7 @@ _BASELINES_M = (0.01, 3.0)
 
 def check_recording(
     source: Source,
-    config: Config,
+    config: Config | None = None,
     *,
     n_samples: int | None = None,
     transforms: TfBuffer | None = None,
@@ -42,7 +42,7 @@ def check_recording(
     ----------
     source : Source
         The recording.
-    config : Config
+    config : Config, optional
         The thresholds are in `check`; the rest is as for odometry.
     n_samples : int, optional
         Number of decoded frames, each with the next one; default: `check.n_samples`.
@@ -62,9 +62,10 @@ def check_recording(
     --------
     >>> import gvo
     >>> recording = gvo.SyntheticRecording("handheld", "stereo", n_frames=8, scale=0.5)
-    >>> check_recording(recording, gvo.Config(), n_samples=4).is_healthy
+    >>> check_recording(recording, n_samples=4).is_healthy
     True
     """
+    config = config or Config()
     found = survey(source, config, n_samples=n_samples or config.check.n_samples)
     info = source.info
     camera = _find_camera(info)
