@@ -480,7 +480,9 @@ def edge_graph(tracked: Sequence[TrackedPose], config: WindowConfig) -> gtsam.No
     graph, factors = gtsam.NonlinearFactorGraph(), Factors(config)
     for pose in tracked:
         for edge in pose.edges:
-            graph.add(factors.between(edge.reference_id, pose.stamp_ns, Measurement.of(edge)))
+            if isinstance(edge.reference_id, int):
+                measurement = Measurement.of(edge)
+                graph.add(factors.between(edge.reference_id, pose.stamp_ns, measurement))
     return graph
 
 

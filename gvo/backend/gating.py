@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import compress
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -31,6 +32,8 @@ from gvo.types import (
     Prior,
     Rejected,
 )
+
+_Item = TypeVar("_Item")
 
 # Sigmas of the difference of two edges, a 6-vector: 99.9 % of correct ones are below.
 _AGREEMENT = 5.0
@@ -342,28 +345,21 @@ class Admission:
             In sigmas of the difference of two edges.
         """
         refuse = partial(_refuse, frame_id, stamp_ns)
-        rejected, valid = [], []
+        rejected = []
         if prior is not None and (fault := prior_fault(prior)):
             rejected.append(refuse(None, fault))
             prior = None
-        for edge, fault in zip(edges, find_faults(edges), strict=True):
-            if reason := self._graph.poses.edge_fault(frame_id, edge, is_new=True) or fault:
-                rejected.append(refuse(edge, reason))
-            else:
-                valid.append(Measurement.of(edge))
-        if not valid:
+        usable, invalid = _split(edges, self._faults(frame_id, edges))
+        rejected += [refuse(edge, reason) for edge, reason in invalid]
+        if not usable:
             return self._unmeasured(frame_id, stamp_ns, prior, rejected)
+        measurements = list(map(Measurement.of, usable))
         T_world_references = {
-            measurement.edge.reference_id: self._graph.pose3(measurement.edge.reference_id)
-            for measurement in valid
+            edge.reference_id: self._graph.pose3(edge.reference_id) for edge in usable
         }
-        result = self._gate(valid, T_world_references, stamp_ns, gate)
-        accepted = []
-        for measurement, reason in zip(valid, result.reasons, strict=True):
-            if reason:
-                rejected.append(refuse(measurement.edge, reason))
-            else:
-                accepted.append(measurement)
+        result = self._gate(measurements, T_world_references, stamp_ns, gate)
+        accepted, gated = _split(measurements, result.reasons)
+        rejected += [refuse(measurement.edge, reason) for measurement, reason in gated]
         return NewPose(
             frame_id=frame_id,
             stamp_ns=stamp_ns,
@@ -372,8 +368,16 @@ class Admission:
             T_world_references=T_world_references,
             prior=prior,
             rejected=tuple(rejected),
-            n_gated=len(valid) - len(accepted),
+            n_gated=len(gated),
         )
+
+    def _faults(self, frame_id: FrameId, edges: Sequence[Edge]) -> list[str]:
+        """Say for each edge of a new pose why it is unusable; empty if it is usable."""
+        poses = self._graph.poses
+        return [
+            poses.edge_fault(frame_id, edge, is_new=True) or fault
+            for edge, fault in zip(edges, find_faults(edges), strict=True)
+        ]
 
     def _gate(
         self,
@@ -446,6 +450,15 @@ class Admission:
             covariance=covariance,
             kernel="none",
         )
+
+
+def _split(
+    items: Sequence[_Item], reasons: Sequence[str]
+) -> tuple[list[_Item], list[tuple[_Item, str]]]:
+    """Return the items without a reason, and the others with theirs."""
+    pairs = list(zip(items, reasons, strict=True))
+    accepted = [item for item, reason in pairs if not reason]
+    return accepted, [pair for pair in pairs if pair[1]]
 
 
 def _refuse(frame_id: FrameId, stamp_ns: int, edge: Edge | None, reason: str) -> Rejected:

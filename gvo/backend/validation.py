@@ -41,7 +41,8 @@ def pose_fault(T_world_frame: FloatArray) -> str:
     rows = T_world_frame.tolist()
     if not math.isfinite(sum(map(sum, rows))):
         return "a pose is not finite"
-    return _divergence(max(abs(row[3]) for row in rows))
+    (_, _, _, x), (_, _, _, y), (_, _, _, z), _ = rows
+    return _divergence(max(abs(x), abs(y), abs(z)))
 
 
 def _divergence(largest: float) -> str:

@@ -149,9 +149,10 @@ def test_all_kinds_of_bad_edges_at_once_are_refused_one_by_one() -> None:
 
 
 BAD_PRIORS: dict[str, Prior] = {
-    f"pose: {name}": replace(POSE_PRIOR, T_world_frame=fault(POSE_PRIOR.T_world_frame))
-    for name, fault in TRANSFORM_FAULTS.items()
-} | {
+    **{
+        f"pose: {name}": replace(POSE_PRIOR, T_world_frame=fault(POSE_PRIOR.T_world_frame))
+        for name, fault in TRANSFORM_FAULTS.items()
+    },
     "pose: a zero covariance": replace(POSE_PRIOR, covariance=np.zeros((6, 6))),
     "position: an infinite coordinate": replace(
         POSITION_PRIOR, position_world=np.array([0.0, -np.inf, 0.0])
