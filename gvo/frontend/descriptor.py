@@ -212,14 +212,8 @@ class DescriptorFrontend:
             predicted=predicted,
             pixels=(reference.keypoints, current.keypoints),
         )
-        return match_temporal(
-            reference,
-            current,
-            predicted,
-            radius_px=radius_px,
-            max_distance=self._config.temporal.max_distance,
-            max_ratio=self._config.temporal.max_ratio,
-        )
+        config = self._config.temporal
+        return match_temporal(reference, current, predicted, config, radius_px=radius_px)
 
 
 def as_stereo(camera: StereoCamera | PinholeCamera, config: Config) -> StereoCamera:

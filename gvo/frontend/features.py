@@ -166,13 +166,18 @@ def _spread(
 
 
 def choose_spread(
-    pixels: FloatArray, responses: NDArray[Any], *, width: int, cell_size_px: int, n_chosen: int
+    pixels: FloatArray | IntArray,
+    responses: NDArray[Any],
+    *,
+    width: int,
+    cell_size_px: int,
+    n_chosen: int,
 ) -> IntArray:
     """Choose the strongest keypoints of each grid cell, round by round, up to the budget.
 
     Parameters
     ----------
-    pixels : ndarray of float64, shape (n, 2)
+    pixels : ndarray of float64 or int64, shape (n, 2)
     responses : ndarray, shape (n,)
         Strengths.
     width : int

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gvo._trace import note
+from gvo.config import StereoConfig, TemporalConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray, IntArray, Observations
@@ -106,6 +107,21 @@ def best_ratios(members: IntArray, distances: FloatArray, n_members: int) -> Flo
     return ratios
 
 
+def select_matches(
+    pairs: IntArray,
+    distances: FloatArray,
+    config: StereoConfig | TemporalConfig,
+    n_members: tuple[int, int],
+) -> IntArray:
+    """Keep pairs, shape (k, 2), by `max_distance`, `max_ratio` and mutual best distance."""
+    is_usable = distances <= config.max_distance
+    if config.max_ratio < 1.0:
+        ratios = best_ratios(pairs[:, 0], distances, n_members[0])
+        is_usable &= ratios[pairs[:, 0]] <= config.max_ratio
+    pairs, distances = pairs[is_usable], distances[is_usable]
+    return np.asarray(pairs[mutual_best(pairs, distances, *n_members)])
+
+
 def expand_ranges(starts: IntArray, stops: IntArray) -> tuple[IntArray, IntArray]:
     """List all (row, position) of half-open ranges of positions, one range a row.
 
@@ -148,10 +164,9 @@ def match_temporal(
     reference: Observations,
     current: Observations,
     predicted: tuple[FloatArray, IntArray],
+    config: TemporalConfig,
     *,
     radius_px: float,
-    max_distance: float,
-    max_ratio: float = 1.0,
 ) -> IntArray:
     """Match observations of two frames: window, left and right descriptors, ratio, reciprocal.
 
@@ -160,12 +175,10 @@ def match_temporal(
     reference, current : Observations
     predicted : tuple of arrays
         From `predict_pixels`.
+    config : TemporalConfig
+        Limits of descriptor distances and their ratios.
     radius_px : float
         Search radius around a predicted pixel.
-    max_distance : float
-        Largest mean descriptor distance over left and right, as a share of the largest.
-    max_ratio : float
-        Largest ratio of a reference's best to its second best distance; 1 takes any.
 
     Returns
     -------
@@ -178,12 +191,8 @@ def match_temporal(
     pairs = _pairs_within(pixels, current.keypoints, radius_px)
     pairs = np.stack([indices[pairs[:, 0]], pairs[:, 1]], axis=1)
     distances = _mean_distances(reference, current, pairs)
-    is_usable = distances <= max_distance
     note("temporal.candidates", pairs=pairs, distances=distances)
-    if max_ratio < 1.0:
-        is_usable &= best_ratios(pairs[:, 0], distances, len(reference))[pairs[:, 0]] <= max_ratio
-    pairs, distances = pairs[is_usable], distances[is_usable]
-    return pairs[mutual_best(pairs, distances, len(reference), len(current))]
+    return select_matches(pairs, distances, config, (len(reference), len(current)))
 
 
 def _mean_distances(reference: Observations, current: Observations, pairs: IntArray) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sized
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
+
+# Frames and observations of the front-end's own kind.
+_Own: TypeAlias = Any
 
 
 class Stamped(Protocol):
@@ -37,7 +40,7 @@ class Frontend(Protocol[ObservationsT]):
     `gvo.testing.check_frontend` tests the contract.
     """
 
-    def extract(self, frame: Any, /) -> ObservationsT:  # noqa: ANN401 - its own kind of frame
+    def extract(self, frame: _Own, /) -> ObservationsT:
         """Return what is needed of a frame, which is left as it is.
 
         Parameters
@@ -71,12 +74,7 @@ class Frontend(Protocol[ObservationsT]):
 class Relocalizer(Protocol):
     """A front-end that finds a place again, however far apart two frames are."""
 
-    def relocalize(
-        self,
-        reference: Any,  # noqa: ANN401 - the front-end's own
-        current: Any,  # noqa: ANN401
-        /,
-    ) -> RelativePose | Failure:
+    def relocalize(self, reference: _Own, current: _Own, /) -> RelativePose | Failure:
         """Estimate the motion between two frames; rather fail than be wrong.
 
         Without this method `register` is called, without a prior.
@@ -154,7 +152,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         offsets = None if self._learner is None else self._learner.rig_offsets
         return offsets if isinstance(offsets, RigOffsets) else None
 
-    def extract(self, frame: Any, /) -> ObservationsT:  # noqa: ANN401 - the front-end's own
+    def extract(self, frame: _Own, /) -> ObservationsT:
         """Extract as the front-end does."""
         return self._frontend.extract(frame)
 

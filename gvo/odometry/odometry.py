@@ -37,6 +37,8 @@ from gvo.types import (
     Status,
 )
 
+# Whatever the front-end returns.
+_Observations: TypeAlias = Any
 _Offer: TypeAlias = tuple[LinkKind, Edge]
 
 
@@ -167,7 +169,7 @@ class Odometry:
 
     def _result(
         self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
+        observations: _Observations,
         step: RawStep,
         offered: list[_Offer],
         causal: Estimate,
@@ -243,9 +245,7 @@ class Odometry:
                 self._window.release(stamp_ns)
 
     def _link(
-        self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
-        step: RawStep,
+        self, observations: _Observations, step: RawStep
     ) -> tuple[dict[int, float], list[_Offer]]:
         """Return the keyframes' scores, and edges to the predecessor and to keyframes."""
         note("odometry.step", step=step)
@@ -253,7 +253,7 @@ class Odometry:
         offered: list[_Offer] = []
         if step.registration is not None:
             offered.append(("step", step.edge))
-        if step.reference_ns not in self._window:  # not even alone would it go in
+        if step.reference_ns not in self._window:  # which would refuse the edges
             return {}, offered
         T_frame_keyframes = self._predict_keyframes(step)
         scores = self._keyframes.scores(T_frame_keyframes)
@@ -279,7 +279,7 @@ class Odometry:
 
     def _register_keyframe(
         self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
+        observations: _Observations,
         stamp_ns: int,
         T_keyframe_frame: FloatArray,
     ) -> Edge | None:
@@ -298,11 +298,7 @@ class Odometry:
         """Return the keyframes of earlier segments that the current one is not joined to."""
         return self._segments.unjoined(self._keyframes.stamps_ns)
 
-    def _relocalize(
-        self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
-        step: RawStep,
-    ) -> list[_Offer]:
+    def _relocalize(self, observations: _Observations, step: RawStep) -> list[_Offer]:
         """Return the edge to a keyframe of an earlier segment, where two frames agree."""
         if not self._config.window.relocalize:
             return []
@@ -333,7 +329,7 @@ class Odometry:
 
     def _select_keyframes(
         self,
-        observations: Any,  # noqa: ANN401 - the front-end's own
+        observations: _Observations,
         step: RawStep,
         scores: dict[int, float],
         causal: Estimate,

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gvo.config import TemporalConfig
 from gvo.frontend.matching import match_temporal, predict_pixels
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray, IntArray, Observations
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CONFIG = TemporalConfig(max_distance=0.25, max_ratio=1.0)
 CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 
 
@@ -52,8 +54,8 @@ def match(reference: Observations, current: Observations, radius: float = 10.0) 
         reference,
         current,
         predict_pixels(reference, None, CAMERA),
+        CONFIG,
         radius_px=radius,
-        max_distance=0.25,
     )
 
 
@@ -189,7 +191,7 @@ def test_matches_of_a_prediction_keep_the_indices_of_the_reference() -> None:
     pixels = np.array([[500 * 0.5 / 4 + 320, 240.0], [320.0, 480 * 0.5 / 6 + 240]])
     current = observe(pixels, codes[1:])
     predicted = predict_pixels(reference, T_reference_current, CAMERA)
-    matches = match_temporal(reference, current, predicted, radius_px=2.0, max_distance=0.25)
+    matches = match_temporal(reference, current, predicted, CONFIG, radius_px=2.0)
     assert matches.tolist() == [[1, 0], [2, 1]]
 
 
@@ -204,8 +206,7 @@ def test_a_match_must_stand_out_from_the_second_best(max_ratio: float, is_found:
         reference,
         current,
         predict_pixels(reference, None, CAMERA),
+        CONFIG.model_copy(update={"max_ratio": max_ratio}),
         radius_px=10.0,
-        max_distance=0.25,
-        max_ratio=max_ratio,
     )
     assert found.tolist() == ([[0, 0]] if is_found else [])

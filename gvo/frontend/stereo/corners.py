@@ -100,7 +100,8 @@ def measure_corners(
     owners = np.concatenate([np.arange(len(placed)), doubtful])
     starts = np.concatenate([rough[placed], rivals[placed[doubtful]]])
     # One pixel wider on all sides, for the gradients along rows and across them.
-    left = sample_patches(images[0], *corners[placed].T, radius + 1, radius + 1)
+    u, v = corners[placed].T
+    left = sample_patches(images[0], u, v, radius + 1, radius + 1)
     found, right, is_at_rest = _search_strips(
         (left, images[1]), corners[placed], owners, starts, config, row_offset_px=row_offset_px
     )

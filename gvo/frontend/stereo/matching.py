@@ -9,12 +9,7 @@ from numpy.typing import NDArray
 from gvo._trace import note
 from gvo.config import StereoConfig
 from gvo.frontend.features import Features
-from gvo.frontend.matching import (
-    best_ratios,
-    descriptor_distances,
-    expand_ranges,
-    mutual_best,
-)
+from gvo.frontend.matching import descriptor_distances, expand_ranges, select_matches
 from gvo.geometry.camera import StereoCamera
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -76,13 +71,8 @@ def match_stereo(
     octave_steps = left.octaves[pairs[:, 0]] - right.octaves[pairs[:, 1]]
     pairs = pairs[np.abs(octave_steps) <= 1]
     distances = descriptor_distances(left.descriptors, right.descriptors, pairs)
-    is_usable = distances <= config.max_distance
     note("stereo.candidates", in_range=in_range, pairs=pairs, distances=distances)
-    if config.max_ratio < 1.0:
-        ratios = best_ratios(pairs[:, 0], distances, len(left))
-        is_usable &= ratios[pairs[:, 0]] <= config.max_ratio
-    pairs, distances = pairs[is_usable], distances[is_usable]
-    return np.asarray(pairs[mutual_best(pairs, distances, len(left), len(right))])
+    return select_matches(pairs, distances, config, (len(left), len(right)))
 
 
 def refine_disparities(
