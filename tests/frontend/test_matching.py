@@ -1,21 +1,30 @@
-"""Descriptor distances and mutual best pairs against plain loops."""
+"""Descriptor distances and mutual best pairs against plain loops; matches of two frames."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from gvo.config import TemporalConfig
 from gvo.frontend.matching import (
     best_ratios,
     descriptor_distances,
     expand_ranges,
+    match_temporal,
     mutual_best,
+    predict_pixels,
 )
-from gvo.types import FloatArray, IntArray
+from gvo.geometry.camera import StereoCamera
+from gvo.types import FloatArray, IntArray, Observations
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
+CONFIG = TemporalConfig(max_distance=0.25, max_ratio=1.0)
+CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 
 
 def random_pairs(rng: np.random.Generator, n: int, m: int) -> IntArray:
@@ -139,3 +148,196 @@ def test_the_ratio_is_that_of_the_two_best_candidates(k: int, n: int, seed: int)
         two = sorted(distances[members == member].tolist())[:2]
         expected = 0.0 if len(two) < 2 else 1.0 if two[1] == 0 else two[0] / two[1]
         assert ratios[member] == expected
+
+
+def random_codes(rng: np.random.Generator, n: int) -> NDArray[np.uint8]:
+    return rng.integers(0, 256, (n, 32), dtype=np.uint8)
+
+
+def flip(codes: NDArray[np.uint8], n_bits: int, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return descriptors with `n_bits` of 256 bits flipped in each."""
+    bits = np.unpackbits(codes, axis=1)
+    for row in bits:
+        row[rng.permutation(256)[:n_bits]] ^= 1
+    return np.packbits(bits, axis=1)
+
+
+def observe(
+    keypoints: FloatArray,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8] | None = None,
+    points: FloatArray | None = None,
+) -> Observations:
+    n = len(keypoints)
+    return Observations(
+        stamp_ns=0,
+        keypoints=keypoints,
+        disparities=np.full(n, 20.0),
+        points_cam=np.tile([0.0, 0.0, 5.0], (n, 1)) if points is None else points,
+        sigmas=np.ones((n, 3)),
+        descriptors_left=left,
+        descriptors_right=right,
+    )
+
+
+def match(reference: Observations, current: Observations, radius: float = 10.0) -> IntArray:
+    return match_temporal(
+        reference,
+        current,
+        predict_pixels(reference, None, CAMERA),
+        CONFIG,
+        radius_px=radius,
+    )
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds, n=st.integers(1, 60))
+def test_known_correspondences_are_found_and_nothing_else(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    codes = random_codes(rng, n)
+    keypoints = rng.uniform(0, [640, 480], (n, 2))
+    order = rng.permutation(n)
+    shifts = rng.uniform(-6, 6, (n, 2))
+    reference = observe(keypoints, codes)
+    # Each point twice more than once flipped; one in three vanishes and another takes its place.
+    current_codes = flip(codes, 20, rng)
+    is_gone = rng.random(n) < 0.3
+    current_codes[is_gone] = random_codes(rng, int(is_gone.sum()))
+    current = observe((keypoints + shifts)[order], current_codes[order])
+    expected = {(int(order[j]), j) for j in range(n) if not is_gone[order[j]]}
+    matches = match(reference, current)
+    assert set(map(tuple, matches.tolist())) == expected
+    assert len(matches) == len(expected)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds, radius=st.floats(1.0, 50.0))
+def test_with_equal_descriptors_matches_lie_within_the_radius_and_are_one_to_one(
+    seed: int, radius: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    same = np.zeros((40, 32), dtype=np.uint8)
+    first, second = rng.uniform(0, 200, (2, 40, 2))
+    matches = match(observe(first, same), observe(second, same), radius)
+    distances = np.linalg.norm(first[matches[:, 0]] - second[matches[:, 1]], axis=1)
+    assert np.all(distances <= radius)
+    assert len(set(matches[:, 0].tolist())) == len(set(matches[:, 1].tolist())) == len(matches)
+    nearest = np.linalg.norm(first[:, None] - second[None], axis=2).min()
+    assert (len(matches) > 0) == (nearest <= radius)
+
+
+def test_a_partner_at_the_very_pixel_is_found() -> None:
+    code = random_codes(np.random.default_rng(0), 1)
+    pixel = np.array([[100.0, 50.0]])
+    assert match(observe(pixel, code), observe(pixel, code)).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize(("shift", "is_found"), [(9.9, True), (10.1, False)])
+def test_the_radius_is_respected(shift: float, is_found: bool) -> None:
+    code = random_codes(np.random.default_rng(0), 1)
+    pixel = np.array([[100.0, 50.0]])
+    moved = pixel + shift * np.array([0.6, 0.8])
+    assert bool(len(match(observe(pixel, code), observe(moved, code)))) == is_found
+
+
+@pytest.mark.parametrize(("n_bits", "is_found"), [(64, True), (65, False)])
+def test_the_largest_distance_is_respected(n_bits: int, is_found: bool) -> None:
+    rng = np.random.default_rng(0)
+    code, pixel = random_codes(rng, 1), np.array([[100.0, 50.0]])
+    other = flip(code, n_bits, rng)
+    assert bool(len(match(observe(pixel, code), observe(pixel, other)))) == is_found
+
+
+def test_the_right_descriptors_decide_where_the_left_ones_are_alike() -> None:
+    rng = np.random.default_rng(1)
+    left = np.repeat(random_codes(rng, 1), 2, axis=0)
+    right = random_codes(rng, 2)
+    keypoints = np.array([[100.0, 50.0], [103.0, 50.0]])
+    reference = observe(keypoints, left, right)
+    assert match(reference, observe(keypoints, left, right[::-1])).tolist() == [[0, 1], [1, 0]]
+    assert match(reference, observe(keypoints, left, right)).tolist() == [[0, 0], [1, 1]]
+
+
+def test_the_left_descriptors_decide_where_the_right_ones_are_alike() -> None:
+    rng = np.random.default_rng(1)
+    right = np.repeat(random_codes(rng, 1), 2, axis=0)
+    left = random_codes(rng, 2)
+    keypoints = np.array([[100.0, 50.0], [103.0, 50.0]])
+    reference = observe(keypoints, left, right)
+    assert match(reference, observe(keypoints, left[::-1], right)).tolist() == [[0, 1], [1, 0]]
+
+
+def test_the_distance_is_the_mean_of_left_and_right() -> None:
+    rng = np.random.default_rng(2)
+    left, right = random_codes(rng, 1), random_codes(rng, 1)
+    pixel = np.array([[100.0, 50.0]])
+    reference = observe(pixel, left, right)
+    worse = flip(right, 108, rng)  # with 20 on the left: 64 on average
+    assert len(match(reference, observe(pixel, flip(left, 20, rng), worse))) == 1
+    assert len(match(reference, observe(pixel, flip(left, 21, rng), worse))) == 0
+
+
+def test_frames_without_right_descriptors_are_matched_by_the_left_ones() -> None:
+    rng = np.random.default_rng(3)
+    codes, keypoints = random_codes(rng, 5), rng.uniform(0, 400, (5, 2))
+    both = observe(keypoints, codes, random_codes(rng, 5))
+    for current in (both, replace(both, descriptors_right=None)):
+        reference = replace(both, descriptors_right=None)
+        assert match(reference, current).tolist() == [[i, i] for i in range(5)]
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (0, 0)])
+def test_nothing_to_match_gives_no_matches(n: int, m: int) -> None:
+    rng = np.random.default_rng(0)
+    reference = observe(np.zeros((n, 2)), random_codes(rng, n))
+    current = observe(np.zeros((m, 2)), random_codes(rng, m))
+    assert match(reference, current).shape == (0, 2)
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=seeds)
+def test_a_prediction_is_the_projection_into_the_current_camera(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-3, -3, 0.5], [3, 3, 9], (30, 3))
+    T_reference_current = np.eye(4)
+    T_reference_current[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
+    T_reference_current[:3, 3] = rng.normal(size=3) + np.array([0.0, 0.0, 2.0])
+    reference = observe(np.zeros((30, 2)), random_codes(rng, 30), points=points)
+    pixels, indices = predict_pixels(reference, T_reference_current, CAMERA)
+    T_current_reference = np.linalg.inv(T_reference_current)
+    moved = points @ T_current_reference[:3, :3].T + T_current_reference[:3, 3]
+    assert set(np.flatnonzero(moved[:, 2] > 0.01)) <= set(indices.tolist())
+    assert set(indices.tolist()) <= set(np.flatnonzero(moved[:, 2] > 0))
+    homogeneous = moved[indices] @ CAMERA.K.T
+    np.testing.assert_allclose(pixels, homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-6)
+
+
+def test_matches_of_a_prediction_keep_the_indices_of_the_reference() -> None:
+    rng = np.random.default_rng(4)
+    codes = random_codes(rng, 3)
+    points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 6.0], [0.0, 0.5, 8.0]])
+    reference = observe(np.zeros((3, 2)), codes, points=points)
+    T_reference_current = np.eye(4)
+    T_reference_current[2, 3] = 2.0  # the first point falls behind
+    pixels = np.array([[500 * 0.5 / 4 + 320, 240.0], [320.0, 480 * 0.5 / 6 + 240]])
+    current = observe(pixels, codes[1:])
+    predicted = predict_pixels(reference, T_reference_current, CAMERA)
+    matches = match_temporal(reference, current, predicted, CONFIG, radius_px=2.0)
+    assert matches.tolist() == [[1, 0], [2, 1]]
+
+
+@pytest.mark.parametrize(("max_ratio", "is_found"), [(1.0, True), (0.51, True), (0.49, False)])
+def test_a_match_must_stand_out_from_the_second_best(max_ratio: float, is_found: bool) -> None:
+    rng = np.random.default_rng(0)
+    code = random_codes(rng, 1)
+    reference = observe(np.array([[100.0, 50.0]]), code)
+    codes = np.concatenate([flip(code, 10, rng), flip(code, 20, rng)])
+    current = observe(np.array([[101.0, 50.0], [102.0, 50.0]]), codes)
+    found = match_temporal(
+        reference,
+        current,
+        predict_pixels(reference, None, CAMERA),
+        CONFIG.model_copy(update={"max_ratio": max_ratio}),
+        radius_px=10.0,
+    )
+    assert found.tolist() == ([[0, 0]] if is_found else [])
