@@ -1,4 +1,4 @@
-"""The trajectory in the frame asked for: the camera's, or one that the camera is mounted on.
+"""The base frame, whose poses are written: the camera's, or one that the camera is mounted on.
 
 The camera frame of a recording is the frame_id of its images. It names the optical frame of the
 rectified camera (x right, y down, z forward), as in image_geometry and stereo_image_proc; so what
@@ -29,7 +29,7 @@ _ROTATION_TOLERANCE = 1e-3
 
 
 class BaseFrame:
-    """Turns poses of the camera into poses of the frame asked for.
+    """Converts poses of the camera into poses of the base frame.
 
     The world is chosen so that the first pose is the initial pose. The first estimate given to
     `apply` is taken for that of the first frame, unless `start` was called.

@@ -1,4 +1,4 @@
-"""True poses out of a bag: named, or found by name."""
+"""Ground truth in a bag: named by the user, or found by the name of its topic."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def parse_bag_truth(text: str) -> BagTruthSpec:
     Raises
     ------
     TrajectoryError
-        Where there is a part too few or too many.
+        When a part is missing, or there is one too many.
     """
     kind, _, rest = text.partition(":")
     if kind == "tf" and rest:
@@ -249,7 +249,7 @@ def _describe(topic: Topic, what: str, child: str, notes: Sequence[str]) -> str:
     return "; ".join([f"{topic.name} ({topic.type}), {what}{of}", *notes])
 
 
-# Systems that measure from outside, and what people call their poses. Odometry is none of them.
+# Motion-capture systems, and usual names of ground truth. Odometry is not ground truth.
 _WORDS = (
     "ground[_-]?truth",
     "true_?(pose|odom|odometry|state)",
@@ -261,7 +261,7 @@ _WORDS = (
     "leica",
     "vrpn",
 )
-# a word by itself, or together with others by anything but letters
+# as a whole word
 _IS_TRUTH = re.compile(rf"(?<![a-z])({'|'.join(_WORDS)})(?![a-z])")
 
 
@@ -279,7 +279,7 @@ def is_named_truth(topic: str) -> bool:
 def find_named_truth(
     reader: BagReader, buffer: TfBuffer | None = None, *, where: str
 ) -> BagTruth | Failure:
-    """Find the ground truth that names itself: `world` -> `ground_truth` in tf, or one topic.
+    """Find the ground truth by its name: `world` -> `ground_truth` in tf, or one topic.
 
     Parameters
     ----------
@@ -292,12 +292,12 @@ def find_named_truth(
     Returns
     -------
     BagTruth or Failure
-        The failure says that there is none, or among which topics to choose, and how.
+        The failure says that there is none, or which topics to choose from.
 
     Raises
     ------
     RecordingError
-        When the bag cannot be read on, or what names itself truth holds no pose.
+        When the bag cannot be read on, or the named truth holds no pose.
     """
     frames = (TRUTH_FRAMES.parent, TRUTH_FRAMES.child)
     buffer = read_tf(reader, frames=frames) if buffer is None else buffer

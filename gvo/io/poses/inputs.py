@@ -32,7 +32,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
 _MARK = "#"
-# The frames of a run's bag are those of the robot under names of their own.
+# A run's bag writes the robot's frames with the name of the estimate before theirs.
 _OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed)/")
 
 
@@ -50,8 +50,8 @@ class PoseInput:
     decision : str
         What was read, in one line; empty for a file.
     warning : str
-        What of the bag could not be read, or why they are compared though of another frame than
-        the reference; empty where there is nothing.
+        What could not be read, or that they are of another frame than the reference; empty if
+        none.
     """
 
     name: str
@@ -155,7 +155,7 @@ def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -
 def find_base_frame(
     source: Source, name: str | None = None, *, T_initial: FloatArray | None = None
 ) -> BaseFrame:
-    """Find how the camera sits in the frame whose poses are asked for.
+    """Find a base frame by its name, and where the camera is mounted on it.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def find_base_frame(
 
 
 def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None) -> Truth:
-    """Read the true poses that were asked for.
+    """Read the true poses that a text names.
 
     Parameters
     ----------
@@ -201,9 +201,9 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
         The recording.
     text : str
         `tf:PARENT:CHILD` or a topic of the recording, which must be a bag; or a file of poses,
-        or another recording, of the frame that is asked for.
+        or another recording, of the base frame.
     base_frame : BaseFrame, optional
-        Whose poses are asked for; the camera's where omitted.
+        The camera's where omitted.
 
     Raises
     ------
@@ -225,14 +225,14 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
 
 
 def recorded_truth(source: Source, *, base_frame: BaseFrame | None = None) -> Truth | Failure:
-    """Read what a recording itself names its ground truth.
+    """Read the ground truth that a recording itself holds.
 
     Parameters
     ----------
     source : Source
         The recording.
     base_frame : BaseFrame, optional
-        Whose poses are asked for; the camera's where omitted.
+        The camera's where omitted.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def read_compared(
     estimates : dict of str to Trajectory
         By their shortest names that differ.
     warnings : list of str
-        What they are to be taken with, a line each.
+        A line each.
 
     Raises
     ------
@@ -341,7 +341,7 @@ def initial_pose(truth: Truth | Failure, stamp_ns: int) -> FloatArray:
     Parameters
     ----------
     truth : Truth or Failure
-        In the frame that is asked for.
+        Of the base frame.
     stamp_ns : int
         Of the first frame, nanoseconds.
 

@@ -24,13 +24,13 @@ class Truth:
     Parameters
     ----------
     trajectory : Trajectory
-        T_parent_frame; of positions without rotations those of the point that was measured.
+        T_parent_frame; or positions of the measured point, without rotations.
     decision : str
         What was read and how it was brought into the frame, in one line.
     T_frame_point : ndarray of float64, shape (4, 4)
         Where that point lies in the frame, metres; the identity for poses.
     warning : str
-        What the errors are to be taken with, in one line; empty where there is nothing.
+        A caveat of the errors, in one line; empty if none.
     """
 
     trajectory: Trajectory
@@ -39,7 +39,7 @@ class Truth:
     warning: str = ""
 
     def comparable(self, estimate: Trajectory) -> Trajectory:
-        """Return the estimate of the frame as that of what the truth is of."""
+        """Return the estimate of the frame, moved to the point whose true positions are known."""
         if np.array_equal(self.T_frame_point, np.eye(4)):
             return estimate
         return estimate.transformed(self.T_frame_point)
@@ -47,7 +47,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Place:
-    """A frame fixed to one of tf, whose name is empty where it is not known."""
+    """A frame rigidly attached to one of tf; an empty name if that is not known."""
 
     name: str
     T_name_frame: FloatArray = field(default_factory=lambda: np.eye(4))
@@ -66,13 +66,13 @@ def find_truth(
     T_frame_cam: FloatArray | None = None,
     buffer: TfBuffer | None = None,
 ) -> Truth | Failure:
-    """Read the truth that was asked for, or the named one, in the frame that is estimated.
+    """Read the truth that `spec` names, else the named truth, in the frame that is estimated.
 
     Parameters
     ----------
     reader : BagReader
     spec : TfTruth or TopicTruth, optional
-        What to read; omitted: what names itself ground truth, see `find_named_truth`.
+        What to read; see `find_named_truth` where omitted.
     where : str
         The bag, for messages.
     frame, camera_frame, T_frame_cam
@@ -206,14 +206,14 @@ def _framed(truth: BagTruth, how: str) -> Truth:
     return Truth(trajectory=truth.trajectory, decision=f"{truth.decision}{how}")
 
 
-# A truth that stands while the estimate moves is none of it.
+# Truth that stands still while the estimate moves is of something else.
 _MIN_EXTENT_M = 0.1
 _MIN_SHARE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TruthComparison:
-    """Estimates as those of what the truth is of, and their errors.
+    """Estimates compared with the truth, and their errors.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ class TruthComparison:
         return cls(truth=truth, estimates=comparable, evaluations=evaluations)
 
     def warnings(self) -> list[str]:
-        """Return what the errors are to be taken with, a line each."""
+        """Return caveats of the errors, a line each."""
         warnings = [self.truth.warning] if self.truth.warning else []
         true_m = _extent(self.truth.trajectory)
         estimated_m = max(map(_extent, self.estimates.values()))
