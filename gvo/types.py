@@ -578,7 +578,7 @@ class Progress:
     n_done, n_total : int
         Frames taken, and images that are expected in all.
     n_tracked : int
-        Frames tied to earlier ones by a registration.
+        Frames registered to earlier ones.
     """
 
     n_done: int

@@ -1,4 +1,4 @@
-"""The loop of a run: frames in, poses out to all that writes them."""
+"""The loop of a run: frames in, poses out to all outputs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Pro
 
 
 class Output(Protocol):
-    """What writes a run as it goes; all poses are of the base frame."""
+    """Writes a run as it goes; all poses are of the base frame."""
 
     def add_frame(self, frame: Any, result: FrameResult) -> None:  # noqa: ANN401
         """Write what one frame gave, and the smoothed poses that are final with it."""
@@ -51,7 +51,7 @@ class RunLoop:
     Attributes
     ----------
     statistics : RunStatistics
-        What was counted.
+        Counts so far.
     """
 
     def __init__(
@@ -76,6 +76,11 @@ class RunLoop:
         self._odometry = Odometry(source.info.camera, config)
 
     @property
+    def is_placed(self) -> bool:
+        """Tell whether an initial pose was asked for: the world is not that of the first frame."""
+        return self.base_frame.is_placed or self._first_pose is not None
+
+    @property
     def is_excerpt(self) -> bool:
         """Tell whether a part of the recording is read."""
         return not self._excerpt.is_everything
@@ -83,12 +88,12 @@ class RunLoop:
     def run(
         self, outputs: Iterable[Output], on_progress: Callable[[Progress], None] | None
     ) -> None:
-        """Take all frames; where the recording breaks off, note it and end.
+        """Track all frames; where the recording breaks off, note it and end.
 
         Parameters
         ----------
         outputs : iterable of Output
-            Are given the poses, also those that the window still holds where it is interrupted.
+            Get all poses, also those still in the window where the run is interrupted.
         on_progress : callable, optional
             Called after each frame.
         """
@@ -110,7 +115,7 @@ class RunLoop:
                 self.count()
 
     def count(self) -> None:
-        """Take into the statistics what others have counted so far."""
+        """Copy the counts of window, front-end and base frame into the statistics."""
         window = self._odometry.window
         self.statistics.window, self.statistics.polish = window.counts, window.polish
         self.statistics.rig_offsets = self._odometry.rig_offsets
@@ -118,7 +123,7 @@ class RunLoop:
         self.statistics.mount_travel_m = self.base_frame.mount_travel_m
 
     def _n_expected(self, stamp_ns: int) -> int:
-        """Estimate how many images are to come in all, from the stamps so far."""
+        """Estimate the number of images in all, from the stamps so far."""
         n_images, n_done = (
             self.source.info.n_images,
             self.statistics.n_frames + self.statistics.n_unpaired,

@@ -18,6 +18,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.inputs import initial_pose, recorded_truth
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
+from gvo.io.run_folder.reader import read_run
 from gvo.io.run_folder.writer import (
     PICTURE,
     REPORT,
@@ -38,20 +39,20 @@ from gvo.types import Failure, Progress
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunResult:
-    """What a run left.
+    """What a run gave.
 
     Parameters
     ----------
     summary : dict
         As written to `summary.json`.
     evaluations : tuple of Evaluation
-        Of raw, causal and smoothed; empty without ground truth.
+        Of raw, causal and smoothed; empty where they were not compared.
     is_complete : bool
         Whether no frame is missing, all are tracked, and all was compared and drawn as asked.
     warnings : tuple of str
-        What was skipped or broke off, a line each.
+        A line each.
     report : Path or None
-        The page that shows it, where one was written.
+        The page written, if any.
     """
 
     summary: dict[str, Any]
@@ -80,20 +81,20 @@ def run_recording(
     source : Source
         From `open_recording`, or a rendered one.
     out : str or Path
-        Folder for the trajectories, covariances, tables, summary and report; a run that is there
-        is replaced.
+        Folder for the trajectories, covariances, tables, summary and report; replaces an earlier
+        run.
     config : Config, optional
     ground_truth : Trajectory or Truth, optional
         Poses of the base frame; the recording's own where omitted.
     base_frame : BaseFrame, optional
-        Whose poses are written, and where they start; the camera's, from the identity, where
+        The frame whose poses are written, and its first pose; the camera from the identity where
         omitted.
     starts_at_truth : bool
-        Take the first true pose for the initial one.
+        Start at the true pose of the first frame.
     excerpt : Excerpt, optional
         Which frames are read; all where omitted.
     outputs : RunOutputs, optional
-        What is written besides; the report where omitted.
+        What is written besides the folder's tables; the report where omitted.
     on_progress : callable, optional
         Called after each frame.
 
@@ -106,54 +107,33 @@ def run_recording(
     RecordingError
         When no frame is usable.
     OutputError
-        When something cannot be written; what was written before stands.
+        When something cannot be written; the files hold what was written before.
     RunBusyError
         When another process is writing a run into the folder.
     """
     config = config or Config()
     base_frame = base_frame or BaseFrame(source.info.frame_id)
-    truth = _find_truth(source, ground_truth, base_frame)
     outputs = outputs or RunOutputs()
+    truth = _find_truth(source, ground_truth, base_frame)
+    first_pose = partial(initial_pose, truth) if starts_at_truth else None
     start = truth.trajectory if starts_at_truth and isinstance(truth, Truth) else None
     identity = run_identity(source, base_frame, excerpt, start=start)
+    loop = RunLoop(source, config, base_frame, excerpt=excerpt, first_pose=first_pose)
     with ExitStack() as stack, ExitStack() as files:
-        is_placed = base_frame.is_placed or starts_at_truth
-        others, notes = outputs.open(source, base_frame, files, config=config, is_placed=is_placed)
+        others, notes = outputs.open(loop, files)
         stack.enter_context(written_alone(Path(out)))
         folder = files.enter_context(RunFolder(Path(out)))
-        loop = RunLoop(
-            source,
-            config,
-            base_frame,
-            excerpt=excerpt,
-            first_pose=partial(initial_pose, truth) if starts_at_truth else None,
-        )
-        summary = RunningSummary(loop, folder, identity, on_progress)
-        with summary.told():
+        with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
             files.close()
-        _refuse_nothing(loop, folder)
-        estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-        compared = _compare(truth, folder, loop, estimates)
         is_asked = ground_truth is not None
-        result = _conclude(loop, folder, identity, compared, notes, is_asked=is_asked)
-    if not outputs.report:
-        return result
-    return _drawn(result, folder, compared, estimates, plots=outputs.plots)
-
-
-def _refuse_nothing(loop: RunLoop, folder: RunFolder) -> None:
-    """Refuse a run without a single pose; no summary is left of it."""
-    if loop.statistics.n_with_pose == 0:
-        (folder.path / SUMMARY).unlink(missing_ok=True)
-        raise RecordingError(
-            f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
-        )
+        result = _conclude(loop, folder, identity, truth, notes, is_asked=is_asked)
+    return _drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Fault(Failure):
-    """Why there is no truth to compare with, though there should be one."""
+    """A truth that exists cannot be read, or not be compared."""
 
 
 def _find_truth(
@@ -170,85 +150,47 @@ def _find_truth(
         return _Fault(reason=str(error))
 
 
-def _compare(
-    truth: Truth | Failure,
-    folder: RunFolder,
-    loop: RunLoop,
-    estimates: dict[str, Trajectory],
-) -> TruthComparison | Failure:
-    if isinstance(truth, Failure):
-        return truth
-    try:
-        return TruthComparison.of(_within(truth, folder, loop), estimates)
-    except GvoError as error:
-        return _Fault(reason=str(error))
-
-
 def _conclude(
     loop: RunLoop,
     folder: RunFolder,
     identity: dict[str, Any],
-    compared: TruthComparison | Failure,
+    truth: Truth | Failure,
     notes: list[str],
     *,
     is_asked: bool,
 ) -> RunResult:
-    """Write truth and summary."""
-    warnings = loop.statistics.warnings() + notes
-    found = compared if isinstance(compared, TruthComparison) else None
-    if found is not None:
-        warnings += [f"ground truth: {text}" for text in found.warnings()]
-    elif isinstance(compared, _Fault):
-        warnings.append(f"not compared with the ground truth: {compared.reason}")
+    """Compare with the truth; write truth and summary."""
+    if loop.statistics.n_with_pose == 0:
+        (folder.path / SUMMARY).unlink(missing_ok=True)
+        raise RecordingError(
+            f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
+        )
+    compared = _compare(truth, folder, loop)
+    warnings = [*loop.statistics.warnings(), *notes, *_warnings_of_truth(compared)]
+    evaluations: tuple[Evaluation, ...] = ()
+    if isinstance(compared, TruthComparison):
+        folder.write_truth(compared.truth.trajectory)
+        evaluations = compared.evaluations
+    is_complete = loop.statistics.is_complete and bool(compared or not is_asked)
     summary = summarize(loop, compared, warnings)
-    if found is not None:
-        folder.write_truth(found.truth.trajectory)
-    is_complete = loop.statistics.is_complete and not (is_asked and found is None)
     summary |= {"is_complete": is_complete, "run": identity}
     folder.write_summary(summary)
     return RunResult(
         summary=summary,
-        evaluations=() if found is None else found.evaluations,
+        evaluations=evaluations,
         is_complete=is_complete,
         warnings=tuple(warnings),
     )
 
 
-def _drawn(
-    result: RunResult,
-    folder: RunFolder,
-    compared: TruthComparison | Failure,
-    estimates: dict[str, Trajectory],
-    *,
-    plots: Path | None,
-) -> RunResult:
-    """Draw; what cannot be drawn takes nothing from what was computed and written."""
+def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:
+    if isinstance(truth, Failure):
+        return truth
+    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     try:
-        _draw(folder, compared, estimates, plots=plots)
-    except (GvoError, OSError) as error:
-        warnings = (*result.warnings, f"not all was drawn: {error}")
-        result = replace(result, is_complete=False, warnings=warnings)
-    page = folder.path / REPORT
-    return replace(result, report=page if page.exists() else None)
-
-
-def _draw(
-    folder: RunFolder,
-    compared: TruthComparison | Failure,
-    estimates: dict[str, Trajectory],
-    *,
-    plots: Path | None,
-) -> None:
-    """Draw the picture and write the report."""
-    from gvo.io.run_folder.reader import read_run
-    from gvo.viz.plots import plot_trajectories
-    from gvo.viz.report import write_run_report
-
-    if isinstance(compared, TruthComparison):
-        plot_trajectories(folder.path / PICTURE, compared.truth.trajectory, compared.estimates)
-    else:
-        plot_trajectories(folder.path / PICTURE, None, estimates)
-    write_run_report(folder.path / REPORT, read_run(folder.path), plots=plots)
+        return TruthComparison.of(_within(truth, folder, loop), estimates)
+    except GvoError as error:
+        return _Fault(reason=str(error))
 
 
 def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
@@ -262,3 +204,32 @@ def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
         start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
         trajectory = trajectory.select(slice(int(start), int(end)))
     return replace(truth, trajectory=trajectory)
+
+
+def _warnings_of_truth(compared: TruthComparison | Failure) -> list[str]:
+    if isinstance(compared, TruthComparison):
+        return [f"ground truth: {text}" for text in compared.warnings()]
+    if isinstance(compared, _Fault):
+        return [f"not compared with the ground truth: {compared.reason}"]
+    return []
+
+
+def _drawn(result: RunResult, folder: Path, *, plots: Path | None) -> RunResult:
+    """Draw; what cannot be drawn takes nothing from what was computed and written."""
+    try:
+        _draw(folder, plots=plots)
+    except (GvoError, OSError) as error:
+        warnings = (*result.warnings, f"not all was drawn: {error}")
+        result = replace(result, is_complete=False, warnings=warnings)
+    page = folder / REPORT
+    return replace(result, report=page if page.exists() else None)
+
+
+def _draw(folder: Path, *, plots: Path | None) -> None:
+    """Draw the picture and write the report."""
+    from gvo.viz.plots import plot_trajectories
+    from gvo.viz.report import write_run_report
+
+    record = read_run(folder)
+    plot_trajectories(folder / PICTURE, record.truth, record.comparable())
+    write_run_report(folder / REPORT, record, plots=plots)

@@ -13,7 +13,7 @@ from gvo._version import __version__
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError, TrajectoryError
-from gvo.io.edges.events import EdgeEvent, EdgeSource, Event, InputFaults, PoseEvent
+from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.lines import (
     CSV_HEADER,
     LineFormat,
@@ -47,7 +47,7 @@ _GRAPH_DEFAULTS: dict[str, tuple[object, str]] = {
 
 
 def configuration_for(source: EdgeSource, config: Config) -> tuple[Config, list[str]]:
-    """Return the configuration that fits an input, where the user left it open.
+    """Return the configuration that fits an input; what the user set stays.
 
     Parameters
     ----------
@@ -55,7 +55,6 @@ def configuration_for(source: EdgeSource, config: Config) -> tuple[Config, list[
         A pose graph is smoothed as a whole and taken at its word: `window.size: null`,
         `window.kernel: none` and `window.gate: null`.
     config : Config
-        Values that were set stay.
 
     Returns
     -------
@@ -80,7 +79,7 @@ def configuration_for(source: EdgeSource, config: Config) -> tuple[Config, list[
 
 @dataclass(slots=True, kw_only=True)
 class SmoothingNotes:
-    """What is told of a run beside its poses."""
+    """Decisions and warnings of a run."""
 
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -121,13 +120,9 @@ class Smoother:
         return sum(self.statuses.values())
 
     def take(self, event: Event) -> Estimate | Rejected:
-        """Add a pose or an edge."""
+        """Add a pose, or an edge between two poses of the window."""
         if isinstance(event, PoseEvent):
             return self.add_pose(event)
-        return self.add_edge(event)
-
-    def add_edge(self, event: EdgeEvent) -> Estimate | Rejected:
-        """Add an edge between two poses of the window."""
         return self.window.add_edge(event.frame_id, event.edge)
 
     def add_pose(self, event: PoseEvent) -> Estimate:
@@ -213,7 +208,7 @@ def smooth_edges(
 
 @contextmanager
 def _opened(out: Path, source: EdgeSource) -> Iterator[tuple[RunFolder, GraphFile | None]]:
-    """Open the files of a run, and complete them also where it is interrupted."""
+    """Open the files of a run; complete them also where it is interrupted."""
     with RunFolder(out, columns=POSES_HEADER) as folder:
         if not isinstance(source, PoseGraphSource):
             yield folder, None
@@ -234,9 +229,9 @@ def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
 
 
 def _progress(smoother: Smoother, n_total: int) -> Progress:
-    n_tied = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
+    n_tracked = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
     n_done = smoother.n_poses
-    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=n_tied)
+    return Progress(n_done=n_done, n_total=max(n_total, n_done), n_tracked=n_tracked)
 
 
 def _with_stamps(
@@ -267,26 +262,36 @@ def conclude(
         reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
         raise RecordingError(f"{name}: nothing to smooth: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    warnings = [*_warnings(smoother, notes), *notes.warnings]
+    evaluations, fault = _compare(truth, estimates)
     counts = smoother.window.counts
-    is_complete = not (notes.warnings or notes.broken_off or counts.n_coasting or counts.n_rejected)
-    evaluations: tuple[Evaluation, ...] = ()
-    if truth is not None:
-        try:
-            evaluations = tuple(evaluate(truth, e, name=name) for name, e in estimates.items())
-        except GvoError as error:
-            warnings.append(f"not compared with the ground truth: {error}")
-            is_complete = False
-    summary = _summary(name, smoother, notes)
-    summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
-    folder.write_summary(summary | {"configuration": config.model_dump()})
+    is_whole = not (notes.broken_off or notes.warnings or fault)
+    warnings = [*_warnings(smoother, notes), *notes.warnings, *([fault] if fault else [])]
+    summary = {
+        **_summary(name, smoother, notes),
+        "errors": evaluations_json(evaluations)["estimates"],
+        "warnings": warnings,
+        "configuration": config.model_dump(),
+    }
+    folder.write_summary(summary)
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
-        summary=summary | {"configuration": config.model_dump()},
+        summary=summary,
         evaluations=evaluations,
-        is_complete=is_complete,
+        is_complete=is_whole and not (counts.n_coasting or counts.n_rejected),
         warnings=tuple(warnings),
     )
+
+
+def _compare(
+    truth: Trajectory | None, estimates: dict[str, Trajectory]
+) -> tuple[tuple[Evaluation, ...], str]:
+    """Return the errors, or a warning that says why there are none."""
+    if truth is None:
+        return (), ""
+    try:
+        return tuple(evaluate(truth, e, name=name) for name, e in estimates.items()), ""
+    except GvoError as error:
+        return (), f"not compared with the ground truth: {error}"
 
 
 def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
@@ -310,14 +315,14 @@ def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
 
 
 def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, Any]:
-    n_tied = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
+    n_tracked = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
     polish = smoother.window.polish
     return {
         "gvo_version": __version__,
         "recording": name,
         "decisions": notes.decisions,
         "frames": smoother.n_poses,
-        "tracked": n_tied,
+        "tracked": n_tracked,
         "status_counts": {status.value: smoother.statuses[status] for status in Status},
         "window": asdict(smoother.window.counts),
         "polish": None if polish is None else polish.as_json(),
@@ -339,7 +344,7 @@ def smooth_lines(
     Parameters
     ----------
     lines : iterable of str
-        CSV or JSON, told by the first one; see `gvo.io.edges.lines`.
+        CSV or JSON, recognised by the first one; see `gvo.io.edges.lines`.
     answer : callable
         Gets the answer to each line that holds anything, without its line end: the estimate of
         the line's pose, or `{"error": ...}`.
@@ -347,7 +352,7 @@ def smooth_lines(
         Folder, as of `smooth_edges`.
     config : Config, optional
     keyframes : {"manual", "distance"}
-        Who keeps poses beside the stream's own `keep`.
+        Which poses stay in the window, besides those of the stream's own `keep`.
     ground_truth : Trajectory, optional
         True poses of the same frame.
 
@@ -432,9 +437,7 @@ def _extend(request: Request, smoother: Smoother) -> tuple[Estimate, list[Reject
             f"{frame_id!r} is in the window with the stamp {window.stamp_ns(frame_id)}, got "
             f"{request.stamp_ns}"
         )
-    answers: list[Estimate | Rejected] = [
-        smoother.add_edge(EdgeEvent(frame_id=frame_id, edge=edge)) for edge in request.edges
-    ]
+    answers: list[Estimate | Rejected] = [window.add_edge(frame_id, edge) for edge in request.edges]
     if request.prior is not None:
         answers.append(window.add_prior(frame_id, request.prior))
     rejected = [reply for reply in answers if isinstance(reply, Rejected)]

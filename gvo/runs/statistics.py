@@ -14,14 +14,14 @@ from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01
-# With more poses that only continue a velocity, a trajectory is in parts made up.
+# With more poses that only continue the last velocity, a run is not complete.
 _MAX_UNTRACKED_SHARE = 0.1
-# A head that turns on a robot moves its camera by less.
+# A robot's moving head or arm displaces its camera by less.
 _MAX_MOUNT_TRAVEL_M = 2.0
 
 
 class _Durations:
-    """Durations of a stage, counted in bins of one percent: the memory does not grow."""
+    """A histogram of durations with bins of one percent: constant memory."""
 
     def __init__(self) -> None:
         self._counts: Counter[int] = Counter()
@@ -48,11 +48,11 @@ class Segment:
     first_stamp_ns, last_stamp_ns : int
         Of its frames, nanoseconds.
     n_frames, n_tracked : int
-        All of them, and those tied to earlier ones by a registration.
+        All, and those registered to earlier ones.
     joined_to : int or None
-        Which other one a measurement ties it to; None where none does.
+        Which other one a measurement joined it to, if any.
     joined_at_ns : int or None
-        Stamp of the frame that was measured.
+        Stamp of the frame of that measurement.
     """
 
     id: int
@@ -66,13 +66,13 @@ class Segment:
 
 @dataclass(slots=True, kw_only=True)
 class RunStatistics:
-    """Counts and times over the frames of a run."""
+    """Counts, times and segments of a run."""
 
     statuses: Counter[Status] = field(default_factory=Counter)
     first_fault: str = ""
     n_unpaired: int = 0
     first_unpaired: str = ""
-    first_untied: str = ""
+    first_untracked: str = ""
     broken_off: str = ""
     n_guessed: int = 0
     mount_travel_m: float = 0.0
@@ -89,7 +89,7 @@ class RunStatistics:
 
     @property
     def n_tracked(self) -> int:
-        """Frames tied to earlier ones by a registration."""
+        """Frames registered to earlier ones."""
         return self.statuses[Status.OK] + self.statuses[Status.RESUMED]
 
     @property
@@ -99,27 +99,38 @@ class RunStatistics:
 
     @property
     def n_faulty(self) -> int:
-        """Frames that have none."""
+        """Frames without a pose."""
         return self.statuses[Status.SKIPPED]
 
     @property
     def coverage_percent(self) -> float:
-        """Share of the frames that are tied to others, or bridge a short gap between such."""
+        """Share of the frames that are tracked, or bridge a short gap between tracked ones."""
         n_bridged = self.n_tracked + self.statuses[Status.COASTING]
         return round(100.0 * n_bridged / max(self.n_frames, 1), 3)
 
     @property
     def unjoined(self) -> list[Segment]:
-        """The segments with a measured motion that nothing ties to an earlier one."""
+        """The segments with tracked frames that are not joined to an earlier one."""
         return [
             segment
             for segment in self.segments.values()
             if segment.joined_to is None and segment.n_tracked > 0
         ]
 
-    def segments_json(self) -> list[dict[str, Any]]:
-        """Return all segments as plain values."""
-        return [asdict(segment) for segment in self.segments.values()]
+    def as_json(self) -> dict[str, Any]:
+        """Return what `summary.json` holds of it."""
+        return {
+            "frames": self.n_frames,
+            "tracked": self.n_tracked,
+            "coverage_percent": self.coverage_percent,
+            "segments": [asdict(segment) for segment in self.segments.values()],
+            "status_counts": {status.value: self.statuses[status] for status in Status},
+            "unpaired_images": self.n_unpaired,
+            "window": asdict(self.window),
+            "polish": None if self.polish is None else self.polish.as_json(),
+            "rig_offsets": None if self.rig_offsets is None else self.rig_offsets.as_json(),
+            "median_ms": {name: durations.median() for name, durations in self.stages.items()},
+        }
 
     @property
     def is_complete(self) -> bool:
@@ -142,7 +153,7 @@ class RunStatistics:
         self._add_to_segment(result)
         for join in result.joins:
             self._join(join)
-        self.first_untied = self.first_untied or result.reason
+        self.first_untracked = self.first_untracked or result.reason
         for stage, elapsed_ms in result.stage_ms.items():
             self.add_duration(stage, elapsed_ms)
 
@@ -214,16 +225,16 @@ class RunStatistics:
 
     def _warnings_of_poses(self) -> list[str]:
         warnings = []
-        n_untied = self.n_with_pose - self.n_tracked
-        if n_untied and self.n_tracked < 2:
+        n_untracked = self.n_with_pose - self.n_tracked
+        if n_untracked and self.n_tracked < 2:
             warnings.append(
                 "no frame could be registered against another (are left and right exchanged, is "
                 "the calibration or depth.scale wrong, are the images dark?); the first: "
-                f"{self.first_untied}"
+                f"{self.first_untracked}"
             )
-        elif n_untied:
+        elif n_untracked:
             warnings.append(
-                f"{n_untied} of {self.n_with_pose} poses continue the last velocity, without a "
+                f"{n_untracked} of {self.n_with_pose} poses continue the last velocity, without a "
                 "registration (frames.csv: coasting, lost)"
             )
         if self.mount_travel_m > _MAX_MOUNT_TRAVEL_M:
@@ -251,8 +262,8 @@ class RunStatistics:
             )
         if len(self.unjoined) > 1:
             warnings.append(
-                f"the camera was lost; {len(self.unjoined)} segments are not joined: nothing ties "
-                "one to the other, and errors over several of them mean little (frames.csv: "
+                f"the camera was lost; {len(self.unjoined)} segments are not joined: their "
+                "relative poses are unknown, errors over several of them mean little (frames.csv: "
                 "segment)"
             )
         return warnings

@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import asdict, fields
 from itertools import islice
 from typing import Any, Literal, TypeAlias
@@ -23,9 +23,9 @@ from gvo.io.poses.truth import TruthComparison
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import RunFolder
 from gvo.runs.loop import RunLoop
-from gvo.trajectory.evaluation import Evaluation, evaluations_json
+from gvo.trajectory.evaluation import evaluations_json
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, Progress, Status
+from gvo.types import Failure, Progress
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
@@ -47,23 +47,13 @@ def summarize(
     loop : RunLoop
         After its run, or in the middle of it.
     compared : TruthComparison or Failure
-        The errors, or why there are none.
+        The errors, or the reason for none.
     warnings : list of str
         A line each.
     state : {"running", "interrupted", "complete"}
         How far the run is.
     """
-    info, statistics = loop.source.info, loop.statistics
-    evaluations: tuple[Evaluation, ...] = ()
-    point: list[list[float]] | None = None
-    stamps_from: str | None = None
-    if isinstance(compared, Failure):
-        truth = f"none: {compared.reason}"
-    else:
-        truth, evaluations = compared.truth.decision, compared.evaluations
-        point = compared.truth.T_frame_point.tolist()
-        stamps_from = compared.truth.trajectory.stamps_from
-    medians = {stage: durations.median() for stage, durations in statistics.stages.items()}
+    info = loop.source.info
     return {
         "gvo_version": __version__,
         "state": state,
@@ -71,23 +61,24 @@ def summarize(
         "sensor": info.sensor,
         "decisions": list(info.decisions),
         "base_frame": _frame_text(loop.base_frame),
-        "ground_truth": truth,
-        "T_frame_truth": point,
-        "ground_truth_stamps_from": stamps_from,
-        "frames": statistics.n_frames,
-        "tracked": statistics.n_tracked,
-        "coverage_percent": statistics.coverage_percent,
-        "segments": statistics.segments_json(),
-        "status_counts": {status.value: statistics.statuses[status] for status in Status},
-        "unpaired_images": statistics.n_unpaired,
-        "window": asdict(statistics.window),
-        "polish": None if statistics.polish is None else statistics.polish.as_json(),
-        "rig_offsets": None if statistics.rig_offsets is None else statistics.rig_offsets.as_json(),
-        "median_ms": medians,
+        **_truth_json(compared),
+        **loop.statistics.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
-        "errors": evaluations_json(evaluations)["estimates"],
         "warnings": warnings,
         "configuration": loop.config.model_dump(),
+    }
+
+
+def _truth_json(compared: TruthComparison | Failure) -> dict[str, Any]:
+    if isinstance(compared, Failure):
+        absent = dict.fromkeys(("T_frame_truth", "ground_truth_stamps_from"))
+        return {"ground_truth": f"none: {compared.reason}", **absent, "errors": []}
+    truth = compared.truth
+    return {
+        "ground_truth": truth.decision,
+        "T_frame_truth": truth.T_frame_point.tolist(),
+        "ground_truth_stamps_from": truth.trajectory.stamps_from,
+        "errors": evaluations_json(compared.evaluations)["estimates"],
     }
 
 
@@ -109,12 +100,12 @@ def run_identity(
     *,
     start: Trajectory | None = None,
 ) -> dict[str, Any]:
-    """Return what makes a run, beside its configuration, this one and no other.
+    """Return what identifies a run, besides its configuration.
 
     Parameters
     ----------
     source : Source
-        Of its images the first one of either stream is read.
+        The first image of either stream is read.
     base_frame : BaseFrame
         Before the first frame.
     excerpt : Excerpt or None
@@ -205,8 +196,8 @@ _EVERY_S = 3.0
 _NOT_YET = Failure(reason="the run has not ended")
 
 
-class RunningSummary:
-    """Replaces `summary.json` every few seconds.
+class RunningSummary(AbstractContextManager["RunningSummary"]):
+    """Replaces `summary.json` every few seconds, and where a run is interrupted.
 
     Parameters
     ----------
@@ -215,7 +206,7 @@ class RunningSummary:
     identity : dict
         See `run_identity`.
     on_progress : callable, optional
-        Called before, after each frame.
+        Called first, after each frame.
     """
 
     def __init__(
@@ -232,7 +223,7 @@ class RunningSummary:
         self._written_s: float | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Take that a frame is done."""
+        """Count a frame."""
         if self._on_progress is not None:
             self._on_progress(progress)
         if self._written_s is None or time.monotonic() - self._written_s > _EVERY_S:
@@ -240,7 +231,7 @@ class RunningSummary:
             self.write("running")
 
     def write(self, state: State, *warnings: str) -> None:
-        """Write what was done so far.
+        """Write how far the run came.
 
         Raises
         ------
@@ -252,29 +243,20 @@ class RunningSummary:
         self._folder.write_summary(summary | {"run": self._identity})
         self._written_s = time.monotonic()
 
-    @contextmanager
-    def told(self) -> Iterator[None]:
-        """Say in the summary, and in an error of writing, what stands.
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Write, where the run is interrupted, how far it came.
 
         Raises
         ------
         OutputError
-            The same, with the number of frames that stand.
+            In place of the same, with the number of frames written.
         """
-        try:
-            yield
-        except OutputError as error:
-            self._write_interrupted(str(error))
-            raise self._explained(error) from error
-        except (GvoError, KeyboardInterrupt):
-            self._write_interrupted("interrupted")
-            raise
-
-    def _write_interrupted(self, what: str) -> None:
+        if not isinstance(error, GvoError | KeyboardInterrupt):
+            return
+        is_output = isinstance(error, OutputError)
         with suppress(OutputError):
-            self.write("interrupted", what)
-
-    def _explained(self, error: OutputError) -> OutputError:
-        statistics = self._loop.statistics
-        text = f"{error}; {statistics.n_frames} frames stand whole in {self._folder.path}"
-        return OutputError(text, is_partly=statistics.n_with_pose > 0)
+            self.write("interrupted", str(error) if is_output else "interrupted")
+        if is_output:
+            statistics = self._loop.statistics
+            text = f"{error}; {statistics.n_frames} frames stand whole in {self._folder.path}"
+            raise OutputError(text, is_partly=statistics.n_with_pose > 0) from error

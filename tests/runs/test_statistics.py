@@ -75,7 +75,7 @@ def test_segments_are_told_with_their_frames_and_what_they_are_joined_to() -> No
     add(statistics, 40, Status.RESUMED, 1)
     add(statistics, 50, Status.OK, 1, (1, 0))
     statistics.add_faulty(FaultyFrame(stamp_ns=60, reason="black"), is_loss=True)
-    first, second = statistics.segments_json()
+    first, second = statistics.as_json()["segments"]
     assert first == {
         "id": 0,
         "first_stamp_ns": 10,

@@ -213,8 +213,8 @@ class RunBag(AbstractContextManager["RunBag"]):
         After coasting, the registration is against an older frame than the pose before.
         """
         last = self._last.get("raw")
-        is_tied = last is not None and last.status == raw.status == Status.OK
-        if not is_tied or result.registration is None:
+        is_step = last is not None and last.status == raw.status == Status.OK
+        if not is_step or result.registration is None:
             return None
         Ad = se3.adjoint(self._frames.mount(raw.stamp_ns))
         return np.asarray(Ad @ result.registration.covariance @ Ad.T)

@@ -173,7 +173,7 @@ def write_diagnostics(
 ) -> None:
     """Write the state of a frame to `/diagnostics`.
 
-    Its level is OK for a frame tied to its predecessors, WARN where it coasts or has resumed,
+    Its level is OK for a frame registered to its predecessors, WARN where it coasts or has resumed,
     ERROR where it is lost or was skipped.
 
     Parameters

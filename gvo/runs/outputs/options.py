@@ -6,11 +6,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvo.config import Config
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
-from gvo.runs.loop import Output
+from gvo.runs.loop import Output, RunLoop
 from gvo.runs.outputs.frames import RunFrames
 
 
@@ -46,29 +45,15 @@ class RunOutputs:
         if self.plots is not None and not self.report:
             raise ConfigurationError("--plots are those of the report: not with --no-report")
 
-    def open(
-        self,
-        source: Source,
-        base_frame: BaseFrame,
-        stack: ExitStack,
-        *,
-        config: Config,
-        is_placed: bool,
-    ) -> tuple[list[Output], list[str]]:
+    def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[Output], list[str]]:
         """Open what is written as the run goes.
 
         Parameters
         ----------
-        source : Source
-            The recording.
-        base_frame : BaseFrame
-            Whose poses are written.
+        loop : RunLoop
+            Before its run.
         stack : ExitStack
             Closes what is opened.
-        config : Config
-            Of the run.
-        is_placed : bool
-            The first pose was asked for: the world is not that of the first frame.
 
         Returns
         -------
@@ -88,7 +73,9 @@ class RunOutputs:
         if self.plots is not None:
             _make_folder(self.plots)
         if self.bag is not None or self.rerun is not None:
-            names = name_frames(source, base_frame, is_placed=is_placed, world=self.world)
+            names = name_frames(
+                loop.source, loop.base_frame, is_placed=loop.is_placed, world=self.world
+            )
         if self.bag is not None:
             from gvo.runs.outputs.bag import RunBag
 
@@ -96,13 +83,13 @@ class RunOutputs:
         if self.overlay is not None:
             from gvo.runs.outputs.video import RunOverlay
 
-            film = RunOverlay(self.overlay, source.info.camera)
+            film = RunOverlay(self.overlay, loop.source.info.camera)
             warnings += film.decisions
             outputs.append(stack.enter_context(film))
         if self.rerun is not None:
             from gvo.runs.outputs.rerun import RunRerun
 
-            rerun = RunRerun(self.rerun, source.info.camera, names, config=config)
+            rerun = RunRerun(self.rerun, loop.source.info.camera, names, config=loop.config)
             outputs.append(stack.enter_context(rerun))
         return outputs, warnings
 
