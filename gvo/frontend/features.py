@@ -124,10 +124,8 @@ def _make_detectors(config: FeaturesConfig, orb: cv2.Feature2D) -> list[cv2.Feat
 
 
 def _no_features(kind: str) -> Features:
-    is_real = kind == "sift"
-    descriptors: Descriptors = (
-        np.zeros((0, 128), np.float32) if is_real else np.zeros((0, 32), np.uint8)
-    )
+    size = 128 if kind == "sift" else 32
+    descriptors = _typed(np.zeros((0, size)), kind)
     return Features(
         keypoints=np.zeros((0, 2)), octaves=np.zeros(0, np.int64), descriptors=descriptors
     )

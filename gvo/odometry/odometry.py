@@ -70,7 +70,13 @@ class Odometry:
         self._config = self._next_config = config or Config()
         self._camera = camera
         self._is_own = frontend is not None
-        self._frontend = CheckedFrontend(_choose_frontend(camera, self._config, frontend))
+        if frontend is None:
+            if camera is None:
+                raise ValueError(
+                    "Odometry needs a camera, or a front-end of your own (frontend=...)"
+                )
+            frontend = make_frontend(camera, self._config)
+        self._frontend = CheckedFrontend(frontend)
         self._chain: RawChain[Any] = RawChain(self._frontend, self._config.window)
         self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
@@ -391,16 +397,6 @@ def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
         T_reference_frame=np.eye(4),
         covariance=config.zero_motion_sigma_factor**2 * step.covariance,
     )
-
-
-def _choose_frontend(
-    camera: StereoCamera | PinholeCamera | None, config: Config, frontend: Frontend[Any] | None
-) -> Frontend[Any]:
-    if frontend is not None:
-        return frontend
-    if camera is None:
-        raise ValueError("Odometry needs a camera, or a front-end of your own (frontend=...)")
-    return make_frontend(camera, config)
 
 
 class Stopwatch:

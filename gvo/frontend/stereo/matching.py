@@ -125,14 +125,10 @@ def _have_room(
 ) -> BoolArray:
     """Tell which patches, and the strips to search them in, lie in the images."""
     height, width = shape
-    return np.asarray(
-        (row >= radius)
-        & (row < height - radius)
-        & (column_left >= radius)
-        & (column_left < width - radius)
-        & (column_right >= radius + reach)
-        & (column_right < width - radius - reach)
-    )
+    margin = radius + reach
+    is_inside = (row >= radius) & (row < height - radius)
+    is_inside &= (column_left >= radius) & (column_left < width - radius)
+    return np.asarray(is_inside & (column_right >= margin) & (column_right < width - margin))
 
 
 def is_in_depth_range(

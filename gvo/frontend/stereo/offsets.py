@@ -33,21 +33,21 @@ class OffsetFilter:
     ----------
     prior_sigma_px : float
         Standard deviation of the prior around zero, pixels.
+
+    Attributes
+    ----------
+    value_px : float
+        The present estimate, pixels.
     """
 
     def __init__(self, prior_sigma_px: float) -> None:
         self._prior_variance = prior_sigma_px**2
         self._variance = self._prior_variance
-        self._value = 0.0
-
-    @property
-    def value_px(self) -> float:
-        """The value, pixels."""
-        return self._value
+        self.value_px = 0.0
 
     @property
     def sigma_px(self) -> float:
-        """Its standard deviation, pixels."""
+        """Standard deviation of the value, pixels."""
         return math.sqrt(self._variance)
 
     def update(self, left_px: float, sigma_px: float) -> None:
@@ -55,7 +55,7 @@ class OffsetFilter:
         variance = min(self._variance + _DRIFT_PX**2, self._prior_variance)
         limit = _MAX_SURPRISE * math.sqrt(variance + sigma_px**2)
         gain = variance / (variance + sigma_px**2)
-        self._value += gain * min(max(left_px, -limit), limit)
+        self.value_px += gain * min(max(left_px, -limit), limit)
         self._variance = (1.0 - gain) * variance
 
 
