@@ -75,10 +75,10 @@ def truth_stamps(rate_hz: int = 100, offset_ns: int = 3_700_000) -> IntArray:
 
 
 def moved_by_hand(
-    T_world_cam: FloatArray, T_frame_cam: FloatArray, T_initial: FloatArray | None = None
+    T_world_cam: FloatArray, T_base_cam: FloatArray, T_initial: FloatArray | None = None
 ) -> FloatArray:
     """Return the poses (n, 4, 4) of a frame that carries the camera; each starts at its first."""
-    mounts = np.broadcast_to(T_frame_cam, T_world_cam.shape)
+    mounts = np.broadcast_to(T_base_cam, T_world_cam.shape)
     poses = mounts[0] @ T_world_cam @ np.linalg.inv(mounts)
     return poses if T_initial is None else np.asarray(T_initial @ poses)
 

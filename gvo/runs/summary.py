@@ -71,12 +71,12 @@ def summarize(
 
 def _truth_json(compared: TruthComparison | Failure) -> dict[str, Any]:
     if isinstance(compared, Failure):
-        absent = dict.fromkeys(("T_frame_truth", "ground_truth_stamps_from"))
+        absent = dict.fromkeys(("T_base_truth", "ground_truth_stamps_from"))
         return {"ground_truth": f"none: {compared.reason}", **absent, "errors": []}
     truth = compared.truth
     return {
         "ground_truth": truth.decision,
-        "T_frame_truth": truth.T_frame_point.tolist(),
+        "T_base_truth": truth.T_base_point.tolist(),
         "ground_truth_stamps_from": truth.trajectory.stamps_from,
         "errors": evaluations_json(compared.evaluations)["estimates"],
     }

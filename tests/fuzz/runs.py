@@ -24,7 +24,7 @@ _FILES = {
     "summary.json": json.dumps(
         {
             "recording": "x",
-            "T_frame_truth": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]],
+            "T_base_truth": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]],
             "ground_truth_stamps_from": "file",
         }
     ),

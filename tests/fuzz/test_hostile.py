@@ -402,8 +402,8 @@ def test_a_name_that_no_file_can_have_names_none() -> None:
     ("name", "content"),
     [
         ("summary.json", "[" * 50000),
-        ("summary.json", json.dumps({"T_frame_truth": "x"})),
-        ("summary.json", json.dumps({"T_frame_truth": [[1e200] * 4] * 4})),
+        ("summary.json", json.dumps({"T_base_truth": "x"})),
+        ("summary.json", json.dumps({"T_base_truth": [[1e200] * 4] * 4})),
         ("frames.csv", "x" * 200000 + "\n"),
     ],
     ids=range(4),

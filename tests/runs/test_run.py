@@ -305,7 +305,7 @@ def _poses(folder: Path, name: str) -> np.ndarray:
     return gvo.read_trajectory(folder / f"{name}.txt").T_world_cam
 
 
-def _covariance_by_hand(covariance: np.ndarray, T_frame_cam: np.ndarray) -> np.ndarray:
+def _covariance_by_hand(covariance: np.ndarray, T_base_cam: np.ndarray) -> np.ndarray:
     """Move each axis of the camera a little and see how the frame moves with it."""
     J = np.zeros((6, 6))
     for k in range(6):
@@ -314,16 +314,16 @@ def _covariance_by_hand(covariance: np.ndarray, T_frame_cam: np.ndarray) -> np.n
         hat = np.zeros((4, 4))
         hat[[2, 0, 1], [1, 2, 0]], hat[[1, 2, 0], [2, 0, 1]] = small[:3], -small[:3]
         hat[:3, 3] = small[3:]
-        step = T_frame_cam @ expm(hat) @ np.linalg.inv(T_frame_cam)
+        step = T_base_cam @ expm(hat) @ np.linalg.inv(T_base_cam)
         J[:, k] = [*Rotation.from_matrix(step[:3, :3]).as_rotvec(), *step[:3, 3]]
     return np.asarray(1e12 * J @ covariance @ J.T)
 
 
 def _assert_moved(
-    base: Path, camera: Path, T_frame_cam: np.ndarray, T_initial: np.ndarray | None = None
+    base: Path, camera: Path, T_base_cam: np.ndarray, T_initial: np.ndarray | None = None
 ) -> None:
     """Compare a run of a frame with the camera's run, pose by pose and covariance by covariance."""
-    mounts = np.broadcast_to(T_frame_cam, (N_FRAMES, 4, 4))
+    mounts = np.broadcast_to(T_base_cam, (N_FRAMES, 4, 4))
     for name in TRAJECTORIES:
         expected = moved_by_hand(_poses(camera, name), mounts, T_initial)
         np.testing.assert_allclose(_poses(base, name), expected, atol=1e-8)

@@ -165,19 +165,19 @@ class BagSource:
         self,
         spec: BagTruthSpec | None = None,
         *,
-        frame: str = "",
-        T_frame_cam: FloatArray | None = None,
+        base_frame: str = "",
+        T_base_cam: FloatArray | None = None,
     ) -> Truth | Failure:
-        """Return true poses of a frame.
+        """Return true poses of a base frame.
 
         Parameters
         ----------
         spec : TfTruth or TopicTruth, optional
             What to read; omitted: what names itself ground truth.
-        frame : str
+        base_frame : str
             In tf; empty: the rectified left or colour camera.
-        T_frame_cam : ndarray of float64, shape (4, 4), optional
-            How the camera sits in the frame, where tf does not say so.
+        T_base_cam : ndarray of float64, shape (4, 4), optional
+            Where the camera is mounted on it, if that does not come from tf.
 
         Returns
         -------
@@ -195,9 +195,9 @@ class BagSource:
             spec,
             buffer=whole if whole.is_whole else None,
             where=self._where,
-            frame=frame,
+            base_frame=base_frame,
             camera_frame=self._info.frame_id,
-            T_frame_cam=T_frame_cam,
+            T_base_cam=T_base_cam,
         )
 
     def ground_truth(self) -> Trajectory | None:

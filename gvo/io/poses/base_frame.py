@@ -38,47 +38,47 @@ class BaseFrame:
     ----------
     name : str
         Of the frame; empty where it has none.
-    T_frame_cam : ndarray of float64, shape (4, 4), or callable
-        Maps camera coordinates to the frame, metres. A function of stamp_ns where the camera
-        moves in the frame: it returns the matrix, and whether it had to be guessed.
+    T_base_cam : ndarray of float64, shape (4, 4), or callable
+        Maps camera coordinates to the base frame, metres. A function of stamp_ns where the
+        camera moves on it: returns the matrix, and whether it is that of another stamp.
     T_initial : ndarray of float64, shape (4, 4), optional
-        T_world_frame of the first frame, metres; the identity where omitted.
+        T_world_base of the first frame, metres; the identity where omitted.
 
     Attributes
     ----------
     name : str
     origin : str
-        What says where the camera is in it, in words; empty for tf and the camera itself.
+        Where its mount comes from, in words; empty for tf and the camera itself.
     first_stamp_ns : int or None
         Stamp of the first frame, once it is known.
 
     Raises
     ------
     ValueError
-        Where a matrix is no rigid transform.
+        When a matrix is no rigid transform.
     """
 
     def __init__(
         self,
         name: str = "",
-        T_frame_cam: FloatArray | Callable[[int], tuple[FloatArray, bool]] | None = None,
+        T_base_cam: FloatArray | Callable[[int], tuple[FloatArray, bool]] | None = None,
         *,
         T_initial: FloatArray | None = None,
     ) -> None:
         self.name = name
         self.origin = ""
         self.first_stamp_ns: int | None = None
-        self._is_camera = T_frame_cam is None
+        self._is_camera = T_base_cam is None
         self._T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
         self._guessed_stamps_ns: set[int] = set()
         self._mount_low = np.full(3, np.inf)
         self._mount_high = np.full(3, -np.inf)
         self._T_world_cam_first = np.eye(4)
         self._T_frame_cam: FloatArray | None = None
-        if callable(T_frame_cam):
-            self._mount = T_frame_cam
+        if callable(T_base_cam):
+            self._mount = T_base_cam
         else:
-            T = np.eye(4) if T_frame_cam is None else _rigid("T_frame_cam", T_frame_cam)
+            T = np.eye(4) if T_base_cam is None else _rigid("T_base_cam", T_base_cam)
             self._T_frame_cam = T
             self._mount = lambda _: (T, False)
 
@@ -92,18 +92,18 @@ class BaseFrame:
         T_initial: FloatArray | None = None,
         where: str = "the recording",
     ) -> BaseFrame:
-        """Take the camera's place in a frame from `/tf`.
+        """Take from `/tf` where the camera is mounted on a frame.
 
         Parameters
         ----------
         buffer : TfBuffer
             Of the recording.
         frame : str
-            The frame asked for.
+            Its name.
         camera_frame : str
             The frame_id of the images.
         T_initial : ndarray of float64, shape (4, 4), optional
-            T_world_frame of the first frame, metres; the identity where omitted.
+            T_world_base of the first frame, metres; the identity where omitted.
         where : str
             The recording, for messages.
 
@@ -121,10 +121,10 @@ class BaseFrame:
                 "empty); give T_body_cam by --calibration FILE"
             )
         if buffer.is_static(frame, camera_frame):
-            T_frame_cam = buffer.lookup(frame, camera_frame, 0)
-            if isinstance(T_frame_cam, Failure):
-                raise _not_found(where, frame, camera_frame, buffer, T_frame_cam.reason)
-            return cls(frame, T_frame_cam, T_initial=T_initial)
+            T_base_cam = buffer.lookup(frame, camera_frame, 0)
+            if isinstance(T_base_cam, Failure):
+                raise _not_found(where, frame, camera_frame, buffer, T_base_cam.reason)
+            return cls(frame, T_base_cam, T_initial=T_initial)
         mount = _MovingMount(buffer, frame, camera_frame, where)
         return cls(frame, mount, T_initial=T_initial)
 
@@ -140,12 +140,12 @@ class BaseFrame:
 
     @property
     def T_initial(self) -> FloatArray | None:  # noqa: N802 - the field's name
-        """T_world_frame of the first frame that was asked for, shape (4, 4), metres."""
+        """T_world_base of the first frame, where asked for, shape (4, 4), metres."""
         return self._T_initial
 
     @property
     def fixed_mount(self) -> FloatArray | None:
-        """T_frame_cam, shape (4, 4), metres; None for the camera, and where it moves."""
+        """T_base_cam, shape (4, 4), metres; None for the camera, and where it moves."""
         return None if self._is_camera else self._T_frame_cam
 
     @property
@@ -155,7 +155,7 @@ class BaseFrame:
 
     @property
     def mount_travel_m(self) -> float:
-        """How far the camera went in the frame so far, metres: the diagonal of its places."""
+        """Diagonal of the box around the camera's positions on the base frame so far, metres."""
         return float(np.linalg.norm(np.maximum(self._mount_high - self._mount_low, 0.0)))
 
     def start(self, stamp_ns: int, T_initial: FloatArray | None = None) -> None:
@@ -166,7 +166,7 @@ class BaseFrame:
         stamp_ns : int
             Its stamp, nanoseconds.
         T_initial : ndarray of float64, shape (4, 4), optional
-            T_world_frame at that stamp, in place of the one given before.
+            T_world_base at that stamp, in place of the one given before.
 
         Raises
         ------
@@ -178,12 +178,12 @@ class BaseFrame:
         if T_initial is not None:
             self._T_initial = _rigid("T_initial", T_initial)
         self.first_stamp_ns = stamp_ns
-        T_frame_cam = self.T_frame_cam(stamp_ns)
+        T_base_cam = self.T_base_cam(stamp_ns)
         T_initial = np.eye(4) if self._T_initial is None else self._T_initial
-        self._T_world_cam_first = T_initial @ T_frame_cam
+        self._T_world_cam_first = T_initial @ T_base_cam
 
-    def T_frame_cam(self, stamp_ns: int) -> FloatArray:  # noqa: N802 - the field's name
-        """Return how the camera sits in the frame at a stamp, shape (4, 4), metres."""
+    def T_base_cam(self, stamp_ns: int) -> FloatArray:  # noqa: N802 - the field's name
+        """Return where the camera is mounted at a stamp, shape (4, 4), metres."""
         T, is_guessed = self._mount(stamp_ns)
         self._mount_low = np.minimum(self._mount_low, T[:3, 3])
         self._mount_high = np.maximum(self._mount_high, T[:3, 3])
@@ -192,7 +192,7 @@ class BaseFrame:
         return T
 
     def apply(self, estimate: Estimate) -> Estimate:
-        """Return the estimate of the frame.
+        """Return the estimate of the base frame.
 
         Parameters
         ----------
@@ -209,19 +209,19 @@ class BaseFrame:
             self.start(estimate.stamp_ns)
         if self._is_camera and self._T_initial is None:
             return estimate
-        T_frame_cam = self.T_frame_cam(estimate.stamp_ns)
+        T_base_cam = self.T_base_cam(estimate.stamp_ns)
         T_camera = self._T_world_cam_first @ estimate.T_world_cam
         # T exp(xi) B = T B exp(Ad(B^-1) xi), with B = T_cam_frame
-        Ad = se3.adjoint(T_frame_cam)
+        Ad = se3.adjoint(T_base_cam)
         covariance = Ad @ estimate.covariance @ Ad.T
         return replace(
             estimate,
-            T_world_cam=T_camera @ se3.invert(T_frame_cam),
+            T_world_cam=T_camera @ se3.invert(T_base_cam),
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
         )
 
     def convert(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory of the frame that belongs to one of the camera.
+        """Convert a trajectory of the camera into that of the base frame.
 
         Its world stays as it is: for comparing true poses of the camera with estimates of the
         frame.
@@ -253,14 +253,14 @@ class BaseFrame:
             return trajectory.transformed(se3.invert(self._T_frame_cam))
         found = [self._mount(int(stamp_ns)) for stamp_ns in trajectory.stamps_ns]
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
-        T_frame_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]
+        T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]
         known = trajectory.select(is_known)
-        T_world_frame = known.T_world_cam @ se3.invert(T_frame_cam)
+        T_world_frame = known.T_world_cam @ se3.invert(T_base_cam)
         return replace(known, T_world_cam=T_world_frame, covariances=None)
 
 
 class _MovingMount:
-    """Looks up how a camera that moves in the frame sits there."""
+    """Looks up where a camera that moves on the base frame is mounted."""
 
     def __init__(self, buffer: TfBuffer, frame: str, camera_frame: str, where: str) -> None:
         self._buffer, self._frame, self._camera_frame = buffer, frame, camera_frame
@@ -297,7 +297,7 @@ def parse_initial_pose(text: str) -> InitialPose:
     Returns
     -------
     ndarray of float64, shape (4, 4), or "truth"
-        T_world_frame of the first frame; `truth` means the first pose of the ground truth.
+        T_world_base of the first frame; `truth` means the first pose of the ground truth.
 
     Raises
     ------

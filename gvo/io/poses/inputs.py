@@ -139,7 +139,7 @@ def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -
     reason = "positions without rotations cannot be moved"
     if truth.trajectory.has_rotations:
         tree = read_tf(reader, frames=(truth.child_frame, frame))
-        framed = in_frame(truth, tree, frame=frame)
+        framed = in_frame(truth, tree, base_frame=frame)
         if not isinstance(framed, Failure):
             return replace(
                 found,
@@ -218,7 +218,9 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
         raise TrajectoryError(
             f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
         )
-    truth = source.truth(spec, frame=_name_in_tf(base_frame), T_frame_cam=base_frame.fixed_mount)
+    truth = source.truth(
+        spec, base_frame=_name_in_tf(base_frame), T_base_cam=base_frame.fixed_mount
+    )
     if isinstance(truth, Failure):
         raise TrajectoryError(f"--ground-truth {text}: {truth.reason}")
     return truth
@@ -246,7 +248,7 @@ def recorded_truth(source: Source, *, base_frame: BaseFrame | None = None) -> Tr
     """
     base_frame = base_frame or BaseFrame()
     if isinstance(source, BagSource):
-        return source.truth(frame=_name_in_tf(base_frame), T_frame_cam=base_frame.fixed_mount)
+        return source.truth(base_frame=_name_in_tf(base_frame), T_base_cam=base_frame.fixed_mount)
     truth = source.ground_truth()
     if truth is None:
         return Failure(reason="the recording holds none")

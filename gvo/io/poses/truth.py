@@ -1,4 +1,4 @@
-"""True poses in the frame that is estimated; estimates compared with them."""
+"""True poses of the base frame; estimates compared with them."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from gvo.types import BoolArray, Failure, FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """True poses to be compared with the estimates of one frame.
+    """True poses of the base frame, to compare estimates with.
 
     Parameters
     ----------
     trajectory : Trajectory
-        T_parent_frame; or positions of the measured point, without rotations.
+        T_parent_base; or positions of the measured point, without rotations.
     decision : str
-        What was read and how it was brought into the frame, in one line.
-    T_frame_point : ndarray of float64, shape (4, 4)
-        Where that point lies in the frame, metres; the identity for poses.
+        What was read and how it was brought to the base frame, in one line.
+    T_base_point : ndarray of float64, shape (4, 4)
+        Where that point lies in the base frame, metres; the identity for poses.
     warning : str
         A caveat of the errors, in one line; empty if none.
     """
 
     trajectory: Trajectory
     decision: str
-    T_frame_point: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_base_point: FloatArray = field(default_factory=lambda: np.eye(4))
     warning: str = ""
 
     def comparable(self, estimate: Trajectory) -> Trajectory:
-        """Return the estimate of the frame, moved to the point whose true positions are known."""
-        if np.array_equal(self.T_frame_point, np.eye(4)):
+        """Return the estimate of the base frame, moved to the point of the true positions."""
+        if np.array_equal(self.T_base_point, np.eye(4)):
             return estimate
-        return estimate.transformed(self.T_frame_point)
+        return estimate.transformed(self.T_base_point)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,12 +61,12 @@ def find_truth(
     spec: BagTruthSpec | None = None,
     *,
     where: str,
-    frame: str = "",
+    base_frame: str = "",
     camera_frame: str = "",
-    T_frame_cam: FloatArray | None = None,
+    T_base_cam: FloatArray | None = None,
     buffer: TfBuffer | None = None,
 ) -> Truth | Failure:
-    """Read the truth that `spec` names, else the named truth, in the frame that is estimated.
+    """Read the truth that `spec` names, else the named truth, as poses of the base frame.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def find_truth(
         What to read; see `find_named_truth` where omitted.
     where : str
         The bag, for messages.
-    frame, camera_frame, T_frame_cam
+    base_frame, camera_frame, T_base_cam
         As of `in_frame`.
     buffer : TfBuffer, optional
         Of the bag, with all its frames; read where omitted and needed.
@@ -98,53 +98,55 @@ def find_truth(
     else:
         truth = read_bag_truth(reader, spec, where=where, buffer=buffer)
     if buffer is None:
-        frames = [name for name in (truth.child_frame, frame, camera_frame) if name]
+        frames = [name for name in (truth.child_frame, base_frame, camera_frame) if name]
         buffer = read_tf(reader, frames=frames) if len({*frames}) > 1 else TfBuffer()
-    return in_frame(truth, buffer, frame=frame, camera_frame=camera_frame, T_frame_cam=T_frame_cam)
+    return in_frame(
+        truth, buffer, base_frame=base_frame, camera_frame=camera_frame, T_base_cam=T_base_cam
+    )
 
 
 def in_frame(
     truth: BagTruth,
     buffer: TfBuffer,
     *,
-    frame: str = "",
+    base_frame: str = "",
     camera_frame: str = "",
-    T_frame_cam: FloatArray | None = None,
+    T_base_cam: FloatArray | None = None,
 ) -> Truth | Failure:
-    """Bring true poses into the frame that is estimated: T_parent_child @ T_child_frame.
+    """Bring true poses to the base frame: T_parent_child @ T_child_base.
 
-    Where the messages name no child frame, they are taken for poses of the frame itself.
+    Where the messages name no child frame, they are taken for poses of the base frame.
     Positions without rotations stay: estimates are moved to the point instead, by
-    `Truth.comparable`; where the place of the point in the frame is not known it is taken
-    for the frame's origin, with a warning.
+    `Truth.comparable`; where the place of the point in the base frame is not known it is taken
+    for its origin, with a warning.
 
     Parameters
     ----------
     truth : BagTruth
     buffer : TfBuffer
         Of the bag.
-    frame : str
-        That is estimated, by its name in tf; empty: the rectified camera.
+    base_frame : str
+        Its name in tf; empty: the rectified camera.
     camera_frame : str
         Of the rectified camera in tf; empty where the recording names none.
-    T_frame_cam : ndarray of float64, shape (4, 4), optional
-        Where the camera sits in the frame, metres, if that does not come from tf.
+    T_base_cam : ndarray of float64, shape (4, 4), optional
+        Where the camera is mounted on it, metres, if that does not come from tf.
 
     Returns
     -------
     Truth or Failure
-        The failure says why tf does not bring the child frame of poses to the frame.
+        The failure says why tf does not bring the poses to the base frame.
     """
     camera = _Place(name=bare(camera_frame))
     asked = camera
-    if T_frame_cam is not None:
-        asked = _Place(name=camera.name, T_name_frame=se3.invert(T_frame_cam))
-    elif frame:
-        asked = _Place(name=bare(frame))
+    if T_base_cam is not None:
+        asked = _Place(name=camera.name, T_name_frame=se3.invert(T_base_cam))
+    elif base_frame:
+        asked = _Place(name=bare(base_frame))
     if not truth.is_of_camera and not truth.child_frame:
-        return _framed(truth, f"; it names no frame, taken for {frame or 'the camera'}")
+        return _framed(truth, f"; it names no frame, taken for {base_frame or 'the camera'}")
     child = camera if truth.is_of_camera else _Place(name=bare(truth.child_frame))
-    if child is asked or (not truth.is_of_camera and child.name == bare(frame)):
+    if child is asked or (not truth.is_of_camera and child.name == bare(base_frame)):
         return _framed(truth, "")
     if not truth.trajectory.has_rotations:
         return _at_point(truth, buffer, child, asked)
@@ -182,7 +184,7 @@ def _at_point(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -
     T_asked_point = se3.make_transform(np.eye(3), points[0])
     place = ", ".join(f"{value:.3f}" for value in points[0])
     how = f"; {child.name} lies at ({place}) m from {asked.name} by tf"
-    return replace(framed, T_frame_point=T_asked_point, decision=f"{framed.decision}{how}")
+    return replace(framed, T_base_point=T_asked_point, decision=f"{framed.decision}{how}")
 
 
 def _between(
@@ -230,7 +232,7 @@ class TruthComparison:
 
     @classmethod
     def of(cls, truth: Truth, estimates: Mapping[str, Trajectory]) -> TruthComparison:
-        """Compare estimates of the frame that was asked for.
+        """Compare estimates of the base frame.
 
         Parameters
         ----------

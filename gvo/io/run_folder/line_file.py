@@ -1,10 +1,15 @@
-"""Text files of whole lines: a group of lines is in the file or it is not."""
+"""Files that are whole whenever a run is stopped: lines appended, files replaced or renamed."""
 
 from __future__ import annotations
 
 import io
 import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from gvo.errors import RecordingError
 
 
 def append_whole(file: io.FileIO, data: bytes) -> None:
@@ -83,3 +88,52 @@ def replace_bytes(path: Path, data: bytes) -> None:
     except OSError:
         beside.unlink(missing_ok=True)
         raise
+
+
+class PartFile:
+    """A file written under another name in its folder; it takes its own once it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder is made where it is missing.
+    *errors : type
+        Raised, besides OSError, where it cannot be written.
+
+    Attributes
+    ----------
+    part : Path
+        Where it is written; what is given its name in the end.
+
+    Raises
+    ------
+    RecordingError
+        When it exists, or cannot be written.
+    """
+
+    def __init__(self, path: Path, *errors: type[Exception]) -> None:
+        self.path = path
+        self._errors = (OSError, *errors)
+        if path.exists():
+            raise RecordingError(f"{path}: exists already; give another path or remove it")
+        with self.refused_on_error():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-part-")
+        self.part = Path(self._folder.name) / path.name
+
+    @contextmanager
+    def refused_on_error(self) -> Iterator[None]:
+        """Raise a RecordingError where it cannot be written."""
+        try:
+            yield
+        except self._errors as error:
+            detail = getattr(error, "strerror", None) or error
+            raise RecordingError(f"{self.path}: cannot be written: {detail}") from error
+
+    @contextmanager
+    def completed(self, *, is_kept: bool) -> Iterator[None]:
+        """Give the file its name after the last lines are written, or remove it."""
+        with self._folder, self.refused_on_error():
+            yield
+            if is_kept:
+                self.part.rename(self.path)

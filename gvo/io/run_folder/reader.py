@@ -130,10 +130,10 @@ class RunRecord:
     def comparable(self) -> dict[str, Trajectory]:
         """Return the trajectories that hold poses, as those of what the truth is of."""
         filled = {name: t for name, t in self.trajectories.items() if len(t) > 0}
-        T_frame_truth = self.summary.get("T_frame_truth")
-        if self.truth is None or T_frame_truth is None:
+        T_base_truth = self.summary.get("T_base_truth")
+        if self.truth is None or T_base_truth is None:
             return filled
-        T = np.array(T_frame_truth, dtype=np.float64)
+        T = np.array(T_base_truth, dtype=np.float64)
         if np.array_equal(T, np.eye(4)):
             return filled
         return {name: trajectory.transformed(T) for name, trajectory in filled.items()}
@@ -188,9 +188,9 @@ def _read_summary(path: Path) -> dict[str, Any]:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
     if not isinstance(summary, dict):
         raise RecordingError(f"{path}: holds no object; {_EXPECTED}")
-    fault = _transform_fault(summary.get("T_frame_truth"))
+    fault = _transform_fault(summary.get("T_base_truth"))
     if fault:
-        raise RecordingError(f"{path}: T_frame_truth {fault}; run again")
+        raise RecordingError(f"{path}: T_base_truth {fault}; run again")
     return summary
 
 

@@ -31,9 +31,8 @@ the length of the run, not with its square; those at the end hold all poses.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -45,6 +44,7 @@ from rosbags.rosbag2 import WriterError as WriterError2
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_transforms
+from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.bag_messages import (
     write_diagnostics,
     write_odometry,
@@ -101,11 +101,14 @@ class RunBag(AbstractContextManager["RunBag"]):
         self._newest_ns = 0
         self._n_seconds = 0
         self._is_open = True
-        _check_target(self.path)
-        with self._refused_on_error():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".gvo-bag-")
-            self._bag = BagWriter(Path(self._folder.name) / self.path.name).__enter__()
+        if self.path.suffix not in SUFFIXES:
+            raise RecordingError(
+                f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got "
+                f"{self.path.name}"
+            )
+        self._file = PartFile(self.path, WriterError1, WriterError2)
+        with self._file.refused_on_error():
+            self._bag = BagWriter(self._file.part).__enter__()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Write what one frame gave.
@@ -115,7 +118,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         frame : StereoFrame or RgbdFrame
             Whose image the matches are drawn over.
         result : FrameResult
-            Its poses are those of the tracked frame.
+            Its poses are those of the base frame.
 
         Raises
         ------
@@ -123,7 +126,7 @@ class RunBag(AbstractContextManager["RunBag"]):
             When the file cannot be written.
         """
         raw, causal = result.raw, result.causal
-        with self._refused_on_error():
+        with self._file.refused_on_error():
             self._begin(frame.stamp_ns)
             self._write_tf([("raw", raw), ("causal", causal)])
             covariance = self._step_covariance(result, raw)
@@ -136,7 +139,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         self.add_smoothed(result.finished)
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses of the tracked frame that are final, in any order.
+        """Write smoothed poses of the base frame that are final, in any order.
 
         Raises
         ------
@@ -145,7 +148,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         """
         estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
         track = self._tracks["smoothed"]
-        with self._refused_on_error():
+        with self._file.refused_on_error():
             self._write_tf([("smoothed", estimate) for estimate in estimates])
             for estimate in estimates:
                 self._write_odometry("smoothed", estimate, track.before(estimate.stamp_ns))
@@ -155,7 +158,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         """Tell of a frame without a pose, in the diagnostics alone."""
         if self._first_ns is None:
             return
-        with self._refused_on_error():
+        with self._file.refused_on_error():
             header = Header(frame.stamp_ns, self._frames.camera)
             write_diagnostics(self._bag, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
 
@@ -170,26 +173,18 @@ class RunBag(AbstractContextManager["RunBag"]):
         if not self._is_open:
             return
         self._is_open = False
-        with self._folder, self._refused_on_error():
+        has_frames = self._first_ns is not None
+        with self._file.completed(is_kept=has_frames):
             try:
-                if self._first_ns is not None:
+                if has_frames:
                     self._write_paths()
             finally:
                 self._bag.__exit__(None, None, None)
-            if self._first_ns is not None:
-                self._bag.result.rename(self.path)
+                self._file.part = self._bag.result
 
     def __exit__(self, *exception: object) -> None:
         """Close it."""
         self.close()
-
-    @contextmanager
-    def _refused_on_error(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, WriterError1, WriterError2) as error:
-            detail = getattr(error, "strerror", None) or error
-            raise RecordingError(f"{self.path}: cannot be written: {detail}") from error
 
     def _begin(self, stamp_ns: int) -> None:
         """Note the stamp of a frame; before the first, write what never changes."""
@@ -230,7 +225,7 @@ class RunBag(AbstractContextManager["RunBag"]):
             self._bag,
             f"/gvo/{name}/odometry",
             estimate,
-            (self._frames.world, self._frames.tracked_by(name)),
+            (self._frames.world, self._frames.base_by(name)),
             twist_between(estimate, previous, step_covariance),
         )
 
@@ -273,15 +268,6 @@ class RunBag(AbstractContextManager["RunBag"]):
         for name, track in self._tracks.items():
             if len(track) > 0:
                 write_path(self._bag, f"/gvo/{name}/path", header, *track.poses(n_most))
-
-
-def _check_target(path: Path) -> None:
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
-    if path.suffix not in SUFFIXES:
-        raise RecordingError(
-            f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got {path.name}"
-        )
 
 
 def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:

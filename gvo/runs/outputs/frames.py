@@ -34,10 +34,10 @@ class RunFrames:
         The fixed frame that the poses are stated in.
     camera : str
         The optical frame of the rectified left or colour camera; `camera_optical` where empty.
-    tracked : str
+    base : str
         The frame whose poses they are; where empty, the camera's.
-    T_tracked_cam : ndarray of float64, shape (4, 4), or callable
-        Maps camera coordinates to the tracked frame, metres. A function of stamp_ns where the
+    T_base_cam : ndarray of float64, shape (4, 4), or callable
+        Maps camera coordinates to the base frame, metres. A function of stamp_ns where the
         camera moves in that frame.
     is_world_optical : bool
         Whether `world` has the axes of a camera: z forward.
@@ -50,10 +50,8 @@ class RunFrames:
 
     world: str = "world"
     camera: str = ""
-    tracked: str = ""
-    T_tracked_cam: FloatArray | Callable[[int], FloatArray] = field(
-        default_factory=lambda: np.eye(4)
-    )
+    base: str = ""
+    T_base_cam: FloatArray | Callable[[int], FloatArray] = field(default_factory=lambda: np.eye(4))
     is_world_optical: bool = False
 
     def __post_init__(self) -> None:
@@ -62,33 +60,33 @@ class RunFrames:
         names = {
             "world": bare(self.world),
             "camera": camera,
-            "tracked": bare(self.tracked) or camera,
+            "base": bare(self.base) or camera,
         }
         for key, name in names.items():
             object.__setattr__(self, key, name)
         if not self.world:
             raise ValueError("the world needs a name")
-        if not callable(self.T_tracked_cam):
-            T = np.array(self.T_tracked_cam, dtype=np.float64)
+        if not callable(self.T_base_cam):
+            T = np.array(self.T_base_cam, dtype=np.float64)
             T.setflags(write=False)
-            object.__setattr__(self, "T_tracked_cam", T)
+            object.__setattr__(self, "T_base_cam", T)
             if self.is_camera and not np.array_equal(T, np.eye(4)):
                 raise ValueError(f"{camera}: its transform to itself must be the identity")
 
     @property
     def is_camera(self) -> bool:
         """Whether the trajectory is the camera's own."""
-        return self.tracked == self.camera
+        return self.base == self.camera
 
     def mount(self, stamp_ns: int) -> FloatArray:
-        """Return T_tracked_cam, shape (4, 4), at a stamp."""
+        """Return T_base_cam, shape (4, 4), at a stamp."""
         if self.is_camera:
             return np.eye(4)
-        return self.T_tracked_cam(stamp_ns) if callable(self.T_tracked_cam) else self.T_tracked_cam
+        return self.T_base_cam(stamp_ns) if callable(self.T_base_cam) else self.T_base_cam
 
-    def tracked_by(self, name: str) -> str:
-        """Return the tracked frame as one of `ESTIMATES` places it."""
-        return f"gvo/{name}/{self.tracked}"
+    def base_by(self, name: str) -> str:
+        """Return the base frame as one of `ESTIMATES` places it."""
+        return f"gvo/{name}/{self.base}"
 
     def camera_by(self, name: str) -> str:
         """Return the camera's optical frame as one of `ESTIMATES` places it."""
@@ -97,20 +95,20 @@ class RunFrames:
     def moving(self, name: str, estimate: Estimate) -> Iterator[FramePose]:
         """Yield what a pose says of the frames."""
         stamp_ns = estimate.stamp_ns
-        yield FramePose(stamp_ns, self.world, self.tracked_by(name), estimate.T_world_cam)
-        if callable(self.T_tracked_cam) and not self.is_camera:
+        yield FramePose(stamp_ns, self.world, self.base_by(name), estimate.T_world_cam)
+        if callable(self.T_base_cam) and not self.is_camera:
             yield self._mounted(stamp_ns, name)
 
     def fixed(self, stamp_ns: int) -> Iterator[FramePose]:
         """Yield what never moves."""
         if self.is_world_optical:
             yield FramePose(stamp_ns, f"{self.world}_flu", self.world, _T_FLU_OPTICAL)
-        if not callable(self.T_tracked_cam) and not self.is_camera:
+        if not callable(self.T_base_cam) and not self.is_camera:
             for name in ESTIMATES:
                 yield self._mounted(stamp_ns, name)
 
     def _mounted(self, stamp_ns: int, name: str) -> FramePose:
-        parent, child = self.tracked_by(name), self.camera_by(name)
+        parent, child = self.base_by(name), self.camera_by(name)
         return FramePose(stamp_ns, parent, child, self.mount(stamp_ns))
 
 

@@ -132,5 +132,5 @@ def _named(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str
     if base_frame.is_camera:
         return RunFrames(world=world, camera=camera, is_world_optical=not is_placed)
     fixed = base_frame.fixed_mount
-    mount = base_frame.T_frame_cam if fixed is None else fixed
-    return RunFrames(world=world, camera=camera, tracked=base_frame.name, T_tracked_cam=mount)
+    mount = base_frame.T_base_cam if fixed is None else fixed
+    return RunFrames(world=world, camera=camera, base=base_frame.name, T_base_cam=mount)

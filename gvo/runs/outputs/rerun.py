@@ -32,15 +32,15 @@ positions in single precision.
 from __future__ import annotations
 
 import importlib.util
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gvo.config import Config, describe_configuration
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.geometry.camera import PinholeCamera
+from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Status
 
@@ -90,20 +90,23 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._n_frames = 0
         self._is_open = True
         _check_sdk()
-        _check_target(self.path)
+        if self.path.suffix != SUFFIX:
+            raise RecordingError(
+                f"{path}: expected a name ending in {SUFFIX}, got {self.path.name}"
+            )
+        self._file = PartFile(self.path, RuntimeError)  # which rerun raises
         text = "" if config is None else describe_configuration(config)
-        with self._refused_on_error():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".gvo-rerun-")
+        with self._file.refused_on_error():
             self._writer = self._open(camera, frames or RunFrames(), text)
 
     def _open(self, camera: PinholeCamera, frames: RunFrames, text: str) -> RerunWriter:
         from gvo.runs.outputs.rerun_stream import RerunStream
         from gvo.runs.outputs.rerun_writer import RerunWriter
 
-        stream = RerunStream(Path(self._folder.name) / self.path.name, self.path.stem)
+        stream = RerunStream(self._file.part, self.path.stem)
         if not stream.is_enabled:
-            self._folder.cleanup()
+            with self._file.completed(is_kept=False):
+                pass
             raise ConfigurationError(
                 "--rerun: the environment variable RERUN switches rerun off; unset it"
             )
@@ -117,7 +120,7 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         frame : StereoFrame or RgbdFrame
             Whose image is shown.
         result : FrameResult
-            Its poses are those of the tracked frame.
+            Its poses are those of the base frame.
 
         Raises
         ------
@@ -127,11 +130,11 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._writer.add_frame(frame, result)
         self._n_frames += 1
         if self._n_frames % N_FRAMES_HELD == 0:
-            with self._refused_on_error():
+            with self._file.refused_on_error():
                 self._writer.stream.flush()
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses of the tracked frame that are final, in any order."""
+        """Write smoothed poses of the base frame that are final, in any order."""
         self._writer.add_smoothed(estimates)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
@@ -149,35 +152,18 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         if not self._is_open:
             return
         self._is_open = False
-        with self._folder, self._refused_on_error():
+        with self._file.completed(is_kept=self._n_frames > 0):
             try:
                 if self._n_frames > 0:
                     self._writer.add_paths()
             finally:
                 self._writer.stream.close()
-            if self._n_frames > 0:
-                (Path(self._folder.name) / self.path.name).rename(self.path)
 
     def __exit__(self, *exception: object) -> None:
         """Close it."""
         self.close()
 
-    @contextmanager
-    def _refused_on_error(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, RuntimeError) as error:  # rerun raises the latter
-            detail = getattr(error, "strerror", None) or error
-            raise RecordingError(f"{self.path}: cannot be written: {detail}") from error
-
 
 def _check_sdk() -> None:
     if importlib.util.find_spec("rerun") is None:
         raise ConfigurationError("--rerun needs rerun-sdk: pip install 'gvo[rerun]'")
-
-
-def _check_target(path: Path) -> None:
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
-    if path.suffix != SUFFIX:
-        raise RecordingError(f"{path}: expected a name ending in {SUFFIX}, got {path.name}")

@@ -125,7 +125,7 @@ class RerunWriter:
             self._frames.is_camera and result.causal.T_world_cam[1, 1] > np.cos(np.pi / 4)
         )
         self.stream.log("world", make_axes(is_optical=is_optical), is_static=True)
-        if not callable(self._frames.T_tracked_cam):
+        if not callable(self._frames.T_base_cam):
             mount = make_transform(self._frames.mount(result.stamp_ns))
             self.stream.log(_CAMERA, mount, is_static=True)
 
@@ -141,7 +141,7 @@ class RerunWriter:
             self.stream.log(f"{path}/covariance", make_ellipsoids(name, [estimate]))
             self._tracks[name].add(estimate)
             self._recent[name].append(estimate.T_world_cam[:3, 3])
-        if callable(self._frames.T_tracked_cam):
+        if callable(self._frames.T_base_cam):
             self.stream.log(_CAMERA, make_transform(self._frames.mount(result.stamp_ns)))
 
     def _add_picture(self, frame: Frame, image: ImageArray, result: FrameResult) -> None:

@@ -185,7 +185,7 @@ def test_while_the_camera_is_off_its_mount_the_transform_nearest_in_time_is_take
         buffer.add("base", "cam", stamp_ns, se3.make_transform(np.eye(3), at))
     buffer.add("shelf", "cam", 30, np.eye(4))
     frame = BaseFrame.from_tf(buffer, "base", "cam")
-    xs = [float(frame.T_frame_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
+    xs = [float(frame.T_base_cam(stamp_ns)[0, 3]) for stamp_ns in (15, 25, 32, 50, 65)]
     np.testing.assert_allclose(xs, [15.0, 20.0, 20.0, 60.0, 65.0])
     assert frame.n_guessed == 2
 
@@ -236,7 +236,7 @@ def test_without_any_tf_the_line_says_so() -> None:
 
 def test_what_is_no_rigid_transform_is_refused() -> None:
     for T in (np.eye(3), np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan), 2 * np.eye(4)):
-        with pytest.raises(ValueError, match="T_frame_cam"):
+        with pytest.raises(ValueError, match="T_base_cam"):
             BaseFrame("body", T)
         with pytest.raises(ValueError, match="T_initial"):
             BaseFrame(T_initial=T)

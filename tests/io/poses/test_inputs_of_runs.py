@@ -154,7 +154,7 @@ def test_a_name_decides_what_is_the_named_truth(walk_bag: Path, tmp_path: Path) 
 
 
 def framed(trajectory: Trajectory) -> Truth:
-    return Truth(trajectory=trajectory, T_frame_point=np.eye(4), decision="")
+    return Truth(trajectory=trajectory, T_base_point=np.eye(4), decision="")
 
 
 def test_the_initial_pose_lies_between_the_true_ones_around_the_first_frame() -> None:

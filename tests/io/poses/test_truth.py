@@ -75,7 +75,7 @@ def test_the_truth_of_the_base_becomes_that_of_the_camera(seed: int) -> None:
 def test_a_frame_asked_for_counts_not_the_camera() -> None:
     T_map_cam = motion() @ T_BASE_CAM
     found = framed(
-        truth_of(trajectory(T_map_cam), "cam"), mounted(), frame="base", camera_frame="cam"
+        truth_of(trajectory(T_map_cam), "cam"), mounted(), base_frame="base", camera_frame="cam"
     )
     np.testing.assert_allclose(found.trajectory.T_world_cam, motion(), atol=1e-9)
     same = framed(truth_of(trajectory(T_map_cam), "cam"), TfBuffer(), camera_frame="cam")
@@ -87,8 +87,8 @@ def test_the_truth_of_the_camera_follows_its_mount_from_tf_or_from_a_file() -> N
     truth = truth_of(trajectory(motion() @ T_BASE_CAM), "ground_truth", is_of_camera=True)
     assert framed(truth, TfBuffer()).trajectory is truth.trajectory
     assert framed(truth, TfBuffer(), camera_frame="cam").trajectory is truth.trajectory
-    by_tf = framed(truth, mounted(), frame="base", camera_frame="cam")
-    by_file = framed(truth, TfBuffer(), frame="body", T_frame_cam=T_BASE_CAM)
+    by_tf = framed(truth, mounted(), base_frame="base", camera_frame="cam")
+    by_file = framed(truth, TfBuffer(), base_frame="body", T_base_cam=T_BASE_CAM)
     for found in (by_tf, by_file):
         np.testing.assert_allclose(found.trajectory.T_world_cam, motion(), atol=1e-9)
 
@@ -97,7 +97,7 @@ def test_a_mount_from_a_file_goes_with_tf_up_to_the_camera() -> None:
     """The body of the file, which tf does not know, hangs on the camera, which tf knows."""
     T_body_cam = se3.exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
     truth = truth_of(trajectory(motion()), "base")
-    found = framed(truth, mounted(), frame="body", camera_frame="cam", T_frame_cam=T_body_cam)
+    found = framed(truth, mounted(), base_frame="body", camera_frame="cam", T_base_cam=T_body_cam)
     expected = motion() @ T_BASE_CAM @ np.linalg.inv(T_body_cam)
     np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
 
@@ -105,7 +105,7 @@ def test_a_mount_from_a_file_goes_with_tf_up_to_the_camera() -> None:
 def test_poses_that_name_no_frame_are_taken_for_the_one_asked_for() -> None:
     truth = truth_of(trajectory(motion()), "")
     for frame, name in (("base", "base"), ("", "the camera")):
-        found = framed(truth, TfBuffer(), frame=frame)
+        found = framed(truth, TfBuffer(), base_frame=frame)
         assert found.trajectory is truth.trajectory
         assert found.decision.endswith(f"; it names no frame, taken for {name}")
 
@@ -162,7 +162,7 @@ def test_an_antenna_whose_place_is_not_known_is_compared_with_a_warning() -> Non
         found = framed(truth_of(positions, "gps"), buffer, camera_frame="cam")
         assert reason in found.warning
         assert found.warning.endswith("the errors hold its lever arm")
-        np.testing.assert_array_equal(found.T_frame_point, np.eye(4))
+        np.testing.assert_array_equal(found.T_base_point, np.eye(4))
 
 
 def test_a_point_without_a_frame_is_the_frame_itself() -> None:
@@ -174,7 +174,7 @@ def test_a_point_without_a_frame_is_the_frame_itself() -> None:
 
 def test_a_mount_from_a_file_names_the_frame_of_the_truth() -> None:
     truth = truth_of(trajectory(motion()), "vicon/drone")
-    found = framed(truth, TfBuffer(), frame="vicon/drone", T_frame_cam=T_BASE_CAM)
+    found = framed(truth, TfBuffer(), base_frame="vicon/drone", T_base_cam=T_BASE_CAM)
     assert found.trajectory is truth.trajectory
 
 
@@ -201,7 +201,7 @@ def test_what_is_asked_for_or_named_comes_in_the_frame_of_the_camera(
         assert isinstance(found, Truth)
         expected = motion() @ T_BASE_CAM
         np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
-    as_it_is = find_truth(reader, spec, where=name, frame="base", camera_frame="cam")
+    as_it_is = find_truth(reader, spec, where=name, base_frame="base", camera_frame="cam")
     assert isinstance(as_it_is, Truth)
     np.testing.assert_allclose(as_it_is.trajectory.T_world_cam, motion(), atol=1e-9)
 

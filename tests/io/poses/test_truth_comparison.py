@@ -46,7 +46,7 @@ def spoilt(poses: FloatArray, seed: int = 0) -> FloatArray:
 @given(seeds)
 def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed: int) -> None:
     poses = Walk().true_poses().T_world_cam
-    truth = Truth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
+    truth = Truth(trajectory=estimate(poses), T_base_point=np.eye(4), decision="")
     elsewhere = se3.exp(np.random.default_rng(seed).normal(size=6))
     wrong = spoilt(poses, seed)
     found = TruthComparison.of(
@@ -65,7 +65,7 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
     points = poses[:, :3, :3] @ LEVER + poses[:, :3, 3]
     truth = Truth(
         trajectory=Trajectory.of_positions(STAMPS_NS, points),
-        T_frame_point=make_transform(np.eye(3), LEVER),
+        T_base_point=make_transform(np.eye(3), LEVER),
         decision="",
     )
     wrong = spoilt(poses, seed)
@@ -76,7 +76,7 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
     assert mistaken.ate_m == pytest.approx(ate_by_hand(wrong_points, points), abs=1e-9)
     np.testing.assert_allclose(found.estimates["wrong"].T_world_cam[:, :3, 3], wrong_points)
     # without its place on the camera, the same positions hold an error that is none
-    unknown = replace(truth, T_frame_point=np.eye(4))
+    unknown = replace(truth, T_base_point=np.eye(4))
     assert TruthComparison.of(unknown, {"right": estimate(poses)}).evaluations[0].ate_m > 0.01
 
 
@@ -84,21 +84,21 @@ def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
     poses = Walk().true_poses().T_world_cam
     standing = Truth(
         trajectory=estimate(np.tile(np.eye(4), (len(poses), 1, 1))),
-        T_frame_point=np.eye(4),
+        T_base_point=np.eye(4),
         decision="",
     )
     found = TruthComparison.of(standing, {"raw": estimate(poses)})
     assert found.evaluations[0].path_ratio is None
     (warning,) = found.warnings()
     assert "exchanged?" in warning
-    moving = Truth(trajectory=estimate(poses), T_frame_point=np.eye(4), decision="")
+    moving = Truth(trajectory=estimate(poses), T_base_point=np.eye(4), decision="")
     assert TruthComparison.of(moving, {"raw": estimate(poses)}).warnings() == []
 
 
 def test_nothing_of_another_time_is_compared() -> None:
     poses = Walk().true_poses()
     late = Trajectory(stamps_ns=poses.stamps_ns + 10**12, T_world_cam=poses.T_world_cam)
-    truth = Truth(trajectory=late, T_frame_point=np.eye(4), decision="")
+    truth = Truth(trajectory=late, T_base_point=np.eye(4), decision="")
     with pytest.raises(TrajectoryError, match="share no stamps"):
         TruthComparison.of(truth, {"raw": poses})
 

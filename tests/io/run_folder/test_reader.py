@@ -100,7 +100,7 @@ def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Pat
     summary = json.loads((copy / "summary.json").read_text())
     T = np.eye(4)
     T[:3, 3] = (1.0, 0.0, 2.0)
-    (copy / "summary.json").write_text(json.dumps(summary | {"T_frame_truth": T.tolist()}))
+    (copy / "summary.json").write_text(json.dumps(summary | {"T_base_truth": T.tolist()}))
     record = read_run(copy)
     assert record.truth is not None
     assert not record.truth.has_rotations

@@ -49,7 +49,7 @@ _T_BASE_CAM = make_transform(
     np.asarray(Rotation.from_euler("ZYX", [-90, 0, -110], degrees=True).as_matrix()),
     np.array([0.3, -0.1, 0.5]),
 )
-_MOUNTED = RunFrames(tracked="base_link", camera="/left_optical", T_tracked_cam=_T_BASE_CAM)
+_MOUNTED = RunFrames(base="base_link", camera="/left_optical", T_base_cam=_T_BASE_CAM)
 
 
 class _Message(NamedTuple):
@@ -69,7 +69,7 @@ class _Run:
     results: list[FrameResult]
     last: tuple[Estimate, ...]
 
-    def estimates(self, T_frame_cam: FloatArray) -> dict[str, dict[int, Estimate]]:
+    def estimates(self, T_base_cam: FloatArray) -> dict[str, dict[int, Estimate]]:
         """Return all poses, of a frame that the camera is mounted on."""
         smoothed = [e for r in self.results for e in r.finished] + list(self.last)
         named = {
@@ -78,21 +78,21 @@ class _Run:
             "smoothed": smoothed,
         }
         return {
-            name: {e.stamp_ns: _mounted(e, T_frame_cam) for e in poses}
+            name: {e.stamp_ns: _mounted(e, T_base_cam) for e in poses}
             for name, poses in named.items()
         }
 
 
-def _mounted(estimate: Estimate, T_frame_cam: FloatArray) -> Estimate:
+def _mounted(estimate: Estimate, T_base_cam: FloatArray) -> Estimate:
     """Move a pose to another frame, the covariance by differences of the pose."""
-    T_cam_frame = np.linalg.inv(T_frame_cam)
+    T_cam_frame = np.linalg.inv(T_base_cam)
     J = np.zeros((6, 6))
     for k, xi in enumerate(1e-6 * np.eye(6)):
-        step = T_frame_cam @ expm(_hat(xi)) @ T_cam_frame
+        step = T_base_cam @ expm(_hat(xi)) @ T_cam_frame
         J[:, k] = np.concatenate([_rotation_vector(step), step[:3, 3]]) / 1e-6
     return replace(
         estimate,
-        T_world_cam=T_frame_cam @ estimate.T_world_cam @ T_cam_frame,
+        T_world_cam=T_base_cam @ estimate.T_world_cam @ T_cam_frame,
         covariance=J @ estimate.covariance @ J.T,
     )
 
@@ -274,7 +274,7 @@ def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: 
     found: dict[str, set[int]] = defaultdict(set)
     for parent, child, stamp_ns, T in _transforms(_read(tmp_path / name)):
         gvo, kind, tracked = child.split("/")
-        assert (parent, gvo, tracked) == ("world", "gvo", names.tracked)
+        assert (parent, gvo, tracked) == ("world", "gvo", names.base)
         np.testing.assert_allclose(T, expected[kind][stamp_ns].T_world_cam, atol=1e-12)
         assert stamp_ns not in found[kind]
         found[kind].add(stamp_ns)
@@ -306,7 +306,7 @@ def test_a_camera_that_moves_on_the_robot_is_placed_at_each_stamp(
         return turned
 
     poses = {s: r.causal for s, r in zip(stamps, stereo_run.results, strict=True)}
-    names = RunFrames(tracked="base_link", T_tracked_cam=mount)
+    names = RunFrames(base="base_link", T_base_cam=mount)
     with RunBag(tmp_path / "run.mcap", names) as bag:
         for frame, result in zip(stereo_run.frames, stereo_run.results, strict=True):
             bag.add_frame(frame, result)
@@ -338,7 +338,7 @@ def test_odometry_holds_pose_and_covariance_in_the_order_of_ros(
         for message in messages[f"/gvo/{kind}/odometry"]:
             content, estimate = message.content, poses[message.stamp_ns]
             assert content.header.frame_id == "world"
-            assert content.child_frame_id == f"gvo/{kind}/{names.tracked}"
+            assert content.child_frame_id == f"gvo/{kind}/{names.base}"
             pose = content.pose.pose
             T = _pose_matrix(pose.position, pose.orientation)
             np.testing.assert_allclose(T, estimate.T_world_cam, atol=1e-12)

@@ -7,15 +7,15 @@ from gvo.runs.outputs.frames import RunFrames
 
 
 def test_without_names_the_trajectory_is_that_of_the_camera() -> None:
-    names = RunFrames(camera="", tracked="")
-    assert (names.camera, names.tracked) == ("camera_optical", "camera_optical")
-    assert RunFrames(camera="left").tracked_by("raw") == "gvo/raw/left"
+    names = RunFrames(camera="", base="")
+    assert (names.camera, names.base) == ("camera_optical", "camera_optical")
+    assert RunFrames(camera="left").base_by("raw") == "gvo/raw/left"
     assert list(names.fixed(5)) == []
 
 
 def test_tf_refuses_leading_slashes_so_they_are_taken_away() -> None:
-    names = RunFrames(world="/map", camera="/left", tracked="/base_link")
-    assert (names.world, names.camera, names.tracked) == ("map", "left", "base_link")
+    names = RunFrames(world="/map", camera="/left", base="/base_link")
+    assert (names.world, names.camera, names.base) == ("map", "left", "base_link")
 
 
 def test_a_world_without_a_name_and_a_frame_apart_from_itself_are_refused() -> None:
@@ -24,12 +24,12 @@ def test_a_world_without_a_name_and_a_frame_apart_from_itself_are_refused() -> N
     moved = np.eye(4)
     moved[0, 3] = 0.1
     with pytest.raises(ValueError, match="left: its transform to itself"):
-        RunFrames(camera="left", tracked="/left", T_tracked_cam=moved)
+        RunFrames(camera="left", base="/left", T_base_cam=moved)
 
 
 def test_the_mount_cannot_be_changed_from_outside() -> None:
     T = np.eye(4)
-    names = RunFrames(tracked="base_link", T_tracked_cam=T)
+    names = RunFrames(base="base_link", T_base_cam=T)
     T[0, 3] = 7.0
     np.testing.assert_array_equal(names.mount(0), np.eye(4))
     with pytest.raises(ValueError, match="read-only"):

@@ -15,11 +15,11 @@ from tests.rendered_walk import CAMERA, T_BASE_CAM, Walk
 def test_the_bag_of_a_run_names_the_frames_of_the_recording(walk_bag: Path) -> None:
     walk = gvo.open_recording(walk_bag)
     camera = name_frames(walk, BaseFrame(CAMERA), is_placed=False, world="odom")
-    assert (camera.world, camera.tracked, camera.is_world_optical) == ("odom", CAMERA, True)
+    assert (camera.world, camera.base, camera.is_world_optical) == ("odom", CAMERA, True)
     placed = name_frames(walk, BaseFrame(CAMERA), is_placed=True, world="odom")
     assert not placed.is_world_optical
     base = name_frames(walk, BaseFrame("base_link", T_BASE_CAM), is_placed=False, world="odom")
-    assert (base.tracked, base.camera, base.is_world_optical) == ("base_link", CAMERA, False)
+    assert (base.base, base.camera, base.is_world_optical) == ("base_link", CAMERA, False)
     np.testing.assert_allclose(base.mount(0), T_BASE_CAM, atol=1e-12)
     moving = name_frames(
         walk, BaseFrame("base_link", lambda _: (T_BASE_CAM, False)), is_placed=False, world="odom"

@@ -59,7 +59,7 @@ _T_BASE_CAM = make_transform(
     np.asarray(Rotation.from_euler("ZYX", [-90, 0, -110], degrees=True).as_matrix()),
     np.array([0.3, -0.1, 0.5]),
 )
-_MOUNTED = RunFrames(tracked="base_link", camera="left_optical", T_tracked_cam=_T_BASE_CAM)
+_MOUNTED = RunFrames(base="base_link", camera="left_optical", T_base_cam=_T_BASE_CAM)
 # Up 1, down 2, right 3, left 4, forward 5, back 6.
 _RIGHT_DOWN_FORWARD, _FORWARD_LEFT_UP = [3, 2, 5], [5, 4, 1]
 _CAMERA = StereoCamera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48, baseline=0.1)
@@ -456,7 +456,7 @@ def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path
     def mount(stamp_ns: int) -> FloatArray:
         return make_transform(np.eye(3), np.array([0.0, 1e-3 * stamp_ns, 1.0]))
 
-    names = RunFrames(tracked="base_link", camera="pan", T_tracked_cam=mount)
+    names = RunFrames(base="base_link", camera="pan", T_base_cam=mount)
     read = _write_made(tmp_path, [_made(5), _made(9)], names)
     poses = read.poses(_CAMERA_ENTITY)
     assert {ns: pytest.approx(mount(ns)[1, 3]) for ns in (5, 9)} == {
