@@ -1,4 +1,4 @@
-"""What several commands take: parameters, recordings, their calibration and topics."""
+"""Options that commands share: parameters, recordings, calibration, topics."""
 
 from __future__ import annotations
 
@@ -35,11 +35,9 @@ Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images."
 Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")]
 Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")]
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")]
-Start = Annotated[float, typer.Option(metavar="S", help="Leave out the first seconds.")]
-Duration = Annotated[
-    float | None, typer.Option(metavar="S", help="Read no more than so many seconds.")
-]
-Every = Annotated[int, typer.Option(metavar="N", help="Take each Nth frame only.")]
+Start = Annotated[float, typer.Option(metavar="S", help="Skip the first seconds.")]
+Duration = Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")]
+Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
 
 
 def load(path: Path | None, settings: list[str] | None) -> Config:
@@ -56,7 +54,7 @@ def recording_options(
     color: str | None,
     depth: str | None,
 ) -> RecordingOptions:
-    """Return what the options say about a recording."""
+    """Return the options of a recording."""
     from gvo.io.opening import RecordingOptions
 
     return RecordingOptions(

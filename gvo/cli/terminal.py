@@ -1,4 +1,4 @@
-"""What the commands share: signals, progress bars, and what is printed at the end."""
+"""Signals, progress bars, and what commands print at the end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gvo.types import Progress
 
 ProgressT = TypeVar("ProgressT")
-# By how much the total of a progress bar may be off.
+# Share by which the total of a progress bar may be off.
 _MAX_OFF = 0.02
 _EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 EXIT_FAULTS = 1
@@ -29,7 +29,7 @@ def exit_code(is_complete: bool) -> int:
 
 
 def report(result: RunResult, out: Path) -> NoReturn:
-    """Print what a run of odometry gave, and end with its exit code."""
+    """Print the result of a run, and end with its exit code."""
     from gvo.trajectory.evaluation import format_evaluations
 
     for key in ("base_frame", "ground_truth"):
@@ -53,7 +53,7 @@ def report(result: RunResult, out: Path) -> NoReturn:
 
 
 def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:
-    """Print what smoothing gave, and end with its exit code.
+    """Print the result of smoothing, and end with its exit code.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
 
 
 def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
-    """Tell how many segments there are, where there is more than one."""
+    """Return how many segments there are, if more than one."""
     if len(segments) < 2:
         return ""
     n_joined = sum(segment["joined_to"] is not None for segment in segments)
@@ -94,7 +94,7 @@ def warn(warnings: Sequence[str]) -> None:
 
 @contextmanager
 def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], None]]:
-    """Give a callback that draws a bar on a terminal, and nothing in a pipe."""
+    """Yield a callback that draws a bar on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
         yield lambda progress: None
         return
@@ -143,7 +143,7 @@ def both(
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[object], None]]:
-    """Give a function that ends the work where a signal has come; call it between frames.
+    """Yield a function that ends the work once a signal has come; call it between frames.
 
     So a frame is either in all files or in none. A second signal ends at once.
     """

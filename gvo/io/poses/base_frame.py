@@ -74,12 +74,12 @@ class BaseFrame:
         self._mount_low = np.full(3, np.inf)
         self._mount_high = np.full(3, -np.inf)
         self._T_world_cam_first = np.eye(4)
-        self._T_frame_cam: FloatArray | None = None
+        self._T_base_cam: FloatArray | None = None
         if callable(T_base_cam):
             self._mount = T_base_cam
         else:
             T = np.eye(4) if T_base_cam is None else _rigid("T_base_cam", T_base_cam)
-            self._T_frame_cam = T
+            self._T_base_cam = T
             self._mount = lambda _: (T, False)
 
     @classmethod
@@ -146,7 +146,7 @@ class BaseFrame:
     @property
     def fixed_mount(self) -> FloatArray | None:
         """T_base_cam, shape (4, 4), metres; None for the camera, and where it moves."""
-        return None if self._is_camera else self._T_frame_cam
+        return None if self._is_camera else self._T_base_cam
 
     @property
     def n_guessed(self) -> int:
@@ -249,8 +249,8 @@ class BaseFrame:
                 "positions of the camera without rotations tell no positions of "
                 f"{self.name or 'another frame'}; run without --frame to compare them"
             )
-        if self._T_frame_cam is not None:
-            return trajectory.transformed(se3.invert(self._T_frame_cam))
+        if self._T_base_cam is not None:
+            return trajectory.transformed(se3.invert(self._T_base_cam))
         found = [self._mount(int(stamp_ns)) for stamp_ns in trajectory.stamps_ns]
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
         T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]

@@ -1,4 +1,4 @@
-"""Transforms over time, as tf2."""
+"""A tree of frames whose transforms change over time, as in tf2."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Samples:
     changes_parent: bool
 
     def parents_at(self, stamps_ns: IntArray) -> IntArray:
-        """Return the parent at stamps (m,); outside of the known range that of its end."""
+        """Return the parents at stamps (m,); outside of the known range the nearest known."""
         return self.parents[np.maximum(self._before(stamps_ns), 0)]
 
     def at(self, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -85,7 +85,7 @@ class Samples:
 
 
 class SampleLog:
-    """Takes the transforms of one child frame in any order."""
+    """Collects the transforms of one child frame in any order."""
 
     def __init__(self) -> None:
         self._sorted = Samples(
@@ -140,7 +140,7 @@ def _sorted(stamps_ns: IntArray, poses: FloatArray, parents: IntArray) -> Sample
 
 
 def _between(start: FloatArray, end: FloatArray, shares: FloatArray) -> FloatArray:
-    """Return transforms (n, 4, 4) at shares (n, 1) of the ways between poses (n, 7)."""
+    """Interpolate between poses (n, 7) at shares (n, 1); return transforms (n, 4, 4)."""
     if len(shares) == 0:
         return np.empty((0, 4, 4))
     rotations = Rotation.from_quat(start[:, 3:])
@@ -156,16 +156,16 @@ _ROTATION_TOLERANCE = 1e-3
 class TfBuffer:
     """Transforms between named frames over time.
 
-    A moving edge is interpolated between its two neighbours and never extrapolated, a static one
-    is valid at all stamps. Names with and without a leading slash are the same. Each transform of
-    a child names its parent anew; of two with one stamp the later one counts.
+    A moving edge is interpolated between its two neighbours and never extrapolated; a static one
+    is valid at all stamps. A leading slash of a name does not count. A child may change its
+    parent; of two transforms with one stamp the later one counts.
 
     Attributes
     ----------
     n_refused : int
-        Transforms that are none, and were left out.
+        Invalid transforms, which were left out.
     first_refused : str
-        The first of them in one line; empty where there is none.
+        The first of them in one line; empty if none.
     """
 
     def __init__(self) -> None:
@@ -200,7 +200,7 @@ class TfBuffer:
 
     @property
     def notes(self) -> list[str]:
-        """What is unusual about the transforms, a line each."""
+        """Peculiarities of the transforms, a line each."""
         notes = []
         if self.n_refused:
             notes.append(
@@ -241,7 +241,7 @@ class TfBuffer:
         Raises
         ------
         ValueError
-            Where it is no rigid transform, or a name is empty, or both are the same.
+            When it is no rigid transform, a name is empty, or both names are the same.
         """
         T = np.array(T_parent_child, dtype=np.float64)
         fault = se3.transform_fault(T, tolerance=_ROTATION_TOLERANCE)
@@ -255,7 +255,7 @@ class TfBuffer:
         self._put(bare(parent), bare(child), stamp_ns, pose, is_static=is_static)
 
     def add_message(self, message: Any, *, is_static: bool = False) -> None:  # noqa: ANN401
-        """Add a `geometry_msgs/TransformStamped`; one that holds no transform is counted only.
+        """Add a `geometry_msgs/TransformStamped`; an invalid one is only counted.
 
         Parameters
         ----------
@@ -275,14 +275,14 @@ class TfBuffer:
             self._put(parent, child, stamp_ns, pose, is_static=is_static)
 
     def refuse(self, reason: str) -> None:
-        """Count something that is no transform; `reason` tells what, in one line."""
+        """Count an invalid transform, for a reason of one line."""
         self.n_refused += 1
         self.first_refused = self.first_refused or reason
 
     def keep(self, children: Collection[str]) -> None:
-        """Forget the transforms of all other children, now and of those to come.
+        """Drop the transforms of all other children, also of messages to come.
 
-        `frames` and `edges` name them still.
+        `frames` and `edges` still name them.
         """
         self._kept = children
         self._moving = {name: log for name, log in self._moving.items() if name in children}
@@ -397,7 +397,7 @@ class TfBuffer:
         return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *stamps]))
 
     def _changing(self, children: Collection[str]) -> list[str]:
-        """Return which of the children hang on different parents over time."""
+        """Return those of the children that change their parent."""
         moving = self._moving.keys() & children
         return sorted(child for child in moving if self._moving[child].samples().changes_parent)
 
@@ -423,12 +423,12 @@ class TfBuffer:
     def _paths(
         self, target: str, source: str, stamps_ns: IntArray
     ) -> Iterator[tuple[FramePath | Failure, IntArray]]:
-        """Yield the ways between two frames, and at which of the stamps they are there."""
+        """Yield the paths between two frames, each with the stamps at which it exists."""
         for parents, rows in self._trees((target, source), stamps_ns):
             yield find_path(parents, target, source), rows
 
     def _paths_over_time(self, target: str, source: str) -> list[FramePath | Failure]:
-        """Return all ways between two frames that there ever are, that of the end as the last."""
+        """Return all paths between two frames over time, the newest last."""
         changing = self._changing(ancestors(self._edges, (target, source)))
         stamps_ns = self._stamps_ns(changing)
         paths = list(self._paths(target, source, stamps_ns))
@@ -471,7 +471,7 @@ class TfBuffer:
 
 
 def _fault(parent: str, child: str, pose: tuple[float, ...]) -> str:
-    """Return what keeps seven numbers from being a transform; empty where nothing does."""
+    """Say why seven numbers are no valid transform; empty if valid."""
     if not parent or not child:
         return "a name is empty"
     if parent == child:

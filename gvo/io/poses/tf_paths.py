@@ -20,7 +20,7 @@ class FramePath:
     from_target, from_source : tuple of str
         The children on the way up from either frame, the common ancestor left out.
     ancestor : str
-        Where both ways meet.
+        Where both meet.
     """
 
     from_target: tuple[str, ...]
@@ -44,7 +44,7 @@ def bare(name: str) -> str:
 
 
 def find_path(parents: Mapping[str, str], target: str, source: str) -> FramePath | Failure:
-    """Find the way between two frames by their lowest common ancestor.
+    """Find the path between two frames by their lowest common ancestor.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def _upwards(parents: Mapping[str, str], frame: str) -> list[str]:
 
 
 def ancestors(edges: Iterable[tuple[str, str]], frames: Iterable[str]) -> set[str]:
-    """Return frames and all that lies above them.
+    """Return frames and all their ancestors.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def ancestors(edges: Iterable[tuple[str, str]], frames: Iterable[str]) -> set[st
 
 
 def describe_unknown(name: str, frames: Sequence[str]) -> str:
-    """Return one line about a frame that is none of those known."""
+    """Return one line about a frame that is not known."""
     if not frames:
         return f"tf holds no frame {name}: it is empty"
     close = get_close_matches(name, frames, n=3, cutoff=0.5)

@@ -13,7 +13,7 @@ from gvo.errors import RecordingError
 
 
 def append_whole(file: io.FileIO, data: bytes) -> None:
-    """Append all of something to an unbuffered file, or nothing of it.
+    """Append all of the data to an unbuffered file, or nothing.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def append_whole(file: io.FileIO, data: bytes) -> None:
 
 
 class LineFile:
-    """A text file that grows by whole lines; one that is there is replaced.
+    """A text file that grows by whole lines; replaces an existing one.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class LineFile:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file so that at any moment the one before or the new one is there.
+    """Replace a text file atomically.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def replace_bytes(path: Path, data: bytes) -> None:
-    """Write a file as `replace_text` does."""
+    """Replace a file atomically."""
     beside = path.with_name(f"{path.name}.new")
     try:
         with io.FileIO(beside, "wb") as file:

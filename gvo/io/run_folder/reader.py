@@ -1,4 +1,4 @@
-"""A run folder read back: also that of a run that still goes on, or was interrupted."""
+"""A run folder read back, also of a run that still goes on or was interrupted."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class FrameTable:
     counts : dict of str to ndarray of int64, shape (n,)
         By the names of `COUNTS`; those that the table has.
     reasons : tuple of str
-        Why a frame is not ok; empty where there is nothing to say.
+        Why a frame is not ok; empty if it is.
     """
 
     stamps_ns: IntArray
@@ -99,14 +99,13 @@ class RunRecord:
         interrupted that of a few seconds before.
     frames : FrameTable
     edges : EdgeTable or None
-        None where the folder holds none, as that of `gvo smooth`.
+        None where the folder holds no such table, as that of `gvo smooth`.
     timings : TimingTable or None
         Likewise.
     trajectories : dict of str to Trajectory
-        "raw", "causal" and "smoothed", with covariances; those may be without poses.
+        "raw", "causal" and "smoothed", with covariances; may be empty.
     truth : Trajectory or None
-        What the estimates were compared with; of positions without rotations those of the point
-        that was measured.
+        What the estimates were compared with: poses, or positions of the measured point.
     """
 
     folder: Path
@@ -128,7 +127,7 @@ class RunRecord:
         return bool(self.summary) and self.summary.get("state", "complete") == "complete"
 
     def comparable(self) -> dict[str, Trajectory]:
-        """Return the trajectories that hold poses, as those of what the truth is of."""
+        """Return the trajectories that hold poses, moved to the point that the truth is of."""
         filled = {name: t for name, t in self.trajectories.items() if len(t) > 0}
         T_base_truth = self.summary.get("T_base_truth")
         if self.truth is None or T_base_truth is None:
@@ -157,9 +156,9 @@ def read_run(folder: str | Path) -> RunRecord:
     Raises
     ------
     RecordingError
-        Where it is no run folder, or a table or the summary is damaged.
+        When it is no run folder, or a table or the summary is damaged.
     TrajectoryError
-        Where a file of poses or covariances is damaged.
+        When a file of poses or covariances is damaged.
     """
     folder = Path(folder)
     needed = ["frames.csv", *(f"{name}.txt" for name in TRAJECTORIES)]
@@ -195,7 +194,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
 
 
 def _transform_fault(value: object) -> str:
-    """Say why what a summary holds is no rigid transform; empty if it is one, or None."""
+    """Say why a value of a summary is no rigid transform; empty if it is one, or None."""
     if value is None:
         return ""
     try:
@@ -208,7 +207,7 @@ def _transform_fault(value: object) -> str:
 
 
 def _whole_lines(path: Path) -> list[str]:
-    """Return the lines of a file; of one that is being written, without the last half one."""
+    """Return the whole lines of a file: an unfinished last one is left out."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -217,7 +216,7 @@ def _whole_lines(path: Path) -> list[str]:
 
 
 def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]] | None:
-    """Return the rows of a table; None where there is no such file, or nothing in it."""
+    """Return the rows of a table; None where the file is missing or empty."""
     lines = _whole_lines(path) if path.is_file() else []
     if not lines:
         return None

@@ -62,7 +62,7 @@ _OF_EARLIER_RUNS = (
 
 @contextmanager
 def written_alone(folder: Path) -> Iterator[None]:
-    """Make a run folder where it is missing, and keep it from other processes inside the context.
+    """Lock a run folder, made where it is missing, against other processes.
 
     Raises
     ------
@@ -100,9 +100,8 @@ def _open_no_link(path: str, flags: int) -> int:
 class RunFolder(AbstractContextManager["RunFolder"]):
     """Trajectories, covariances and the tables of frames, edges and times, line by line.
 
-    Smoothed poses come in the order in which they leave the window; `close` puts them in the
-    order of their stamps. At any moment the files hold whole lines, whatever happens to the
-    process; only the end of the power can cut one off.
+    Smoothed poses come in the order in which they leave the window; `close` sorts them by stamp.
+    Whatever stops the process, the files hold whole lines; only a power failure can cut one off.
 
     Parameters
     ----------
@@ -161,7 +160,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             file.write(lines)
 
     def add_frame(self, frame: object, result: FrameResult) -> None:
-        """Write what one frame gave; its images are not needed."""
+        """Write the result of a frame."""
         row = (
             result.stamp_ns,
             result.status,
@@ -221,7 +220,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             path.write_text("".join(lines), encoding="utf-8")
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write `summary.json`; at any moment the one before or this one is there, whole."""
+        """Replace `summary.json` atomically."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         path = self.path / SUMMARY
         with self._refused_on_error(path):

@@ -75,7 +75,7 @@ _NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zero
 
 
 class RunBag(AbstractContextManager["RunBag"]):
-    """A bag of what a run computes, open inside a `with` block.
+    """A bag of the results of a run, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
     where the run is interrupted. Without a single frame no file is left.
@@ -111,7 +111,7 @@ class RunBag(AbstractContextManager["RunBag"]):
             self._bag = BagWriter(self._file.part).__enter__()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Write what one frame gave.
+        """Write the result of a frame.
 
         Parameters
         ----------
@@ -155,7 +155,7 @@ class RunBag(AbstractContextManager["RunBag"]):
                 track.add(estimate)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
-        """Tell of a frame without a pose, in the diagnostics alone."""
+        """Write a frame without a pose to the diagnostics."""
         if self._first_ns is None:
             return
         with self._file.refused_on_error():
@@ -163,7 +163,7 @@ class RunBag(AbstractContextManager["RunBag"]):
             write_diagnostics(self._bag, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
 
     def close(self) -> None:
-        """Write the whole paths and give the file its name; again: nothing.
+        """Write the whole paths and give the file its name; a second call does nothing.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         self.close()
 
     def _begin(self, stamp_ns: int) -> None:
-        """Note the stamp of a frame; before the first, write what never changes."""
+        """Note the stamp of a frame; at the first, write the static transforms."""
         self._newest_ns = stamp_ns
         if self._first_ns is not None:
             return
@@ -287,7 +287,7 @@ def _caption(result: FrameResult) -> list[str]:
 
 
 def _numbers(result: FrameResult) -> dict[str, object]:
-    """Return what the diagnostics list."""
+    """Return the values of the diagnostics."""
     numbers: dict[str, object] = {
         "status": result.status,
         "status of the raw chain": result.raw.status,

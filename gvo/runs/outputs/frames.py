@@ -26,7 +26,7 @@ _T_FLU_OPTICAL: Final = se3.make_transform(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunFrames:
-    """The names of a run's frames, and how the camera sits in the frame of the trajectory.
+    """The names of a run's frames, and where the camera is mounted on the base frame.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class RunFrames:
     camera : str
         The optical frame of the rectified left or colour camera; `camera_optical` where empty.
     base : str
-        The frame whose poses they are; where empty, the camera's.
+        The base frame; the camera's where empty.
     T_base_cam : ndarray of float64, shape (4, 4), or callable
         Maps camera coordinates to the base frame, metres. A function of stamp_ns where the
         camera moves in that frame.
@@ -55,7 +55,7 @@ class RunFrames:
     is_world_optical: bool = False
 
     def __post_init__(self) -> None:
-        """Choose names where none are given; tf refuses a leading slash."""
+        """Fill in names; tf refuses a leading slash."""
         camera = bare(self.camera) or "camera_optical"
         names = {
             "world": bare(self.world),
@@ -93,14 +93,14 @@ class RunFrames:
         return f"gvo/{name}/{self.camera}"
 
     def moving(self, name: str, estimate: Estimate) -> Iterator[FramePose]:
-        """Yield what a pose says of the frames."""
+        """Yield the moving transforms of a pose."""
         stamp_ns = estimate.stamp_ns
         yield FramePose(stamp_ns, self.world, self.base_by(name), estimate.T_world_cam)
         if callable(self.T_base_cam) and not self.is_camera:
             yield self._mounted(stamp_ns, name)
 
     def fixed(self, stamp_ns: int) -> Iterator[FramePose]:
-        """Yield what never moves."""
+        """Yield the static transforms."""
         if self.is_world_optical:
             yield FramePose(stamp_ns, f"{self.world}_flu", self.world, _T_FLU_OPTICAL)
         if not callable(self.T_base_cam) and not self.is_camera:

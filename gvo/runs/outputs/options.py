@@ -1,4 +1,4 @@
-"""What a run writes beside the tables of its folder."""
+"""What a run writes besides the tables of its folder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gvo.runs.outputs.frames import RunFrames
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutputs:
-    """What a run writes beside the tables of its folder.
+    """What a run writes besides the tables of its folder.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ class RunOutputs:
     plots: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not go together."""
+        """Refuse contradictory options."""
         if self.plots is not None and not self.report:
             raise ConfigurationError("--plots are those of the report: not with --no-report")
 
     def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[Output], list[str]]:
-        """Open what is written as the run goes.
+        """Open the files that are written as the run goes.
 
         Parameters
         ----------
@@ -59,12 +59,12 @@ class RunOutputs:
         -------
         outputs : list of Output
         warnings : list of str
-            What is written otherwise than asked for, a line each.
+            Where another file is written than asked for, a line each.
 
         Raises
         ------
         ConfigurationError
-            When a name cannot be one, or what a file needs is not installed.
+            When a frame's name is invalid, or a package is not installed.
         RecordingError
             When a file cannot be written.
         """
@@ -95,7 +95,7 @@ class RunOutputs:
 
 
 def _make_folder(path: Path) -> None:
-    """Make a folder before the work that is to fill it."""
+    """Make a folder, so that a failure comes before the work."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -112,14 +112,14 @@ def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world
     base_frame : BaseFrame
         Whose poses are written.
     is_placed : bool
-        The first pose was asked for: the world is not that of the first frame.
+        Whether an initial pose was asked for: the world is not that of the first frame.
     world : str
         The fixed frame.
 
     Raises
     ------
     ConfigurationError
-        When a name cannot be one.
+        When a frame's name is invalid.
     """
     try:
         return _named(source, base_frame, is_placed=is_placed, world=world)

@@ -19,7 +19,7 @@ Entities
 `status`, `configuration`                    a line per frame; what was set
 ===========================================  ======================================================
 
-All is told on two timelines: `stamp`, and `frame`, the number of the frame, faulty ones counted.
+All is logged on two timelines: `stamp`, and `frame`, the number of the frame, faulty ones counted.
 Stamps before the year 2000 are durations, others dates. A pose has its own stamp, a smoothed one
 too; lines, ellipsoids and numbers have that of the frame with which they were known.
 
@@ -53,7 +53,7 @@ N_FRAMES_HELD: Final = 20
 
 
 class RunRerun(AbstractContextManager["RunRerun"]):
-    """A Rerun file of what a run computes, open inside a `with` block.
+    """A Rerun file of the results of a run, open inside a `with` block.
 
     It is written under another name in the same folder and takes its own when it is closed, also
     where the run is interrupted. Without a single frame no file is left. No viewer is needed, and
@@ -113,7 +113,7 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         return RerunWriter(stream, camera, frames, text)
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Write what one frame gave.
+        """Write the result of a frame.
 
         Parameters
         ----------
@@ -138,11 +138,11 @@ class RunRerun(AbstractContextManager["RunRerun"]):
         self._writer.add_smoothed(estimates)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
-        """Tell of a frame without a pose, in the log alone."""
+        """Write a frame without a pose to the log."""
         self._writer.add_status(frame.stamp_ns, Status.SKIPPED, f"skipped: {frame.reason}")
 
     def close(self) -> None:
-        """Write the whole paths and give the file its name; again: nothing.
+        """Write the whole paths and give the file its name; a second call does nothing.
 
         Raises
         ------

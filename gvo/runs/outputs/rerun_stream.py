@@ -15,10 +15,9 @@ _N_BYTES: Final = 2**20
 
 
 class FilePipe:
-    """Takes all that is written to it, and keeps in a file what the disk has room for.
+    """A pipe into a file that never fails: what does not fit on the disk is dropped.
 
-    For writers that cannot bear a write that fails: rerun's waits for ever, now and then, where
-    the disk is full.
+    rerun's writer may wait for ever where a write fails, as on a full disk.
 
     Parameters
     ----------
@@ -45,11 +44,11 @@ class FilePipe:
 
     @property
     def entrance(self) -> Path:
-        """What is to be opened for writing, once."""
+        """The path to open for writing, once."""
         return Path(f"/dev/fd/{self._writer}")
 
     def leave(self) -> None:
-        """Leave the entrance to who has opened it: the file ends when they close it."""
+        """Close this end: the file ends when the writer closes its own."""
         os.close(self._writer)
 
     def join(self) -> None:
@@ -172,7 +171,7 @@ class RerunStream:
         self._recording.send_recording_name(name)
 
     def set_frame(self, stamp_ns: int, index: int) -> None:
-        """Say which frame what is logged next belongs to.
+        """Set the frame of what is logged next.
 
         The first stamp decides whether the timeline shows dates or durations.
 
@@ -196,7 +195,7 @@ class RerunStream:
         self._recording.log(path, *archetypes, static=is_static, strict=True)
 
     def flush(self) -> None:
-        """Hand over what was logged, so that it need not be held in memory.
+        """Flush what was logged, so that it is not held in memory.
 
         Raises
         ------

@@ -77,7 +77,7 @@ class RerunWriter:
             stream.log(place.CONFIGURATION, document, is_static=True)
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Log what one frame gave."""
+        """Log the result of a frame."""
         image = frame.left if isinstance(frame, StereoFrame) else frame.image
         self._begin(result)
         self._stamps_ns.append(frame.stamp_ns)
@@ -92,7 +92,7 @@ class RerunWriter:
         self._add_lines(frame.stamp_ns)
 
     def add_status(self, stamp_ns: int, status: Status, text: str) -> None:
-        """Log a line that tells of a new frame."""
+        """Log the status line of a new frame."""
         self.stream.set_frame(stamp_ns, self._n_seen)
         self._n_seen += 1
         self.stream.log(place.STATUS, make_status(status, text))
@@ -116,7 +116,7 @@ class RerunWriter:
         self._add_recent()
 
     def _begin(self, result: FrameResult) -> None:
-        """Log, before the first pose, what never changes."""
+        """Log, before the first pose, what is static."""
         if self._first_ns is not None:
             return
         self._first_ns = result.stamp_ns
@@ -399,7 +399,7 @@ def make_pinhole(camera: PinholeCamera) -> rr.Pinhole:
 
 
 def shrinkage(width: int) -> int:
-    """Return by what an image of this width is divided for the scene: 1, 2, 4, ..."""
+    """Return the factor that shrinks an image of this width for the scene: 1, 2, 4, ..."""
     n = 1
     while width // n > SHOWN_WIDTH_PX:
         n *= 2

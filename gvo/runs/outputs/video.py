@@ -72,7 +72,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         self._waiting: deque[Future[None]] = deque()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
-        """Take one frame and what it gave.
+        """Take a frame and its result.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         self._put((frame, result))
 
     def add_faulty(self, frame: FaultyFrame) -> None:
-        """Take a frame without a pose: its picture tells the reason.
+        """Take a frame without a pose; its picture says why.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         """Take smoothed poses, which the film does not show."""
 
     def close(self) -> None:
-        """Write what waits and finish the film; again: nothing.
+        """Write what waits and finish the film; a second call does nothing.
 
         Raises
         ------
