@@ -84,7 +84,7 @@ class SlidingWindow:
         self._clock = StatusClock(self._config.lost_after_s)
         self._motion = ConstantVelocity(self._config)
         self._admission = Admission(self._graph, self._motion)
-        self._polish: BatchResult | None = None
+        self._batch_result: BatchResult | None = None
 
     def __repr__(self) -> str:
         """Return the number of poses, the newest, and the counts in one line."""
@@ -114,9 +114,9 @@ class SlidingWindow:
         return self._counter.counts
 
     @property
-    def polish(self) -> BatchResult | None:
+    def batch_result(self) -> BatchResult | None:
         """The batch optimization in `finish`, if the window kept everything; else None."""
-        return self._polish
+        return self._batch_result
 
     def reconfigure(self, config: WindowConfig) -> None:
         """Use another configuration from now on; measurements keep their kernels.
@@ -341,7 +341,7 @@ class SlidingWindow:
 
         If no pose left before, they are optimized in a batch first.
         """
-        self._polish = self._graph.finish()
+        self._batch_result = self._graph.finish()
         self._motion.restart()
         self._clock = StatusClock(self._config.lost_after_s)
         return sorted(self.pop_finished(), key=lambda estimate: estimate.stamp_ns)

@@ -68,9 +68,9 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
     summary = result.summary
-    if summary["polish"] is not None:
-        errors = summary["polish"]
-        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} polished"
+    if summary["batch"] is not None:
+        errors = summary["batch"]
+        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} in a batch"
         typer.echo(text, err=is_stdout_taken)
     counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
     typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)

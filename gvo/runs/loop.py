@@ -117,7 +117,7 @@ class RunLoop:
     def count(self) -> None:
         """Copy the counts of window, front-end and base frame into the statistics."""
         window = self._odometry.window
-        self.statistics.window, self.statistics.polish = window.counts, window.polish
+        self.statistics.window, self.statistics.batch_result = window.counts, window.batch_result
         self.statistics.rig_offsets = self._odometry.rig_offsets
         self.statistics.n_guessed = self.base_frame.n_guessed
         self.statistics.mount_travel_m = self.base_frame.mount_travel_m

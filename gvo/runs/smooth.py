@@ -316,7 +316,7 @@ def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
 
 def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, Any]:
     n_tracked = smoother.statuses[Status.OK] + smoother.statuses[Status.RESUMED]
-    polish = smoother.window.polish
+    batch_result = smoother.window.batch_result
     return {
         "gvo_version": __version__,
         "recording": name,
@@ -325,7 +325,7 @@ def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, 
         "tracked": n_tracked,
         "status_counts": {status.value: smoother.statuses[status] for status in Status},
         "window": asdict(smoother.window.counts),
-        "polish": None if polish is None else polish.as_json(),
+        "batch": None if batch_result is None else batch_result.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
 

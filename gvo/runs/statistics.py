@@ -77,7 +77,7 @@ class RunStatistics:
     n_guessed: int = 0
     mount_travel_m: float = 0.0
     window: WindowCounts = field(default_factory=WindowCounts)
-    polish: BatchResult | None = None
+    batch_result: BatchResult | None = None
     rig_offsets: RigOffsets | None = None
     stages: dict[str, _Durations] = field(default_factory=dict)
     segments: dict[int, Segment] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class RunStatistics:
             "status_counts": {status.value: self.statuses[status] for status in Status},
             "unpaired_images": self.n_unpaired,
             "window": asdict(self.window),
-            "polish": None if self.polish is None else self.polish.as_json(),
+            "batch": None if self.batch_result is None else self.batch_result.as_json(),
             "rig_offsets": None if self.rig_offsets is None else self.rig_offsets.as_json(),
             "median_ms": {name: durations.median() for name, durations in self.stages.items()},
         }

@@ -175,14 +175,14 @@ def test_late_measurements_are_listed_with_the_others() -> None:
     assert ends == [(0, 1), (1, 2), (None, 2), (2, 3), (0, 3)]
 
 
-def test_all_late_measurements_are_polished_with_the_others() -> None:
+def test_all_late_measurements_are_optimized_with_the_others() -> None:
     window = walk(WindowConfig(size=None, kernel="none"), 5)
     loop = edge(0, se3.normalize(np.linalg.matrix_power(STEP, 4) @ se3.exp(np.full(6, 0.02))))
     assert isinstance(window.add_edge(4, loop), Estimate)
     place = PositionPrior(position_world=window.pose(2)[:3, 3] + 0.05, covariance=1e-4 * np.eye(3))
     assert isinstance(window.add_prior(2, place), Estimate)
     smoothed = window.finish()
-    assert window.polish is not None
+    assert window.batch_result is not None
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.01)
     sure = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
@@ -198,13 +198,13 @@ def test_all_late_measurements_are_polished_with_the_others() -> None:
     for frame in range(5):
         values.insert(frame, gtsam.Pose3(np.linalg.matrix_power(STEP, frame)))
     optimum = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    # The polish of the window is the same optimum, and its error the same sum.
-    assert window.polish.error_after == pytest.approx(graph.error(optimum), rel=1e-4)
-    assert window.polish.error_after > 1.0
-    assert window.polish.as_json() == {
-        "error_isam2": window.polish.error_before,
-        "error": window.polish.error_after,
-        "iterations": window.polish.n_iterations,
+    # The batch optimum of the window is the same optimum, and its error the same sum.
+    assert window.batch_result.error_after == pytest.approx(graph.error(optimum), rel=1e-4)
+    assert window.batch_result.error_after > 1.0
+    assert window.batch_result.as_json() == {
+        "error_isam2": window.batch_result.error_before,
+        "error": window.batch_result.error_after,
+        "iterations": window.batch_result.n_iterations,
     }
     for frame, each in enumerate(smoothed):
         expected = optimum.atPose3(frame).matrix()
@@ -456,27 +456,27 @@ def test_an_empty_window_takes_another_size_as_if_it_had_begun_with_it(
     assert len(window) == (12 if after is None else after)
     assert len(window.pop_finished()) == (0 if after is None else 12 - after)
     window.finish()
-    assert (window.polish is not None) == (after is None)
+    assert (window.batch_result is not None) == (after is None)
 
 
-def test_what_the_last_polish_gained_is_not_told_of_the_next_run() -> None:
+def test_what_the_last_batch_optimization_gained_is_not_told_of_the_next_run() -> None:
     window = SlidingWindow(WindowConfig(size=None))
     go_on(window, 0, 4)
     window.finish()
-    assert window.polish is not None
+    assert window.batch_result is not None
     window.reconfigure(WindowConfig(size=3))
     go_on(window, 0, 6)
     assert len(window) == 3
     assert [each.frame_id for each in window.finish()] == list(range(6))
-    assert window.polish is None
+    assert window.batch_result is None
     # And back: a window that slid can keep everything from its next start on.
     go_on(window, 0, 4)
     window.reconfigure(WindowConfig(size=None))
     window.finish()
-    assert window.polish is None
+    assert window.batch_result is None
     go_on(window, 0, 4)
     window.finish()
-    assert window.polish is not None
+    assert window.batch_result is not None
 
 
 def test_a_window_that_finished_knows_nothing_of_the_motion_before() -> None:
@@ -563,7 +563,7 @@ def test_a_window_that_keeps_all_can_begin_to_slide_and_stop_again() -> None:
     finished = window.pop_finished()
     assert len(window) > 20  # none left after the second change
     finished += window.finish()
-    assert window.polish is None
+    assert window.batch_result is None
     assert sorted(estimate.frame_id for estimate in finished) == list(range(100))  # type: ignore[type-var]
     reference, _ = reconfigured({}, whole, 100)
     expected = stacked(reference.finish())

@@ -171,7 +171,7 @@ def test_an_edge_or_a_prior_at_which_gtsam_fails_is_refused_and_leaves_no_trace(
     assert found.window.counts.n_restored == 1
 
 
-def test_a_polish_that_fails_leaves_the_estimates_as_they_were(
+def test_a_batch_optimization_that_fails_leaves_the_estimates_as_they_were(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     failed = []
@@ -440,21 +440,21 @@ def test_a_whole_window_that_cannot_be_made_to_slide_goes_on_all_the_same(
         np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-6)
 
 
-def test_measurements_at_which_cholesky_gives_up_are_smoothed_and_polished() -> None:
+def test_measurements_at_which_cholesky_gives_up_are_smoothed_and_optimized() -> None:
     window = SlidingWindow(WindowConfig(size=None, kernel="none"))
     window.add_pose(0, 0, [], PosePrior(T_world_frame=np.eye(4), covariance=1e4 * np.eye(6)))
     for frame in range(1, 6):
         window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 1e-3)])
     assert window.counts.n_restored >= 1  # there was something to survive
     smoothed = window.finish()
-    assert window.polish is not None
-    assert window.polish.error_after == pytest.approx(0.0, abs=1e-6)
+    assert window.batch_result is not None
+    assert window.batch_result.error_after == pytest.approx(0.0, abs=1e-6)
     for frame, each in enumerate(smoothed):
         expected = np.linalg.matrix_power(STEP, frame)
         np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-4)
 
 
-def test_where_cholesky_gives_up_the_polish_is_done_by_qr() -> None:
+def test_where_cholesky_gives_up_the_batch_is_solved_by_qr() -> None:
     window = walk(WindowConfig(size=None, kernel="none"), 5)
     place = PositionPrior(position_world=window.pose(4)[:3, 3] + 0.1, covariance=1e-4 * np.eye(3))
     assert isinstance(window.add_prior(4, place), Estimate)
@@ -470,7 +470,7 @@ def test_where_cholesky_gives_up_the_polish_is_done_by_qr() -> None:
         patch.setattr(gtsam, "LevenbergMarquardtOptimizer", picky)
         finished = window.finish()
     assert solvers == ["MULTIFRONTAL_CHOLESKY", "MULTIFRONTAL_QR"]
-    assert window.polish is not None
-    assert window.polish.error_after < window.polish.error_before
-    assert window.polish.n_iterations > 0
+    assert window.batch_result is not None
+    assert window.batch_result.error_after < window.batch_result.error_before
+    assert window.batch_result.n_iterations > 0
     assert [each.frame_id for each in finished] == list(range(5))

@@ -243,10 +243,10 @@ def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_pr
         expected = optimum.atPose3(frame).matrix()
         np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-6)
         assert_equal_covariances(estimate.covariance, marginals.marginalCovariance(frame), 0.05)
-    assert window.polish is not None
+    assert window.batch_result is not None
     error = build(problem).error(optimum)
-    assert window.polish.error_after == pytest.approx(error, rel=1e-6)
-    assert window.polish.error_before >= window.polish.error_after * (1 - 1e-9)
+    assert window.batch_result.error_after == pytest.approx(error, rel=1e-6)
+    assert window.batch_result.error_before >= window.batch_result.error_after * (1 - 1e-9)
 
 
 @settings(deadline=None, max_examples=6)
@@ -312,7 +312,7 @@ def test_poses_and_covariances_of_the_window_are_those_of_the_batch(
     poses = window.poses()
     assert list(poses) == list(range(25 - (size or 25), 25))
     for frame, T in poses.items():
-        # A whole graph relinearizes rarely; it is polished at its end.
+        # A whole graph relinearizes rarely; it is optimized in a batch at its end.
         atol = 1e-7 if size else 1e-5
         np.testing.assert_allclose(T, optimum.atPose3(number(frame)).matrix(), atol=atol)
         np.testing.assert_array_equal(T, window.pose(frame))
@@ -430,8 +430,8 @@ def test_without_a_prior_the_graph_tells_at_most_the_start_beside_the_edges() ->
     assert all(edge.frame_id == 0 for edge in graph if edge.reference_id is None)
     chi2 = sum(edge.chi2 for edge in edges)
     window.finish()
-    assert window.polish is not None
-    assert window.polish.error_before == pytest.approx(0.5 * chi2, rel=1e-3)
+    assert window.batch_result is not None
+    assert window.batch_result.error_before == pytest.approx(0.5 * chi2, rel=1e-3)
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:])
@@ -455,8 +455,8 @@ def test_full_smoothing_with_a_kernel_reaches_the_cost_of_the_batch(
     assert graph.error(found) <= graph.error(optimise(graph, found)) * (1 + 1e-6)
     if kernel in ("huber", "cauchy"):  # the others have many optima
         assert graph.error(found) <= graph.error(optimise(graph, truth)) * (1 + 1e-6)
-    assert window.polish is not None
-    assert window.polish.error_after == pytest.approx(graph.error(found), rel=1e-6)
+    assert window.batch_result is not None
+    assert window.batch_result.error_after == pytest.approx(graph.error(found), rel=1e-6)
     if kernel in ("huber", "cauchy"):
         assert graph.error(found) < graph.error(optimise(build(problem), truth))
 

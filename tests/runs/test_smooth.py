@@ -132,8 +132,8 @@ def test_a_pose_graph_reaches_the_error_of_batch_optimization(tmp_path: Path, na
     reread = errors_by_gtsam(tmp_path / "smoothed.g2o", tmp_path / "smoothed.g2o")
     assert reread == pytest.approx(expected, rel=1e-6)
     assert errors_by_gtsam(tmp_path / "smoothed.g2o", path) == pytest.approx(expected, rel=1e-6)
-    assert result.summary["polish"]["error"] == pytest.approx(expected, rel=1e-6)
-    assert result.summary["polish"]["error_isam2"] >= expected * (1 - 1e-9)
+    assert result.summary["batch"]["error"] == pytest.approx(expected, rel=1e-6)
+    assert result.summary["batch"]["error_isam2"] >= expected * (1 - 1e-9)
 
 
 def test_the_smoothed_graph_keeps_ids_order_and_edges(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_graph_may_be_smoothed_by_a_small_window(tmp_path: Path) -> None:
     config = Config(window=WindowConfig(size=3))
     result = smooth_file(path, tmp_path, config)
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 27
-    assert result.summary["polish"] is None
+    assert result.summary["batch"] is None
 
 
 def test_a_pose_without_a_usable_edge_is_in_all_trajectories(tmp_path: Path) -> None:
