@@ -47,9 +47,9 @@ class Trace(list[Event]):
         """Return the events before the first one of a name; all if there is none."""
         return Trace(takewhile(lambda event: event.name != name, self))
 
-    def split(self, *names: str) -> list[Trace]:
-        """Return the parts that begin with an event of one of the names."""
-        starts = [n for n, event in enumerate(self) if event.name in names]
+    def split(self, name: str) -> list[Trace]:
+        """Return the parts that begin with an event of a name."""
+        starts = [n for n, event in enumerate(self) if event.name == name]
         return [Trace(self[start:end]) for start, end in pairwise([*starts, len(self)])]
 
 

@@ -61,11 +61,11 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     ConfigurationError
         When the folder cannot be written to.
     """
+    open_folder(out)
     pictures = draw_pictures(explanation)
     files = {out / f"{each.name}.png": each.png for each in pictures if each.png is not None}
     numbers = json.dumps(explanation_json(explanation), indent=2, allow_nan=False)
     files[out / "explanation.json"] = numbers.encode()
-    open_folder(out)
     try:
         for path, content in files.items():
             path.write_bytes(content)

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gvo._trace import Event, Trace
 from gvo.backend.keyframe_policy import choose_links
 from gvo.config import Config, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
+from gvo.diagnostics.explain.motion import explain_consensus, explain_refinement
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.frames import frames
@@ -19,7 +21,7 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FaultyFrame, FrameResult
+from gvo.types import FaultyFrame, FrameResult, Progress
 
 KINDS = ("klt", "descriptor")
 SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
@@ -173,6 +175,26 @@ def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
     assert linked
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_keyframe_has_an_edge_or_the_reason_why_not(kind: str) -> None:
+    source = SyntheticRecording("driving", "stereo", n_frames=7, scale=0.4)
+    config = configuration(kind)
+    done: list[Progress] = []
+    explanation = explain_frame(source, 6, config=config, on_progress=done.append)
+    before = run(source, config)[5]
+    links = explanation.links
+    assert links[0].kind == "step"
+    assert links[0].reference_ns == before.stamp_ns
+    stamps_ns = [link.reference_ns for link in links]
+    assert sorted(stamps_ns) == sorted({before.stamp_ns, *before.keyframes_ns})
+    assert all(bool(link.reason) != link.is_accepted for link in links)
+    assert {"step", "not linked"} <= {link.kind for link in links}
+    assert explanation.result.n_links == sum(link.is_accepted for link in links)
+    assert [(each.n_done, each.n_total, each.n_tracked) for each in done] == [
+        (n, 7, n) for n in range(1, 7)
+    ]
+
+
 def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> None:
     step = explained("klt", "stereo").consensus
     assert step is not None
@@ -181,6 +203,38 @@ def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> N
     if step.is_known:
         assert step.n_agreeing_with_prediction is not None
         assert step.n_agreeing_with_prediction >= step.n_needed
+
+
+def test_what_happened_after_a_step_is_not_counted_with_it() -> None:
+    # Without a prediction samples are drawn.
+    explanation = explained("descriptor", "stereo", 1)
+    attempt, camera, config = explanation.attempt, explanation.camera, explanation.config
+    later = Event(
+        name="ransac.block",
+        values={"n_before": 0, "is_valid": np.ones(9_999, np.bool_), "counts": 0, "share": 0.0},
+    )
+    longer = Trace([*attempt, later, *attempt])
+    consensus = explain_consensus(longer, camera, config)
+    refinement = explain_refinement(longer, camera, config)
+    assert explanation.consensus is not None
+    assert explanation.refinement is not None
+    assert consensus is not None
+    assert refinement is not None
+    assert consensus.counts.tolist() == explanation.consensus.counts.tolist()
+    assert refinement.n_steps == explanation.refinement.n_steps > 0
+
+
+def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> None:
+    config, source = configuration("klt"), recording("stereo")
+    odometry = Odometry(source.info.camera, config)
+    for frame in frames(source, config):
+        assert not isinstance(frame, FaultyFrame)
+        odometry.track(frame)
+    # What the last frame taught takes effect with the next one.
+    offsets, explanation = odometry.rig_offsets, explained("klt", "stereo")
+    assert offsets is not None
+    assert explanation.offset_px == offsets.disparity.value_px != 0.0
+    assert explanation.row_offset_px == offsets.row.value_px != 0.0
 
 
 def test_a_first_frame_is_explained_without_a_motion() -> None:

@@ -2,14 +2,15 @@
 
 import json
 import re
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from gvo.config import Config, RegistrationConfig
+from gvo.config import Config, RegistrationConfig, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import ConfigurationError
 from gvo.io.recording import Sensor
@@ -39,11 +40,22 @@ def explained(sensor: Sensor, index: int) -> FrameExplanation:
     return explain_frame(source, index)
 
 
-@pytest.mark.parametrize(("sensor", "names"), [("stereo", STEREO), ("rgbd", RGBD)])
+def explained_descriptors() -> FrameExplanation:
+    source = SyntheticRecording("driving", "stereo", n_frames=5, scale=0.4)
+    return explain_frame(
+        source, 4, config=load_configuration(settings=["frontend.kind=descriptor"])
+    )
+
+
+@pytest.mark.parametrize(
+    ("explain", "names"),
+    [(explained_descriptors, STEREO), (partial(explained, "rgbd", 2), RGBD)],
+    ids=["descriptors", "tracks"],
+)
 def test_each_step_has_its_picture_in_order(
-    sensor: Sensor, names: list[str], tmp_path: Path
+    explain: Callable[[], FrameExplanation], names: list[str], tmp_path: Path
 ) -> None:
-    written = write_explanation(explained(sensor, 2), tmp_path / "made" / "here")
+    written = write_explanation(explain(), tmp_path / "made" / "here")
     assert [path.stem for path in written] == [*names, "explanation", "explanation"]
     for path in written[:-2]:
         image = cv2.imread(str(path))
