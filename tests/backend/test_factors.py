@@ -5,7 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
@@ -43,7 +43,6 @@ def weight(kernel: Kernel, r: FloatArray, k: float) -> FloatArray:
     return np.minimum(1.0, 2.0 * k / (k + r**2)) ** 2
 
 
-@settings(deadline=None)
 @given(seed=seeds, size=st.floats(0.01, 40.0), kernel=st.sampled_from(KERNELS))
 def test_the_cost_of_an_edge_is_that_of_its_kernel(seed: int, size: float, kernel: Kernel) -> None:
     rng = np.random.default_rng(seed)
@@ -120,7 +119,6 @@ def test_a_position_weighs_along_the_axes_of_the_world() -> None:
     np.testing.assert_allclose(found.residual, [1.0, 1.0, 1.0])
 
 
-@settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_residuals_are_those_of_gtsam_in_the_axes_of_the_frame(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -44,7 +44,7 @@ def walk(step: FloatArray, n: int = 5) -> SlidingWindow:
 
 @pytest.mark.parametrize("is_wrong_first", [False, True])
 @pytest.mark.parametrize("is_wrong_nearer", [False, True])
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(seed=seeds, offset_m=st.floats(8.0, 1000.0))
 def test_of_two_edges_that_disagree_the_one_that_fits_the_motion_stays(
     is_wrong_first: bool, is_wrong_nearer: bool, seed: int, offset_m: float
@@ -111,7 +111,7 @@ def last_to_first(edges: list[Edge]) -> list[Edge]:
 
 
 @pytest.mark.parametrize("rearrange", [list, first_to_last, last_to_first])
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seed=seeds)
 def test_a_loop_that_turns_uncertain_references_is_believed_at_the_end_of_a_long_arm(
     rearrange: Callable[[list[Edge]], list[Edge]], seed: int
@@ -131,7 +131,7 @@ def test_a_loop_that_turns_uncertain_references_is_believed_at_the_end_of_a_long
 
 
 @pytest.mark.parametrize("rearrange", [list, first_to_last, last_to_first])
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seed=seeds)
 def test_a_stretch_of_the_arm_is_not_excused_by_turns_of_the_references(
     rearrange: Callable[[list[Edge]], list[Edge]], seed: int
@@ -182,7 +182,7 @@ def verdict_of(
 
 
 @pytest.mark.parametrize("gate", [None, 1e-3, 10.0])
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(seed=seeds, n=st.integers(3, 6), n_wrong=st.integers(0, 1))
 def test_the_start_is_the_optimum_of_the_edges_that_agree(
     gate: float | None, seed: int, n: int, n_wrong: int
@@ -212,7 +212,6 @@ def test_the_start_is_the_optimum_of_the_edges_that_agree(
     np.testing.assert_allclose(verdict.T_world_start.matrix(), expected, atol=tolerance)
 
 
-@settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_a_disagreement_is_told_in_sigmas_of_both_covariances(seed: int) -> None:
     rng = np.random.default_rng(seed)

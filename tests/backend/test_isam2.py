@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.backend.batch import optimize_batch
@@ -264,7 +264,6 @@ def correlations(rng: np.random.Generator, least: float) -> FloatArray:
     return np.asarray((flat + least * np.eye(6)) / (1.0 + least))
 
 
-@settings(deadline=None, max_examples=50)
 @given(seed=seeds, exponent=st.floats(-9.0, -7.0))
 def test_a_little_less_than_definite_is_mended_and_keeps_what_it_says(
     seed: int, exponent: float
@@ -282,7 +281,6 @@ def test_a_little_less_than_definite_is_mended_and_keeps_what_it_says(
     np.testing.assert_allclose(eigenvalues[1:], np.linalg.eigvalsh(spoilt)[1:], atol=1e-12)
 
 
-@settings(deadline=None, max_examples=50)
 @given(seed=seeds)
 def test_a_definite_one_is_only_made_symmetric(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.backend.keyframe_policy import choose_links, choose_released, is_needed, proximity
@@ -59,7 +59,6 @@ def test_the_score_falls_linearly_with_the_larger_ratio(
     assert proximity(moved(distance_m, angle_deg), configure()) == pytest.approx(score, abs=1e-9)
 
 
-@settings(deadline=None)
 @given(twist=twists)
 def test_two_poses_are_as_near_from_either_side(twist: np.ndarray[Any, Any]) -> None:
     T = se3.exp(twist)
@@ -113,7 +112,6 @@ def test_frames_need_no_order_of_their_own() -> None:
     assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
 
 
-@settings(deadline=None)
 @given(
     scores=st.dictionaries(st.integers(0, 50), st.floats(0.0, 1.0), max_size=12),
     n_links=st.integers(1, 8),
@@ -132,7 +130,6 @@ def test_links_are_near_once_each_and_not_to_the_predecessor(
     assert len(chosen) == min(n_links - 1, len(worth_it))
 
 
-@settings(deadline=None)
 @given(
     shares=st.lists(st.floats(0.0, 1.0), max_size=8),
     n_keyframes=st.integers(0, 6),

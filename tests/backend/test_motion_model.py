@@ -36,7 +36,7 @@ def moving(
     return given
 
 
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_a_constant_velocity_goes_on(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def test_a_constant_velocity_goes_on(seed: int) -> None:
     np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-15)
 
 
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_poses_without_a_measurement_follow_the_velocity_before_them(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -631,7 +631,7 @@ configurations = st.builds(
     kept=st.sets(st.integers(0, 39)),
     gaps=st.sets(st.integers(1, 39), max_size=10),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_each_pose_is_finished_exactly_once_over_any_changes(
     changes: dict[int, WindowConfig], kept: set[int], gaps: set[int]
 ) -> None:

@@ -230,7 +230,7 @@ def assert_equal_covariances(found: FloatArray, expected: FloatArray, tolerance:
     np.testing.assert_allclose(found / scale, expected / scale, atol=tolerance)
 
 
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(seed=seeds, with_priors=st.booleans())
 def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_priors: bool) -> None:
     problem = loopy_problem(seed, 40, 0.01, with_priors=with_priors)
@@ -249,7 +249,7 @@ def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_pr
     assert window.batch_result.error_before >= window.batch_result.error_after * (1 - 1e-9)
 
 
-@settings(deadline=None, max_examples=6)
+@settings(max_examples=6)
 @given(seed=seeds, with_priors=st.booleans())
 def test_each_answer_is_the_batch_optimum_of_what_was_known(seed: int, with_priors: bool) -> None:
     # Measurements so good that one linearization is as good as many.
@@ -542,7 +542,6 @@ def assert_refused(gross: Gross, kernel: Any, atol: float) -> None:
     assert_equal_covariances(found.covariance, expected.covariance, 0.03)
 
 
-@settings(deadline=None, max_examples=20)
 @given(
     seed=seeds,
     n_edges=st.integers(3, 5),
@@ -591,7 +590,7 @@ def test_without_a_gate_nothing_is_gated() -> None:
     assert (window.counts.n_gated, window.counts.n_edges) == (0, 3)
 
 
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 @given(seed=seeds)
 def test_edges_whose_covariance_is_true_are_not_refused(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -1,5 +1,7 @@
 """The offset of a rig's disparities, planted in simulated matches and found again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -16,54 +18,48 @@ from gvo.geometry.refinement import (
 )
 from gvo.geometry.residuals import Linearization, StereoResiduals
 from gvo.types import FloatArray
+from tests.geometry.scenes import (
+    all_of,
+    derivative,
+    matched,
+    move,
+    project,
+    random_motion,
+    unproject,
+)
 
 CAMERA = StereoCamera(fx=700.0, fy=690.0, cx=600.0, cy=180.0, width=1226, height=370, baseline=0.5)
 SETTINGS = RegistrationConfig(n_iterations=20, huber=2.8, gate=5.0)
-SIGMAS = np.array([0.2, 0.2, 0.2])
+SIGMA = 0.2
 
 
-def project(points: FloatArray) -> FloatArray:
-    x, y, z = points.T
-    return np.stack([700 * x / z + 600, 690 * y / z + 180, 350 / z], axis=1)
-
-
-def unproject(uvd: FloatArray) -> FloatArray:
-    z = 350 / uvd[:, 2]
-    return np.stack([(uvd[:, 0] - 600) * z / 700, (uvd[:, 1] - 180) * z / 690, z], axis=1)
-
-
-def drive(
-    seed: int,
-    offset_px: float,
-    *,
-    noise: float = 1.0,
-) -> tuple[FloatArray, Correspondences]:
+def drive(seed: int, offset_px: float, *, noise: float = 1.0) -> tuple[FloatArray, Correspondences]:
     """Return T_target_source and matches, the disparities of both frames too large."""
     rng = np.random.default_rng(seed)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(0.01 * rng.normal(size=3)).as_matrix()
+    T = random_motion(rng, 0.01)
     T[:3, 3] = [0.02, 0.01, -1.0]
-    inverse_depths = rng.uniform(1 / 50, 1 / 5, 400)
+    disparities = 350 * rng.uniform(1 / 50, 1 / 5, 400)
     pixels = rng.uniform([100, 40], [1100, 330], size=(400, 2))
-    source = unproject(np.column_stack([pixels, 350 * inverse_depths]))
-    target = source @ T[:3, :3].T + T[:3, 3]
+    source = unproject(np.column_stack([pixels, disparities]), CAMERA)
     uvds = [
-        project(points) + noise * SIGMAS * rng.normal(size=(400, 3)) + [0.0, 0.0, offset_px]
-        for points in (source, target)
+        project(points, CAMERA) + noise * SIGMA * rng.normal(size=(400, 3)) + [0.0, 0.0, offset_px]
+        for points in (source, move(T, source))
     ]
-    return T, Correspondences(
-        source_points=unproject(uvds[0]),
-        target_points=unproject(uvds[1]),
-        source_uvd=uvds[0],
-        target_uvd=uvds[1],
-        source_sigmas=np.tile(SIGMAS, (400, 1)),
-        target_sigmas=np.tile(SIGMAS, (400, 1)),
+    points = [unproject(uvd, CAMERA) for uvd in uvds]
+    return T, matched(
+        *points, source_uvd=uvds[0], target_uvd=uvds[1], source_sigmas=SIGMA, target_sigmas=SIGMA
     )
 
 
+def linearized(T: FloatArray, matches: Correspondences) -> tuple[StereoResiduals, Linearization]:
+    residuals = StereoResiduals.of(T, matches, CAMERA, huber=1e9)
+    at = residuals.linearize(T)
+    assert isinstance(at, Linearization)
+    return residuals, at
+
+
 def refine(T: FloatArray, matches: Correspondences, *, with_offset: bool = True) -> Refinement:
-    everything = np.ones(len(matches), dtype=np.bool_)
-    result = refine_pose(T, matches, everything, CAMERA, SETTINGS, with_offset=with_offset)
+    result = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS, with_offset=with_offset)
     assert isinstance(result, Refinement), result
     return result
 
@@ -105,9 +101,9 @@ def test_the_estimate_is_that_of_least_squares_over_pose_and_offset() -> None:
     T, matches = drive(3, 0.2, noise=0.01)
 
     def residuals(x: FloatArray) -> FloatArray:
-        source = unproject(matches.source_uvd - [0.0, 0.0, x[6]])
+        source = unproject(matches.source_uvd - [0.0, 0.0, x[6]], CAMERA)
         moved = source @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
-        return np.asarray((matches.target_uvd - [0.0, 0.0, x[6]] - project(moved)).ravel())
+        return np.asarray((matches.target_uvd - [0.0, 0.0, x[6]] - project(moved, CAMERA)).ravel())
 
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0]])
     optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
@@ -126,22 +122,13 @@ def test_the_pose_is_the_same_with_and_without_the_estimate() -> None:
 def test_a_camera_at_rest_says_nothing_of_the_offset() -> None:
     # Both frames are wrong alike: the residuals are those of a rig without offset.
     _, matches = drive(2, 0.3, noise=0.0)
-    same = Correspondences(
-        source_points=matches.source_points,
-        target_points=matches.source_points,
-        source_uvd=matches.source_uvd,
-        target_uvd=matches.source_uvd,
-        source_sigmas=matches.source_sigmas,
-        target_sigmas=matches.target_sigmas,
-    )
+    same = replace(matches, target_points=matches.source_points, target_uvd=matches.source_uvd)
     assert refine(np.eye(4), same).offset is None
 
 
 def test_settled_points_do_not_lean_to_their_own_residuals() -> None:
     T, matches = drive(11, 0.0)
-    residuals = StereoResiduals.of(T, matches, CAMERA, huber=100.0)
-    at = residuals.linearize(T)
-    assert isinstance(at, Linearization)
+    residuals, at = linearized(T, matches)
     truth = 350 / drive(11, 0.0, noise=0.0)[1].source_points[:, 2]
     settled = 350 / residuals.settled_points(T, at)[2]
     errors = {"measured": matches.source_uvd[:, 2] - truth, "settled": settled - truth}
@@ -158,18 +145,10 @@ def information_share(T: FloatArray, matches: Correspondences) -> float:
     """
     rows = []
     for source, sigmas in zip(matches.source_points, matches.target_sigmas, strict=True):
-        x, y, z = T[:3, :3] @ source + T[:3, 3]
-        by_point = np.array(
-            [
-                [700 / z, 0, -700 * x / z**2],
-                [0, 690 / z, -690 * y / z**2],
-                [0, 0, -350 / z**2],
-            ]
-        )
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        J = derivative(move(T, source), CAMERA)
         # A larger disparity draws a point along its ray.
-        by_offset = [0, 0, 1] + by_point @ T[:3, :3] @ source * source[2] / 350
-        J = np.column_stack([-by_point @ cross, by_point, by_offset])
+        by_offset = [0, 0, 1] + J[:, 3:] @ T[:3, :3] @ source * source[2] / 350
+        J = np.column_stack([J, by_offset])
         rows.append(J / sigmas[:, np.newaxis])
     R = np.linalg.qr(np.concatenate(rows))[1]
     return float(R[6, 6] ** 2 / np.sum(1.0 / matches.target_sigmas[:, 2] ** 2))
@@ -181,15 +160,16 @@ def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
     source_uvd = np.column_stack([pixels, rng.uniform(7.0, 70.0, 200)])
     T = np.eye(4)
     T[2, 3] = -step_m
-    source = unproject(source_uvd)
-    target_uvd = project(source + T[:3, 3])
-    return T, Correspondences(
-        source_points=source,
-        target_points=source + T[:3, 3],
+    source = unproject(source_uvd, CAMERA)
+    target = move(T, source)
+    target_uvd = project(target, CAMERA)
+    return T, matched(
+        source,
+        target,
         source_uvd=source_uvd,
         target_uvd=target_uvd,
-        source_sigmas=np.zeros((200, 3)),
-        target_sigmas=np.tile([0.4, 0.3, 0.2], (200, 1)),
+        source_sigmas=0.0,
+        target_sigmas=[0.4, 0.3, 0.2],
     )
 
 
@@ -200,28 +180,17 @@ def test_a_motion_too_small_to_tell_the_offset_from_rounding_tells_nothing(
     step = 1e-3 * np.sqrt(share / information_share(*barely_moved(1e-3)))
     T, matches = barely_moved(float(step))
     assert information_share(T, matches) == pytest.approx(share, rel=0.01)
-    residuals = StereoResiduals.of(T, matches, CAMERA, huber=100.0)
-    at = residuals.linearize(T)
-    assert isinstance(at, Linearization)
+    residuals, at = linearized(T, matches)
     assert (estimate_disparity_offset(T, residuals, at) is not None) == is_told
 
 
 def test_the_sigma_of_the_offset_is_that_of_the_scores_that_the_matches_show() -> None:
     T, matches = drive(4, 0.0)
-    matches = Correspondences(
-        source_points=matches.source_points,
-        target_points=matches.target_points,
-        source_uvd=matches.source_uvd,
-        target_uvd=matches.target_uvd,
-        source_sigmas=np.full((400, 3), 1e-12),
-        target_sigmas=matches.target_sigmas,
-    )
-    residuals = StereoResiduals.of(T, matches, CAMERA, huber=1e9)
-    at = residuals.linearize(T)
-    assert isinstance(at, Linearization)
+    matches = replace(matches, source_sigmas=np.full((400, 3), 1e-12))
+    residuals, at = linearized(T, matches)
     found = estimate_disparity_offset(T, residuals, at)
     assert found is not None
-    information = information_share(T, matches) * 400 / SIGMAS[2] ** 2
+    information = information_share(T, matches) * 400 / SIGMA**2
     # Residuals are those of a noise a few times larger than stated, in each match alike.
     size = np.sqrt(np.mean(at.r**2))
     assert found.sigma_px == pytest.approx(size / np.sqrt(information), rel=0.2)

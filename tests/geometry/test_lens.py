@@ -1,12 +1,13 @@
 """Lenses against OpenCV's projections of the same points, and the rectification of pairs."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
@@ -16,8 +17,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectification_maps, rectify_stereo, stereo_camera
 from gvo.geometry.lens import N_COEFFICIENTS, DistortionModel, Lens, bouguet_wide
 from gvo.types import FloatArray
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
+from tests.geometry.scenes import random_motion, seeds
 
 # As calibrated for real cameras: a wide lens, one with eight coefficients, a fisheye.
 _RADTAN = [-0.283, 0.0740, 1.9e-4, 1.8e-5, 0.0]
@@ -61,10 +61,15 @@ def see(
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def read_maps(calibration: Calibration, pixels: FloatArray) -> FloatArray:
-    """Return where the maps say that rectified pixels (n, 2) come from."""
+def maps_of(calibration: Calibration) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     maps = rectification_maps(calibration)
     assert maps is not None
+    return maps
+
+
+def read_maps(calibration: Calibration, pixels: FloatArray) -> FloatArray:
+    """Return where the maps say that rectified pixels (n, 2) come from."""
+    maps = maps_of(calibration)
     at = pixels[:, ::-1].T
     return np.stack([map_coordinates(m.astype(float), at, order=3) for m in maps], axis=1)
 
@@ -83,9 +88,7 @@ def test_the_maps_send_the_pixel_of_a_point_to_its_raw_pixel(
     camera = raw(model, D)
     R = np.asarray(Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix())
     P = np.array([[240.0, 0, 255, 0], [0, 245.0, 238, 0], [0, 0, 1, 0]])
-    calibration = Calibration(
-        width=512, height=480, K=camera.K, D=camera.D, R=R, P=P, is_rectified=False, model=model
-    )
+    calibration = replace(camera, R=R, P=P)
     points_cam = visible(calibration, rng)
     found = read_maps(calibration, calibration.pinhole().project(points_cam))
     np.testing.assert_allclose(found, see(points_cam @ R, camera), atol=1e-3)
@@ -100,10 +103,8 @@ def test_each_model_says_how_many_numbers_it_has() -> None:
 
 def mount(seed: int) -> FloatArray:
     """Return T_left_right of cameras mounted with a few degrees of error."""
-    rng = np.random.default_rng(seed)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(0.03 * rng.normal(size=3)).as_matrix()
-    T[:3, 3] = np.array([0.11, 0.0, 0.0]) + 0.004 * rng.normal(size=3)
+    T = random_motion(np.random.default_rng(seed), 0.03, 0.004)
+    T[0, 3] += 0.11
     return T
 
 
@@ -115,7 +116,7 @@ _PAIRS = [
 ]
 
 
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 @given(seed=seeds)
 @pytest.mark.parametrize(("first", "second"), _PAIRS, ids=lambda lens: f"{lens[0]}{len(lens[1])}")
 def test_a_point_lies_on_one_row_of_the_pair_at_the_disparity_of_its_depth(
@@ -160,8 +161,7 @@ def test_a_fisheye_pair_keeps_the_resolution_of_its_centre_and_has_no_empty_bord
     for rectified in pair:
         assert rectified.P[0, 0] == rectified.P[1, 1]
         assert 190.0 <= rectified.P[0, 0] < 1.1 * 192.0
-        maps = rectification_maps(rectified)
-        assert maps is not None
+        maps = maps_of(rectified)
         for values, size in zip(maps, (512, 480), strict=True):
             assert values.min() >= -0.01
             assert values.max() <= size - 1 + 0.01
@@ -171,8 +171,7 @@ def test_a_lens_narrower_than_a_plane_is_enlarged_until_no_border_is_empty() -> 
     # pincushion: the rim of the raw image is nearer to the axis than that of a pinhole
     lens = raw("equidistant", [0.75, 0.1, 0.0, 0.0])
     left, _ = rectify_stereo(lens, lens, mount(1))
-    maps = rectification_maps(left)
-    assert maps is not None
+    maps = maps_of(left)
     assert left.P[0, 0] > 1.02 * lens.K[0, 0]
     assert maps[0].min() >= -0.01
     assert maps[1].max() <= 479.01
@@ -181,8 +180,7 @@ def test_a_lens_narrower_than_a_plane_is_enlarged_until_no_border_is_empty() -> 
 def test_a_pair_of_plain_lenses_shows_no_empty_border_at_the_middle_of_its_sides() -> None:
     lens = raw("plumb_bob", _RADTAN)
     for rectified in rectify_stereo(lens, lens, mount(1)):
-        maps = rectification_maps(rectified)
-        assert maps is not None
+        maps = maps_of(rectified)
         columns, rows = maps[0][240, [0, -1]], maps[1][[0, -1], 256]
         for values, size in ((columns, 512), (rows, 480)):
             assert values.min() >= -1.0
@@ -197,8 +195,7 @@ def test_lenses_that_see_behind_the_plane_of_the_pair_are_still_rectified() -> N
     for rectified in rectify_stereo(lens, lens, T_left_right):
         # No enlargement up to twice leaves the border full: the resolution of the centre stays.
         assert rectified.P[0, 0] == 60.0
-        maps = rectification_maps(rectified)
-        assert maps is not None
+        maps = maps_of(rectified)
         assert 0.0 < maps[0][240, 256] < 511.0
 
 
@@ -223,16 +220,7 @@ def test_the_middle_of_a_wide_pair_is_between_the_middles_of_its_lenses(seed: in
 
 def test_a_fisheye_without_coefficients_is_still_no_pinhole() -> None:
     camera = raw("equidistant", [0.0] * 4)
-    as_raw = Calibration(
-        width=512,
-        height=480,
-        K=camera.K,
-        D=camera.D,
-        R=np.eye(3),
-        P=np.hstack([camera.K, np.zeros((3, 1))]),
-        is_rectified=False,
-        model="equidistant",
-    )
+    as_raw = replace(camera, R=np.eye(3), P=np.hstack([camera.K, np.zeros((3, 1))]))
     # 45 degrees off the axis: f * theta in the raw image, f * tan(theta) in the rectified one
     found = read_maps(as_raw, np.array([[260.0 + 200.0, 250.0]]))
     np.testing.assert_allclose(found, [[260.0 + 250.0 * np.arctan(0.8), 250.0]], atol=1e-3)
@@ -248,14 +236,7 @@ def test_exchanged_cameras_give_no_positive_baseline(model: DistortionModel) -> 
 
 @pytest.mark.parametrize(
     "t",
-    [
-        [0.0, 0.1, 0.0],
-        [0.05, 0.1, 0.0],
-        [0.1, 0.1, 0.0],
-        [-0.1, 0.0, 0.1],
-        [0.0, 0.0, 0.0],
-        [0, 0, 0.2],
-    ],
+    [[0.0, 0.1, 0.0], [0.05, 0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.0, 0.1], [0, 0, 0], [0, 0, 0.2]],
 )
 def test_cameras_that_do_not_stand_side_by_side_are_refused(t: list[float]) -> None:
     T_left_right = np.eye(4)
@@ -267,9 +248,7 @@ def test_cameras_that_do_not_stand_side_by_side_are_refused(t: list[float]) -> N
 
 def test_cameras_of_two_sizes_are_refused_with_both() -> None:
     lens = raw("plumb_bob", _RADTAN)
-    small = Calibration(
-        width=256, height=240, K=lens.K, D=lens.D, R=lens.R, P=lens.P, is_rectified=False
-    )
+    small = replace(lens, width=256, height=240)
     with pytest.raises(CalibrationError, match=r"512x480 and 256x240") as caught:
         rectify_stereo(lens, small, mount(0))
     assert "\n" not in str(caught.value)
@@ -279,6 +258,32 @@ def test_a_pair_of_barrels_is_shrunk_to_show_all_that_leaves_no_border_empty() -
     lens = raw("plumb_bob", _RADTAN)
     for rectified in rectify_stereo(lens, lens, mount(3)):
         assert 0.7 < rectified.P[0, 0] / lens.K[0, 0] < 0.95
+
+
+def test_rectification_keeps_the_raw_calibrations_but_for_what_they_say_of_it() -> None:
+    pair = raw("plumb_bob", _RADTAN), raw("rational_polynomial", _RATIONAL, shift=8.0)
+    said = [replace(lens, is_rectified=True) for lens in pair]
+    left, right = rectify_stereo(said[0], said[1], mount(0))
+    for before, after in zip(said, (left, right), strict=True):
+        assert after.K is before.K
+        assert after.D is before.D
+        assert (after.width, after.height) == (512, 480)
+        assert not after.is_rectified
+        assert rectification_maps(after) is not None
+        np.testing.assert_allclose(after.R @ after.R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(left.P[:, :3], right.P[:, :3])
+
+
+def test_a_pair_at_which_opencv_gives_up_is_refused_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def give_up(*_: object, **__: object) -> None:
+        raise cv2.error("no projection")
+
+    monkeypatch.setattr(cv2, "stereoRectify", give_up)
+    lens = raw("plumb_bob", _RADTAN)
+    with pytest.raises(CalibrationError, match=r"cannot be rectified.*calibrate the pair again"):
+        rectify_stereo(lens, lens, mount(0))
 
 
 # Pinholes side by side: a wide pair of them is known to the last digit.

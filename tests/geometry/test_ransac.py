@@ -2,24 +2,22 @@
 
 from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare
 
 from gvo.config import RansacConfig
 from gvo.geometry import ransac
-from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, draw_samples, find_inliers, ransac_rigid
 from gvo.geometry.umeyama import fit_rigid_triples
 from gvo.types import BoolArray, Failure, FloatArray
+from tests.geometry.scenes import CAMERA, matched, move, project, random_motion, seeds
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 SETTINGS = RansacConfig(
     n_hypotheses=200,
     inlier_metric="reprojection",
@@ -30,33 +28,12 @@ SETTINGS = RansacConfig(
 )
 
 
-def uvd(points: FloatArray) -> FloatArray:
-    x, y, z = points.T
-    return np.stack([500 * x / z + 320, 480 * y / z + 240, 500 * 0.2 / z], axis=1)
+def configure(**changes: Any) -> RansacConfig:
+    return RansacConfig.model_validate(SETTINGS.model_dump() | changes)
 
 
 def random_points(rng: np.random.Generator, n: int) -> FloatArray:
     return np.column_stack([rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), rng.uniform(2, 9, n)])
-
-
-def random_motion(rng: np.random.Generator) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
-    T[:3, 3] = 0.2 * rng.normal(size=3)
-    return T
-
-
-def matched(source: FloatArray, target: FloatArray) -> Correspondences:
-    """Return correspondences of points (n, 3), all of sigma one."""
-    ones = np.ones(source.shape)
-    return Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=uvd(source),
-        target_uvd=uvd(target),
-        source_sigmas=ones,
-        target_sigmas=ones,
-    )
 
 
 def scene(
@@ -65,7 +42,7 @@ def scene(
     """Return T_target_source, correspondences and which of them obey it."""
     T = random_motion(rng)
     source = random_points(rng, n)
-    target = source @ T[:3, :3].T + T[:3, 3]
+    target = move(T, source)
     is_inlier = rng.permutation(n) >= n_outliers
     target[~is_inlier] = random_points(rng, n_outliers)
     matches = matched(source, target)
@@ -77,11 +54,10 @@ def run(matches: Correspondences, config: RansacConfig, seed: int = 0) -> Consen
     return ransac_rigid(matches, CAMERA, config, weights=None, rng=rng)
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=seeds, metric=st.sampled_from(["reprojection", "distance"]))
 def test_the_motion_is_found_among_six_outliers_in_ten(seed: int, metric: str) -> None:
     T, matches, is_inlier = scene(np.random.default_rng(seed), 150, 90)
-    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": metric})
+    config = configure(inlier_metric=metric)
     result = run(matches, config)
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=0.025)
@@ -89,7 +65,6 @@ def test_the_motion_is_found_among_six_outliers_in_ten(seed: int, metric: str) -
     assert result.inliers[~is_inlier].mean() < 0.05
 
 
-@settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_the_same_seed_gives_the_same_result(seed: int) -> None:
     _, matches, _ = scene(np.random.default_rng(seed), 80, 40)
@@ -100,15 +75,11 @@ def test_the_same_seed_gives_the_same_result(seed: int) -> None:
     assert first.inliers.tobytes() == second.inliers.tobytes()
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds, metric=st.sampled_from(["reprojection", "distance"]))
 def test_inliers_are_those_within_the_threshold_of_the_metric(seed: int, metric: str) -> None:
     rng = np.random.default_rng(seed)
     _, matches, _ = scene(rng, 40, 10)
-    config = RansacConfig.model_validate(
-        SETTINGS.model_dump()
-        | {"inlier_metric": metric, "inlier_threshold_px": 30.0, "inlier_threshold_m": 0.4}
-    )
+    config = configure(inlier_metric=metric, inlier_threshold_px=30.0, inlier_threshold_m=0.4)
     hypotheses = np.stack([random_motion(rng) for _ in range(4)])
     found = find_inliers(hypotheses, matches, CAMERA, config)
     assert found.shape == (4, 40)
@@ -118,21 +89,9 @@ def test_inliers_are_those_within_the_threshold_of_the_metric(seed: int, metric:
             if metric == "distance":
                 ratio = np.linalg.norm(point - matches.target_points[j]) / 0.4
             else:
-                ratio = np.linalg.norm(uvd(point[None])[0] - matches.target_uvd[j]) / 30.0
+                ratio = np.linalg.norm(project(point[None])[0] - matches.target_uvd[j]) / 30.0
             if abs(ratio - 1.0) > 1e-4:  # single precision decides nearer than this
                 assert found[i, j] == (ratio < 1.0)
-
-
-def same_points(points: FloatArray, measured: FloatArray) -> Correspondences:
-    """Return correspondences of points with themselves, measured at `measured`."""
-    return Correspondences(
-        source_points=points,
-        target_points=points,
-        source_uvd=measured,
-        target_uvd=measured,
-        source_sigmas=np.ones((len(points), 3)),
-        target_sigmas=np.ones((len(points), 3)),
-    )
 
 
 def test_points_behind_the_camera_are_no_inliers() -> None:
@@ -141,12 +100,17 @@ def test_points_behind_the_camera_are_no_inliers() -> None:
     nearer = np.column_stack([points[:, :2], np.ones(30)])
     # Behind the camera the formulas of the projection fit as well as in front of it.
     for there, measured, expected in (
-        (points, uvd(points), 1.0),
-        (-points, uvd(-points), 0.0),
-        (mirrored, uvd(points), 0.0),
-        (mirrored, uvd(nearer), 0.0),
+        (points, project(points), 1.0),
+        (-points, project(-points), 0.0),
+        (mirrored, project(points), 0.0),
+        (mirrored, project(nearer), 0.0),
     ):
-        found = find_inliers(np.eye(4)[None], same_points(there, measured), CAMERA, SETTINGS)
+        found = find_inliers(
+            np.eye(4)[None],
+            matched(there, there, source_uvd=measured, target_uvd=measured),
+            CAMERA,
+            SETTINGS,
+        )
         assert found.mean() == expected
 
 
@@ -160,13 +124,12 @@ def test_samples_are_drawn_of_near_points() -> None:
     measured = matches.source_uvd.copy()
     measured[:, 2] = np.where(is_near, 40.0, 5.0)
     far = replace(matches, target_points=spoilt, source_uvd=measured)
-    config = SETTINGS.model_copy(update={"min_disparity_px": 10.0, "n_hypotheses": 3})
+    config = configure(min_disparity_px=10.0, n_hypotheses=3)
     result = run(far, config)
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
 
 
-@settings(deadline=None)
 @given(seed=seeds, n=st.integers(min_value=3, max_value=40))
 def test_samples_are_triples_of_distinct_indices(seed: int, n: int) -> None:
     samples = draw_samples(n, 64, np.random.default_rng(seed))
@@ -206,7 +169,7 @@ def test_matches_without_a_common_motion_are_a_failure_with_counts() -> None:
 @pytest.mark.parametrize("metric", ["reprojection", "distance"])
 def test_as_many_inliers_as_are_needed_are_enough(metric: str) -> None:
     rng = np.random.default_rng(3)
-    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": metric})
+    config = configure(inlier_metric=metric)
     T, matches, is_inlier = scene(rng, 15, 3)
     result = run(matches, config)
     assert isinstance(result, Consensus), result
@@ -241,7 +204,7 @@ def test_far_points_are_counted_but_not_fitted() -> None:
     spoilt = matches.target_points.copy()
     spoilt[is_far] *= 0.9
     spoilt_matches = replace(matches, target_points=spoilt)
-    config = SETTINGS.model_copy(update={"min_disparity_px": 30.0, "inlier_threshold_px": 5.0})
+    config = configure(min_disparity_px=30.0, inlier_threshold_px=5.0)
     result = run(spoilt_matches, config)
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
@@ -254,7 +217,7 @@ def test_weights_enter_the_last_fit() -> None:
     shifted = matches.target_points.copy()
     shifted[30:] += 0.05
     noisy = replace(matches, target_points=shifted)
-    config = SETTINGS.model_copy(update={"inlier_metric": "distance", "inlier_threshold_m": 1.0})
+    config = configure(inlier_metric="distance", inlier_threshold_m=1.0)
     weights = np.repeat([1.0, 1e-12], 30)
     result = ransac_rigid(noisy, CAMERA, config, weights=weights, rng=np.random.default_rng(0))
     assert isinstance(result, Consensus)
@@ -282,7 +245,7 @@ def test_the_search_stops_when_a_better_sample_is_no_longer_to_be_expected(
     numbers = {}
     for n_outliers in (0, 60, 120, 200):
         _, matches, _ = scene(np.random.default_rng(1), 200, n_outliers)
-        config = SETTINGS.model_copy(update={"n_hypotheses": 1000})
+        config = configure(n_hypotheses=1000)
         numbers[n_outliers] = count_hypotheses(monkeypatch, matches, config)
         share = 1.0 - n_outliers / 200
         if share > 0:
@@ -301,7 +264,7 @@ def test_only_inliers_among_the_near_points_shorten_the_search(
     measured = matches.source_uvd.copy()
     measured[:, 2] = np.where(is_near, 100.0, 5.0)
     near = replace(matches, source_uvd=measured)
-    config = SETTINGS.model_copy(update={"n_hypotheses": 1000})
+    config = configure(n_hypotheses=1000)
     everywhere = count_hypotheses(monkeypatch, near, config)
     config = config.model_copy(update={"min_disparity_px": 8.0})
     assert everywhere <= 64 < count_hypotheses(monkeypatch, near, config)
@@ -312,7 +275,7 @@ def test_no_more_hypotheses_are_tried_than_configured(
     monkeypatch: pytest.MonkeyPatch, n: int
 ) -> None:
     _, matches, _ = scene(np.random.default_rng(3), 60, 60)
-    config = SETTINGS.model_copy(update={"n_hypotheses": n})
+    config = configure(n_hypotheses=n)
     assert count_hypotheses(monkeypatch, matches, config) == n
 
 
@@ -325,9 +288,9 @@ def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
         [np.linspace(-1, 1, 400), np.linspace(-1, 0.5, 400), np.full(400, 5.0)]
     )
     source[rng.integers(400)] += [0.0, 2.0, 1.0]
-    target = source @ T[:3, :3].T + T[:3, 3]
+    target = move(T, source)
     matches = matched(source, target)
-    result = run(matches, SETTINGS.model_copy(update={"n_hypotheses": 3000}), 100 + seed)
+    result = run(matches, configure(n_hypotheses=3000), 100 + seed)
     assert isinstance(result, Consensus)
     assert result.inliers.all()
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
@@ -336,7 +299,7 @@ def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
 def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
     # All weight on three neighbours, each off by less than the threshold: the fit turns far.
     rng = np.random.default_rng(5)
-    config = RansacConfig.model_validate(SETTINGS.model_dump() | {"inlier_metric": "distance"})
+    config = configure(inlier_metric="distance")
     source = random_points(rng, 30)
     source[:3] = [0.0, 0.0, 5.0] + 0.1 * np.eye(3)
     target = source.copy()
@@ -355,15 +318,13 @@ def test_a_fit_that_its_weights_spoil_takes_no_inlier_away() -> None:
 def test_what_is_as_far_as_the_threshold_is_no_inlier(metric: str, axis: int) -> None:
     # Of numbers that single precision holds: two pixels, or half a metre.
     camera = replace(CAMERA, fy=500.0, baseline=0.25)
-    config = RansacConfig.model_validate(
-        SETTINGS.model_dump() | {"inlier_metric": metric, "inlier_threshold_m": 0.5}
-    )
+    config = configure(inlier_metric=metric, inlier_threshold_m=0.5)
     point, measured = np.array([[0.0, 0.0, 4.0]]), np.array([[320.0, 240.0, 31.25]])
     for share, expected in ((0.0, True), (0.999, True), (1.0, False), (-1.0, False)):
         seen, there = measured.copy(), point.copy()
         seen[0, axis] += 2.0 * share
         there[0, axis] += 0.5 * share
-        matches = replace(same_points(point, seen), target_points=there)
+        matches = matched(point, there, source_uvd=seen, target_uvd=seen)
         found = find_inliers(np.eye(4)[None], matches, camera, config)
         assert found.tolist() == [[expected]]
 
@@ -371,13 +332,13 @@ def test_what_is_as_far_as_the_threshold_is_no_inlier(metric: str, axis: int) ->
 @pytest.mark.parametrize("depth", [0.0011, 0.01, 0.5, 1.0])
 def test_what_is_near_the_camera_is_still_in_front_of_it(depth: float) -> None:
     points = np.array([[0.0, 0.0, depth]])
-    found = find_inliers(np.eye(4)[None], same_points(points, uvd(points)), CAMERA, SETTINGS)
+    found = find_inliers(np.eye(4)[None], matched(points, points), CAMERA, SETTINGS)
     assert found.tolist() == [[True]]
 
 
 def test_three_matches_are_enough_where_three_are_asked_for() -> None:
     T, matches, _ = scene(np.random.default_rng(0), 3, 0)
-    config = SETTINGS.model_copy(update={"min_inliers": 3})
+    config = configure(min_inliers=3)
     result = run(matches, config)
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
@@ -401,9 +362,7 @@ def test_near_points_are_fitted_alone_where_they_are_as_many_as_are_needed(
     target = matches.target_points.copy()
     target[~is_near] += 0.01
     near = replace(matches, source_uvd=measured, target_uvd=target_uvd, target_points=target)
-    config = RansacConfig.model_validate(
-        SETTINGS.model_dump() | {"inlier_metric": "distance", "min_disparity_px": 20.0}
-    )
+    config = configure(inlier_metric="distance", min_disparity_px=20.0)
     for each in (near, replace(near, source_uvd=target_uvd, target_uvd=measured)):
         result = run(each, config)
         assert isinstance(result, Consensus)

@@ -5,58 +5,43 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
 
 from gvo._trace import Event, watched
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
-from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
 from gvo.geometry.residuals import StereoResiduals
-from gvo.types import BoolArray, Failure, FloatArray
+from gvo.types import Failure, FloatArray
+from tests.geometry.scenes import (
+    CAMERA,
+    all_of,
+    derivative,
+    matched,
+    move,
+    near_a_line,
+    project,
+    random_motion,
+    random_points,
+    seeds,
+)
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 HUBER = 1.9
 SETTINGS = RegistrationConfig(n_iterations=20, huber=HUBER, gate=4.0)
-
-
-def project(points: FloatArray) -> FloatArray:
-    x, y, z = points.T
-    return np.stack([500 * x / z + 320, 480 * y / z + 240, 100 / z], axis=1)
-
-
-def derivative(point: FloatArray) -> FloatArray:
-    """Return that of (u, v, disparity), shape (3, 6), by a motion of the point on the left."""
-    x, y, z = point
-    by_point = np.array(
-        [[500 / z, 0, -500 * x / z**2], [0, 480 / z, -480 * y / z**2], [0, 0, -100 / z**2]]
-    )
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.hstack([-by_point @ cross, by_point])
 
 
 def measure(rng: np.random.Generator, errors: FloatArray) -> tuple[FloatArray, Correspondences]:
     """Return T_target_source and matches; errors (n, 3) in sigmas, in the target frame alone."""
     n = len(errors)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(0.05 * rng.normal(size=3)).as_matrix()
-    T[:3, 3] = 0.3 * rng.normal(size=3)
-    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
-    target = source @ T[:3, :3].T + T[:3, 3]
+    T = random_motion(rng, 0.05, 0.3)
+    source = random_points(rng, n)
+    target = move(T, source)
     sigmas = rng.uniform(0.2, 1.0, size=(n, 3))
-    return T, Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=project(source),
-        target_uvd=project(target) + sigmas * errors,
-        source_sigmas=np.zeros((n, 3)),
-        target_sigmas=sigmas,
-    )
+    uvd = project(target) + sigmas * errors
+    return T, matched(source, target, target_uvd=uvd, source_sigmas=0.0, target_sigmas=sigmas)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +66,9 @@ def add_up(T: FloatArray, matches: Correspondences) -> Sums:
     n = len(matches)
     H, curvature, seen, squares = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), 0.0
     for i in range(n):
-        point = T[:3, :3] @ matches.source_points[i] + T[:3, 3]
+        point = move(T, matches.source_points[i])
         J = derivative(point) / matches.target_sigmas[i][:, np.newaxis]
-        r = (matches.target_uvd[i] - project(point[np.newaxis])[0]) / matches.target_sigmas[i]
+        r = (matches.target_uvd[i] - project(point)) / matches.target_sigmas[i]
         length = float(np.linalg.norm(r))
         weight = min(1.0, HUBER / length)
         along = np.outer(r, r) / length**2 if length > HUBER else np.zeros((3, 3))
@@ -98,17 +83,12 @@ def add_up(T: FloatArray, matches: Correspondences) -> Sums:
     return Sums(H=H, curvature=curvature, spread=spread, scale=scale)
 
 
-def all_of(matches: Correspondences) -> BoolArray:
-    return np.ones(len(matches), dtype=np.bool_)
-
-
 def covariance_of(T: FloatArray, matches: Correspondences) -> Refinement:
     found = fit_covariance(T, matches, all_of(matches), CAMERA, SETTINGS)
     assert isinstance(found, Refinement), found
     return found
 
 
-@settings(deadline=None, max_examples=25)
 @given(seed=seeds, n=st.integers(8, 60), size=st.sampled_from([0.02, 0.5, 1.0, 1.5]))
 def test_the_covariance_is_that_of_the_robust_cost_match_by_match(
     seed: int, n: int, size: float
@@ -168,18 +148,9 @@ def test_the_curvature_counts_where_it_loses_less_than_nine_tenths(
 # Where a direction is open.
 
 
-def near_a_line(spread_m: float) -> Correspondences:
-    rng = np.random.default_rng(1)
-    line = np.linspace(0.0, 1.0, 30)[:, np.newaxis] * [1.0, 0.3, 4.0] + [0.5, 0.0, 3.0]
-    points = line + spread_m * rng.normal(size=(30, 3))
-    return Correspondences(
-        source_points=points,
-        target_points=points,
-        source_uvd=project(points),
-        target_uvd=project(points),
-        source_sigmas=np.zeros((30, 3)),
-        target_sigmas=np.ones((30, 3)),
-    )
+def seen_near_a_line(spread_m: float) -> Correspondences:
+    points = near_a_line(spread_m)
+    return matched(points, points, source_sigmas=0.0)
 
 
 def inflation_of(matches: Correspondences) -> float:
@@ -194,8 +165,8 @@ def inflation_of(matches: Correspondences) -> float:
 def test_a_direction_is_open_beyond_a_hundred_thousand_sigmas(
     inflation: float, is_open: bool
 ) -> None:
-    spread = 1e-4 * np.sqrt(inflation_of(near_a_line(1e-4)) / inflation)
-    matches = near_a_line(float(spread))
+    spread = 1e-4 * np.sqrt(inflation_of(seen_near_a_line(1e-4)) / inflation)
+    matches = seen_near_a_line(float(spread))
     assert inflation_of(matches) == pytest.approx(inflation, rel=0.05)
     found = fit_covariance(np.eye(4), matches, all_of(matches), CAMERA, SETTINGS)
     assert isinstance(found, Failure if is_open else Refinement)
@@ -298,7 +269,7 @@ def test_descending_leads_where_a_refinement_leads() -> None:
 
 
 def test_descending_from_nowhere_leads_nowhere() -> None:
-    matches = near_a_line(0.0)
+    matches = seen_near_a_line(0.0)
     assert descend(np.eye(4), residuals_of(np.eye(4), matches), n_iterations=5) is None
     behind = replace(matches, source_points=-matches.source_points)
     assert descend(np.eye(4), residuals_of(np.eye(4), behind), n_iterations=5) is None

@@ -2,12 +2,10 @@
 
 import numpy as np
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
-from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.residuals import (
     Linearization,
@@ -16,37 +14,25 @@ from gvo.geometry.residuals import (
     source_jacobian,
 )
 from gvo.types import Failure, FloatArray
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
-
-
-def project(point: FloatArray) -> FloatArray:
-    x, y, z = point
-    return np.array([500 * x / z + 320, 480 * y / z + 240, 100 / z])
-
-
-def unproject(uvd: FloatArray) -> FloatArray:
-    z = 100 / uvd[2]
-    return np.array([(uvd[0] - 320) * z / 500, (uvd[1] - 240) * z / 480, z])
-
-
-def motion(rng: np.random.Generator) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix()
-    T[:3, 3] = 0.2 * rng.normal(size=3)
-    return T
+from tests.geometry.scenes import (
+    CAMERA,
+    matched,
+    move,
+    project,
+    random_motion,
+    random_points,
+    seeds,
+    unproject,
+)
 
 
 def random_matches(rng: np.random.Generator, T: FloatArray, n: int) -> Correspondences:
-    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
-    target = source @ T[:3, :3].T + T[:3, 3]
-    uvd = np.array([project(point) for point in target]) + rng.normal(size=(n, 3))
-    return Correspondences(
-        source_points=source,
-        target_points=target,
-        source_uvd=np.array([project(point) for point in source]),
-        target_uvd=uvd,
+    source = random_points(rng, n)
+    target = move(T, source)
+    return matched(
+        source,
+        target,
+        target_uvd=project(target) + rng.normal(size=(n, 3)),
         source_sigmas=rng.uniform(0.0, 1.0, size=(n, 3)),
         target_sigmas=rng.uniform(0.1, 1.0, size=(n, 3)),
     )
@@ -58,7 +44,6 @@ def linearize(residuals: StereoResiduals, T: FloatArray) -> Linearization:
     return at
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds)
 def test_the_derivatives_by_the_pose_are_the_numerical_ones(seed: int) -> None:
     point = np.random.default_rng(seed).uniform([-2, -2, 1], [2, 2, 9])
@@ -71,25 +56,23 @@ def test_the_derivatives_by_the_pose_are_the_numerical_ones(seed: int) -> None:
     np.testing.assert_allclose(J, expected, atol=5e-3)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds)
 def test_the_derivatives_by_the_source_are_the_numerical_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    T, point = motion(rng), rng.uniform([-2, -2, 2], [2, 2, 9])
+    T, point = random_motion(rng), rng.uniform([-2, -2, 2], [2, 2, 9])
 
     def predicted(uvd: FloatArray) -> FloatArray:
-        return project(T[:3, :3] @ unproject(uvd) + T[:3, 3])
+        return project(move(T, unproject(uvd)))
 
     expected = approx_fprime(project(point), predicted, 1e-6)
     J = source_jacobian(T, point[:, np.newaxis], CAMERA)[..., 0].T
     np.testing.assert_allclose(J, expected, rtol=1e-3, atol=1e-4)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds)
 def test_normal_equations_are_those_of_the_inverse_covariances(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    T = motion(rng)
+    T = random_motion(rng)
     matches = random_matches(rng, T, 9)
     at = linearize(StereoResiduals.of(T, matches, CAMERA, huber=1.5), T)
     H, g = np.zeros((6, 6)), np.zeros(6)
@@ -109,13 +92,12 @@ def test_normal_equations_are_those_of_the_inverse_covariances(seed: int) -> Non
     np.testing.assert_allclose(at.scores().sum(axis=1), at.g, rtol=1e-7, atol=1e-6)
 
 
-@settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_a_gradient_has_new_residuals_and_weights_and_the_derivatives_it_is_given(
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    T = motion(rng)
+    T = random_motion(rng)
     residuals = StereoResiduals.of(T, random_matches(rng, T, 9), CAMERA, huber=1.5)
     here = linearize(residuals, T)
     near = linearize(residuals, se3.exp(0.01 * rng.normal(size=6)) @ T)
@@ -127,11 +109,10 @@ def test_a_gradient_has_new_residuals_and_weights_and_the_derivatives_it_is_give
         np.testing.assert_allclose(found, g, rtol=1e-9, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_the_gate_counts_sigmas_of_the_residual(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    T = motion(rng)
+    T = random_motion(rng)
     residuals = StereoResiduals.of(T, random_matches(rng, T, 30), CAMERA, huber=1e9)
     lengths = np.linalg.norm(linearize(residuals, T).r, axis=0)
     gate = float(np.median(lengths)) + 1e-6
@@ -142,30 +123,28 @@ def test_the_gate_counts_sigmas_of_the_residual(seed: int) -> None:
     )
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seed=seeds)
 def test_settled_points_are_the_likeliest_for_both_frames(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    T = motion(rng)
-    n = 5
-    source = rng.uniform([-2, -1.5, 3], [2, 1.5, 9], size=(n, 3))
-    seen = np.array([project(T[:3, :3] @ point + T[:3, 3]) for point in source])
-    matches = Correspondences(
-        source_points=source,
-        target_points=source @ T[:3, :3].T + T[:3, 3],
-        source_uvd=np.array([project(point) for point in source]),
+    T = random_motion(rng)
+    source = random_points(rng, 5)
+    target = move(T, source)
+    matches = matched(
+        source,
+        target,
         # Small against the curvature of the projection: one linear step is the whole way.
-        target_uvd=seen + 1e-3 * rng.normal(size=(n, 3)),
-        source_sigmas=rng.uniform(0.3, 1.0, size=(n, 3)),
-        target_sigmas=rng.uniform(0.3, 1.0, size=(n, 3)),
+        target_uvd=project(target) + 1e-3 * rng.normal(size=(5, 3)),
+        source_sigmas=rng.uniform(0.3, 1.0, size=(5, 3)),
+        target_sigmas=rng.uniform(0.3, 1.0, size=(5, 3)),
     )
     residuals = StereoResiduals.of(T, matches, CAMERA, huber=1e9)
     settled = residuals.settled_points(T, linearize(residuals, T)).T
-    for i in range(n):
+    for i in range(5):
 
         def misfit(point: FloatArray, i: int = i) -> FloatArray:
             here = (project(point) - matches.source_uvd[i]) / matches.source_sigmas[i]
-            there = project(T[:3, :3] @ point + T[:3, 3]) - matches.target_uvd[i]
+            there = project(move(T, point)) - matches.target_uvd[i]
             return 1e4 * np.concatenate([here, there / matches.target_sigmas[i]])
 
         best = least_squares(misfit, source[i], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
@@ -176,16 +155,9 @@ def test_settled_points_are_the_likeliest_for_both_frames(seed: int) -> None:
 def test_a_settled_point_goes_to_at_most_twice_its_distance() -> None:
     # A disparity of 10 px that the target says is -5: no point lies there.
     point = np.array([[0.5, -0.4, 10.0]])
-    seen = np.array([project(point[0])])
     for sigma, expected in ((0.1, 20.0), (10.0, None)):
-        matches = Correspondences(
-            source_points=point,
-            target_points=point,
-            source_uvd=seen,
-            target_uvd=seen - [0.0, 0.0, 15.0],
-            source_sigmas=np.full((1, 3), 1.0),
-            target_sigmas=np.full((1, 3), sigma),
-        )
+        target_uvd = project(point) - [0.0, 0.0, 15.0]
+        matches = matched(point, point, target_uvd=target_uvd, target_sigmas=sigma)
         residuals = StereoResiduals.of(np.eye(4), matches, CAMERA, huber=1e9)
         (settled,) = residuals.settled_points(np.eye(4), linearize(residuals, np.eye(4))).T
         if expected is None:
@@ -204,15 +176,7 @@ def test_noise_is_carried_for_points_well_in_front_alone() -> None:
     # What lies a millimetre in front has a derivative by the pose, what lies nearer has none.
     for depth, is_good in ((1.01e-3, True), (0.99e-3, False)):
         near = np.array([[0.0, 0.0, depth]])
-        ones = np.ones((1, 3))
-        matches = Correspondences(
-            source_points=near,
-            target_points=near,
-            source_uvd=np.array([project(near[0])]),
-            target_uvd=np.array([project(near[0])]),
-            source_sigmas=ones,
-            target_sigmas=ones,
-        )
+        matches = matched(near, near)
         residuals = StereoResiduals.of(T, matches, CAMERA, huber=2.0)
         assert isinstance(residuals.linearize(T), Linearization) == is_good
         assert residuals.within(T, 1e9).tolist() == [is_good]

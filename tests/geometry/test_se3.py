@@ -12,8 +12,8 @@ from scipy.special import bernoulli
 
 from gvo.geometry import se3
 from gvo.types import FloatArray
+from tests.geometry.scenes import seeds
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
 # From exactly zero over the change of formulas to just below half a turn.
 angles = st.one_of(
     st.just(0.0),
@@ -38,21 +38,18 @@ def generator(xi: FloatArray) -> FloatArray:
     return np.array([[0, -rz, ry, tx], [rz, 0, -rx, ty], [-ry, rx, 0, tz], [0, 0, 0, 0]])
 
 
-@settings(deadline=None)
 @given(angle=angles, seed=seeds)
 def test_exp_is_the_matrix_exponential(angle: float, seed: int) -> None:
     xi = twist(angle, seed)
     np.testing.assert_allclose(se3.exp(xi), expm(generator(xi)), rtol=0, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(angle=angles, seed=seeds)
 def test_log_undoes_exp_from_zero_to_half_a_turn(angle: float, seed: int) -> None:
     xi = twist(angle, seed)
     np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, rtol=0, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(seed=seeds)
 def test_exp_undoes_log_at_half_a_turn(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +60,6 @@ def test_exp_undoes_log_at_half_a_turn(seed: int) -> None:
     np.testing.assert_allclose(se3.exp(xi), T, atol=1e-7)
 
 
-@settings(deadline=None)
 @given(angle=st.one_of(angles, st.just(np.pi)), seed=seeds)
 def test_quaternions_are_those_of_scipy(angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -79,7 +75,6 @@ def test_quaternions_are_those_of_scipy(angle: float, seed: int) -> None:
         np.testing.assert_allclose(q, theirs, rtol=0, atol=1e-15)
 
 
-@settings(deadline=None)
 @given(angle=st.floats(min_value=0.0, max_value=3.0), seed=seeds)
 def test_order_and_side_of_twists_are_those_of_gtsam(angle: float, seed: int) -> None:
     xi = twist(angle, seed)
@@ -89,7 +84,6 @@ def test_order_and_side_of_twists_are_those_of_gtsam(angle: float, seed: int) ->
     np.testing.assert_allclose(se3.adjoint(theirs.matrix()), theirs.AdjointMap(), atol=1e-12)
 
 
-@settings(deadline=None)
 @given(seed=seeds)
 def test_the_adjoint_moves_a_perturbation_to_the_other_side(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -99,7 +93,6 @@ def test_the_adjoint_moves_a_perturbation_to_the_other_side(seed: int) -> None:
     )
 
 
-@settings(deadline=None)
 @given(seed=seeds)
 def test_batches_equal_one_by_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -125,14 +118,12 @@ def test_skew_is_the_cross_product() -> None:
     np.testing.assert_allclose((se3.skew(v) @ w[..., None])[..., 0], np.cross(v, w), atol=1e-14)
 
 
-@settings(deadline=None)
 @given(angle=angles, seed=seeds)
 def test_the_rotation_angle_is_the_length_of_the_rotation_vector(angle: float, seed: int) -> None:
     T = se3.exp(twist(angle, seed))
     assert float(se3.rotation_angle(T)) == pytest.approx(angle, abs=2e-8)
 
 
-@settings(deadline=None)
 @given(seed=seeds)
 def test_normalizing_gives_the_nearest_rotation_and_keeps_the_translation(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -173,7 +164,7 @@ def test_composed_covariance_is_that_of_sampled_compositions() -> None:
     assert np.abs(deviation).max() < 0.05
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(seed=seeds)
 def test_the_covariance_of_a_ros_message_is_that_of_the_twist_it_causes(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -201,7 +192,6 @@ def test_the_covariance_of_a_ros_message_is_that_of_the_twist_it_causes(seed: in
 small_angles = st.floats(min_value=-12.0, max_value=-0.001).map(lambda exponent: 10.0**exponent)
 
 
-@settings(deadline=None)
 @given(share=small_angles)
 def test_small_turns_are_those_of_the_power_series_to_the_last_digits(share: float) -> None:
     angle = 1e-5 * share
@@ -216,7 +206,6 @@ def test_small_turns_are_those_of_the_power_series_to_the_last_digits(share: flo
     np.testing.assert_allclose(turn[0, 0], np.cos(angle), rtol=4e-16)
 
 
-@settings(deadline=None)
 @given(share=small_angles)
 def test_the_twist_of_a_small_turn_is_that_of_bernoullis_series(share: float) -> None:
     angle = 1e-4 * share

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from gvo.geometry import se3
 from gvo.geometry.se3 import is_definite, is_plain_covariance, is_rigid
 from gvo.types import FloatArray
+from tests.geometry.scenes import seeds
 
-seeds = st.integers(0, 2**32 - 1)
 WRONG = [np.nan, np.inf, -np.inf]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.errors import TrajectoryError
@@ -135,7 +135,6 @@ def test_a_segment_ends_at_the_first_pose_beyond_its_length() -> None:
         assert len(shares) == expected
 
 
-@settings(max_examples=20)
 @given(seeds)
 def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) -> None:
     reference = drive(80, seed=seed)
@@ -146,7 +145,6 @@ def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) ->
     assert evaluation.path_ratio == pytest.approx(1.0)
 
 
-@settings(max_examples=20)
 @given(seeds)
 def test_the_errors_do_not_depend_on_the_world_of_the_estimate(seed: int) -> None:
     reference = drive(80)

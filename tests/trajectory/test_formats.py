@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -38,7 +38,6 @@ def random_trajectory(seed: int, n: int = 8) -> Trajectory:
     )
 
 
-@settings(max_examples=30)
 @given(seeds)
 def test_a_tum_file_gives_back_stamps_exactly_and_poses_to_nanometres(
     tmp_path_factory: pytest.TempPathFactory, seed: int
@@ -52,7 +51,6 @@ def test_a_tum_file_gives_back_stamps_exactly_and_poses_to_nanometres(
     assert back.stamps_from == "file"
 
 
-@settings(max_examples=30)
 @given(seeds)
 def test_a_kitti_file_gives_back_the_poses(
     tmp_path_factory: pytest.TempPathFactory, seed: int
@@ -66,7 +64,6 @@ def test_a_kitti_file_gives_back_the_poses(
     assert back.stamps_ns.tolist() == [n * 10**9 for n in range(8)]
 
 
-@settings(max_examples=30)
 @given(seeds)
 def test_covariances_come_back_without_loss(
     tmp_path_factory: pytest.TempPathFactory, seed: int
