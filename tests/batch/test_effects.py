@@ -91,7 +91,7 @@ def test_a_run_that_lost_the_camera_is_set_aside_where_others_did_not() -> None:
     size = value_medians(table)["window.size"]
     assert size["runs", "set aside"].tolist() == [1, 0, 0]
     without = value_medians(to_frame(rows[1:]))["window.size"]
-    pd.testing.assert_series_equal(size["error"], without["error"])
+    pd.testing.assert_frame_equal(size[["error"]], without[["error"]])
     # what is set aside has its ratio, but is in no median
     assert relative(table, ERROR)[0] < 1e-5
 
