@@ -328,7 +328,7 @@ def test_a_report_shows_what_a_recording_says_and_does_not_run_it(
     run = tmp_path / "run"
     gvo.run_recording(recording, run, outputs=gvo.RunOutputs(report=False))
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    for key in ("recording", "sensor", "frame", "ground_truth", "gvo_version"):
+    for key in ("recording", "sensor", "base_frame", "ground_truth", "gvo_version"):
         summary[key] = PAYLOAD
     summary["decisions"] = summary["warnings"] = [PAYLOAD]
     summary["errors"] = [{**row, "name": PAYLOAD} for row in summary["errors"]]
