@@ -201,15 +201,15 @@ class RawChain(Generic[ObservationsT]):
         config: WindowConfig,
         observations: Mapping[int, ObservationsT],
     ) -> None:
-        """Go on with another front-end or configuration; poses and velocity stay.
+        """Change front-end or configuration; poses and velocity are kept.
 
         Parameters
         ----------
         frontend : Frontend
         config : WindowConfig
         observations : mapping of int to observations
-            What the front-end keeps of the last frame and of the last registered one, by their
-            stamps; where one is missing, what was kept before is registered.
+            New ones of the last frame and of the last registered one, by stamp; where one is
+            missing, the former are kept.
         """
         self._frontend, self._config = frontend, config
         if self._poses is not None:

@@ -82,7 +82,7 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
         self._anchor_ns: int | None = None
-        # The last frame and the last registered one, in case that they are extracted again.
+        # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
 
     @property
@@ -97,26 +97,25 @@ class Odometry:
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
-        """What is learnt of a stereo rig; None where nothing is."""
+        """Offsets of a stereo rig, calibrated online; None where they are not."""
         offsets = self._frontend.rig_offsets
         return offsets if offsets is not None and offsets.is_learning else None
 
     def reconfigure(self, config: Config) -> None:
-        """Go on with another configuration from the next frame on.
+        """Change the configuration from the next frame on.
 
-        Poses, velocity and the window go on. What takes effect, by section:
+        Poses, velocity and the window are kept. What takes effect, by section:
 
         - `temporal`, `ransac`, `registration`: with the next registration.
-        - `window`: with the next update, see `SlidingWindow.reconfigure`; edges that are in keep
-          their kernel.
-        - `frontend`, `klt` or `features`, `stereo` or `depth`, whichever the sensor and the kind
-          of front-end use: the last frame is extracted again, so that the next one is registered
-          against what the new parameters find in it. Keyframes stay where they can be registered
+        - `window`: with the next update, see `SlidingWindow.reconfigure`; edges in the window
+          keep their kernel.
+        - `frontend`, `klt` or `features`, `stereo` or `depth`, as the sensor and the front-end
+          use them: the last frame is extracted again. Keyframes stay where they can be registered
           with new frames. They cannot after another `frontend.kind`,
           `depth.virtual_baseline_m`, or `kind`, `n_octaves`, `scale_factor` or `upright` of
-          `features` (descriptor): then those of the front-end of tracks, which holds their
-          images, are extracted again, and those of descriptors are released.
-        - `stereo`: the offsets of the rig are learnt anew; else they go on.
+          `features` (descriptor): then KLT keyframes, which hold their images, are extracted
+          again, and those of descriptors are released.
+        - `stereo`: the offsets of the rig are estimated anew.
         - `runtime`: with the next frame.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 
@@ -378,10 +377,10 @@ class Odometry:
 
 
 def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:
-    """Return the edge that holds a frame where its predecessor was, if it stands still.
+    """Return a zero-motion edge to the predecessor at standstill, else None.
 
-    Both must hold: the image hardly moves, and the motion is insignificant against its own
-    covariance, so that a slow motion that the registration can tell is not frozen.
+    Both are required: little flow in the image, and a motion insignificant against its
+    covariance, so that a slow but significant motion is not frozen.
     """
     if not config.zero_motion or step.registration is None:
         return None
