@@ -205,10 +205,13 @@ def test_the_samples_are_shown_although_the_prediction_made_them_needless() -> N
         assert step.n_agreeing_with_prediction >= step.n_needed
 
 
-def test_what_happened_after_a_step_is_not_counted_with_it() -> None:
-    # Without a prediction samples are drawn.
-    explanation = explained("descriptor", "stereo", 1)
-    attempt, camera, config = explanation.attempt, explanation.camera, explanation.config
+@pytest.mark.parametrize("refine", ["none", "gauss_newton"])
+def test_what_happened_after_a_step_is_not_counted_with_it(refine: str) -> None:
+    # Samples are drawn where nothing is refined.
+    settings = ["frontend.kind=descriptor", f"registration.refine={refine}"]
+    config = load_configuration(settings=settings)
+    explanation = explain_frame(recording("stereo"), 1, config=config)
+    attempt, camera = explanation.attempt, explanation.camera
     later = Event(
         name="ransac.block",
         values={"n_before": 0, "is_valid": np.ones(9_999, np.bool_), "counts": 0, "share": 0.0},
@@ -220,8 +223,10 @@ def test_what_happened_after_a_step_is_not_counted_with_it() -> None:
     assert explanation.refinement is not None
     assert consensus is not None
     assert refinement is not None
+    assert consensus.is_known == (refine != "none")
     assert consensus.counts.tolist() == explanation.consensus.counts.tolist()
-    assert refinement.n_steps == explanation.refinement.n_steps > 0
+    assert refinement.n_steps == explanation.refinement.n_steps
+    assert bool(refinement.n_steps) == (refine != "none")
 
 
 def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> None:
