@@ -12,7 +12,7 @@ import typer
 
 from gvo._version import __version__
 from gvo.cli import batch as cli_batch
-from gvo.cli import inspect as cli_seeing
+from gvo.cli import inspect as cli_inspect
 from gvo.cli.options import (
     CalibrationFiles,
     Color,
@@ -204,7 +204,7 @@ def check_(
     config: ConfigFile = None,
     set_: Settings = None,
     frame: Annotated[
-        str, typer.Option(metavar="NAME", help="The robot's own frame in tf.")
+        str, typer.Option(metavar="NAME", help="The robot's base frame in tf.")
     ] = "base_link",
     calibration: CalibrationFiles = None,
     left: Left = None,
@@ -251,14 +251,14 @@ def smooth(
     sigma: Annotated[
         list[str] | None,
         typer.Option(
-            "--sigma", metavar="DEG,M", help="Of a step, for all inputs or one after another."
+            "--sigma", metavar="DEG,M", help="Noise of a step; one for all inputs, or one each."
         ),
     ] = None,
     ground_truth: Annotated[
         Path | None, typer.Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
     ] = None,
     keyframes: Annotated[
-        _KeyframePolicy, typer.Option(help="What keeps poses in the window.")
+        _KeyframePolicy, typer.Option(help="Which poses stay in the window.")
     ] = _KeyframePolicy.DISTANCE,
     config: ConfigFile = None,
     set_: Settings = None,
@@ -329,12 +329,14 @@ def compare(
         ),
     ],
     estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
-    align: Annotated[_Align, typer.Option(help="What moves each estimate.")] = _Align.SE3,
+    align: Annotated[_Align, typer.Option(help="How the estimates are aligned.")] = _Align.SE3,
     segments: Annotated[
-        str | None, typer.Option(metavar="L,...", help="Lengths in m; 100,...,800 or 20,50.")
+        str | None,
+        typer.Option(metavar="L,...", help="Segment lengths in m; 100,...,800 or 20,50."),
     ] = None,
     segment_step: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Every Nth pose a start; 10 or 1.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Start a segment at every Nth pose; 10 or 1."),
     ] = None,
     as_json: _AsJson = False,
     plot: Annotated[
@@ -440,7 +442,7 @@ def _parse_lengths(text: str) -> list[float]:
 
 
 cli_batch.add_commands(app)
-cli_seeing.add_commands(app)
+cli_inspect.add_commands(app)
 
 
 def main() -> None:

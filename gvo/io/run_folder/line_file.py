@@ -113,7 +113,7 @@ class PartFile:
 
     def __init__(self, path: Path, *errors: type[Exception]) -> None:
         self.path = path
-        self._errors = (OSError, *errors)
+        self._errors: tuple[type[Exception], ...] = (OSError, *errors)
         if path.exists():
             raise RecordingError(f"{path}: exists already; give another path or remove it")
         with self.refused_on_error():
