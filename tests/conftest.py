@@ -18,17 +18,6 @@ settings.register_profile("thorough", deadline=None, derandomize=True, max_examp
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gvo"))
 
-# All tests of these folders are left to `pytest -m "acceptance or slow"`.
-_ACCEPTANCE = tuple(Path(__file__).parent / name for name in ("acceptance", "fuzz", "quality"))
-
-
-@pytest.hookimpl(tryfirst=True)  # before -m deselects
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of whole folders."""
-    for item in items:
-        if any(folder in item.path.parents for folder in _ACCEPTANCE):
-            item.add_marker("acceptance")
-
 
 class Answer(NamedTuple):
     """What a command gave."""

@@ -20,7 +20,7 @@ DRIVE = "driving stereo"
 HAND = "handheld stereo"
 HAND_RGBD = "handheld rgbd"
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.acceptance
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,8 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
 
+pytestmark = pytest.mark.acceptance
+
 _CONTAINERS = ("a.bag", "a.mcap", "a.db3", "folder")
 _N_FRAMES = 6
 _LENSES: dict[DistortionModel, list[float]] = {

@@ -15,6 +15,8 @@ from gvo.io.convert.convert import convert
 from gvo.io.convert.folder_writer import Layout
 from gvo.io.synthetic.recording import SyntheticRecording
 
+pytestmark = pytest.mark.acceptance
+
 PROGRAM = Path(__file__).parent / "audited_commands.py"
 # What a run measures of the machine it runs on, and the number of threads that it was given.
 MEASURED = ("median_ms", "peak_memory_mb")

@@ -19,6 +19,8 @@ from gvo.io.bag.image_encodings import DEPTHS, IMAGES
 from gvo.io.bag.reader import BagReader
 from tests.io.pose_bags import PoseBag
 
+pytestmark = pytest.mark.acceptance
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = [

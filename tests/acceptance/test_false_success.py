@@ -12,6 +12,8 @@ from gvo.geometry import se3
 from gvo.io.synthetic.worlds.deceptive import bus_path
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
 
+pytestmark = pytest.mark.acceptance
+
 TIED = (Status.OK, Status.RESUMED)
 
 
@@ -58,14 +60,12 @@ def follow(recording: SyntheticRecording, **sections: Any) -> Tracked:
     return Tracked(results, recording.ground_truth().T_world_cam)
 
 
-@pytest.mark.slow
 def test_a_bus_that_fills_two_thirds_of_the_view_does_not_carry_the_camera_along() -> None:
     tracked = track("traffic", n_frames=100, scale=0.4)
     assert not list(tracked.wrong_steps())
     assert tracked.errors_m().max() < 0.3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "speed", "seed"),
     [
@@ -109,7 +109,6 @@ def test_a_front_that_repeats_exactly_is_not_followed_by_a_window_off() -> None:
     assert tracked.errors_m()[-1] < 0.03 * travelled
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
 def test_before_a_blank_wall_no_pose_is_called_ok_until_the_room_is_back(sensor: str) -> None:
     tracked = track("wall", sensor, n_frames=250, scale=0.3)

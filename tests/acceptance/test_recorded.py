@@ -14,7 +14,7 @@ KITTI = "kitti_06_start"
 XYZ = "rgbd_dataset_freiburg1_xyz_start"
 EUROC = "euroc_mh01_start"
 
-pytestmark = [pytest.mark.recorded, pytest.mark.slow]
+pytestmark = [pytest.mark.recorded, pytest.mark.acceptance]
 
 
 @pytest.mark.parametrize("name", [KITTI, XYZ, EUROC])

@@ -14,6 +14,8 @@ import pytest
 import gvo
 from gvo.geometry import se3
 
+pytestmark = pytest.mark.acceptance
+
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 # The scripts import the same package as the tests do.
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)}
@@ -98,7 +100,6 @@ def test_the_benchmark_compares_the_whole_run_with_the_yardstick(
     assert ratios[3] == pytest.approx(wall_ms / yardstick[0], rel=0.05)
 
 
-@pytest.mark.slow
 def test_the_ablation_leaves_out_what_its_rows_say(drive_bag: Path) -> None:
     measured = run("benchmark", drive_bag, "--rounds", 1, "--ablation")
     assert measured.returncode == 0, measured.stderr
@@ -109,7 +110,6 @@ def test_the_ablation_leaves_out_what_its_rows_say(drive_bag: Path) -> None:
     assert chain[:4] == chain[4:] == rows["as set"][:4]
 
 
-@pytest.mark.slow
 def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
     options = ["--set", "frontend.kind=klt", "--rounds", 1, "--ablation"]
     measured = run("benchmark", room_bag, *options)
@@ -240,7 +240,6 @@ def test_bad_input_is_told_without_a_traceback(name: str, arguments: list[str]) 
     assert "error" in answer.stderr
 
 
-@pytest.mark.slow
 def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at() -> None:
     # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of one they spread more.
     kinds = "descriptor", "klt"

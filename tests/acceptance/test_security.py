@@ -20,6 +20,8 @@ from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.viz.report import write_comparison_report, write_run_report
 
+pytestmark = pytest.mark.acceptance
+
 ROOT = Path(__file__).parents[2]
 PROGRAMS = [*sorted((ROOT / "gvo").rglob("*.py")), *sorted((ROOT / "scripts").rglob("*.py"))]
 
@@ -225,7 +227,6 @@ def watched(tmp_path: Path) -> Watched:
     return Watched(tmp_path.resolve() / "watched")
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_commands_write_nothing_but_what_they_are_told_to(
     small_bag: Path, watched: Watched

@@ -17,6 +17,8 @@ from gvo.frontend.klt import KltFrontend
 from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.types import Progress
 
+pytestmark = pytest.mark.acceptance
+
 ROOT = Path(__file__).parents[2]
 BENCHMARK = ROOT / "scripts/benchmark.py"
 SOAK = ROOT / "tests/quality/soak.py"

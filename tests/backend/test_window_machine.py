@@ -410,7 +410,7 @@ def test_any_mixture_of_calls_leaves_a_window_that_goes_on() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_thousands_of_mixed_calls_leave_a_window_that_goes_on() -> None:
     run_state_machine_as_test(
         WindowMachine,

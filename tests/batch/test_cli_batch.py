@@ -11,13 +11,13 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from distributed import Client
 
 from gvo.batch import BatchProgress
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import (
     GVO,
-    Cluster,
     assert_same_run,
     copy_of,
     is_complete,
@@ -31,11 +31,12 @@ Batch = Callable[..., Answer]
 
 
 @pytest.fixture
-def batch(cluster: Cluster, command: Command) -> Batch:
-    """Return a function that runs `gvo batch` on the cluster."""
+def batch(near: Client, command: Command) -> Batch:
+    """Return a function that runs `gvo batch` on the workers of this process."""
+    address = near.scheduler_info(n_workers=0)["address"]
 
     def run(*arguments: object) -> Answer:
-        return command("batch", *arguments, "--scheduler", cluster.address, "--no-report")
+        return command("batch", *arguments, "--scheduler", address, "--no-report")
 
     return run
 
@@ -174,7 +175,7 @@ def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, nam
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
     bags: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
 ) -> None:
@@ -187,7 +188,7 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
     assert_same_run(tmp_path / bag.stem, run_alone(bag))
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
     bags: Path, long_bag: Path, tmp_path: Path, batch: Batch, number: signal.Signals

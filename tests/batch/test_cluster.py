@@ -59,6 +59,7 @@ def test_tasks_spread_over_the_workers(cluster: Cluster, bags: Path, tmp_path: P
     assert watch.names == set(cluster.workers)
 
 
+@pytest.mark.acceptance
 def test_recordings_and_results_are_found_by_their_urls(
     cluster: Cluster,
     bags: Path,
@@ -76,7 +77,7 @@ def test_recordings_and_results_are_found_by_their_urls(
     assert "complete, found" in answer.err
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
     cluster: Cluster,
     bags: Path,
@@ -103,7 +104,7 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
         assert_same_run(tmp_path / bag.stem, run_alone(bag))
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_batch_that_was_stopped_goes_on_where_it_was(
     cluster: Cluster,
@@ -139,7 +140,7 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
         assert_same_run(tmp_path / bag.stem, run_alone(bag))
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
     tmp_path: Path, long_bag: Path, bags: Path, cluster: Cluster, command: Command
 ) -> None:
@@ -165,6 +166,7 @@ def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
     assert answer.err.count("complete, found") == 1
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 def test_a_worker_with_another_disk_or_version_says_so(
     tmp_path: Path, bags: Path, monkeypatch: pytest.MonkeyPatch
@@ -205,6 +207,7 @@ def test_no_scheduler_is_a_line(
     assert answer.err.count("\n") == 1
 
 
+@pytest.mark.acceptance
 def test_a_lost_scheduler_is_an_error_of_its_own(tmp_path: Path, blocked: Path) -> None:
     (tmp_path / "cluster").mkdir()
     cluster = Cluster(tmp_path / "cluster")

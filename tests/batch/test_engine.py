@@ -194,7 +194,7 @@ class Killer:
                     os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_who_kills_each_worker_fails_and_the_neighbours_complete(
     options: TaskOptions, bags: Path, blocked: Path
 ) -> None:

@@ -281,7 +281,7 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
     np.testing.assert_allclose(np.array(numbers["raw"]["T_world_cam"])[:3, 3], position, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_a_frame_with_depth_is_explained_by_its_depth(
     command: Command, room_bag: Path, tmp_path: Path
 ) -> None:

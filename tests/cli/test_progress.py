@@ -97,7 +97,7 @@ def test_the_tracked_share_is_that_of_the_run(room_bag: Path, tmp_path: Path) ->
     assert int(shown.states()[-1]["tracked"]) == pytest.approx(100 * share, abs=0.51)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_a_round_trip_counts_the_way_there_and_the_way_back(room_bag: Path, tmp_path: Path) -> None:
     shown = on_terminal("round-trip", room_bag, "--out", tmp_path, columns=100)
     assert shown.code == 0

@@ -17,12 +17,15 @@ SCRIPT = Path(__file__).parents[1] / "quality" / "fuzz.py"
 _N_SLOW = 40
 _N_QUICK = 400
 _SLOW = {"smoothed_lines", "sqlite_bags", "mcap_bags", "ros1_bags", "recordings", "configurations"}
+_IN_SHORT_RUN = "edge_lines"
+_TARGETS = [
+    pytest.param(target, id=name, marks=() if name == _IN_SHORT_RUN else pytest.mark.acceptance)
+    for name, target in TARGETS.items()
+]
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
-def test_a_target_stands_its_seeds_and_changes_of_them(
-    target: Target,
-) -> None:
+@pytest.mark.parametrize("target", _TARGETS)
+def test_a_target_stands_its_seeds_and_changes_of_them(target: Target) -> None:
     rng = random.Random(target.name)
     seeds = target.seeds()
     for seed in seeds:
@@ -35,6 +38,7 @@ def test_a_target_stands_its_seeds_and_changes_of_them(
         target.execute(data[: target.max_bytes])
 
 
+@pytest.mark.acceptance
 def test_seeds_are_what_a_target_understands() -> None:
     """Most seeds get through: a fuzzer that starts from refusals never gets deep."""
     for target in TARGETS.values():
@@ -58,7 +62,7 @@ def test_a_finding_is_found() -> None:
         Target(name="broken", run=run, seeds=lambda: [b""]).execute(b"x")
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 @pytest.mark.skipif(
     importlib.util.find_spec("atheris") is None, reason="atheris has no wheel for this machine"
 )

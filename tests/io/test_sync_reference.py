@@ -17,14 +17,10 @@ from gvo.types import FaultyFrame
 
 _HEADERS = ("message_filters/sync_policies/approximate_time.h", "ros/message_event.h")
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        which("g++") is None
-        or not all((Path("/usr/include") / name).exists() for name in _HEADERS),
-        reason="needs g++ and message_filters of ROS 1 (libmessage-filters-dev)",
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    which("g++") is None or not all((Path("/usr/include") / name).exists() for name in _HEADERS),
+    reason="needs g++ and message_filters of ROS 1 (libmessage-filters-dev)",
+)
 
 # Reads a line per sequence: queue size, limit, age penalty, then stream and stamp of each image.
 # Writes a line: for each pair the number of images pushed so far, and the places of both images
@@ -220,6 +216,7 @@ def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
     _check(reference, scaled, 100, limit * unit, age_penalty, is_overflowing=False)
 
 
+@pytest.mark.acceptance
 @settings(max_examples=1500, deadline=None)
 @given(
     messages=_messages,
@@ -237,6 +234,7 @@ def test_queues_overflow_as_those_of_message_filters(
     _check(reference, messages, queue_size, limit, age_penalty, is_overflowing=True)
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("age_penalty", [0.1, 0.25, 0.5])
 def test_durations_are_scaled_to_the_same_nanosecond(
     reference: Reference, age_penalty: float
@@ -261,6 +259,7 @@ def _camera_stamps(
     return stamps
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("rates", [(30, 30), (30, 15), (15, 30), (30, 10), (20, 29)])
 def test_cameras_of_any_rates_are_paired_as_by_message_filters(
     reference: Reference, rates: tuple[int, int]

@@ -88,8 +88,8 @@ def measure_coverage(arguments: argparse.Namespace) -> int:
                 [sys.executable, "-m", *command], env=world, check=False
             ).returncode
 
-        tests = arguments.tests or []
-        failed = run("coverage", "run", "-m", "pytest", "-q", "-n", str(arguments.jobs), *tests)
+        tests, jobs = arguments.tests or [], str(arguments.jobs)
+        failed = run("coverage", "run", "-m", "pytest", "-q", "-m", "", "-n", jobs, *tests)
         run("coverage", "combine", "--quiet")
         run("coverage", "json", "--quiet", "-o", f"{folder}/report.json")
         run("coverage", "report", "--show-missing", "--skip-covered", "--sort=cover")
@@ -119,7 +119,7 @@ def measure_mutation(arguments: argparse.Namespace) -> int:
         "-p",
         "no:xdist",
         "-m",
-        "not slow",
+        "not acceptance",
         "--tb=native",
     ]
     with redirect_stdout(sys.stderr):

@@ -8,6 +8,8 @@ import pytest
 
 from tests.acceptance.test_scripts import run
 
+pytestmark = pytest.mark.acceptance
+
 ROOT = Path(__file__).parents[2]
 MAX_BYTES = 250_000
 NAMES = {"explain", "report", "overlay", "view"}

@@ -16,6 +16,8 @@ from tests.viz.browser_checks import (
     overlapping_texts,
 )
 
+pytestmark = pytest.mark.acceptance
+
 LEAKING = """<img src="https://picture.example/a.png">
 <style>@import url("https://style.example/a.css");</style>
 <script>new Worker(URL.createObjectURL(new Blob([

@@ -29,9 +29,9 @@ WORLDS = [pytest.param("driving", marks=pytest.mark.acceptance), "handheld"]
         ("handheld", "stereo", 0),
         ("handheld", "rgbd", 0),
         ("handheld", "rgbd", 1),
-        pytest.param("driving", "stereo", 1, marks=pytest.mark.slow),
-        pytest.param("handheld", "stereo", 1, marks=pytest.mark.slow),
-        pytest.param("handheld", "rgbd", 2, marks=pytest.mark.slow),
+        pytest.param("driving", "stereo", 1, marks=pytest.mark.acceptance),
+        pytest.param("handheld", "stereo", 1, marks=pytest.mark.acceptance),
+        pytest.param("handheld", "rgbd", 2, marks=pytest.mark.acceptance),
     ],
 )
 def test_clean_recordings_have_nothing_to_complain_about(

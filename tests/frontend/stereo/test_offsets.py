@@ -105,7 +105,7 @@ def learn(frames: list[StereoFrame], kind: str, *, is_on: bool = True) -> gvo.Od
 Kind = Literal["klt", "descriptor"]
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 @pytest.mark.parametrize("kind", ["klt", "descriptor"])
 @pytest.mark.parametrize("planted_px", [-0.15, 0.0, 0.15])
 def test_a_planted_offset_is_found_within_twenty_frames(kind: Kind, planted_px: float) -> None:
@@ -116,7 +116,7 @@ def test_a_planted_offset_is_found_within_twenty_frames(kind: Kind, planted_px: 
     assert abs(offsets.disparity.value_px - planted_px) < 0.03 + 0.3 * abs(planted_px)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_rows_that_differ_are_found() -> None:
     offsets = learn(frames(0.0, row_px=1), "klt").rig_offsets
     assert offsets is not None
@@ -126,7 +126,7 @@ def test_rows_that_differ_are_found() -> None:
     assert abs(straight.row.value_px) < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_length_of_the_path_is_right_with_it_and_wrong_without() -> None:
     truth = gvo.SyntheticRecording("driving", n_frames=N_FRAMES, seed=3).ground_truth()
     lengths = []

@@ -157,7 +157,7 @@ def test_other_names_are_refused_before_anything_is_read(drive: _Run, tmp_path: 
         RunOverlay(tmp_path / "film.webm", drive[0].info.camera)
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_overlay_benchmark_prints_a_table(drive_bag: Path, tmp_path: Path) -> None:
     package = Path(gvo.__file__).parent.parent
     script = Path(__file__).parents[3] / "scripts" / "benchmark_overlay.py"

@@ -11,10 +11,11 @@ from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.viz.explanation import write_explanation
 from tests.viz.browser import Browser
 
+pytestmark = pytest.mark.acceptance
+
 _PICTURES = "return [...document.images].map(i => [i.alt, i.naturalWidth, i.clientWidth])"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("world", "sensor"), [("driving", "stereo"), ("handheld", "rgbd")])
 def test_an_explained_frame_opens_from_disk_with_every_picture(
     browser: Browser, tmp_path: Path, world: WorldName, sensor: Sensor

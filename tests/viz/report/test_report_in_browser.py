@@ -48,7 +48,7 @@ def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / "report.html"
 
 
-@pytest.fixture(params=["short", "long"])
+@pytest.fixture(params=["short", pytest.param("long", marks=pytest.mark.acceptance)])
 def report(request: pytest.FixtureRequest) -> Path:
     """Return either report."""
     path: Path = request.getfixturevalue(f"{request.param}_report")
@@ -65,7 +65,6 @@ def _drawings(browser: Browser) -> "list[WebElement]":
     return [svg for svg in browser.all(".panel > svg") if svg.is_displayed()]
 
 
-@pytest.mark.slow
 def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: Path) -> None:
     browser.open_file(report)
     others = [url for url in browser.requests() if not url.startswith(("data:", "blob:"))]
@@ -77,7 +76,7 @@ def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: 
     assert min(shown.values()) >= 1, f"not to be seen: {shown}"
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_no_text_of_a_plot_lies_on_another_or_is_cut_off(browser: Browser, report: Path) -> None:
     browser.open_file(report)
     drawings = _drawings(browser)
@@ -88,7 +87,7 @@ def test_no_text_of_a_plot_lies_on_another_or_is_cut_off(browser: Browser, repor
         assert cut_texts(browser, svg) == [], name
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_paths_in_space_turn_when_dragged(browser: Browser, report: Path) -> None:
     browser.open_file(report)
     canvas = browser.all("canvas")[0]
@@ -99,7 +98,7 @@ def test_the_paths_in_space_turn_when_dragged(browser: Browser, report: Path) ->
     assert browser.console_errors() == []
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_print_shows_all_that_the_page_shows(browser: Browser, report: Path) -> None:
     browser.open_file(report)
     on_screen = _shown(browser)
@@ -110,6 +109,6 @@ def test_print_shows_all_that_the_page_shows(browser: Browser, report: Path) -> 
             assert overlapping_texts(browser, svg) == [], svg.get_attribute("aria-label")
 
 
-@pytest.mark.slow
+@pytest.mark.acceptance
 def test_the_report_of_ten_thousand_frames_is_small(long_report: Path) -> None:
     assert long_report.stat().st_size < MAX_BYTES

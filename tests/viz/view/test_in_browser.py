@@ -15,6 +15,8 @@ from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, n_colours
 from tests.viz.view.page_driver import ViewPage
 
+pytestmark = pytest.mark.acceptance
+
 N_FRAMES = 20
 
 
@@ -37,7 +39,6 @@ def page(browser: Browser, player: Player) -> Iterator[ViewPage]:
         assert browser.console_errors() == []
 
 
-@pytest.mark.slow
 def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> None:
     page.press("step")
     page.wait_for_frame(0)
@@ -63,7 +64,6 @@ def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> 
     assert player.n_done == at + 2
 
 
-@pytest.mark.slow
 def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player: Player) -> None:
     page.press("step")
     page.wait_for_frame(0)
@@ -103,7 +103,6 @@ def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player:
     assert len(player.history.causal_path()[0]) == 2, "the world does not begin at frame 1"
 
 
-@pytest.mark.slow
 def test_the_page_of_a_finished_run_plays_and_seeks(browser: Browser, tmp_path: Path) -> None:
     source = SyntheticRecording("driving", "stereo", n_frames=N_FRAMES, scale=0.5)
     gvo.run_recording(source, tmp_path, outputs=RunOutputs(report=False))
