@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from gvo.errors import CalibrationError
@@ -15,9 +16,8 @@ from gvo.io.calibration.files import (
     read_cameras,
 )
 from gvo.io.calibration.stereo_pair import stereo_baseline
-from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamp
+from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
 from gvo.io.images import FULL_RANGE, GreyRange
-from gvo.io.recording import RecordingInfo
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -52,34 +52,26 @@ class EurocSource(FolderSource):
         grey_range: GreyRange = FULL_RANGE,
     ) -> None:
         self._root = folder / "mav0" if (folder / "mav0").is_dir() else folder
-        name = folder.resolve().parent.name if folder.name == "mav0" else folder.resolve().name
-        cameras = [self._root / "cam0", self._root / "cam1"]
-        left, right = (_list_images(camera) for camera in cameras)
-        sensors = [camera / "sensor.yaml" for camera in cameras]
+        images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
+        sensors = [self._root / name / "sensor.yaml" for name in images]
         files = paths_of(calibration)
+        cameras = read_cameras(files or sensors, sensor="stereo", is_rectified=False)
+        rectification = "from T_BS and distortion of cam0 and cam1"
         if files:
-            found = read_cameras(files, sensor="stereo", is_rectified=False)
-            names = " + ".join(file.name for file in files)
-            key = "R and P" if found.baseline_from == "P" else found.baseline_from
-            rectification = f"rectification: {key} of {names}"
-        else:
-            found = read_cameras(sensors, sensor="stereo", is_rectified=False)
-            rectification = "rectification: from T_BS and distortion of cam0 and cam1"
-        self._T_body_cam = _pose_on_body(found, sensors[0])
+            key = "R and P" if cameras.baseline_from == "P" else cameras.baseline_from
+            rectification = f"{key} of {' + '.join(file.name for file in files)}"
+        self._T_body_cam = _pose_on_body(cameras, sensors[0])
         decisions = [
-            f"stereo: cam0 + cam1 ({len(left)} + {len(right)} images)",
-            rectification,
-            f"baseline: {stereo_baseline(found.pair, str(self._root)):.4f} m",
+            f"rectification: {rectification}",
+            f"baseline: {stereo_baseline(cameras.pair, str(self._root)):.4f} m",
         ]
-        info = RecordingInfo(
-            name=name,
-            sensor="stereo",
-            calibrations=found.calibrations,
-            n_images=len(left),
-            decisions=decisions,
-            T_body_cam=self._T_body_cam,
+        super().__init__(
+            folder.resolve().parent if folder.name == "mav0" else folder,
+            replace(cameras, T_body_cam=self._T_body_cam),
+            images,
+            decisions,
+            grey_range=grey_range,
         )
-        super().__init__(info, left, right, grey_range=grey_range)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the rectified left camera.
@@ -110,11 +102,5 @@ def _pose_on_body(cameras: CameraSet, sensor: Path) -> FloatArray:
 
 
 def _list_images(camera: Path) -> list[StampedPath]:
-    table = camera / "data.csv"
-    return [
-        (
-            read_stamp(fields[0], f"{table}, line {number}", unit_ns=1),
-            camera / "data" / fields[1],
-        )
-        for number, fields in read_rows(table, n_fields=2, separator=",")
-    ]
+    rows = read_stamped_rows(camera / "data.csv", unit_ns=1, separator=",")
+    return [(stamp_ns, camera / "data" / fields[0]) for stamp_ns, fields in rows]

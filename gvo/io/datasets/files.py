@@ -1,9 +1,9 @@
-"""Image folders and text tables."""
+"""What all data-set folders have: two lists of image files, and text tables."""
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from gvo._text import cut, read_text
 from gvo.errors import RecordingError
+from gvo.io.calibration.files import CameraSet
 from gvo.io.images import FULL_RANGE, GreyRange, read_image
-from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.trajectory.trajectory import parse_stamp
 
 StampedPath = tuple[int, Path]
@@ -22,14 +23,19 @@ _Row = tuple[int, list[str]]
 
 
 class FolderSource:
-    """Two lists of image files: what every recording in a folder is.
+    """A recording of two lists of image files.
 
     Parameters
     ----------
-    info : RecordingInfo
-        What is known before the first image.
-    first, second : sequence of (int, Path)
-        Stamps in nanoseconds and files; first are colour or grey images.
+    folder : Path
+        It names the recording.
+    cameras : CameraSet
+        Of both streams, or of the colour images.
+    streams : mapping of str to sequence of (int, Path)
+        Two names, and the stamps in nanoseconds and files of each; first the left or colour
+        images.
+    decisions : sequence of str
+        What was chosen beside the streams, a line each.
     load_second : callable, optional
         Reads a file of the second stream; as a colour or grey image when left out.
     grey_range : GreyRange
@@ -38,16 +44,25 @@ class FolderSource:
 
     def __init__(
         self,
-        info: RecordingInfo,
-        first: Sequence[StampedPath],
-        second: Sequence[StampedPath],
+        folder: Path,
+        cameras: CameraSet,
+        streams: Mapping[str, Sequence[StampedPath]],
+        decisions: Sequence[str],
         *,
         load_second: Callable[[Path], NDArray[Any]] | None = None,
         grey_range: GreyRange = FULL_RANGE,
     ) -> None:
-        self._info = info
-        self._first = first
-        self._second = second
+        self._first, self._second = streams.values()
+        sensor: Sensor = "stereo" if len(cameras.calibrations) == 2 else "rgbd"
+        n_images = f"({len(self._first)} + {len(self._second)} images)"
+        self._info = RecordingInfo(
+            name=folder.resolve().name,
+            sensor=sensor,
+            calibrations=cameras.calibrations,
+            n_images=len(self._first),
+            decisions=[f"{sensor}: {' + '.join(streams)} {n_images}", *decisions],
+            T_body_cam=cameras.T_body_cam,
+        )
         self._load = partial(read_image, grey_range=grey_range)
         self._load_second = load_second or self._load
 
@@ -63,43 +78,6 @@ class FolderSource:
             _stream(1, self._second, self._load_second),
             key=lambda image: image.stamp_ns,
         )
-
-
-def first_image_size(
-    paths: Sequence[Path], folder: Path, grey_range: GreyRange = FULL_RANGE
-) -> tuple[int, int]:
-    """Return width and height of the first image that can be read.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Image files.
-    folder : Path
-        Where they lie, for the message.
-    grey_range : GreyRange
-        Of images with 16 bits.
-
-    Returns
-    -------
-    tuple of two int
-        Pixels.
-
-    Raises
-    ------
-    RecordingError
-        When there is none.
-    """
-    first_fault = ""
-    for path in paths:
-        try:
-            height, width = read_image(path, grey_range).shape[:2]
-        except RecordingError as error:
-            first_fault = first_fault or str(error)
-            continue  # it becomes a faulty frame later
-        return width, height
-    raise RecordingError(
-        f"{folder}: none of its {len(paths)} images can be read; the first: {first_fault}"
-    )
 
 
 def _stream(
@@ -147,27 +125,36 @@ def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> lis
     return rows
 
 
-def read_stamp(text: str, where: str, *, unit_ns: int) -> int:
-    """Return the nanoseconds that a field of a table says, without loss.
+def read_stamped_rows(
+    path: Path, *, unit_ns: int, n_fields: int = 2, separator: str | None = None
+) -> list[tuple[int, list[str]]]:
+    """Read a table whose first field is a stamp.
 
     Parameters
     ----------
-    text : str
-        A decimal number.
-    where : str
-        File and line, for the message.
+    path, n_fields, separator
+        As of `read_rows`.
     unit_ns : int
-        Nanoseconds of its unit: 1_000_000_000 for seconds, 1 for nanoseconds.
+        Nanoseconds of the stamps' unit: 1_000_000_000 for seconds, 1 for nanoseconds.
+
+    Returns
+    -------
+    list of (int, list of str)
+        Stamp in nanoseconds, without loss, and the fields behind it.
 
     Raises
     ------
     RecordingError
-        When the text is no number, or out of range.
+        As `read_rows`, and when a stamp is no number or out of range.
     """
-    try:
-        return parse_stamp(text, unit_ns=unit_ns)
-    except ValueError as error:
-        raise RecordingError(f"{where}: {cut(str(error), _MAX_REASON)}") from None
+    rows = []
+    for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
+        try:
+            rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields))
+        except ValueError as error:
+            reason = cut(str(error), _MAX_REASON)
+            raise RecordingError(f"{path}, line {number}: {reason}") from None
+    return rows
 
 
 def _read_lines(path: Path) -> list[str]:

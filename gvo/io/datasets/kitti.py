@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,8 @@ from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import check_camera
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.calibration.stereo_pair import stereo_baseline
-from gvo.io.datasets.files import FolderSource, StampedPath, first_image_size, read_rows, read_stamp
-from gvo.io.images import FULL_RANGE, GreyRange
-from gvo.io.recording import RecordingInfo
+from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamped_rows
+from gvo.io.images import FULL_RANGE, GreyRange, read_image
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -54,40 +54,27 @@ class KittiSource(FolderSource):
         grey_range: GreyRange = FULL_RANGE,
     ) -> None:
         self._folder = folder
-        rows = read_rows(folder / "times.txt", n_fields=1)
-        self._stamps_ns = [
-            read_stamp(fields[0], f"{folder / 'times.txt'}, line {number}", unit_ns=10**9)
-            for number, fields in rows
-        ]
+        times = read_stamped_rows(folder / "times.txt", unit_ns=10**9, n_fields=1)
+        self._stamps_ns = [stamp_ns for stamp_ns, _ in times]
         names = _find_pair(folder)
-        left, right = (self._list_images(name) for name in names)
+        images = {name: self._list_images(name) for name in names}
         files = paths_of(calibration)
         if files:
             cameras = read_cameras(files, sensor="stereo", is_rectified=True)
         else:
             files = (folder / "calib.txt",)
-            paths = [path for _, path in left]
-            size = first_image_size(paths, folder / names[0], grey_range)
+            size = _image_size([path for _, path in images[names[0]]], grey_range)
             cameras = _read_cameras(files[0], names, size)
         self._t_cam0_cam = _camera_offset(cameras.calibrations[0])
         state = "rectified" if cameras.calibrations[0].is_rectified else "raw"
         decisions = [
-            f"stereo: {names[0]} + {names[1]} ({len(left)} + {len(right)} images)",
             f"calibration: {' + '.join(file.name for file in files)}, {state}",
             f"baseline: {stereo_baseline(cameras.pair, cameras.origin):.4f} m",
         ]
-        n_missing = len(self._stamps_ns) - len(left)
+        n_missing = len(self._stamps_ns) - len(images[names[0]])
         if n_missing:
             decisions.append(f"missing: {n_missing} rows of times.txt have no image {names[0]}")
-        info = RecordingInfo(
-            name=folder.resolve().name,
-            sensor="stereo",
-            calibrations=cameras.calibrations,
-            n_images=len(left),
-            decisions=decisions,
-            T_body_cam=cameras.T_body_cam,
-        )
-        super().__init__(info, left, right, grey_range=grey_range)
+        super().__init__(folder, cameras, images, decisions, grey_range=grey_range)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the left camera; the world is the first grey left camera.
@@ -142,6 +129,21 @@ def _find_pair(folder: Path) -> tuple[str, str]:
         if all((folder / name).is_dir() for name in pair):
             return pair
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
+
+
+def _image_size(paths: Sequence[Path], grey_range: GreyRange) -> tuple[int, int]:
+    """Return width and height of the first image that can be read."""
+    first_fault = ""
+    for path in paths:
+        try:
+            height, width = read_image(path, grey_range).shape[:2]
+        except RecordingError as error:
+            first_fault = first_fault or str(error)
+            continue  # it becomes a faulty frame later
+        return width, height
+    raise RecordingError(
+        f"{paths[0].parent}: none of its {len(paths)} images can be read; the first: {first_fault}"
+    )
 
 
 def _read_cameras(path: Path, names: tuple[str, str], size: tuple[int, int]) -> CameraSet:

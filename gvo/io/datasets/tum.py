@@ -12,16 +12,14 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.io.calibration.camera_info import CameraFields, make_calibration
 from gvo.io.calibration.files import (
     CalibrationPaths,
     CameraSet,
     paths_of,
     read_cameras,
 )
-from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamp
+from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
 from gvo.io.images import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
-from gvo.io.recording import RecordingInfo
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 
@@ -80,29 +78,22 @@ class TumSource(FolderSource):
         grey_range: GreyRange = FULL_RANGE,
     ) -> None:
         self._folder = folder
-        color, depth = (_list_images(folder / name) for name in ("rgb.txt", "depth.txt"))
+        images = {name: _list_images(folder / f"{name}.txt") for name in ("rgb", "depth")}
         cameras = _find_calibration(folder, paths_of(calibration))
         if depth_scale is not None:
             scale, reason = depth_scale, "by depth.scale"
         elif cameras.depth_scale is not None:
             scale, reason = cameras.depth_scale, "by the calibration"
         else:
-            scale, reason = _assume_scale([path for _, path in depth])
-        decisions = [
-            f"rgbd: rgb + depth ({len(color)} + {len(depth)} images)",
-            f"calibration: {cameras.origin}",
-            f"depth: {scale:g} counts per metre, {reason}",
-        ]
-        info = RecordingInfo(
-            name=folder.resolve().name,
-            sensor="rgbd",
-            calibrations=cameras.calibrations,
-            n_images=len(color),
-            decisions=decisions,
-            T_body_cam=cameras.T_body_cam,
+            scale, reason = _assume_scale([path for _, path in images["depth"]])
+        super().__init__(
+            folder,
+            cameras,
+            images,
+            [f"calibration: {cameras.origin}", f"depth: {scale:g} counts per metre, {reason}"],
+            load_second=partial(read_depth, scale=scale),
+            grey_range=grey_range,
         )
-        load_second = partial(read_depth, scale=scale)
-        super().__init__(info, color, depth, load_second=load_second, grey_range=grey_range)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the colour camera.
@@ -134,13 +125,8 @@ def published_calibration(name: str) -> Calibration | None:
 
 
 def _list_images(table: Path) -> list[StampedPath]:
-    return [
-        (
-            read_stamp(fields[0], f"{table}, line {number}", unit_ns=10**9),
-            table.parent / fields[1],
-        )
-        for number, fields in read_rows(table, n_fields=2)
-    ]
+    rows = read_stamped_rows(table, unit_ns=10**9)
+    return [(stamp_ns, table.parent / fields[0]) for stamp_ns, fields in rows]
 
 
 def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
@@ -166,17 +152,16 @@ def _published_camera(
     intrinsics: tuple[float, float, float, float], distortion: Sequence[float]
 ) -> Calibration:
     fx, fy, cx, cy = intrinsics
-    fields = CameraFields(
-        where="published calibration",
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Calibration(
         width=640,
         height=480,
-        model="plumb_bob",
-        K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-        D=distortion,
-        R=np.zeros(9),
-        P=np.zeros(12),
+        K=K,
+        D=np.array(distortion),
+        R=np.eye(3),
+        P=np.hstack([K, np.zeros((3, 1))]),
+        is_rectified=False,
     )
-    return make_calibration(fields, is_rectified=False)
 
 
 def _assume_scale(paths: Sequence[Path]) -> tuple[float, str]:

@@ -3,29 +3,26 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gvo.errors import RecordingError
-from gvo.io.datasets.files import read_rows, read_stamp
+from gvo.io.datasets.files import read_rows, read_stamped_rows
 
 
-@given(stamp_ns=st.integers(0, 2**62))
-def test_nine_decimals_of_seconds_are_exact(stamp_ns: int) -> None:
-    text = f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
-    assert read_stamp(text, "row", unit_ns=10**9) == stamp_ns
-    assert read_stamp(str(stamp_ns), "row", unit_ns=1) == stamp_ns
+def test_stamps_are_read_without_loss(tmp_path: Path) -> None:
+    path = tmp_path / "rgb.txt"
+    path.write_text("1305031102.175304001 a\n1.037875e-01 b\n0 c\n")
+    rows = read_stamped_rows(path, unit_ns=10**9)
+    assert rows == [(1305031102175304001, ["a"]), (103_787_500, ["b"]), (0, ["c"])]
+    path.write_text("4611686018427387903,a\n")
+    assert read_stamped_rows(path, unit_ns=1, separator=",") == [(4611686018427387903, ["a"])]
 
 
-def test_exponents_are_understood() -> None:
-    assert read_stamp("1.037875e-01", "row", unit_ns=10**9) == 103_787_500
-    assert read_stamp("0", "row", unit_ns=10**9) == 0
-
-
-@pytest.mark.parametrize("text", ["", "nan", "inf", "1,5", "stamp", "1e40", "1e999999999999"])
-def test_what_is_no_stamp_is_refused_by_its_place(text: str) -> None:
+@pytest.mark.parametrize("text", ["nan", "inf", "1,5", "stamp", "1e40", "1e999999999999"])
+def test_what_is_no_stamp_is_refused_by_its_place(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "rgb.txt"
+    path.write_text(f"# comment\n1.0 a\n{text} b\n")
     with pytest.raises(RecordingError, match=r"rgb\.txt, line 3"):
-        read_stamp(text, "rgb.txt, line 3", unit_ns=10**9)
+        read_stamped_rows(path, unit_ns=10**9)
 
 
 def test_comments_and_empty_lines_do_not_count(tmp_path: Path) -> None:
