@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 import stat
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,6 +34,7 @@ _TIFF_FORMS = {3: "H", 4: "I"}
 _N_HEAD = 512
 _MAX_PIXELS_PER_BYTE = 2048  # twice what deflate makes of black, four times what JPEG does
 _TOO_DARK = 1 << 12
+_JPEG_QUALITY = 80  # of 100
 _MAX_FILE_BYTES = 1 << 30  # more than all pixels that are allowed need
 MILLIMETRES = 1000.0
 """Counts per metre of depth in millimetres: integer depth in messages is so by REP 118."""
@@ -426,56 +426,22 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
         raise RecordingError(f"{str(path)!r}: is no name of a file") from error
 
 
-def encode_png(pixels: NDArray[Any]) -> bytes:
-    """Return an image as a PNG file.
+def encode_image(pixels: NDArray[Any], suffix: Literal[".png", ".tiff", ".jpg"]) -> bytes:
+    """Return an image as the bytes of a file: PNG and TIFF without loss, JPEG of quality 80.
 
     Parameters
     ----------
-    pixels : ndarray of uint8 or uint16, shape (h, w) or (h, w, 3)
+    pixels : ndarray of uint8, uint16 (PNG) or float32 (TIFF), shape (h, w) or (h, w, 3)
         Grey, or colour in BGR order.
+    suffix : {".png", ".tiff", ".jpg"}
+        Of the format.
 
     Raises
     ------
     RecordingError
         When it cannot be one.
     """
-    return _encode(".png", pixels)
-
-
-def encode_tiff(pixels: NDArray[Any]) -> bytes:
-    """Return an image as a TIFF file.
-
-    Parameters
-    ----------
-    pixels : ndarray of float32, shape (h, w)
-
-    Raises
-    ------
-    RecordingError
-        When it cannot be one.
-    """
-    return _encode(".tiff", pixels)
-
-
-def encode_jpeg(image: ImageArray, *, quality: int = 80) -> bytes:
-    """Return a picture as a JPEG file.
-
-    Parameters
-    ----------
-    image : ndarray of uint8, shape (height, width, 3)
-        BGR.
-    quality : int
-        0 to 100.
-
-    Raises
-    ------
-    RecordingError
-        When it cannot be one.
-    """
-    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def _encode(suffix: str, pixels: NDArray[Any], parameters: Sequence[int] = ()) -> bytes:
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
     is_encoded, data = cv2.imencode(suffix, pixels, parameters)
     if not is_encoded:
         raise RecordingError(

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from gvo.errors import ConfigurationError, RecordingError
-from gvo.io.images import encode_png
+from gvo.io.images import encode_image
 from gvo.types import ImageArray
 
 CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
@@ -225,7 +225,7 @@ class PngFolder:
             When it cannot be written.
         """
         with _refused_on_error(self.path):
-            (self.path / f"{self._n:06d}.png").write_bytes(encode_png(picture))
+            (self.path / f"{self._n:06d}.png").write_bytes(encode_image(picture, ".png"))
         self._n += 1
 
     def close(self) -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.io.images import encode_jpeg
+from gvo.io.images import encode_image
 from gvo.types import (
     Estimate,
     FaultyFrame,
@@ -112,7 +112,7 @@ def test_a_coloured_image_and_unequal_counts_are_refused() -> None:
 
 def test_a_jpeg_shows_the_picture() -> None:
     smooth = cv2.GaussianBlur(_draw([((20.0, 30.0), (60.0, 35.0), True)]), (0, 0), 3)
-    data = encode_jpeg(np.asarray(smooth, dtype=np.uint8))
+    data = encode_image(np.asarray(smooth, dtype=np.uint8), ".jpg")
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
     np.testing.assert_allclose(decoded.astype(float), smooth.astype(float), atol=12)

@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.bag.calibration import calibrations_of_file, calibrations_of_messages
+from gvo.io.bag.calibration import (
+    BagCalibration,
+    calibrations_of_file,
+    calibrations_of_messages,
+)
 from gvo.io.bag.cameras import camera_info_changes
 from gvo.io.bag.messages import (
     decode_compressed,
@@ -83,21 +87,7 @@ class BagSource:
             found = calibrations_of_messages(self._reader, self._topics, self._where)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
-        decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
-        if self._topics.sensor == "rgbd":
-            decisions.append(
-                f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
-            )
-        self._info = RecordingInfo(
-            name=paths[0].resolve().stem if paths[0].is_file() else paths[0].resolve().name,
-            sensor=self._topics.sensor,
-            calibrations=found.calibrations,
-            n_images=self._topics.first.n_messages,
-            decisions=decisions,
-            depth_view=found.depth_view,
-            frame_id=found.frame_id,
-            T_body_cam=found.T_body_cam,
-        )
+        self._info = self._describe(paths[0].resolve(), found)
 
     @property
     def info(self) -> RecordingInfo:
@@ -122,7 +112,7 @@ class BagSource:
         for message in self._reader.messages(self.image_topics):
             stream = self.image_topics.index(message.topic.name)
             counts[stream] += 1
-            yield self._image(message, stream)
+            yield self._stamped(message, stream)
         if self._reader.damage:
             raise RecordingError(self._reader.damage)
         for topic, count in zip((self._topics.first, self._topics.second), counts, strict=True):
@@ -211,6 +201,23 @@ class BagSource:
         found = self.truth()
         return found.trajectory if isinstance(found, Truth) else None
 
+    def _describe(self, path: Path, found: BagCalibration) -> RecordingInfo:
+        decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
+        if self._topics.sensor == "rgbd":
+            decisions.append(
+                f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
+            )
+        return RecordingInfo(
+            name=path.stem if path.is_file() else path.name,
+            sensor=self._topics.sensor,
+            calibrations=found.calibrations,
+            n_images=self._topics.first.n_messages,
+            decisions=decisions,
+            depth_view=found.depth_view,
+            frame_id=found.frame_id,
+            T_body_cam=found.T_body_cam,
+        )
+
     def _choose_topics(self, choice: TopicChoice) -> CameraTopics:
         try:
             return choose_topics(self._reader.topics, choice, self._where)
@@ -219,32 +226,25 @@ class BagSource:
                 raise
             raise RecordingError(f"{error}; {self._reader.damage}") from error
 
-    def _image(self, message: BagMessage, stream: int) -> StampedImage:
+    def _stamped(self, message: BagMessage, stream: int) -> StampedImage:
+        log_time_ns = message.log_time_ns
         try:
             content = message.decode()
         except RecordingError as error:
             # Without a header there is no other stamp than that of the recording.
-            stamp_ns, load = message.log_time_ns, partial(_fail, str(error))
+            stamp_ns, load = log_time_ns, partial(_fail, str(error))
         else:
-            decode = self._decoder(message.topic, is_depth=self._is_depth(stream))
-            stamp_ns, load = stamp_of(content.header), partial(decode, content)
-        if self._takes_log_time:
-            stamp_ns = message.log_time_ns
-        return StampedImage(
-            stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=message.log_time_ns
-        )
+            stamp_ns = log_time_ns if self._takes_log_time else stamp_of(content.header)
+            load = partial(self._decoder(message.topic, stream), content)
+        return StampedImage(stream=stream, stamp_ns=stamp_ns, load=load, log_time_ns=log_time_ns)
 
-    def _is_depth(self, stream: int) -> bool:
-        return stream == 1 and self._topics.sensor == "rgbd"
-
-    def _decoder(self, topic: Topic, *, is_depth: bool) -> Callable[[Any], NDArray[Any]]:
+    def _decoder(self, topic: Topic, stream: int) -> Callable[[Any], NDArray[Any]]:
         is_compressed = topic.type == COMPRESSED_TYPE
-        if is_depth:
-            decode = decode_compressed_depth if is_compressed else decode_depth
-            return partial(decode, scale=self._scale, where=topic.name)
-        if is_compressed:
-            return partial(decode_compressed, where=topic.name, grey_range=self._grey_range)
-        return partial(decode_grey_or_color, where=topic.name, grey_range=self._grey_range)
+        if stream == 1 and self._topics.sensor == "rgbd":
+            decode_counts = decode_compressed_depth if is_compressed else decode_depth
+            return partial(decode_counts, scale=self._scale, where=topic.name)
+        decode = decode_compressed if is_compressed else decode_grey_or_color
+        return partial(decode, where=topic.name, grey_range=self._grey_range)
 
 
 def _fail(reason: str) -> NDArray[Any]:

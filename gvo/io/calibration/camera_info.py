@@ -167,46 +167,19 @@ def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration
         When the camera is not calibrated, its distortion model is not known, a matrix is
         malformed, or the region lies outside the image.
     """
-    where = fields.where
-    K = _matrix(fields.K, (3, 3), f"{where}: K")
-    P = _matrix(fields.P, (3, 4), f"{where}: P")
-    R = _matrix(fields.R, (3, 3), f"{where}: R")
-    if not np.any(K):
-        K = P[:, :3].copy()
-    if not np.any(K):
-        raise CalibrationError(
-            f"{where}: the camera is not calibrated: K and P are zero; give --calibration FILE"
-        )
-    if not np.any(P):
-        P = np.hstack([K, np.zeros((3, 1))])
-    if not np.any(R):
-        R = np.eye(3)
-    _check_matrices(K, R, P, where)
+    K, R, P = _matrices(fields)
     model, D = _distortion(fields, is_rectified=is_rectified)
     width, height = fields.recorded_size()
-    recorded = _from_full_image(fields)
-    calibration = Calibration(
-        width=width,
-        height=height,
-        K=K if recorded is None else recorded @ K,
-        D=D,
-        R=R,
-        P=P if recorded is None else recorded @ P,
-        is_rectified=is_rectified,
-        model=model,
-    )
-    check_camera(calibration, where)
-    return calibration
-
-
-def _from_full_image(fields: CameraFields) -> FloatArray | None:
-    """Return what maps pixels of the full image to the recorded one; None where it is whole."""
     binning, roi = fields.binning_factors, fields.roi
-    if binning == (1, 1) and (roi.x_offset, roi.y_offset) == (0, 0):
-        return None
-    scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
-    shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
-    return np.asarray(scale @ shift)
+    if binning != (1, 1) or (roi.x_offset, roi.y_offset) != (0, 0):
+        scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
+        shift = np.array([[1.0, 0.0, -roi.x_offset], [0.0, 1.0, -roi.y_offset], [0.0, 0.0, 1.0]])
+        K, P = scale @ shift @ K, scale @ shift @ P
+    calibration = Calibration(
+        width=width, height=height, K=K, D=D, R=R, P=P, is_rectified=is_rectified, model=model
+    )
+    check_camera(calibration, fields.where)
+    return calibration
 
 
 def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
@@ -277,6 +250,26 @@ def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
     return numbers.reshape(shape)
 
 
+def _matrices(fields: CameraFields) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return K, R and P of the full image, checked; for those not set what they then mean."""
+    where = fields.where
+    K = _matrix(fields.K, (3, 3), f"{where}: K")
+    P = _matrix(fields.P, (3, 4), f"{where}: P")
+    R = _matrix(fields.R, (3, 3), f"{where}: R")
+    if not np.any(K):
+        K = P[:, :3].copy()
+    if not np.any(K):
+        raise CalibrationError(
+            f"{where}: the camera is not calibrated: K and P are zero; give --calibration FILE"
+        )
+    if not np.any(P):
+        P = np.hstack([K, np.zeros((3, 1))])
+    if not np.any(R):
+        R = np.eye(3)
+    _check_matrices(K, R, P, where)
+    return K, R, P
+
+
 def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> None:
     if not se3.is_rotation(R, tolerance=ROTATION_TOLERANCE):
         raise CalibrationError(f"{where}: R is no rotation")
@@ -310,8 +303,7 @@ def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[Distortion
         D = D[:4]
     if D.size not in counts:
         raise CalibrationError(
-            f"{fields.where}: D of {cut(' '.join(fields.model.split()), MAX_SHOWN)} must "
-            f"hold "
+            f"{fields.where}: D of {cut(' '.join(fields.model.split()), MAX_SHOWN)} must hold "
             f"{_alternatives(counts)} numbers, got {D.size}"
         )
     n_missing = max(N_COEFFICIENTS[model][0] - D.size, 0)

@@ -1,4 +1,4 @@
-"""Messages of images, calibrations, poses."""
+"""Bags written: images, calibrations and poses as messages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.reader import TF_TYPE, typestore
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
-from gvo.io.images import MILLIMETRES, encode_jpeg, encode_png, encode_tiff, exact_counts
+from gvo.io.images import MILLIMETRES, encode_image, exact_counts
 from gvo.io.poses.ground_truth import TRUTH_FRAMES
 from gvo.types import DepthArray, FloatArray, ImageArray
 
@@ -133,11 +133,6 @@ class BagWriter:
     def header(self, header: Header) -> Any:  # noqa: ANN401 - made at run time
         """Return the message of a header.
 
-        Parameters
-        ----------
-        header : Header
-            Stamp in nanoseconds, and frame.
-
         Raises
         ------
         RecordingError
@@ -196,19 +191,7 @@ class BagWriter:
 
 
 def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
-    """Write an image.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        Where to.
-    pixels : ndarray
-        uint8 (h, w): mono8; uint8 (h, w, 3): bgr8; float32 (h, w): 32FC1.
-    header : Header
-        Stamp and frame.
-    """
+    """Write an image: uint8 (h, w) as mono8, uint8 (h, w, 3) as bgr8, float32 (h, w) as 32FC1."""
     encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim]
     if pixels.dtype == np.float32:
         encoding = "32FC1"
@@ -229,19 +212,7 @@ def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header
 
 
 def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
-    """Write a calibration as `CameraInfo`, all numbers without loss.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        Where to.
-    calibration : Calibration
-        Of one camera.
-    header : Header
-        Stamp and frame.
-    """
+    """Write a calibration as `CameraInfo`, all numbers without loss."""
     matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
     message = bag.make(
@@ -259,17 +230,7 @@ def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, head
 
 
 def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
-    """Write a pose of the ground truth to `/tf`.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    stamp_ns : int
-        Nanoseconds.
-    T_world_cam : ndarray of float64, shape (4, 4)
-        Of the rectified camera, metres.
-    """
+    """Write a true pose of the rectified camera, shape (4, 4), metres, to `/tf`."""
     parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
     write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])
 
@@ -318,22 +279,10 @@ def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made a
 
 
 def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
-    """Write an image as PNG, without loss.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        Where to; ends in `/compressed`.
-    pixels : ndarray of uint8, shape (h, w) or (h, w, 3)
-        Grey, or colour in BGR order.
-    header : Header
-        Stamp and frame.
-    """
+    """Write an image, uint8 (h, w) or BGR (h, w, 3), as PNG to a topic ending in `/compressed`."""
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"
     kind = f"{encoding}; png compressed {'' if pixels.ndim == 2 else encoding}"
-    _write(bag, topic, kind, encode_png(pixels), header)
+    _write(bag, topic, kind, encode_image(pixels, ".png"), header)
 
 
 def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header: Header) -> None:
@@ -344,34 +293,22 @@ def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header
     bag : BagWriter
         Open.
     topic : str
-        Where to; ends in `/compressedDepth`.
+        Ends in `/compressedDepth`.
     depth : ndarray of float32, shape (h, w)
         Metres, NaN = unknown; as TIFF where it is not of whole millimetres, or beyond 65.5 m.
     header : Header
-        Stamp and frame.
     """
     counts = exact_counts(depth, MILLIMETRES)
     if counts is None:
-        _write(bag, topic, "32FC1; tiff compressed ", encode_tiff(depth), header)
+        _write(bag, topic, "32FC1; tiff compressed ", encode_image(depth, ".tiff"), header)
     else:
-        _write(bag, topic, "16UC1; compressedDepth", _DEPTH_HEADER + encode_png(counts), header)
+        data = _DEPTH_HEADER + encode_image(counts, ".png")
+        _write(bag, topic, "16UC1; compressedDepth", data, header)
 
 
 def write_picture(bag: BagWriter, topic: str, header: Header, image: ImageArray) -> None:
-    """Write a picture as JPEG.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        Where to; by convention it ends in `/compressed`.
-    header : Header
-        Stamp and frame of the camera.
-    image : ndarray of uint8, shape (height, width, 3)
-        BGR.
-    """
-    _write(bag, topic, "jpeg", encode_jpeg(image), header)
+    """Write a picture, uint8 (h, w, 3) in BGR order, as JPEG to a topic ending in `/compressed`."""
+    _write(bag, topic, "jpeg", encode_image(image, ".jpg"), header)
 
 
 def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -> None:

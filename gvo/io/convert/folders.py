@@ -18,7 +18,7 @@ from gvo.geometry.camera import Calibration
 from gvo.io.convert.common import LeftOut, choose_preparers, ideal_calibration, pose_on_body
 from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
 from gvo.io.frames import paired
-from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_png, is_in_counts, to_counts
+from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
 from gvo.io.recording import Source, StampedImage
 from gvo.trajectory.formats import write_euroc, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory, format_stamp
@@ -216,7 +216,7 @@ class KittiFolder(FolderStreams):
                 (self._folder / name).mkdir()
         number = len(self._stamps_ns) - 1
         path = self._folder / self._folders[image.stream] / f"{number:06d}.png"
-        path.write_bytes(encode_png(pixels))
+        path.write_bytes(encode_image(pixels, ".png"))
         return True
 
     def add_truth(self, truth: Trajectory) -> int:
@@ -274,7 +274,8 @@ class EurocFolder(FolderStreams):
         if pixels is None:
             return False
         name = f"{image.stamp_ns}.png"
-        (self._root / f"cam{image.stream}" / "data" / name).write_bytes(encode_png(pixels))
+        path = self._root / f"cam{image.stream}" / "data" / name
+        path.write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{image.stamp_ns},{name}\n")
         return True
 
@@ -354,7 +355,7 @@ class TumFolder(FolderStreams):
                 self._scale = _choose_scale(pixels)
             pixels, n_cut = to_counts(pixels, self._scale or DEFAULT_SCALE)
             self._n_cut += n_cut
-        (self._folder / name).write_bytes(encode_png(pixels))
+        (self._folder / name).write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{format_stamp(image.stamp_ns)} {name}\n")
         return True
 

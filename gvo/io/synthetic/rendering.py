@@ -55,11 +55,7 @@ class View:
 
 
 def look(
-    scene: Scene,
-    T_map_cam: FloatArray,
-    camera: PinholeCamera,
-    *,
-    beyond: Plane | None = None,
+    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
 ) -> View:
     """Keep the rectangles in view and express them as linear forms of the pixel.
 
@@ -81,40 +77,43 @@ def look(
         What the camera may see.
     """
     T_cam_map = invert(T_map_cam)
+    R, K_inverse = T_cam_map[:3, :3], np.linalg.inv(camera.K)
     origins = transform_points(T_cam_map, scene.origins)
-    R = T_cam_map[:3, :3]
     axes_s, axes_t = scene.axes_s @ R.T, scene.axes_t @ R.T
     normals = np.cross(axes_s, axes_t)
-    distances = np.einsum("ij,ij->i", normals, origins)
-    faces = (distances > 1e-9) | (scene.is_two_sided & (distances < -1e-9))
+    distances = _dots(normals, origins)
     corners = _corners(origins, axes_s * scene.sizes[:, :1], axes_t * scene.sizes[:, 1:])
-    keep = np.flatnonzero(faces & _is_in_frustum(corners, camera))
-    K_inverse = np.linalg.inv(camera.K)
+    keep = np.flatnonzero(_faces(scene, distances) & _is_in_frustum(corners, camera))
     inverse_depth = (normals[keep] / distances[keep, np.newaxis]) @ K_inverse
-
-    def coordinate(axes: FloatArray) -> FloatArray:
-        offsets = np.einsum("ij,ij->i", axes[keep], origins[keep])
-        return np.asarray(axes[keep] @ K_inverse - offsets[:, np.newaxis] * inverse_depth)
-
-    s, t = coordinate(axes_s), coordinate(axes_t)
-    inside = []
-    if beyond is not None:
-        point, normal = T_cam_map[:3, :3] @ beyond[0] + T_cam_map[:3, 3], R @ beyond[1]
-        inside.append(normal @ K_inverse - (normal @ point) * inverse_depth)
+    s, t = (
+        axes @ K_inverse - _dots(axes, origins[keep])[:, np.newaxis] * inverse_depth
+        for axes in (axes_s[keep], axes_t[keep])
+    )
     width, height = scene.sizes[keep].T[..., np.newaxis]
-    scale, shift = scene.texels_per_m[keep], scene.texel_offsets[keep]
+    inside = [s, width * inverse_depth - s, t, height * inverse_depth - t]
+    if beyond is not None:
+        point, normal = R @ beyond[0] + T_cam_map[:3, 3], R @ beyond[1]
+        inside.append(normal @ K_inverse - (normal @ point) * inverse_depth)
     return View(
         scene=scene,
         camera=camera,
         indices=keep,
         inverse_depth=inverse_depth,
-        texels_s=scale[:, :1] * s + shift[:, :1] * inverse_depth,
-        texels_t=scale[:, 1:] * t + shift[:, 1:] * inverse_depth,
-        inside=np.stack(
-            [s, width * inverse_depth - s, t, height * inverse_depth - t, *inside], axis=1
-        ),
+        texels_s=scene.texels_per_m[keep, :1] * s + scene.texel_offsets[keep, :1] * inverse_depth,
+        texels_t=scene.texels_per_m[keep, 1:] * t + scene.texel_offsets[keep, 1:] * inverse_depth,
+        inside=np.stack(inside, axis=1),
         corners=corners[keep],
     )
+
+
+def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the inner products of rows."""
+    return np.asarray(np.einsum("ij,ij->i", first, second))
+
+
+def _faces(scene: Scene, distances: FloatArray) -> BoolArray:
+    """Tell which rectangles turn a visible side to the camera, by their distances along normals."""
+    return np.asarray((distances > 1e-9) | (scene.is_two_sided & (distances < -1e-9)))
 
 
 def _corners(origins: FloatArray, edges_s: FloatArray, edges_t: FloatArray) -> FloatArray:
@@ -124,7 +123,7 @@ def _corners(origins: FloatArray, edges_s: FloatArray, edges_t: FloatArray) -> F
 
 
 def _is_in_frustum(corners: FloatArray, camera: PinholeCamera) -> BoolArray:
-    """Tell the rectangles that do not lie wholly beyond one side of the frustum."""
+    """Tell which rectangles do not lie wholly beyond one side of the frustum."""
     x, y, z = np.moveaxis(corners, -1, 0)
     u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
     sides = [u + z, camera.width * z - u, v + z, camera.height * z - v, z - _NEAR_M]
@@ -341,9 +340,8 @@ def render_depth(
         Metres along the optical axis, NaN where there is nothing.
     """
     view = look(scene, T_map_cam, camera, beyond=beyond)
-    visible = find_visible(view)
     forms = np.vstack([view.inverse_depth, np.full(3, np.nan)])  # the last row: nothing
-    a, b, c = forms[visible].transpose(2, 0, 1)
+    a, b, c = forms[find_visible(view)].transpose(2, 0, 1)
     u, v = np.arange(camera.width), np.arange(camera.height)[:, np.newaxis]
     return np.asarray(1.0 / (a * u + b * v + c), dtype=np.float32)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.convert.bag_messages import pose_numbers
-from gvo.io.images import encode_jpeg
+from gvo.io.images import encode_image
 from gvo.runs.outputs import rerun_stream as place
 from gvo.runs.outputs.frames import ESTIMATES, RunFrames, Track
 from gvo.runs.outputs.rerun_stream import RerunStream
@@ -373,7 +373,7 @@ def _points(points: FloatArray, colours: FloatArray | ImageArray) -> rr.Points3D
 
 def make_image(image: ImageArray) -> rr.EncodedImage:
     """Return an image, grey or BGR, as a JPEG file."""
-    return rr.EncodedImage(contents=encode_jpeg(image), media_type="image/jpeg")
+    return rr.EncodedImage(contents=encode_image(image, ".jpg"), media_type="image/jpeg")
 
 
 def halve(image: ImageArray) -> ImageArray:

@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from gvo.errors import RecordingError
 from gvo.io.convert.bag_writer import write_bag
-from gvo.io.images import encode_png
+from gvo.io.images import encode_image
 from gvo.io.opening import open_recording
 from tests.io.conftest import Item, Tiny
 
@@ -88,4 +88,4 @@ def test_depth_that_is_not_of_millimetres_stays_as_it_is(
 
 def test_what_png_cannot_hold_is_refused() -> None:
     with pytest.raises((RecordingError, cv2.error)):
-        encode_png(np.zeros((0, 3), np.uint8))
+        encode_image(np.zeros((0, 3), np.uint8), ".png")
