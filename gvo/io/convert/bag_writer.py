@@ -15,7 +15,6 @@ from rosbags.rosbag1 import WriterError as WriterError1
 from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
-from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.convert.bag_messages import (
     BagWriter,
@@ -34,8 +33,9 @@ from gvo.io.convert.common import (
     LeftOut,
     check_images,
     check_new,
-    choose_preparers,
-    ideal_calibration,
+    load_image,
+    plan_images,
+    pose_of_right,
     pose_on_body,
     readable_images,
     true_poses,
@@ -49,7 +49,7 @@ _SUFFIXES = (".bag", ".mcap", ".db3", "")
 _Progress: TypeAlias = Callable[[int], None]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class BagStream:
     """Where one stream goes.
 
@@ -104,35 +104,17 @@ def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams
         Write images as PNG; depth only where it is in whole millimetres.
     """
     info = source.info
-    is_raw = not info.calibrations[0].is_rectified
-    # Depth that is moved to the colour camera is seen by the rectified one.
-    is_rectifying = is_raw and (rectify or info.depth_view is not None)
-    prepares = choose_preparers(info, is_rectifying=is_rectifying)
-    is_rectified = is_rectifying or not is_raw
+    calibrations, preparers = plan_images(info, rectify=rectify)
+    is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
     if info.sensor == "rgbd":
-        topics = (
-            f"/camera/rgb/{'image_rect_color' if is_rectified else 'image_color'}",
-            "/camera/depth/image",
-        )
-        raws = info.calibrations * 2
-        compressed = (compress, compress and _is_in_millimetres(source))
+        name = "image_rect_color" if is_rectified else "image_color"
+        topics = (f"/camera/rgb/{name}", "/camera/depth/image")
+        calibrations *= 2
+        is_compressed = (compress, compress and _is_in_millimetres(source))
     else:
         name = "image_rect" if is_rectified else "image_raw"
         topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
-        raws = info.calibrations
-        compressed = (compress, compress)
-    first, second = (
-        BagStream(
-            topic=topic,
-            frame_id=frame_id,
-            calibration=ideal_calibration(raw) if is_rectified else raw,
-            prepare=prepare,
-            is_compressed=is_compressed,
-        )
-        for topic, frame_id, raw, prepare, is_compressed in zip(
-            topics, _frame_ids(info), raws, prepares, compressed, strict=True
-        )
-    )
+    first, second = map(BagStream, topics, _frame_ids(info), calibrations, preparers, is_compressed)
     return first, second
 
 
@@ -158,7 +140,7 @@ def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> I
     if T_body_cam is not None and first != BODY_FRAME:
         yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
     if source.info.sensor == "stereo":
-        yield FramePose(stamp_ns, first, second, _pose_of_right(source.info))
+        yield FramePose(stamp_ns, first, second, pose_of_right(source.info))
 
 
 def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
@@ -166,12 +148,6 @@ def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
         return (info.frame_id or "camera_color_optical_frame",) * 2
     left, right = info.frame_id or "camera_left_optical", "camera_right_optical"
     return left, right if left != right else f"{left}_right"
-
-
-def _pose_of_right(info: RecordingInfo) -> FloatArray:
-    left, right = info.calibrations
-    baseline = float(left.P[0, 3] - right.P[0, 3]) / float(left.P[0, 0])
-    return se3.make_transform(np.eye(3), np.array([baseline, 0.0, 0.0]))
 
 
 def _is_in_millimetres(source: Source) -> bool:
@@ -298,12 +274,8 @@ class _Writer:
     def _write_image(self, bag: BagWriter, image: StampedImage) -> bool:
         """Write an image; False, with a note, where it cannot be read."""
         stream = self._streams[image.stream]
-        try:
-            pixels = image.load()
-            if stream.prepare is not None:
-                pixels = stream.prepare(pixels)
-        except RecordingError as error:
-            self.left_out.add_image(stream.topic, image.stamp_ns, str(error))
+        pixels = load_image(image, stream.prepare, stream.topic, self.left_out)
+        if pixels is None:
             return False
         header = Header(image.stamp_ns, stream.frame_id)
         write_camera_info(bag, stream.info_topic, stream.calibration, header)

@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvo.errors import GvoError, RecordingError
+from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.source import BagSource
 from gvo.io.frames import ImagePreparer, make_preparers
@@ -21,6 +24,8 @@ BODY_FRAME = "body"
 """Name in tf of what the calibration of a data set places its cameras on."""
 
 _N_NAMED = 5
+_Calibrations: TypeAlias = tuple[Calibration, ...]
+_Preparers: TypeAlias = tuple[ImagePreparer | None, ImagePreparer | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,17 +63,7 @@ class LeftOut:
         self._lines.append(line)
 
     def add_image(self, name: str, stamp_ns: int, reason: str) -> None:
-        """Note an image of a stream; of many the first ones are named, and the rest counted.
-
-        Parameters
-        ----------
-        name : str
-            Of the stream.
-        stamp_ns : int
-            Nanoseconds.
-        reason : str
-            One line.
-        """
+        """Note an image of a stream; of many the first ones are named, and the rest counted."""
         self._n_images[name] += 1
         if self._n_images[name] <= _N_NAMED:
             self._lines.append(f"{name} at {stamp_ns} ns: {reason}")
@@ -86,11 +81,6 @@ class LeftOut:
 def check_new(path: Path) -> None:
     """Refuse a target that exists, or whose folder does not.
 
-    Parameters
-    ----------
-    path : Path
-        To be made.
-
     Raises
     ------
     RecordingError
@@ -105,19 +95,10 @@ def check_new(path: Path) -> None:
 def check_images(n_images: tuple[int, int], source: Source, left_out: LeftOut) -> None:
     """Refuse what no recording can be read from again.
 
-    Parameters
-    ----------
-    n_images : tuple of two int
-        Written of each stream.
-    source : Source
-        The recording.
-    left_out : LeftOut
-        Why the others were not.
-
     Raises
     ------
     RecordingError
-        When a stream has no image.
+        When no image of a stream was written.
     """
     if not all(n_images):
         name = source.info.stream_names[0 if n_images[0] == 0 else 1]
@@ -126,15 +107,7 @@ def check_images(n_images: tuple[int, int], source: Source, left_out: LeftOut) -
 
 
 def readable_images(source: Source, left_out: LeftOut) -> Iterator[StampedImage]:
-    """Yield the images up to where a recording cannot be read on, which is noted.
-
-    Parameters
-    ----------
-    source : Source
-        The recording.
-    left_out : LeftOut
-        Gets the reason.
-    """
+    """Yield the images up to where a recording cannot be read on; note why."""
     try:
         yield from source.images()
     except RecordingError as error:
@@ -142,20 +115,7 @@ def readable_images(source: Source, left_out: LeftOut) -> Iterator[StampedImage]
 
 
 def true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
-    """Return the ground truth of a recording if it can be written as poses.
-
-    Parameters
-    ----------
-    source : Source
-        The recording.
-    left_out : LeftOut
-        Gets the reason where it cannot.
-
-    Returns
-    -------
-    Trajectory or None
-        T_world_cam of the rectified left or colour camera.
-    """
+    """Return T_world_cam of the rectified first camera; None, with a note, if not poses."""
     try:
         truth = source.ground_truth()
     except GvoError as error:
@@ -169,14 +129,34 @@ def true_poses(source: Source, left_out: LeftOut) -> Trajectory | None:
     return truth
 
 
-def ideal_calibration(calibration: Calibration) -> Calibration:
-    """Return the calibration of the rectified images of a camera, the same for all who read it.
+def plan_images(info: RecordingInfo, *, rectify: bool) -> tuple[_Calibrations, _Preparers]:
+    """Decide how the images of a recording are written.
 
     Parameters
     ----------
-    calibration : Calibration
-        Of raw images, or of rectified ones with K and R of the raw camera beside.
+    info : RecordingInfo
+        Depth of a camera of its own is moved to the rectified colour image.
+    rectify : bool
+        Write raw images rectified and grey.
+
+    Returns
+    -------
+    calibrations : tuple of Calibration
+        Of the images that are written.
+    preparers : tuple of two ImagePreparer, or None where the images stay as they are
     """
+    is_raw = not info.calibrations[0].is_rectified
+    is_moved = info.depth_view is not None
+    is_rectifying = is_raw and (rectify or is_moved)
+    first, second = make_preparers(info)
+    preparers = first if is_rectifying else None, second if is_rectifying or is_moved else None
+    if is_raw and not is_rectifying:
+        return info.calibrations, preparers
+    return tuple(map(_ideal, info.calibrations)), preparers
+
+
+def _ideal(calibration: Calibration) -> Calibration:
+    """Return the calibration of rectified images without K and R of the raw camera."""
     return Calibration(
         width=calibration.width,
         height=calibration.height,
@@ -188,29 +168,23 @@ def ideal_calibration(calibration: Calibration) -> Calibration:
     )
 
 
-def choose_preparers(
-    info: RecordingInfo, *, is_rectifying: bool
-) -> tuple[ImagePreparer | None, ImagePreparer | None]:
-    """Return what makes the images of each stream those that are written.
+def load_image(
+    image: StampedImage, prepare: ImagePreparer | None, name: str, left_out: LeftOut
+) -> NDArray[Any] | None:
+    """Return the pixels to write; None, with a note, where they cannot be read."""
+    try:
+        pixels = image.load()
+        return pixels if prepare is None else prepare(pixels)
+    except RecordingError as error:
+        left_out.add_image(name, image.stamp_ns, str(error))
+        return None
 
-    Parameters
-    ----------
-    info : RecordingInfo
-        Of the recording.
-    is_rectifying : bool
-        They are to be rectified and grey.
 
-    Returns
-    -------
-    tuple of two ImagePreparer, or None where the images stay as they are
-        Depth of a camera of its own is moved to colour, even to colour that stays.
-    """
-    first, second = make_preparers(info)
-    is_moving = info.depth_view is not None
-    return (
-        first if is_rectifying else None,
-        second if is_rectifying or is_moving else None,
-    )
+def pose_of_right(info: RecordingInfo) -> FloatArray:
+    """Return T_left_right of the rectified cameras of a stereo pair, shape (4, 4), metres."""
+    left, right = info.calibrations
+    baseline = float(left.P[0, 3] - right.P[0, 3]) / float(left.P[0, 0])
+    return se3.make_transform(np.eye(3), np.array([baseline, 0.0, 0.0]))
 
 
 def pose_on_body(source: Source) -> FloatArray | None:

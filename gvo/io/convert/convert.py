@@ -57,10 +57,9 @@ def convert(
         read.
     """
     path = Path(path)
-    is_folder = (
-        not path.suffix and isinstance(source, BagSource) if layout is None else (layout != "bag")
-    )
-    if not is_folder:
+    if layout is None and (path.suffix or not isinstance(source, BagSource)):
+        layout = "bag"
+    if layout == "bag":
         return write_bag(source, path, rectify=rectify, compress=compress, progress=progress)
     if path.suffix in BAG_SUFFIXES:
         raise RecordingError(
@@ -70,10 +69,5 @@ def convert(
     if compress:
         raise RecordingError(f"{path}: --png is for bags; the images of data sets are PNG anyway")
     return write_folder(
-        source,
-        path,
-        layout=None if layout == "bag" else layout,
-        rectify=rectify,
-        config=config,
-        progress=progress,
+        source, path, layout=layout, rectify=rectify, config=config, progress=progress
     )

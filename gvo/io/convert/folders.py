@@ -15,7 +15,13 @@ from gvo.config import SyncConfig
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.convert.common import LeftOut, choose_preparers, ideal_calibration, pose_on_body
+from gvo.io.convert.common import (
+    LeftOut,
+    load_image,
+    plan_images,
+    pose_of_right,
+    pose_on_body,
+)
 from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts
@@ -46,8 +52,7 @@ class FolderStreams(ABC):
     def __init__(self, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
         self.info = source.info
         self.left_out = left_out
-        self.is_rectifying = rectify and not self.info.calibrations[0].is_rectified
-        self._prepare = choose_preparers(self.info, is_rectifying=self.is_rectifying)
+        self.calibrations, self._preparers = plan_images(self.info, rectify=rectify)
 
     def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
         """Yield what the layout can hold: images with a stamp of their own."""
@@ -55,7 +60,8 @@ class FolderStreams(ABC):
         for image in images:
             before_ns = last_ns[image.stream]
             if before_ns is not None and image.stamp_ns <= before_ns:
-                self.leave_out(image, f"the stamp does not advance from {before_ns} ns")
+                reason = f"the stamp does not advance from {before_ns} ns"
+                self.left_out.add_image(self.name_of(image.stream), image.stamp_ns, reason)
                 continue
             last_ns[image.stream] = image.stamp_ns
             yield image
@@ -74,35 +80,18 @@ class FolderStreams(ABC):
 
     def load(self, image: StampedImage) -> NDArray[Any] | None:
         """Return the pixels to write; None, with a note, where they cannot be read."""
-        prepare = self._prepare[image.stream]
-        try:
-            pixels = image.load()
-            return pixels if prepare is None else prepare(pixels)
-        except RecordingError as error:
-            self.leave_out(image, str(error))
-            return None
+        prepare = self._preparers[image.stream]
+        return load_image(image, prepare, self.name_of(image.stream), self.left_out)
 
-    def leave_out(self, image: StampedImage, reason: str) -> None:
-        """Note an image that is not written."""
-        self.left_out.add_image(
-            f"{self.info.stream_names[image.stream]} image", image.stamp_ns, reason
-        )
+    def name_of(self, stream: int) -> str:
+        """Return what an image of a stream is called in notes."""
+        return f"{self.info.stream_names[stream]} image"
 
 
-def write_projections(
+def _write_projections(
     path: Path, names: tuple[str, str], calibrations: tuple[Calibration, ...]
 ) -> None:
-    """Write the `calib.txt` of a KITTI folder.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    names : tuple of two str
-        `image_N` of left and right: the rows are `PN`.
-    calibrations : tuple of Calibration
-        Of left and right; their P is written.
-    """
+    """Write the P of left and right as the `calib.txt` of a KITTI folder: `PN` of `image_N`."""
     lines = [
         f"P{name[-1]}: {' '.join(repr(float(value)) for value in calibration.P.ravel())}\n"
         for name, calibration in zip(names, calibrations, strict=True)
@@ -110,48 +99,23 @@ def write_projections(
     path.write_text("".join(lines), encoding="utf-8")
 
 
-def write_sensor_yaml(
-    path: Path, calibration: Calibration, *, T_body_sensor: FloatArray, is_rectified: bool
-) -> None:
-    """Write the `sensor.yaml` of one camera of an EuRoC folder.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    calibration : Calibration
-        Of the recording.
-    T_body_sensor : ndarray of float64, shape (4, 4)
-        Maps the camera, as its images are written, to the body, metres.
-    is_rectified : bool
-        The images that are written are rectified, whatever the recording's are.
-    """
-    written = ideal_calibration(calibration) if is_rectified else calibration
-    K = written.K
+def _write_sensor_yaml(path: Path, calibration: Calibration, T_body_sensor: FloatArray) -> None:
+    """Write the `sensor.yaml` of one camera of an EuRoC folder, as its images are written."""
+    K = calibration.K
     content: dict[str, Any] = {
         "sensor_type": "camera",
         "T_BS": {"cols": 4, "rows": 4, "data": _numbers(T_body_sensor)},
-        "resolution": [written.width, written.height],
+        "resolution": [calibration.width, calibration.height],
         "camera_model": "pinhole",
         "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
-        "distortion_model": _EUROC_MODELS.get(written.model, written.model),
-        "distortion_coefficients": _numbers(written.D),
+        "distortion_model": _EUROC_MODELS.get(calibration.model, calibration.model),
+        "distortion_coefficients": _numbers(calibration.D),
     }
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
-def write_camera_info_yaml(path: Path, calibration: Calibration, *, depth_scale: float) -> None:
-    """Write a calibration as ROS's camera_calibration does, with the scale of the depth.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    calibration : Calibration
-        Of the colour images that are written.
-    depth_scale : float
-        Counts per metre.
-    """
+def _write_camera_info_yaml(path: Path, calibration: Calibration, *, depth_scale: float) -> None:
+    """Write a calibration as ROS's camera_calibration does, with the depth's counts per metre."""
     D = calibration.D
     content = {
         "image_width": calibration.width,
@@ -197,9 +161,7 @@ class KittiFolder(FolderStreams):
         """Yield the images of pairs, left before right."""
         for pair in paired(images, self.info.sensor, self._sync):
             if isinstance(pair, FaultyFrame):
-                self.left_out.add_image(
-                    f"{self.info.stream_names[0]} image", pair.stamp_ns, pair.reason
-                )
+                self.left_out.add_image(self.name_of(0), pair.stamp_ns, pair.reason)
             else:
                 yield from pair
 
@@ -240,7 +202,7 @@ class KittiFolder(FolderStreams):
         lines = [f"{format_stamp(stamp_ns)}\n" for stamp_ns in self._stamps_ns]
         (self._folder / "times.txt").write_text("".join(lines), encoding="utf-8")
         names = self._folders or ("image_0", "image_1")
-        write_projections(self._folder / "calib.txt", names, self.info.calibrations)
+        _write_projections(self._folder / "calib.txt", names, self.calibrations)
 
 
 class EurocFolder(FolderStreams):
@@ -292,23 +254,11 @@ class EurocFolder(FolderStreams):
             camera = self._root / f"cam{stream}"
             text = "#timestamp [ns],filename\n" + "".join(rows)
             (camera / "data.csv").write_text(text, encoding="utf-8")
-            calibration = self.info.calibrations[stream]
-            is_ideal = self.is_rectifying or calibration.is_rectified
-            R_rectified_raw = np.eye(3) if is_ideal else calibration.R
-            write_sensor_yaml(
-                camera / "sensor.yaml",
-                calibration,
-                T_body_sensor=self._T_body_rectified(stream)
-                @ se3.make_transform(R_rectified_raw, np.zeros(3)),
-                is_rectified=is_ideal,
-            )
-
-    def _T_body_rectified(self, stream: int) -> FloatArray:  # noqa: N802 - the field's name
-        """Return where the rectified left or right camera sits."""
-        left, right = self.info.calibrations
-        baseline = float(left.P[0, 3] - right.P[0, 3]) / float(left.P[0, 0])
-        t_left_camera = np.array([stream * baseline, 0.0, 0.0])
-        return np.asarray(self._T_body_cam @ se3.make_transform(np.eye(3), t_left_camera))
+            written = self.calibrations[stream]
+            T_left_rectified = pose_of_right(self.info) if stream == 1 else np.eye(4)
+            T_rectified_written = se3.make_transform(written.R, np.zeros(3))
+            T_body_written = self._T_body_cam @ T_left_rectified @ T_rectified_written
+            _write_sensor_yaml(camera / "sensor.yaml", written, T_body_written)
 
 
 class TumFolder(FolderStreams):
@@ -323,7 +273,7 @@ class TumFolder(FolderStreams):
     left_out : LeftOut
         Gets what cannot be written.
     rectify : bool
-        Write raw images rectified and grey, as it must be where depth is moved to colour.
+        Write raw images rectified and grey.
 
     Raises
     ------
@@ -332,13 +282,9 @@ class TumFolder(FolderStreams):
     """
 
     def __init__(self, folder: Path, source: Source, left_out: LeftOut, *, rectify: bool) -> None:
-        rectify = rectify or source.info.depth_view is not None
         super().__init__(source, left_out, rectify=rectify)
         self._folder = folder
         self._tables: tuple[list[str], list[str]] = ([], [])
-        calibration = self.info.calibrations[0]
-        is_ideal = self.is_rectifying or calibration.is_rectified
-        self._calibration = ideal_calibration(calibration) if is_ideal else calibration
         self._scale = self._scale_by_name()
         self._n_cut = 0
         for name in ("rgb", "depth"):
@@ -371,7 +317,7 @@ class TumFolder(FolderStreams):
             text = f"# {name} images\n# stamp filename\n" + "".join(rows)
             (self._folder / f"{name}.txt").write_text(text, encoding="utf-8")
         path = self._folder / "calibration.yaml"
-        write_camera_info_yaml(path, self._calibration, depth_scale=scale)
+        _write_camera_info_yaml(path, self.calibrations[0], depth_scale=scale)
         if self._n_cut:
             self.left_out.add(
                 f"depth: {self._n_cut} pixels beyond {MAX_COUNT / scale:.1f} m became unknown"
@@ -382,7 +328,7 @@ class TumFolder(FolderStreams):
         published = published_calibration(self._folder.name)
         if published is None:
             return None
-        mine = self._calibration
+        mine = self.calibrations[0]
         if any(not np.array_equal(getattr(published, name), getattr(mine, name)) for name in "KDP"):
             raise RecordingError(
                 f"{self._folder.name}: a TUM folder of this name is read with the published "

@@ -80,8 +80,7 @@ def look(
     R, K_inverse = T_cam_map[:3, :3], np.linalg.inv(camera.K)
     origins = transform_points(T_cam_map, scene.origins)
     axes_s, axes_t = scene.axes_s @ R.T, scene.axes_t @ R.T
-    normals = np.cross(axes_s, axes_t)
-    distances = _dots(normals, origins)
+    distances = _dots(normals := np.cross(axes_s, axes_t), origins)
     corners = _corners(origins, axes_s * scene.sizes[:, :1], axes_t * scene.sizes[:, 1:])
     keep = np.flatnonzero(_faces(scene, distances) & _is_in_frustum(corners, camera))
     inverse_depth = (normals[keep] / distances[keep, np.newaxis]) @ K_inverse
