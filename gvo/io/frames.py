@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -27,94 +27,8 @@ _ROW_STEP = 64
 _N_AHEAD = 2
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
-_Item = Pair | FaultyFrame
-
-
-def refuse_repeats(
-    items: Iterable[Frame | FaultyFrame], names: tuple[str, str]
-) -> Iterator[Frame | FaultyFrame]:
-    """Make frames faulty whose image is, pixel by pixel, that of the frame before.
-
-    No sensor gives the same noise twice: such an image is old. Taken for a new one, it says for
-    sure that the camera stood still. Two in a row make a camera that hangs; a single one, which
-    many drivers give now and then, is let through. Depth images are not compared: some sensors
-    give depth at a lower rate than colour. Nor are images of one value, in which nothing is seen
-    anyway.
-
-    Parameters
-    ----------
-    items : iterable of StereoFrame, RgbdFrame or FaultyFrame
-    names : tuple of two str
-        Of the streams.
-
-    Yields
-    ------
-    StereoFrame, RgbdFrame or FaultyFrame
-        All of them, in their order.
-
-    Raises
-    ------
-    GvoError
-        What reading the items raises, after those read before.
-    """
-    last: Frame | None = None
-    waiting: list[Frame | FaultyFrame] = []  # from the first repeat on
-    is_hanging = False
-    try:
-        for item in items:
-            if isinstance(item, FaultyFrame):
-                waiting.append(item)
-                if not _holds_frame(waiting):
-                    yield waiting.pop()
-                continue
-            repeated = _repeated(last, item, names)
-            waiting.append(item)
-            if repeated and not is_hanging and not _holds_frame(waiting[:-1]):
-                continue
-            is_hanging = bool(repeated)
-            for frame in waiting:
-                yield _refused(frame, repeated) if repeated else frame
-            waiting.clear()
-            last = last if repeated else item
-    except GvoError:
-        yield from waiting
-        raise
-    yield from waiting
-
-
-def _holds_frame(items: Iterable[Frame | FaultyFrame]) -> bool:
-    return any(not isinstance(item, FaultyFrame) for item in items)
-
-
-def _refused(item: Frame | FaultyFrame, name: str) -> FaultyFrame:
-    if isinstance(item, FaultyFrame):
-        return item
-    reason = (
-        f"the {name} image is that of the frame before, pixel by pixel: the camera hangs (one "
-        "without noise that stands still: --set sync.repeated_images=keep)"
-    )
-    return FaultyFrame(stamp_ns=item.stamp_ns, reason=reason)
-
-
-def _repeated(last: Frame | None, frame: Frame, names: tuple[str, str]) -> str:
-    """Name the first stream that shows the same as before; empty where none does."""
-    if last is None:
-        return ""
-    for name, before, now in zip(names, _images(last), _images(frame), strict=False):
-        if _is_same(before, now):
-            return name
-    return ""
-
-
-def _images(frame: Frame) -> tuple[ImageArray, ...]:
-    return (frame.left, frame.right) if isinstance(frame, StereoFrame) else (frame.image,)
-
-
-def _is_same(first: ImageArray, second: ImageArray) -> bool:
-    # a few rows mostly tell
-    if not np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP]):
-        return False
-    return np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
+_Item: TypeAlias = Pair | FaultyFrame
+_Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
 
 
 def frames(
@@ -230,6 +144,188 @@ def pair_limit_key(sensor: Sensor) -> str:
     return "stereo_tolerance_ms" if sensor == "stereo" else "max_difference_ms"
 
 
+def _one_by_one(
+    items: Iterable[_Item], preparers: _Preparers, info: RecordingInfo
+) -> Iterator[Frame | FaultyFrame]:
+    for item in items:
+        if isinstance(item, FaultyFrame):
+            yield item
+        else:
+            results = [_prepare(*job, info) for job in zip(item, preparers, strict=True)]
+            yield _make_frame(item, results, info.sensor)
+
+
+def _ahead(
+    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo
+) -> Iterator[Frame | FaultyFrame]:
+    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
+        started: deque[_Started] = deque()
+        fault: GvoError | None = None
+        while fault is None:
+            try:
+                item = next(items)
+            except StopIteration:
+                break
+            except GvoError as error:
+                fault = error  # what was read before it counts
+            else:
+                started.append(_start(pool.submit, item, preparers, info))
+                if len(started) > _N_AHEAD:
+                    yield _finish(started.popleft(), info.sensor)
+        while started:
+            yield _finish(started.popleft(), info.sensor)
+        if fault is not None:
+            raise fault
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Started:
+    item: _Item
+    results: tuple[Future[NDArray[Any] | str], ...]
+
+
+def _start(
+    submit: Callable[..., Future[NDArray[Any] | str]],
+    item: _Item,
+    preparers: _Preparers,
+    info: RecordingInfo,
+) -> _Started:
+    if isinstance(item, FaultyFrame):
+        return _Started(item=item, results=())
+    jobs = zip(item, preparers, strict=True)
+    return _Started(item=item, results=tuple(submit(_prepare, *job, info) for job in jobs))
+
+
+def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
+    if isinstance(started.item, FaultyFrame):
+        return started.item
+    return _make_frame(started.item, [result.result() for result in started.results], sensor)
+
+
+def _prepare(
+    image: StampedImage, preparer: ImagePreparer, info: RecordingInfo
+) -> NDArray[Any] | str:
+    """Return the prepared image, or one line on what is wrong with it."""
+    try:
+        return preparer(image.load())
+    except (RecordingError, *_LOAD_ERRORS) as error:
+        return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
+
+
+def _make_frame(
+    pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
+) -> Frame | FaultyFrame:
+    stamp_ns = pair[0].stamp_ns
+    first, second = results
+    if isinstance(first, str) or isinstance(second, str):
+        reasons = [result for result in results if isinstance(result, str)]
+        return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
+    if sensor == "stereo":
+        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
+    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
+
+
+def refuse_repeats(
+    items: Iterable[Frame | FaultyFrame], names: tuple[str, str]
+) -> Iterator[Frame | FaultyFrame]:
+    """Make frames faulty whose image is, pixel by pixel, that of the frame before.
+
+    No sensor gives the same noise twice: such an image is old. Taken for a new one, it says for
+    sure that the camera stood still. Two in a row make a camera that hangs; a single one, which
+    many drivers give now and then, is let through. Depth images are not compared: some sensors
+    give depth at a lower rate than colour. Nor are images of one value, in which nothing is seen
+    anyway.
+
+    Parameters
+    ----------
+    items : iterable of StereoFrame, RgbdFrame or FaultyFrame
+    names : tuple of two str
+        Of the streams.
+
+    Yields
+    ------
+    StereoFrame, RgbdFrame or FaultyFrame
+        All of them, in their order.
+
+    Raises
+    ------
+    GvoError
+        What reading the items raises, after those read before.
+    """
+    last: Frame | None = None
+    waiting: list[Frame | FaultyFrame] = []  # from the first repeat on
+    is_hanging = False
+    try:
+        for item in items:
+            if isinstance(item, FaultyFrame):
+                waiting.append(item)
+                if not _holds_frame(waiting):
+                    yield waiting.pop()
+                continue
+            repeated = _repeated(last, item, names)
+            waiting.append(item)
+            if repeated and not is_hanging and not _holds_frame(waiting[:-1]):
+                continue
+            is_hanging = bool(repeated)
+            for frame in waiting:
+                yield _refused(frame, repeated) if repeated else frame
+            waiting.clear()
+            last = last if repeated else item
+    except GvoError:
+        yield from waiting
+        raise
+    yield from waiting
+
+
+def _holds_frame(items: Iterable[Frame | FaultyFrame]) -> bool:
+    return any(not isinstance(item, FaultyFrame) for item in items)
+
+
+def _refused(item: Frame | FaultyFrame, name: str) -> FaultyFrame:
+    if isinstance(item, FaultyFrame):
+        return item
+    reason = (
+        f"the {name} image is that of the frame before, pixel by pixel: the camera hangs (one "
+        "without noise that stands still: --set sync.repeated_images=keep)"
+    )
+    return FaultyFrame(stamp_ns=item.stamp_ns, reason=reason)
+
+
+def _repeated(last: Frame | None, frame: Frame, names: tuple[str, str]) -> str:
+    """Name the first stream that shows the same as before; empty where none does."""
+    if last is None:
+        return ""
+    for name, before, now in zip(names, _images(last), _images(frame), strict=False):
+        if _is_same(before, now):
+            return name
+    return ""
+
+
+def _images(frame: Frame) -> tuple[ImageArray, ...]:
+    return (frame.left, frame.right) if isinstance(frame, StereoFrame) else (frame.image,)
+
+
+def _is_same(first: ImageArray, second: ImageArray) -> bool:
+    # a few rows mostly tell
+    if not np.array_equal(first[::_ROW_STEP], second[::_ROW_STEP]):
+        return False
+    return np.array_equal(first, second) and bool(np.any(first != first[0, 0]))
+
+
+def make_preparers(info: RecordingInfo) -> _Preparers:
+    """Return what makes the raw images of both streams those of frames.
+
+    Parameters
+    ----------
+    info : RecordingInfo
+        Of the recording. Depth of a camera of its own is registered to the colour camera.
+    """
+    first = ImagePreparer(info.calibrations[0])
+    if info.sensor == "stereo":
+        return first, ImagePreparer(info.calibrations[1])
+    return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
+
+
 class ImagePreparer:
     """Make raw pixels of one stream what a frame holds: checked, grey, rectified.
 
@@ -304,104 +400,6 @@ class ImagePreparer:
         return np.asarray(pixels, dtype=np.uint8)
 
 
-_Preparers = tuple[ImagePreparer, ImagePreparer]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Started:
-    item: _Item
-    results: tuple[Future[NDArray[Any] | str], ...]
-
-
-def make_preparers(info: RecordingInfo) -> _Preparers:
-    """Return what makes the raw images of both streams those of frames.
-
-    Parameters
-    ----------
-    info : RecordingInfo
-        Of the recording. Depth of a camera of its own is registered to the colour camera.
-    """
-    first = ImagePreparer(info.calibrations[0])
-    if info.sensor == "stereo":
-        return first, ImagePreparer(info.calibrations[1])
-    return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
-
-
-def _one_by_one(
-    items: Iterable[_Item], preparers: _Preparers, info: RecordingInfo
-) -> Iterator[Frame | FaultyFrame]:
-    for item in items:
-        if isinstance(item, FaultyFrame):
-            yield item
-        else:
-            results = [_prepare(*job, info) for job in zip(item, preparers, strict=True)]
-            yield _make_frame(item, results, info.sensor)
-
-
-def _ahead(
-    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo
-) -> Iterator[Frame | FaultyFrame]:
-    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
-        started: deque[_Started] = deque()
-        fault: GvoError | None = None
-        while fault is None:
-            try:
-                item = next(items)
-            except StopIteration:
-                break
-            except GvoError as error:
-                fault = error  # what was read before it counts
-            else:
-                started.append(_start(pool.submit, item, preparers, info))
-                if len(started) > _N_AHEAD:
-                    yield _finish(started.popleft(), info.sensor)
-        while started:
-            yield _finish(started.popleft(), info.sensor)
-        if fault is not None:
-            raise fault
-
-
-def _start(
-    submit: Callable[..., Future[NDArray[Any] | str]],
-    item: _Item,
-    preparers: _Preparers,
-    info: RecordingInfo,
-) -> _Started:
-    if isinstance(item, FaultyFrame):
-        return _Started(item=item, results=())
-    jobs = zip(item, preparers, strict=True)
-    return _Started(item=item, results=tuple(submit(_prepare, *job, info) for job in jobs))
-
-
-def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
-    if isinstance(started.item, FaultyFrame):
-        return started.item
-    return _make_frame(started.item, [result.result() for result in started.results], sensor)
-
-
-def _prepare(
-    image: StampedImage, preparer: ImagePreparer, info: RecordingInfo
-) -> NDArray[Any] | str:
-    """Return the prepared image, or one line on what is wrong with it."""
-    try:
-        return preparer(image.load())
-    except (RecordingError, *_LOAD_ERRORS) as error:
-        return f"{info.stream_names[image.stream]} image: {_error_text(error)}"
-
-
-def _make_frame(
-    pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
-) -> Frame | FaultyFrame:
-    stamp_ns = pair[0].stamp_ns
-    first, second = results
-    if isinstance(first, str) or isinstance(second, str):
-        reasons = [result for result in results if isinstance(result, str)]
-        return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
-    if sensor == "stereo":
-        return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
-    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
-
-
 def _check_pixels(pixels: object, *, is_depth: bool) -> None:
     """Refuse what would be taken for something else, such as 16 bits cut to 8.
 
@@ -426,14 +424,14 @@ def _is_known(depth: NDArray[Any]) -> bool:
     return bool(np.any((depth > 0) & (depth < np.inf)))
 
 
+def _size_text(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"
+
+
 def _error_text(error: Exception) -> str:
     """Return what an error says on one line, with its kind where that is none of ours."""
     text = " ".join(str(error).split())
     return text if isinstance(error, GvoError) else f"{type(error).__name__}: {text}"
-
-
-def _size_text(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]}x{shape[0]}"
 
 
 @contextmanager

@@ -49,148 +49,6 @@ MAX_COUNT = 65534
 _TOLERANCE = 5e-3
 
 
-class ImageHeader(NamedTuple):
-    """Format by name, width and height in pixels; 0 where the header does not tell."""
-
-    format: str
-    width: int
-    height: int
-
-
-def read_header(data: NDArray[np.uint8]) -> ImageHeader | None:
-    """Read the header of an encoded image.
-
-    Parameters
-    ----------
-    data : ndarray of uint8, shape (n,)
-        The whole file.
-
-    Returns
-    -------
-    ImageHeader or None
-        Of PNG, JPEG, TIFF, BMP, PBM, PGM or PPM; None for anything else.
-    """
-    head = data[:_N_HEAD].tobytes()
-    if head.startswith(_PNG_MAGIC):
-        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
-        return ImageHeader("PNG", *size)
-    if head.startswith(_JPEG_MAGIC):
-        return ImageHeader("JPEG", *_jpeg_size(data))
-    if head[:4] in _TIFF_MAGICS:
-        return ImageHeader("TIFF", *_tiff_size(data, _TIFF_MAGICS[head[:4]]))
-    if head.startswith(_BMP_MAGIC) and len(head) >= 26:
-        width, height = struct.unpack("<ii", head[18:26])
-        return ImageHeader("BMP", abs(width), abs(height))
-    if match := _PNM.match(head):
-        return ImageHeader("PNM", int(match[1]), int(match[2]))
-    return None
-
-
-def check_size(width: int, height: int, where: str, *, max_pixels: int = MAX_PIXELS) -> None:
-    """Refuse sizes that no image has.
-
-    Parameters
-    ----------
-    width, height : int
-        As announced, pixels.
-    where : str
-        File or topic, for the message.
-    max_pixels : int
-        Of an image.
-
-    Raises
-    ------
-    RecordingError
-        When there are no pixels, or more than `max_pixels`.
-    """
-    if not (width > 0 and height > 0 and width * height <= max_pixels):
-        raise RecordingError(f"{where}: the image claims {width}x{height} pixels, it is damaged")
-
-
-def check_density(header: ImageHeader, n_bytes: int, where: str) -> None:
-    """Refuse an image that claims more pixels than its bytes can hold.
-
-    Parameters
-    ----------
-    header : ImageHeader
-    n_bytes : int
-        Of the whole file.
-    where : str
-        File or topic, for the message.
-
-    Raises
-    ------
-    RecordingError
-        Before memory for these pixels is asked for.
-    """
-    if header.width * header.height > n_bytes * _MAX_PIXELS_PER_BYTE:
-        raise RecordingError(
-            f"{where}: the image claims {header.width}x{header.height} pixels in {n_bytes} bytes, "
-            "it is damaged"
-        )
-
-
-def is_png(data: NDArray[np.uint8]) -> bool:
-    """Tell whether data begin as a PNG does."""
-    return data[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
-
-
-def is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
-    """Tell whether a JPEG has its end; cameras fill their buffers up behind it."""
-    end = b"\xff\xd9"
-    return end in data[-1024:].tobytes() or end in data.tobytes().rstrip(b"\0")[-1024:]
-
-
-def is_png_complete(data: NDArray[np.uint8]) -> bool:
-    """Tell whether the chunks of a PNG end before it does.
-
-    OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
-    """
-    position = len(_PNG_MAGIC)
-    while position < len(data):
-        head = data[position : position + 8].tobytes()
-        position += 12 + int.from_bytes(head[:4], "big")
-        if head[4:] == _PNG_END:
-            break
-    return position <= len(data)
-
-
-def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    position = 2
-    while position + 9 <= len(data) and data[position] == 0xFF:
-        segment = data[position : position + 9].tobytes()
-        if segment[1] in _JPEG_FRAME_MARKERS:
-            return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
-        position += _jpeg_step(segment)
-    return 0, 0
-
-
-def _jpeg_step(segment: bytes) -> int:
-    """Return how far it is to what follows, as a decoder goes on."""
-    if segment[1] == 0xFF:
-        return 1  # a marker may be preceded by any number of fill bytes
-    if segment[1] in _JPEG_BARE_MARKERS:
-        return 2
-    return 2 + int.from_bytes(segment[2:4], "big")
-
-
-def _tiff_size(data: NDArray[np.uint8], order: str) -> tuple[int, int]:
-    """Read width and height from the first directory of a TIFF."""
-    sizes = dict.fromkeys(_TIFF_SIZE_TAGS, 0)
-    (offset,) = struct.unpack(f"{order}I", data[4:8].tobytes().ljust(4, b"\0"))
-    (n_entries,) = struct.unpack(f"{order}H", data[offset : offset + 2].tobytes().ljust(2, b"\0"))
-    entries = data[offset + 2 : offset + 2 + 12 * n_entries].tobytes()
-    for start in range(0, len(entries) - 11, 12):
-        tag, type_, _ = struct.unpack_from(f"{order}HHI", entries, start)
-        # of several of one tag the first counts
-        if sizes.get(tag) == 0 and type_ in _TIFF_FORMS:
-            (sizes[tag],) = struct.unpack_from(f"{order}{_TIFF_FORMS[type_]}", entries, start + 8)
-    return sizes[256], sizes[257]
-
-
-_COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GreyRange:
     """Which values of 16-bit images become black and white.
@@ -277,6 +135,22 @@ def read_depth(path: Path, scale: float) -> DepthArray:
         When the file is missing, empty, truncated or no 16-bit grey image.
     """
     return depth_from_counts(decode_image(_read_bytes(path), str(path)), scale, str(path))
+
+
+def _read_bytes(path: Path) -> NDArray[np.uint8]:
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise RecordingError(f"{path}: is no file")  # a device may never end
+        if status.st_size > _MAX_FILE_BYTES:
+            raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
+        return np.fromfile(path, dtype=np.uint8)
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: the file is missing") from error
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a zero in a name
+        raise RecordingError(f"{str(path)!r}: is no name of a file") from error
 
 
 def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
@@ -410,46 +284,6 @@ def depth_from_metres(metres: NDArray[Any]) -> DepthArray:
     return depth
 
 
-def _read_bytes(path: Path) -> NDArray[np.uint8]:
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise RecordingError(f"{path}: is no file")  # a device may never end
-        if status.st_size > _MAX_FILE_BYTES:
-            raise RecordingError(f"{path}: no image has {status.st_size} bytes, it is damaged")
-        return np.fromfile(path, dtype=np.uint8)
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: the file is missing") from error
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a zero in a name
-        raise RecordingError(f"{str(path)!r}: is no name of a file") from error
-
-
-def encode_image(pixels: NDArray[Any], suffix: Literal[".png", ".tiff", ".jpg"]) -> bytes:
-    """Return an image as the bytes of a file: PNG and TIFF without loss, JPEG of quality 80.
-
-    Parameters
-    ----------
-    pixels : ndarray of uint8, uint16 (PNG) or float32 (TIFF), shape (h, w) or (h, w, 3)
-        Grey, or colour in BGR order.
-    suffix : {".png", ".tiff", ".jpg"}
-        Of the format.
-
-    Raises
-    ------
-    RecordingError
-        When it cannot be one.
-    """
-    parameters = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
-    is_encoded, data = cv2.imencode(suffix, pixels, parameters)
-    if not is_encoded:
-        raise RecordingError(
-            f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
-        )
-    return data.tobytes()
-
-
 def is_in_counts(depth: DepthArray, scale: float) -> bool:
     """Tell whether depth was made of counts of this scale.
 
@@ -504,3 +338,169 @@ def exact_counts(depth: DepthArray, scale: float) -> NDArray[np.uint16] | None:
     counts, _ = to_counts(depth, scale)
     is_exact = np.array_equal(depth_from_counts(counts, scale, "depth"), depth, equal_nan=True)
     return counts if is_exact else None
+
+
+def encode_image(pixels: NDArray[Any], suffix: Literal[".png", ".tiff", ".jpg"]) -> bytes:
+    """Return an image as the bytes of a file: PNG and TIFF without loss, JPEG of quality 80.
+
+    Parameters
+    ----------
+    pixels : ndarray of uint8, uint16 (PNG) or float32 (TIFF), shape (h, w) or (h, w, 3)
+        Grey, or colour in BGR order.
+    suffix : {".png", ".tiff", ".jpg"}
+        Of the format.
+
+    Raises
+    ------
+    RecordingError
+        When it cannot be one.
+    """
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
+    is_encoded, data = cv2.imencode(suffix, pixels, parameters)
+    if not is_encoded:
+        raise RecordingError(
+            f"an image of {pixels.dtype} {pixels.shape} cannot be written as {suffix[1:].upper()}"
+        )
+    return data.tobytes()
+
+
+class ImageHeader(NamedTuple):
+    """Format by name, width and height in pixels; 0 where the header does not tell."""
+
+    format: str
+    width: int
+    height: int
+
+
+def read_header(data: NDArray[np.uint8]) -> ImageHeader | None:
+    """Read the header of an encoded image.
+
+    Parameters
+    ----------
+    data : ndarray of uint8, shape (n,)
+        The whole file.
+
+    Returns
+    -------
+    ImageHeader or None
+        Of PNG, JPEG, TIFF, BMP, PBM, PGM or PPM; None for anything else.
+    """
+    head = data[:_N_HEAD].tobytes()
+    if head.startswith(_PNG_MAGIC):
+        size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+        return ImageHeader("PNG", *size)
+    if head.startswith(_JPEG_MAGIC):
+        return ImageHeader("JPEG", *_jpeg_size(data))
+    if head[:4] in _TIFF_MAGICS:
+        return ImageHeader("TIFF", *_tiff_size(data, _TIFF_MAGICS[head[:4]]))
+    if head.startswith(_BMP_MAGIC) and len(head) >= 26:
+        width, height = struct.unpack("<ii", head[18:26])
+        return ImageHeader("BMP", abs(width), abs(height))
+    if match := _PNM.match(head):
+        return ImageHeader("PNM", int(match[1]), int(match[2]))
+    return None
+
+
+def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int]:
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        segment = data[position : position + 9].tobytes()
+        if segment[1] in _JPEG_FRAME_MARKERS:
+            return int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big")
+        position += _jpeg_step(segment)
+    return 0, 0
+
+
+def _jpeg_step(segment: bytes) -> int:
+    """Return how far it is to what follows, as a decoder goes on."""
+    if segment[1] == 0xFF:
+        return 1  # a marker may be preceded by any number of fill bytes
+    if segment[1] in _JPEG_BARE_MARKERS:
+        return 2
+    return 2 + int.from_bytes(segment[2:4], "big")
+
+
+def _tiff_size(data: NDArray[np.uint8], order: str) -> tuple[int, int]:
+    """Read width and height from the first directory of a TIFF."""
+    sizes = dict.fromkeys(_TIFF_SIZE_TAGS, 0)
+    (offset,) = struct.unpack(f"{order}I", data[4:8].tobytes().ljust(4, b"\0"))
+    (n_entries,) = struct.unpack(f"{order}H", data[offset : offset + 2].tobytes().ljust(2, b"\0"))
+    entries = data[offset + 2 : offset + 2 + 12 * n_entries].tobytes()
+    for start in range(0, len(entries) - 11, 12):
+        tag, type_, _ = struct.unpack_from(f"{order}HHI", entries, start)
+        # of several of one tag the first counts
+        if sizes.get(tag) == 0 and type_ in _TIFF_FORMS:
+            (sizes[tag],) = struct.unpack_from(f"{order}{_TIFF_FORMS[type_]}", entries, start + 8)
+    return sizes[256], sizes[257]
+
+
+def check_size(width: int, height: int, where: str, *, max_pixels: int = MAX_PIXELS) -> None:
+    """Refuse sizes that no image has.
+
+    Parameters
+    ----------
+    width, height : int
+        As announced, pixels.
+    where : str
+        File or topic, for the message.
+    max_pixels : int
+        Of an image.
+
+    Raises
+    ------
+    RecordingError
+        When there are no pixels, or more than `max_pixels`.
+    """
+    if not (width > 0 and height > 0 and width * height <= max_pixels):
+        raise RecordingError(f"{where}: the image claims {width}x{height} pixels, it is damaged")
+
+
+def check_density(header: ImageHeader, n_bytes: int, where: str) -> None:
+    """Refuse an image that claims more pixels than its bytes can hold.
+
+    Parameters
+    ----------
+    header : ImageHeader
+    n_bytes : int
+        Of the whole file.
+    where : str
+        File or topic, for the message.
+
+    Raises
+    ------
+    RecordingError
+        Before memory for these pixels is asked for.
+    """
+    if header.width * header.height > n_bytes * _MAX_PIXELS_PER_BYTE:
+        raise RecordingError(
+            f"{where}: the image claims {header.width}x{header.height} pixels in {n_bytes} bytes, "
+            "it is damaged"
+        )
+
+
+def is_png(data: NDArray[np.uint8]) -> bool:
+    """Tell whether data begin as a PNG does."""
+    return data[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
+
+
+def is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
+    """Tell whether a JPEG has its end; cameras fill their buffers up behind it."""
+    end = b"\xff\xd9"
+    return end in data[-1024:].tobytes() or end in data.tobytes().rstrip(b"\0")[-1024:]
+
+
+def is_png_complete(data: NDArray[np.uint8]) -> bool:
+    """Tell whether the chunks of a PNG end before it does.
+
+    OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
+    """
+    position = len(_PNG_MAGIC)
+    while position < len(data):
+        head = data[position : position + 8].tobytes()
+        position += 12 + int.from_bytes(head[:4], "big")
+        if head[4:] == _PNG_END:
+            break
+    return position <= len(data)
+
+
+_COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}

@@ -39,210 +39,6 @@ _REMEDY = "give a topic of depth registered to colour by --depth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Extrinsics:
-    """Where one camera stands as seen from another.
-
-    Parameters
-    ----------
-    T_target_source : ndarray of float64, shape (4, 4)
-        Maps coordinates of the source to the target camera, metres.
-    origin : str
-        What told it.
-    """
-
-    T_target_source: FloatArray
-    origin: str
-
-
-def find_extrinsics(
-    reader: BagReader, target: BagCamera, source: BagCamera
-) -> Extrinsics | Failure:
-    """Find the transform between two cameras of a bag.
-
-    Parameters
-    ----------
-    reader : BagReader
-        The bag; the topics of transforms are read.
-    target, source : BagCamera
-        The cameras.
-
-    Returns
-    -------
-    Extrinsics or Failure
-        By the tf between the frames that their `CameraInfo` name; where these are empty, by the
-        `tf` topics beside the streams of librealsense, which map their reference to each stream.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
-    """
-    frames = (target.fields.frame_id, source.fields.frame_id)
-    if not all(frames):
-        return _of_realsense(reader, target, source)
-    if frames[0] == frames[1]:
-        return Failure(reason=f"both CameraInfo name the frame {frames[0]}")
-    buffer = read_tf(reader, frames=frames)
-    found = _lookup(buffer, frames, target.stamp_ns)
-    if isinstance(found, Failure):
-        return found
-    return Extrinsics(T_target_source=found, origin=f"tf {frames[0]} -> {frames[1]}")
-
-
-def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
-    """Look a mount up at a stamp, or where it is known: `CameraInfo` may come before tf."""
-    found = buffer.lookup(*frames, stamp_ns)
-    if not isinstance(found, Failure):
-        return found
-    stamps_ns = buffer.edge_stamps_ns(*frames)
-    T, is_known = buffer.lookup_many(*frames, stamps_ns)
-    known = np.flatnonzero(is_known)
-    if len(known) == 0:
-        return found
-    return np.asarray(T[known[np.argmin(np.abs(stamps_ns[known] - stamp_ns))]])
-
-
-def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Extrinsics | Failure:
-    streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
-    references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
-    common = sorted(references[0] & references[1])
-    if not common:
-        return Failure(reason="the CameraInfo name no frame")
-    names = [f"{stream[1]}/tf/{common[0]}" for stream in streams if stream is not None]
-    T_stream_reference = {}
-    for message in reader.messages(names):
-        T_stream_reference[message.topic.name] = _transform(message)
-    if len(T_stream_reference) != len(set(names)):
-        return Failure(reason=f"{names[0]} or {names[1]} yields no message")
-    T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)
-    T_target_source = T_target_reference @ se3.invert(T_source_reference)
-    return Extrinsics(T_target_source=T_target_source, origin=" and ".join(names))
-
-
-def _references(reader: BagReader, stream: str) -> set[str]:
-    start = f"{stream}/tf/"
-    return {
-        topic.name.removeprefix(start)
-        for topic in reader.topics
-        if topic.name.startswith(start) and topic.type == TRANSFORM_TYPE
-    }
-
-
-def _transform(message: BagMessage) -> FloatArray:
-    content = message.decode()
-    T = transform_of(content.translation, content.rotation)
-    if isinstance(T, Failure):
-        raise RecordingError(
-            f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
-        )
-    return T
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthChoice:
-    """How depth gets to colour.
-
-    Parameters
-    ----------
-    view : DepthView, optional
-        Of depth that has to be registered; None where it is, or where that is not known.
-    decisions : tuple of str
-        What was found, a line each.
-    """
-
-    view: DepthView | None = None
-    decisions: tuple[str, ...] = ()
-
-
-def choose_depth_view(
-    reader: BagReader, color: tuple[BagCamera, Calibration], depth: BagCamera
-) -> DepthChoice:
-    """Tell whether depth has to be registered to colour.
-
-    It is registered already where the name of the topic says so, and where both cameras have one
-    frame, one size and the same intrinsics.
-
-    Parameters
-    ----------
-    reader : BagReader
-        The bag; the topics of transforms are read where they are needed.
-    color : tuple of BagCamera and Calibration
-        The colour camera.
-    depth : BagCamera
-        The camera that the `CameraInfo` of the depth describes.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
-    """
-    if _REGISTERED.search(depth.image.base.lower()):
-        return DepthChoice()
-    camera, color_calibration = color
-    try:
-        calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
-    except CalibrationError as error:
-        return DepthChoice(decisions=(f"depth: taken as registered to colour: {error}",))
-    difference = _difference(color_calibration, calibration)
-    frames = (camera.fields.frame_id, depth.fields.frame_id)
-    if frames[0] and frames[0] == frames[1]:
-        found: Extrinsics | Failure = Extrinsics(
-            T_target_source=np.eye(4), origin=f"one frame {frames[0]}"
-        )
-    else:
-        found = find_extrinsics(reader, camera, depth)
-    if isinstance(found, Failure):
-        return DepthChoice(decisions=_advice(difference, frames, found))
-    if not difference and np.allclose(found.T_target_source, np.eye(4), atol=_SAME_PLACE_M):
-        return DepthChoice()
-    distance = float(np.linalg.norm(found.T_target_source[:3, 3]))
-    line = f"depth: of a camera {distance:.4f} m from colour by {found.origin}, registered to it"
-    if difference:
-        line += f" ({difference})"
-    view = DepthView(calibration=calibration, T_color_depth=found.T_target_source)
-    return DepthChoice(view=view, decisions=(line,))
-
-
-def _difference(color: Calibration, depth: Calibration) -> str:
-    """Say how two cameras differ; empty where they do not."""
-    if (depth.width, depth.height) != (color.width, color.height):
-        return f"images of {depth.width}x{depth.height} pixels, colour {color.width}x{color.height}"
-    first, second = color.pinhole(), depth.pinhole()
-    for name, limit in (
-        ("fx", _TOLERANCE * first.fx),
-        ("fy", _TOLERANCE * first.fy),
-        ("cx", _TOLERANCE * first.width),
-        ("cy", _TOLERANCE * first.height),
-    ):
-        of_color, of_depth = float(getattr(first, name)), float(getattr(second, name))
-        if abs(of_depth - of_color) > limit:
-            return f"{name} {of_depth:.1f} against {of_color:.1f} px"
-    if not _is_one_lens(color, depth):
-        return "another lens"
-    return ""
-
-
-def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
-    """Tell whether raw images of both are rectified alike, or need not be rectified."""
-    maps = [rectification_maps(camera) for camera in (color, depth)]
-    if maps[1] is None or maps[0] is None:
-        # Depth without a lens of its own is what drivers give that register it to raw colour.
-        return maps[1] is None
-    return all(np.allclose(a, b, atol=_SAME_PIXEL_PX) for a, b in zip(*maps, strict=True))
-
-
-def _advice(difference: str, frames: tuple[str, str], why: Failure) -> tuple[str, ...]:
-    if difference:
-        return (f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}",)
-    if all(frames):
-        return (
-            f"depth: taken as registered to colour, though its frame is {frames[1]} and that of "
-            f"colour {frames[0]} ({why.reason}); if it is not, {_REMEDY}",
-        )
-    return ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BagCalibration:
     """What was found.
 
@@ -379,3 +175,207 @@ def _stereo_pair(
         pair = pair_of_extrinsics((left, right), found.T_target_source, origin)
     baseline = stereo_baseline(pair, origin)
     return pair, f"baseline: {baseline:.4f} m from {found.origin}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthChoice:
+    """How depth gets to colour.
+
+    Parameters
+    ----------
+    view : DepthView, optional
+        Of depth that has to be registered; None where it is, or where that is not known.
+    decisions : tuple of str
+        What was found, a line each.
+    """
+
+    view: DepthView | None = None
+    decisions: tuple[str, ...] = ()
+
+
+def choose_depth_view(
+    reader: BagReader, color: tuple[BagCamera, Calibration], depth: BagCamera
+) -> DepthChoice:
+    """Tell whether depth has to be registered to colour.
+
+    It is registered already where the name of the topic says so, and where both cameras have one
+    frame, one size and the same intrinsics.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag; the topics of transforms are read where they are needed.
+    color : tuple of BagCamera and Calibration
+        The colour camera.
+    depth : BagCamera
+        The camera that the `CameraInfo` of the depth describes.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    """
+    if _REGISTERED.search(depth.image.base.lower()):
+        return DepthChoice()
+    camera, color_calibration = color
+    try:
+        calibration = make_rgbd_calibration(depth.fields, is_rectified=depth.image.is_rectified)
+    except CalibrationError as error:
+        return DepthChoice(decisions=(f"depth: taken as registered to colour: {error}",))
+    difference = _difference(color_calibration, calibration)
+    frames = (camera.fields.frame_id, depth.fields.frame_id)
+    if frames[0] and frames[0] == frames[1]:
+        found: Extrinsics | Failure = Extrinsics(
+            T_target_source=np.eye(4), origin=f"one frame {frames[0]}"
+        )
+    else:
+        found = find_extrinsics(reader, camera, depth)
+    if isinstance(found, Failure):
+        return DepthChoice(decisions=_advice(difference, frames, found))
+    if not difference and np.allclose(found.T_target_source, np.eye(4), atol=_SAME_PLACE_M):
+        return DepthChoice()
+    distance = float(np.linalg.norm(found.T_target_source[:3, 3]))
+    line = f"depth: of a camera {distance:.4f} m from colour by {found.origin}, registered to it"
+    if difference:
+        line += f" ({difference})"
+    view = DepthView(calibration=calibration, T_color_depth=found.T_target_source)
+    return DepthChoice(view=view, decisions=(line,))
+
+
+def _difference(color: Calibration, depth: Calibration) -> str:
+    """Say how two cameras differ; empty where they do not."""
+    if (depth.width, depth.height) != (color.width, color.height):
+        return f"images of {depth.width}x{depth.height} pixels, colour {color.width}x{color.height}"
+    first, second = color.pinhole(), depth.pinhole()
+    for name, limit in (
+        ("fx", _TOLERANCE * first.fx),
+        ("fy", _TOLERANCE * first.fy),
+        ("cx", _TOLERANCE * first.width),
+        ("cy", _TOLERANCE * first.height),
+    ):
+        of_color, of_depth = float(getattr(first, name)), float(getattr(second, name))
+        if abs(of_depth - of_color) > limit:
+            return f"{name} {of_depth:.1f} against {of_color:.1f} px"
+    if not _is_one_lens(color, depth):
+        return "another lens"
+    return ""
+
+
+def _is_one_lens(color: Calibration, depth: Calibration) -> bool:
+    """Tell whether raw images of both are rectified alike, or need not be rectified."""
+    maps = [rectification_maps(camera) for camera in (color, depth)]
+    if maps[1] is None or maps[0] is None:
+        # Depth without a lens of its own is what drivers give that register it to raw colour.
+        return maps[1] is None
+    return all(np.allclose(a, b, atol=_SAME_PIXEL_PX) for a, b in zip(*maps, strict=True))
+
+
+def _advice(difference: str, frames: tuple[str, str], why: Failure) -> tuple[str, ...]:
+    if difference:
+        return (f"depth: it is not registered to colour ({difference}; {why.reason}): {_REMEDY}",)
+    if all(frames):
+        return (
+            f"depth: taken as registered to colour, though its frame is {frames[1]} and that of "
+            f"colour {frames[0]} ({why.reason}); if it is not, {_REMEDY}",
+        )
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Extrinsics:
+    """Where one camera stands as seen from another.
+
+    Parameters
+    ----------
+    T_target_source : ndarray of float64, shape (4, 4)
+        Maps coordinates of the source to the target camera, metres.
+    origin : str
+        What told it.
+    """
+
+    T_target_source: FloatArray
+    origin: str
+
+
+def find_extrinsics(
+    reader: BagReader, target: BagCamera, source: BagCamera
+) -> Extrinsics | Failure:
+    """Find the transform between two cameras of a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag; the topics of transforms are read.
+    target, source : BagCamera
+        The cameras.
+
+    Returns
+    -------
+    Extrinsics or Failure
+        By the tf between the frames that their `CameraInfo` name; where these are empty, by the
+        `tf` topics beside the streams of librealsense, which map their reference to each stream.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read.
+    """
+    frames = (target.fields.frame_id, source.fields.frame_id)
+    if not all(frames):
+        return _of_realsense(reader, target, source)
+    if frames[0] == frames[1]:
+        return Failure(reason=f"both CameraInfo name the frame {frames[0]}")
+    buffer = read_tf(reader, frames=frames)
+    found = _lookup(buffer, frames, target.stamp_ns)
+    if isinstance(found, Failure):
+        return found
+    return Extrinsics(T_target_source=found, origin=f"tf {frames[0]} -> {frames[1]}")
+
+
+def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatArray | Failure:
+    """Look a mount up at a stamp, or where it is known: `CameraInfo` may come before tf."""
+    found = buffer.lookup(*frames, stamp_ns)
+    if not isinstance(found, Failure):
+        return found
+    stamps_ns = buffer.edge_stamps_ns(*frames)
+    T, is_known = buffer.lookup_many(*frames, stamps_ns)
+    known = np.flatnonzero(is_known)
+    if len(known) == 0:
+        return found
+    return np.asarray(T[known[np.argmin(np.abs(stamps_ns[known] - stamp_ns))]])
+
+
+def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Extrinsics | Failure:
+    streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
+    references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
+    common = sorted(references[0] & references[1])
+    if not common:
+        return Failure(reason="the CameraInfo name no frame")
+    names = [f"{stream[1]}/tf/{common[0]}" for stream in streams if stream is not None]
+    T_stream_reference = {}
+    for message in reader.messages(names):
+        T_stream_reference[message.topic.name] = _transform(message)
+    if len(T_stream_reference) != len(set(names)):
+        return Failure(reason=f"{names[0]} or {names[1]} yields no message")
+    T_target_reference, T_source_reference = (T_stream_reference[name] for name in names)
+    T_target_source = T_target_reference @ se3.invert(T_source_reference)
+    return Extrinsics(T_target_source=T_target_source, origin=" and ".join(names))
+
+
+def _references(reader: BagReader, stream: str) -> set[str]:
+    start = f"{stream}/tf/"
+    return {
+        topic.name.removeprefix(start)
+        for topic in reader.topics
+        if topic.name.startswith(start) and topic.type == TRANSFORM_TYPE
+    }
+
+
+def _transform(message: BagMessage) -> FloatArray:
+    content = message.decode()
+    T = transform_of(content.translation, content.rotation)
+    if isinstance(T, Failure):
+        raise RecordingError(
+            f"{message.topic.name}: holds no transform: {T.reason}; give --calibration FILE"
+        )
+    return T

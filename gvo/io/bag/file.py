@@ -74,24 +74,6 @@ FAULTS: tuple[type[Exception], ...] = (
 """What rosbags raises where a file or a message is not what it should be."""
 
 
-def _bound_chunks() -> None:
-    """Let rosbags decompress the chunks of a file into bounded memory.
-
-    A thousand bytes of a chunk can become gigabytes, and it has no limit of its own. It looks the
-    functions up in two tables.
-    """
-    for name in ("bz2", "lz4"):
-        decompressors[name] = partial(inflate_whole, compression=name)
-    for name in ("lz4", "zstd"):
-        DECOMPRESSORS[name] = partial(_inflate_to, compression=name)
-
-
-def _inflate_to(data: bytes, size: int, *, compression: str) -> bytes:
-    return inflate_whole(data, compression, limit=size)
-
-
-_bound_chunks()
-
 DAMAGE: tuple[type[Exception], ...] = (DamageError, *FAULTS)
 """What is raised where a file is damaged."""
 
@@ -257,19 +239,39 @@ def _recover(path: Path, error: Exception) -> Scan:
     return scan
 
 
-def _announced_size(path: Path) -> int:
-    """Return the bytes that the header of an SQLite database claims; 0 if it claims none.
+def _refusal(path: Path) -> str:
+    """Return why a file is no bag at all; nothing where it is one."""
+    if not path.is_file():
+        return f"{path}: is no file"
+    if path.stat().st_size == 0:
+        return f"{path}: the file is empty"
+    if path.suffix == ".bag" and not _has_magic(path, ros1.MAGIC):
+        if _has_magic(path, b"#ROS"):
+            return f"{path}: the bag is of an older format than 2.0; run `rosbag fix` on a copy"
+        return f"{path}: is no ROS 1 bag"
+    if path.suffix == ".mcap" and not _has_magic(path, mcap.MAGIC):
+        return f"{path}: is no MCAP file"
+    if path.suffix == ".db3" and not _has_magic(path, b"SQLite format 3\0"):
+        return f"{path}: is no SQLite database"
+    return ""
 
-    References
-    ----------
-    .. [1] Database File Format, section 1.3, https://sqlite.org/fileformat.html.
-    """
+
+def _has_magic(path: Path, magic: bytes) -> bool:
     with path.open("rb") as file:
-        header = file.read(100)
-    if header[24:28] != header[92:96]:
-        return 0  # the number of pages was not kept up to date
-    page_size = int.from_bytes(header[16:18], "big")
-    return (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
+        return file.read(len(magic)) == magic
+
+
+def _advise(path: Path, error: Exception) -> str:
+    scan = _SCANS.get(path.suffix)
+    tool = scan.tool if scan else "sqlite3 FILE .recover"
+    return (
+        f"{path}: cannot be read ({_one_line(error)}); where it is truncated or damaged, "
+        f"try `{tool}` on a copy"
+    )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _describe_missing_index(path: Path, error: Exception, tool: str) -> str:
@@ -291,36 +293,35 @@ def _unread_log(path: Path) -> str:
     )
 
 
-def _refusal(path: Path) -> str:
-    """Return why a file is no bag at all; nothing where it is one."""
-    if not path.is_file():
-        return f"{path}: is no file"
-    if path.stat().st_size == 0:
-        return f"{path}: the file is empty"
-    if path.suffix == ".bag" and not _has_magic(path, ros1.MAGIC):
-        if _has_magic(path, b"#ROS"):
-            return f"{path}: the bag is of an older format than 2.0; run `rosbag fix` on a copy"
-        return f"{path}: is no ROS 1 bag"
-    if path.suffix == ".mcap" and not _has_magic(path, mcap.MAGIC):
-        return f"{path}: is no MCAP file"
-    if path.suffix == ".db3" and not _has_magic(path, b"SQLite format 3\0"):
-        return f"{path}: is no SQLite database"
-    return ""
+def _announced_size(path: Path) -> int:
+    """Return the bytes that the header of an SQLite database claims; 0 if it claims none.
 
-
-def _advise(path: Path, error: Exception) -> str:
-    scan = _SCANS.get(path.suffix)
-    tool = scan.tool if scan else "sqlite3 FILE .recover"
-    return (
-        f"{path}: cannot be read ({_one_line(error)}); where it is truncated or damaged, "
-        f"try `{tool}` on a copy"
-    )
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _has_magic(path: Path, magic: bytes) -> bool:
+    References
+    ----------
+    .. [1] Database File Format, section 1.3, https://sqlite.org/fileformat.html.
+    """
     with path.open("rb") as file:
-        return file.read(len(magic)) == magic
+        header = file.read(100)
+    if header[24:28] != header[92:96]:
+        return 0  # the number of pages was not kept up to date
+    page_size = int.from_bytes(header[16:18], "big")
+    return (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
+
+
+def _bound_chunks() -> None:
+    """Let rosbags decompress the chunks of a file into bounded memory.
+
+    A thousand bytes of a chunk can become gigabytes, and it has no limit of its own. It looks the
+    functions up in two tables.
+    """
+    for name in ("bz2", "lz4"):
+        decompressors[name] = partial(inflate_whole, compression=name)
+    for name in ("lz4", "zstd"):
+        DECOMPRESSORS[name] = partial(_inflate_to, compression=name)
+
+
+def _inflate_to(data: bytes, size: int, *, compression: str) -> bytes:
+    return inflate_whole(data, compression, limit=size)
+
+
+_bound_chunks()

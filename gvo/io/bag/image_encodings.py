@@ -1,4 +1,4 @@
-"""Sensor_msgs/Image encodings, RVL."""
+"""Encodings of `sensor_msgs/Image`, and the RVL code of depth."""
 
 from __future__ import annotations
 

@@ -32,6 +32,73 @@ POSITION_TYPES = (FIX_TYPE, "geometry_msgs/msg/PointStamped")
 """Message types that hold a position of a stamp."""
 
 
+def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
+    """Return the streams of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag`, `.mcap` or `.db3` file, or a ROS 2 bag folder.
+    names : sequence of str
+        Topics; empty: the only one there is.
+
+    Raises
+    ------
+    RecordingError
+        When the bag cannot be read or does not hold the topics.
+    """
+    reader = BagReader(path)
+    streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
+    streams[0].decisions[:0] = reader.notes
+    return streams
+
+
+def find_topics(
+    reader: BagReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
+) -> list[Topic]:
+    """Find the topics of poses that were asked for, or the only one there is.
+
+    Parameters
+    ----------
+    reader : BagReader
+    names : sequence of str
+        With or without the leading slash; empty: the only topic of poses is taken.
+    where : str
+        The bag, for messages.
+    types : sequence of str
+        Of the messages.
+
+    Returns
+    -------
+    list of Topic
+        In the order of the names.
+
+    Raises
+    ------
+    RecordingError
+        When a name is unknown, or none is given and there is not exactly one topic of poses.
+    """
+    found = [topic for topic in reader.topics if topic.type in types and topic.n_messages]
+    if names:
+        return [_find(name, found, where) for name in names]
+    if len(found) == 1:
+        return found
+    if not found:
+        raise RecordingError(f"{where}: holds no poses; expected a topic of {', '.join(types)}")
+    raise RecordingError(
+        f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
+        f"several: {describe_topics(found)}"
+    )
+
+
+def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
+    topic = find_topic(name, topics)
+    if topic is None:
+        held = describe_topics(topics) or "none"
+        raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
+    return topic
+
+
 class TopicStream:
     """The poses of one topic of a bag.
 
@@ -99,52 +166,6 @@ class TopicStream:
         return is_same
 
 
-def find_topics(
-    reader: BagReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
-) -> list[Topic]:
-    """Find the topics of poses that were asked for, or the only one there is.
-
-    Parameters
-    ----------
-    reader : BagReader
-    names : sequence of str
-        With or without the leading slash; empty: the only topic of poses is taken.
-    where : str
-        The bag, for messages.
-    types : sequence of str
-        Of the messages.
-
-    Returns
-    -------
-    list of Topic
-        In the order of the names.
-
-    Raises
-    ------
-    RecordingError
-        When a name is unknown, or none is given and there is not exactly one topic of poses.
-    """
-    found = [topic for topic in reader.topics if topic.type in types and topic.n_messages]
-    if names:
-        return [_find(name, found, where) for name in names]
-    if len(found) == 1:
-        return found
-    if not found:
-        raise RecordingError(f"{where}: holds no poses; expected a topic of {', '.join(types)}")
-    raise RecordingError(
-        f"{where}: holds more than one topic of poses; choose by --topic NAME, repeated to fuse "
-        f"several: {describe_topics(found)}"
-    )
-
-
-def _find(name: str, topics: Sequence[Topic], where: str) -> Topic:
-    topic = find_topic(name, topics)
-    if topic is None:
-        held = describe_topics(topics) or "none"
-        raise RecordingError(f"{where}: has no poses on topic {name}; topics of poses: {held}")
-    return topic
-
-
 def _sample(message: Any, topic: Topic) -> PoseSample:  # noqa: ANN401 - made at run time
     stamp_ns = stamp_of(message.header)
     has_covariance = topic.type in _COVARIANCE_TYPES
@@ -173,27 +194,6 @@ def _covariance(numbers: FloatArray, R: FloatArray) -> FloatArray | None:
         return None
     covariance = se3.covariance_from_ros(covariance_ros, R)
     return np.asarray(0.5 * (covariance + covariance.T))
-
-
-def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
-    """Return the streams of a bag.
-
-    Parameters
-    ----------
-    path : Path
-        `.bag`, `.mcap` or `.db3` file, or a ROS 2 bag folder.
-    names : sequence of str
-        Topics; empty: the only one there is.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read or does not hold the topics.
-    """
-    reader = BagReader(path)
-    streams = [TopicStream(reader, topic) for topic in find_topics(reader, names, str(path))]
-    streams[0].decisions[:0] = reader.notes
-    return streams
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

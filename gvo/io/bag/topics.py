@@ -195,6 +195,18 @@ def camera_info_names(image: Topic) -> list[str]:
     return [f"{place}/camera_info".strip("/") for place in places]
 
 
+def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
+    """Return the topic of a name, with or without the leading slash; None where there is none."""
+    return next((topic for topic in topics if topic.name.strip("/") == name.strip("/")), None)
+
+
+def describe_topics(topics: Sequence[Topic]) -> str:
+    """Return the first topics with types and numbers of messages in one line; empty for none."""
+    items = [f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics[:_N_LISTED]]
+    n_more = len(topics) - len(items)
+    return ", ".join(items) + (f" and {n_more} more" if n_more else "")
+
+
 def _wanted(choice: TopicChoice, where: str) -> tuple[Sensor | None, _Names]:
     stereo, rgbd = (choice.left, choice.right), (choice.color, choice.depth)
     if any(stereo) and any(rgbd):
@@ -296,15 +308,3 @@ def _explain(where: str, images: Sequence[Topic], candidates: Sequence[CameraTop
         f"{describe_topics(images)}; choose --left TOPIC --right TOPIC or --color TOPIC --depth "
         "TOPIC"
     )
-
-
-def find_topic(name: str, topics: Iterable[Topic]) -> Topic | None:
-    """Return the topic of a name, with or without the leading slash; None where there is none."""
-    return next((topic for topic in topics if topic.name.strip("/") == name.strip("/")), None)
-
-
-def describe_topics(topics: Sequence[Topic]) -> str:
-    """Return the first topics with types and numbers of messages in one line; empty for none."""
-    items = [f"{topic.name} ({topic.type}, {topic.n_messages})" for topic in topics[:_N_LISTED]]
-    n_more = len(topics) - len(items)
-    return ", ".join(items) + (f" and {n_more} more" if n_more else "")

@@ -118,36 +118,6 @@ class CameraFields:
         return width // binning_x, height // binning_y
 
 
-def read_numbers(values: object, what: str) -> FloatArray:
-    """Return what a file or message holds as an array of one dimension.
-
-    Parameters
-    ----------
-    values : object
-        Numbers, nested or not; texts of numbers, as YAML reads `1e-5`.
-    what : str
-        File and key, for messages.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-
-    Raises
-    ------
-    CalibrationError
-        When they are none, not finite, or larger than any calibration holds.
-    """
-    try:
-        numbers = np.array(cast(ArrayLike, values), dtype=np.float64).ravel()
-    except (TypeError, ValueError, OverflowError) as error:
-        raise CalibrationError(f"{what} must hold numbers, got {shortened(values)}") from error
-    if not np.all(np.isfinite(numbers)):
-        raise CalibrationError(f"{what} holds a value that is not finite")
-    if np.any(np.abs(numbers) > _LARGEST_NUMBER):
-        raise CalibrationError(f"{what} holds {np.abs(numbers).max():g}, which no camera has")
-    return numbers
-
-
 def make_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibration:
     """Check the fields of a `CameraInfo` and return the calibration of the recorded image.
 
@@ -241,15 +211,6 @@ def check_camera(calibration: Calibration, where: str) -> None:
         raise CalibrationError(f"{where}: {error}") from error
 
 
-def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
-    numbers = read_numbers(values, what)
-    if numbers.size != shape[0] * shape[1]:
-        raise CalibrationError(
-            f"{what} must hold {shape[0] * shape[1]} numbers, got {numbers.size}"
-        )
-    return numbers.reshape(shape)
-
-
 def _matrices(fields: CameraFields) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return K, R and P of the full image, checked; for those not set what they then mean."""
     where = fields.where
@@ -285,6 +246,15 @@ def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> 
         )
 
 
+def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
+    numbers = read_numbers(values, what)
+    if numbers.size != shape[0] * shape[1]:
+        raise CalibrationError(
+            f"{what} must hold {shape[0] * shape[1]} numbers, got {numbers.size}"
+        )
+    return numbers.reshape(shape)
+
+
 def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[DistortionModel, FloatArray]:
     D = read_numbers(fields.D, f"{fields.where}: D")
     model = _MODELS.get("_".join(fields.model.lower().replace("-", " ").split()))
@@ -313,3 +283,33 @@ def _distortion(fields: CameraFields, *, is_rectified: bool) -> tuple[Distortion
 def _alternatives(counts: set[int]) -> str:
     *most, last = (str(count) for count in sorted(counts))
     return f"{', '.join(most)} or {last}" if most else last
+
+
+def read_numbers(values: object, what: str) -> FloatArray:
+    """Return what a file or message holds as an array of one dimension.
+
+    Parameters
+    ----------
+    values : object
+        Numbers, nested or not; texts of numbers, as YAML reads `1e-5`.
+    what : str
+        File and key, for messages.
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+
+    Raises
+    ------
+    CalibrationError
+        When they are none, not finite, or larger than any calibration holds.
+    """
+    try:
+        numbers = np.array(cast(ArrayLike, values), dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CalibrationError(f"{what} must hold numbers, got {shortened(values)}") from error
+    if not np.all(np.isfinite(numbers)):
+        raise CalibrationError(f"{what} holds a value that is not finite")
+    if np.any(np.abs(numbers) > _LARGEST_NUMBER):
+        raise CalibrationError(f"{what} holds {np.abs(numbers).max():g}, which no camera has")
+    return numbers

@@ -211,73 +211,6 @@ def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header
     bag.write(topic, IMAGE_TYPE, message, header.stamp_ns)
 
 
-def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
-    """Write a calibration as `CameraInfo`, all numbers without loss."""
-    matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
-    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
-    message = bag.make(
-        CAMERA_INFO_TYPE,
-        header=bag.header(header),
-        height=calibration.height,
-        width=calibration.width,
-        distortion_model=calibration.model,
-        binning_x=0,
-        binning_y=0,
-        roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
-        **{name if bag.is_ros1 else name.lower(): M for name, M in matrices.items()},
-    )
-    bag.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
-
-
-def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
-    """Write a true pose of the rectified camera, shape (4, 4), metres, to `/tf`."""
-    parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
-    write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])
-
-
-def write_transforms(
-    bag: BagWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
-) -> None:
-    """Write poses of frames as one `tf2_msgs/TFMessage`; of none: nothing.
-
-    Parameters
-    ----------
-    bag : BagWriter
-        Open.
-    topic : str
-        `/tf`, or `/tf_static` for what never moves, with `is_latched`.
-    poses : iterable of FramePose
-    is_latched : bool
-        As for `BagWriter.write`.
-    """
-    poses = tuple(poses)
-    if poses:
-        message = bag.make(TF_TYPE, transforms=[_transform(bag, pose) for pose in poses])
-        stamp_ns = max(pose.stamp_ns for pose in poses)
-        bag.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
-
-
-def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
-    """Return position and quaternion (x, y, z, qx, qy, qz, qw), shape (7,), of a pose (4, 4)."""
-    quaternion_xyzw = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat()
-    return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
-
-
-def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
-    x, y, z, *q = pose_numbers(pose.T_parent_child).tolist()
-    transform = bag.make(
-        "geometry_msgs/msg/Transform",
-        translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
-    )
-    return bag.make(
-        "geometry_msgs/msg/TransformStamped",
-        header=bag.header(Header(pose.stamp_ns, pose.parent)),
-        child_frame_id=pose.child,
-        transform=transform,
-    )
-
-
 def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
     """Write an image, uint8 (h, w) or BGR (h, w, 3), as PNG to a topic ending in `/compressed`."""
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"
@@ -319,3 +252,70 @@ def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -
         data=np.frombuffer(data, dtype=np.uint8),
     )
     bag.write(topic, COMPRESSED_TYPE, message, header.stamp_ns)
+
+
+def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
+    """Write a calibration as `CameraInfo`, all numbers without loss."""
+    matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
+    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    message = bag.make(
+        CAMERA_INFO_TYPE,
+        header=bag.header(header),
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model=calibration.model,
+        binning_x=0,
+        binning_y=0,
+        roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
+        **{name if bag.is_ros1 else name.lower(): M for name, M in matrices.items()},
+    )
+    bag.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
+
+
+def write_transforms(
+    bag: BagWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
+) -> None:
+    """Write poses of frames as one `tf2_msgs/TFMessage`; of none: nothing.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        `/tf`, or `/tf_static` for what never moves, with `is_latched`.
+    poses : iterable of FramePose
+    is_latched : bool
+        As for `BagWriter.write`.
+    """
+    poses = tuple(poses)
+    if poses:
+        message = bag.make(TF_TYPE, transforms=[_transform(bag, pose) for pose in poses])
+        stamp_ns = max(pose.stamp_ns for pose in poses)
+        bag.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
+
+
+def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
+    x, y, z, *q = pose_numbers(pose.T_parent_child).tolist()
+    transform = bag.make(
+        "geometry_msgs/msg/Transform",
+        translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+    )
+    return bag.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=bag.header(Header(pose.stamp_ns, pose.parent)),
+        child_frame_id=pose.child,
+        transform=transform,
+    )
+
+
+def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
+    """Return position and quaternion (x, y, z, qx, qy, qz, qw), shape (7,), of a pose (4, 4)."""
+    quaternion_xyzw = Rotation.from_matrix(T_parent_child[:3, :3]).as_quat()
+    return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
+
+
+def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
+    """Write a true pose of the rectified camera, shape (4, 4), metres, to `/tf`."""
+    parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
+    write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])

@@ -47,118 +47,7 @@ from gvo.types import FloatArray
 
 _SUFFIXES = (".bag", ".mcap", ".db3", "")
 _Progress: TypeAlias = Callable[[int], None]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BagStream:
-    """Where one stream goes.
-
-    Parameters
-    ----------
-    topic : str
-        Of its images, without the suffix of a transport.
-    frame_id : str
-        Of images and `CameraInfo`: the optical frame of the rectified camera.
-    calibration : Calibration
-        Of the images as they are written.
-    prepare : ImagePreparer, optional
-        What makes them of those of the recording.
-    is_compressed : bool
-        Written as PNG.
-    """
-
-    topic: str
-    frame_id: str
-    calibration: Calibration
-    prepare: ImagePreparer | None
-    is_compressed: bool
-
-    @property
-    def info_topic(self) -> str:
-        """Of its `CameraInfo`."""
-        return f"{self.topic.rpartition('/')[0]}/camera_info"
-
-    def write(self, bag: BagWriter, pixels: NDArray[Any], header: Header) -> None:
-        """Write an image, as PNG where that was asked for."""
-        if not self.is_compressed:
-            write_image(bag, self.topic, pixels, header)
-        elif pixels.dtype == np.float32:
-            write_compressed_depth(bag, f"{self.topic}/compressedDepth", pixels, header)
-        else:
-            write_compressed(bag, f"{self.topic}/compressed", pixels, header)
-
-
-BagStreams: TypeAlias = tuple[BagStream, BagStream]
-
-
-def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams:
-    """Decide where the streams of a recording go.
-
-    Parameters
-    ----------
-    source : Source
-        The recording; of depth the first image is read where it is to be compressed.
-    rectify : bool
-        Write raw images rectified and grey.
-    compress : bool
-        Write images as PNG; depth only where it is in whole millimetres.
-    """
-    info = source.info
-    calibrations, preparers = plan_images(info, rectify=rectify)
-    is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
-    if info.sensor == "rgbd":
-        name = "image_rect_color" if is_rectified else "image_color"
-        topics = (f"/camera/rgb/{name}", "/camera/depth/image")
-        calibrations *= 2
-        is_compressed = (compress, compress and _is_in_millimetres(source))
-    else:
-        name = "image_rect" if is_rectified else "image_raw"
-        topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
-    first, second = map(BagStream, topics, _frame_ids(info), calibrations, preparers, is_compressed)
-    return first, second
-
-
-def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> Iterator[FramePose]:
-    """Yield how the cameras sit on the body and beside each other.
-
-    Parameters
-    ----------
-    source : Source
-        The recording.
-    frame_ids : tuple of two str
-        Of both streams: the optical frames of the rectified cameras.
-    stamp_ns : int
-        Nanoseconds.
-
-    Yields
-    ------
-    FramePose
-        T_body_cam where the recording knows it, T_left_right of a stereo pair.
-    """
-    first, second = frame_ids
-    T_body_cam = pose_on_body(source)
-    if T_body_cam is not None and first != BODY_FRAME:
-        yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
-    if source.info.sensor == "stereo":
-        yield FramePose(stamp_ns, first, second, pose_of_right(source.info))
-
-
-def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
-    if info.sensor == "rgbd":
-        return (info.frame_id or "camera_color_optical_frame",) * 2
-    left, right = info.frame_id or "camera_left_optical", "camera_right_optical"
-    return left, right if left != right else f"{left}_right"
-
-
-def _is_in_millimetres(source: Source) -> bool:
-    """Tell whether the first depth image that can be read is of whole millimetres."""
-    for image in readable_images(source, LeftOut()):
-        if image.stream == 1:
-            try:
-                return exact_counts(image.load(), MILLIMETRES) is not None
-            except RecordingError:
-                continue
-    return False
+BagStreams: TypeAlias = tuple["BagStream", "BagStream"]
 
 
 def write_bag(
@@ -281,3 +170,112 @@ class _Writer:
         write_camera_info(bag, stream.info_topic, stream.calibration, header)
         stream.write(bag, pixels, header)
         return True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BagStream:
+    """Where one stream goes.
+
+    Parameters
+    ----------
+    topic : str
+        Of its images, without the suffix of a transport.
+    frame_id : str
+        Of images and `CameraInfo`: the optical frame of the rectified camera.
+    calibration : Calibration
+        Of the images as they are written.
+    prepare : ImagePreparer, optional
+        What makes them of those of the recording.
+    is_compressed : bool
+        Written as PNG.
+    """
+
+    topic: str
+    frame_id: str
+    calibration: Calibration
+    prepare: ImagePreparer | None
+    is_compressed: bool
+
+    @property
+    def info_topic(self) -> str:
+        """Of its `CameraInfo`."""
+        return f"{self.topic.rpartition('/')[0]}/camera_info"
+
+    def write(self, bag: BagWriter, pixels: NDArray[Any], header: Header) -> None:
+        """Write an image, as PNG where that was asked for."""
+        if not self.is_compressed:
+            write_image(bag, self.topic, pixels, header)
+        elif pixels.dtype == np.float32:
+            write_compressed_depth(bag, f"{self.topic}/compressedDepth", pixels, header)
+        else:
+            write_compressed(bag, f"{self.topic}/compressed", pixels, header)
+
+
+def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams:
+    """Decide where the streams of a recording go.
+
+    Parameters
+    ----------
+    source : Source
+        The recording; of depth the first image is read where it is to be compressed.
+    rectify : bool
+        Write raw images rectified and grey.
+    compress : bool
+        Write images as PNG; depth only where it is in whole millimetres.
+    """
+    info = source.info
+    calibrations, preparers = plan_images(info, rectify=rectify)
+    is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
+    if info.sensor == "rgbd":
+        name = "image_rect_color" if is_rectified else "image_color"
+        topics = (f"/camera/rgb/{name}", "/camera/depth/image")
+        calibrations *= 2
+        is_compressed = (compress, compress and _is_in_millimetres(source))
+    else:
+        name = "image_rect" if is_rectified else "image_raw"
+        topics = (f"/stereo/left/{name}", f"/stereo/right/{name}")
+    first, second = map(BagStream, topics, _frame_ids(info), calibrations, preparers, is_compressed)
+    return first, second
+
+
+def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
+    if info.sensor == "rgbd":
+        return (info.frame_id or "camera_color_optical_frame",) * 2
+    left, right = info.frame_id or "camera_left_optical", "camera_right_optical"
+    return left, right if left != right else f"{left}_right"
+
+
+def _is_in_millimetres(source: Source) -> bool:
+    """Tell whether the first depth image that can be read is of whole millimetres."""
+    for image in readable_images(source, LeftOut()):
+        if image.stream == 1:
+            try:
+                return exact_counts(image.load(), MILLIMETRES) is not None
+            except RecordingError:
+                continue
+    return False
+
+
+def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> Iterator[FramePose]:
+    """Yield how the cameras sit on the body and beside each other.
+
+    Parameters
+    ----------
+    source : Source
+        The recording.
+    frame_ids : tuple of two str
+        Of both streams: the optical frames of the rectified cameras.
+    stamp_ns : int
+        Nanoseconds.
+
+    Yields
+    ------
+    FramePose
+        T_body_cam where the recording knows it, T_left_right of a stereo pair.
+    """
+    first, second = frame_ids
+    T_body_cam = pose_on_body(source)
+    if T_body_cam is not None and first != BODY_FRAME:
+        yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
+    if source.info.sensor == "stereo":
+        yield FramePose(stamp_ns, first, second, pose_of_right(source.info))

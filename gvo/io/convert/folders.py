@@ -88,52 +88,6 @@ class FolderStreams(ABC):
         return f"{self.info.stream_names[stream]} image"
 
 
-def _write_projections(
-    path: Path, names: tuple[str, str], calibrations: tuple[Calibration, ...]
-) -> None:
-    """Write the P of left and right as the `calib.txt` of a KITTI folder: `PN` of `image_N`."""
-    lines = [
-        f"P{name[-1]}: {' '.join(repr(float(value)) for value in calibration.P.ravel())}\n"
-        for name, calibration in zip(names, calibrations, strict=True)
-    ]
-    path.write_text("".join(lines), encoding="utf-8")
-
-
-def _write_sensor_yaml(path: Path, calibration: Calibration, T_body_sensor: FloatArray) -> None:
-    """Write the `sensor.yaml` of one camera of an EuRoC folder, as its images are written."""
-    K = calibration.K
-    content: dict[str, Any] = {
-        "sensor_type": "camera",
-        "T_BS": {"cols": 4, "rows": 4, "data": _numbers(T_body_sensor)},
-        "resolution": [calibration.width, calibration.height],
-        "camera_model": "pinhole",
-        "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
-        "distortion_model": _EUROC_MODELS.get(calibration.model, calibration.model),
-        "distortion_coefficients": _numbers(calibration.D),
-    }
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-
-
-def _write_camera_info_yaml(path: Path, calibration: Calibration, *, depth_scale: float) -> None:
-    """Write a calibration as ROS's camera_calibration does, with the depth's counts per metre."""
-    D = calibration.D
-    content = {
-        "image_width": calibration.width,
-        "image_height": calibration.height,
-        "camera_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.K)},
-        "distortion_model": calibration.model,
-        "distortion_coefficients": {"rows": 1, "cols": len(D), "data": _numbers(D)},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.R)},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": _numbers(calibration.P)},
-        "depth_scale": depth_scale,
-    }
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-
-
-def _numbers(values: FloatArray) -> list[float]:
-    return [float(value) for value in np.ravel(values)]
-
-
 class KittiFolder(FolderStreams):
     """Rectified pairs by number: `image_0` and `image_1`, in colour `image_2` and `image_3`.
 
@@ -347,3 +301,49 @@ def _choose_scale(depth: DepthArray) -> float | None:
             return scale
     farthest = _RESERVE * float(np.nanmax(depth))
     return DEFAULT_SCALE if DEFAULT_SCALE * farthest < MAX_COUNT else MILLIMETRES
+
+
+def _write_projections(
+    path: Path, names: tuple[str, str], calibrations: tuple[Calibration, ...]
+) -> None:
+    """Write the P of left and right as the `calib.txt` of a KITTI folder: `PN` of `image_N`."""
+    lines = [
+        f"P{name[-1]}: {' '.join(repr(float(value)) for value in calibration.P.ravel())}\n"
+        for name, calibration in zip(names, calibrations, strict=True)
+    ]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def _write_sensor_yaml(path: Path, calibration: Calibration, T_body_sensor: FloatArray) -> None:
+    """Write the `sensor.yaml` of one camera of an EuRoC folder, as its images are written."""
+    K = calibration.K
+    content: dict[str, Any] = {
+        "sensor_type": "camera",
+        "T_BS": {"cols": 4, "rows": 4, "data": _numbers(T_body_sensor)},
+        "resolution": [calibration.width, calibration.height],
+        "camera_model": "pinhole",
+        "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+        "distortion_model": _EUROC_MODELS.get(calibration.model, calibration.model),
+        "distortion_coefficients": _numbers(calibration.D),
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _write_camera_info_yaml(path: Path, calibration: Calibration, *, depth_scale: float) -> None:
+    """Write a calibration as ROS's camera_calibration does, with the depth's counts per metre."""
+    D = calibration.D
+    content = {
+        "image_width": calibration.width,
+        "image_height": calibration.height,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.K)},
+        "distortion_model": calibration.model,
+        "distortion_coefficients": {"rows": 1, "cols": len(D), "data": _numbers(D)},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": _numbers(calibration.R)},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": _numbers(calibration.P)},
+        "depth_scale": depth_scale,
+    }
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _numbers(values: FloatArray) -> list[float]:
+    return [float(value) for value in np.ravel(values)]

@@ -87,6 +87,38 @@ def _stream(
         yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(load, path))
 
 
+def read_stamped_rows(
+    path: Path, *, unit_ns: int, n_fields: int = 2, separator: str | None = None
+) -> list[tuple[int, list[str]]]:
+    """Read a table whose first field is a stamp.
+
+    Parameters
+    ----------
+    path, n_fields, separator
+        As of `read_rows`.
+    unit_ns : int
+        Nanoseconds of the stamps' unit: 1_000_000_000 for seconds, 1 for nanoseconds.
+
+    Returns
+    -------
+    list of (int, list of str)
+        Stamp in nanoseconds, without loss, and the fields behind it.
+
+    Raises
+    ------
+    RecordingError
+        As `read_rows`, and when a stamp is no number or out of range.
+    """
+    rows = []
+    for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
+        try:
+            rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields))
+        except ValueError as error:
+            reason = cut(str(error), _MAX_REASON)
+            raise RecordingError(f"{path}, line {number}: {reason}") from None
+    return rows
+
+
 def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> list[_Row]:
     """Read the rows of a table, without comments and empty lines.
 
@@ -122,38 +154,6 @@ def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> lis
         rows.append((number, fields))
     if not rows:
         raise RecordingError(f"{path}: holds no rows")
-    return rows
-
-
-def read_stamped_rows(
-    path: Path, *, unit_ns: int, n_fields: int = 2, separator: str | None = None
-) -> list[tuple[int, list[str]]]:
-    """Read a table whose first field is a stamp.
-
-    Parameters
-    ----------
-    path, n_fields, separator
-        As of `read_rows`.
-    unit_ns : int
-        Nanoseconds of the stamps' unit: 1_000_000_000 for seconds, 1 for nanoseconds.
-
-    Returns
-    -------
-    list of (int, list of str)
-        Stamp in nanoseconds, without loss, and the fields behind it.
-
-    Raises
-    ------
-    RecordingError
-        As `read_rows`, and when a stamp is no number or out of range.
-    """
-    rows = []
-    for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
-        try:
-            rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields))
-        except ValueError as error:
-            reason = cut(str(error), _MAX_REASON)
-            raise RecordingError(f"{path}, line {number}: {reason}") from None
     return rows
 
 

@@ -107,23 +107,6 @@ class TumSource(FolderSource):
         return read_trajectory(path) if path.is_file() else None
 
 
-def published_calibration(name: str) -> Calibration | None:
-    """Return the published calibration of the camera that a folder's name tells.
-
-    Parameters
-    ----------
-    name : str
-        Of the folder.
-
-    Returns
-    -------
-    Calibration or None
-        None where the name tells none of the three cameras.
-    """
-    named = _CAMERA_NAME.search(name.lower())
-    return None if named is None else _published_camera(*_CAMERAS[named[1]])
-
-
 def _list_images(table: Path) -> list[StampedPath]:
     rows = read_stamped_rows(table, unit_ns=10**9)
     return [(stamp_ns, table.parent / fields[0]) for stamp_ns, fields in rows]
@@ -146,6 +129,23 @@ def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
     paths = explicit or (beside,)
     cameras = read_cameras(paths, sensor="rgbd", is_rectified=False)
     return replace(cameras, origin=" + ".join(path.name for path in paths))
+
+
+def published_calibration(name: str) -> Calibration | None:
+    """Return the published calibration of the camera that a folder's name tells.
+
+    Parameters
+    ----------
+    name : str
+        Of the folder.
+
+    Returns
+    -------
+    Calibration or None
+        None where the name tells none of the three cameras.
+    """
+    named = _CAMERA_NAME.search(name.lower())
+    return None if named is None else _published_camera(*_CAMERAS[named[1]])
 
 
 def _published_camera(

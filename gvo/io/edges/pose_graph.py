@@ -211,29 +211,6 @@ def _as_vertex(line: Line | None) -> Vertex | None:
     return line if isinstance(line, Vertex) else None
 
 
-class _Ids:
-    """A set of ids that takes no memory for ids in a row."""
-
-    def __init__(self) -> None:
-        self._first = 0
-        self._end = 0
-        self._others: set[int] = set()
-
-    def __contains__(self, frame_id: int) -> bool:
-        return self._first <= frame_id < self._end or frame_id in self._others
-
-    def __len__(self) -> int:
-        return self._end - self._first + len(self._others)
-
-    def add(self, frame_id: int) -> None:
-        if self._end == self._first:
-            self._first = self._end = frame_id
-        self._others.add(frame_id)
-        while self._end in self._others:
-            self._others.remove(self._end)
-            self._end += 1
-
-
 class _Connector:
     """Turns measurements into events: what is known, what waits."""
 
@@ -336,6 +313,29 @@ def _edge(line: Measurement) -> Edge:
         T_reference_frame=line.T_reference_frame,
         covariance=line.covariance,
     )
+
+
+class _Ids:
+    """A set of ids that takes no memory for ids in a row."""
+
+    def __init__(self) -> None:
+        self._first = 0
+        self._end = 0
+        self._others: set[int] = set()
+
+    def __contains__(self, frame_id: int) -> bool:
+        return self._first <= frame_id < self._end or frame_id in self._others
+
+    def __len__(self) -> int:
+        return self._end - self._first + len(self._others)
+
+    def add(self, frame_id: int) -> None:
+        if self._end == self._first:
+            self._first = self._end = frame_id
+        self._others.add(frame_id)
+        while self._end in self._others:
+            self._others.remove(self._end)
+            self._end += 1
 
 
 class GraphFile:

@@ -113,46 +113,53 @@ class StepSigma:
         return f"{floor} and {100 * self.share:g} % of the motion and {turn}"
 
 
-def step_covariance(before: PoseSample, after: PoseSample, sigma: StepSigma) -> FloatArray:
-    """Return the covariance of the step between two poses of one stream.
+@dataclass(slots=True, kw_only=True)
+class TrajectoryStream:
+    """The poses of a TUM, KITTI or EuRoC file.
 
-    The covariance of odometry grows with the way: the step's is the growth. Where there is no
-    growth the poses are taken for independent fixes: the step's is the sum. Where a pose has no
-    covariance, or one that is not positive definite, it comes of `sigma`.
+    Where a file `NAME_covariance.csv` of a run folder lies beside `NAME.txt`, with the same
+    stamps, the poses have its covariances.
 
     Parameters
     ----------
-    before, after : PoseSample
-    sigma : StepSigma
-
-    Returns
-    -------
-    ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame of `after`.
+    path : Path
     """
-    T_a_b = se3.invert(before.T_world_frame) @ after.T_world_frame
-    if before.covariance is None or after.covariance is None:
-        return sigma.covariance(T_a_b)
-    if not _is_definite(after.covariance, scale=after.covariance):
-        return sigma.covariance(T_a_b)
-    Ad = se3.adjoint(se3.invert(T_a_b))
-    moved = Ad @ before.covariance @ Ad.T
-    growth = after.covariance - moved
-    if _is_definite(growth, scale=after.covariance):
-        return np.asarray(0.5 * (growth + growth.T))
-    if not _is_definite(before.covariance, scale=before.covariance):
-        return sigma.covariance(T_a_b)
-    total = after.covariance + moved
-    return np.asarray(0.5 * (total + total.T))
 
+    path: Path
+    name: str = field(init=False)
+    decisions: list[str] = field(init=False, default_factory=list)
+    n_poses: int = field(init=False)
+    stamps_from: StampsFrom = field(init=False)
+    _trajectory: Trajectory = field(init=False)
+    _covariances: FloatArray | None = field(init=False, default=None)
 
-def _is_definite(matrix: FloatArray, *, scale: FloatArray) -> bool:
-    """Tell whether a matrix is positive definite by more than the rounding of another."""
-    sigmas = np.sqrt(np.maximum(np.diag(scale), 0.0))
-    if not np.isfinite(matrix).all() or sigmas.min() <= 0.0:
-        return False
-    scaled = matrix / np.outer(sigmas, sigmas)
-    return bool(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0] > _MIN_RELATIVE_EIGENVALUE)
+    def __post_init__(self) -> None:
+        """Read the file.
+
+        Raises
+        ------
+        TrajectoryError
+            Where it is missing, empty or malformed.
+        """
+        self._trajectory = read_trajectory(self.path)
+        self.name = self.path.stem
+        self.n_poses = len(self._trajectory)
+        self.stamps_from = self._trajectory.stamps_from
+        beside = self.path.with_name(f"{self.path.stem}_covariance.csv")
+        if beside.is_file():
+            stamps_ns, covariances = read_covariances(beside)
+            if np.array_equal(stamps_ns, self._trajectory.stamps_ns):
+                self._covariances = covariances
+                self.decisions.append(f"{self.name}: covariances of {beside.name}")
+
+    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
+        """Yield the poses."""
+        for i, stamp_ns in enumerate(self._trajectory.stamps_ns):
+            yield PoseSample(
+                stamp_ns=int(stamp_ns),
+                T_world_frame=self._trajectory.T_world_cam[i],
+                covariance=None if self._covariances is None else self._covariances[i],
+            )
 
 
 class FusedChains:
@@ -237,14 +244,6 @@ def _ordered(stream: PoseStream, faults: InputFaults) -> Iterator[PoseSample]:
         yield sample
 
 
-def _step(before: PoseSample, after: PoseSample, sigma: StepSigma) -> Edge:
-    return Edge(
-        reference_id=before.stamp_ns,
-        T_reference_frame=se3.invert(before.T_world_frame) @ after.T_world_frame,
-        covariance=step_covariance(before, after, sigma),
-    )
-
-
 class _Follower:
     """A stream that is read along the stamps of another."""
 
@@ -298,50 +297,51 @@ def _interpolate(before: PoseSample, after: PoseSample, stamp_ns: int) -> PoseSa
     )
 
 
-@dataclass(slots=True, kw_only=True)
-class TrajectoryStream:
-    """The poses of a TUM, KITTI or EuRoC file.
+def _step(before: PoseSample, after: PoseSample, sigma: StepSigma) -> Edge:
+    return Edge(
+        reference_id=before.stamp_ns,
+        T_reference_frame=se3.invert(before.T_world_frame) @ after.T_world_frame,
+        covariance=step_covariance(before, after, sigma),
+    )
 
-    Where a file `NAME_covariance.csv` of a run folder lies beside `NAME.txt`, with the same
-    stamps, the poses have its covariances.
+
+def step_covariance(before: PoseSample, after: PoseSample, sigma: StepSigma) -> FloatArray:
+    """Return the covariance of the step between two poses of one stream.
+
+    The covariance of odometry grows with the way: the step's is the growth. Where there is no
+    growth the poses are taken for independent fixes: the step's is the sum. Where a pose has no
+    covariance, or one that is not positive definite, it comes of `sigma`.
 
     Parameters
     ----------
-    path : Path
+    before, after : PoseSample
+    sigma : StepSigma
+
+    Returns
+    -------
+    ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame of `after`.
     """
+    T_a_b = se3.invert(before.T_world_frame) @ after.T_world_frame
+    if before.covariance is None or after.covariance is None:
+        return sigma.covariance(T_a_b)
+    if not _is_definite(after.covariance, scale=after.covariance):
+        return sigma.covariance(T_a_b)
+    Ad = se3.adjoint(se3.invert(T_a_b))
+    moved = Ad @ before.covariance @ Ad.T
+    growth = after.covariance - moved
+    if _is_definite(growth, scale=after.covariance):
+        return np.asarray(0.5 * (growth + growth.T))
+    if not _is_definite(before.covariance, scale=before.covariance):
+        return sigma.covariance(T_a_b)
+    total = after.covariance + moved
+    return np.asarray(0.5 * (total + total.T))
 
-    path: Path
-    name: str = field(init=False)
-    decisions: list[str] = field(init=False, default_factory=list)
-    n_poses: int = field(init=False)
-    stamps_from: StampsFrom = field(init=False)
-    _trajectory: Trajectory = field(init=False)
-    _covariances: FloatArray | None = field(init=False, default=None)
 
-    def __post_init__(self) -> None:
-        """Read the file.
-
-        Raises
-        ------
-        TrajectoryError
-            Where it is missing, empty or malformed.
-        """
-        self._trajectory = read_trajectory(self.path)
-        self.name = self.path.stem
-        self.n_poses = len(self._trajectory)
-        self.stamps_from = self._trajectory.stamps_from
-        beside = self.path.with_name(f"{self.path.stem}_covariance.csv")
-        if beside.is_file():
-            stamps_ns, covariances = read_covariances(beside)
-            if np.array_equal(stamps_ns, self._trajectory.stamps_ns):
-                self._covariances = covariances
-                self.decisions.append(f"{self.name}: covariances of {beside.name}")
-
-    def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
-        """Yield the poses."""
-        for i, stamp_ns in enumerate(self._trajectory.stamps_ns):
-            yield PoseSample(
-                stamp_ns=int(stamp_ns),
-                T_world_frame=self._trajectory.T_world_cam[i],
-                covariance=None if self._covariances is None else self._covariances[i],
-            )
+def _is_definite(matrix: FloatArray, *, scale: FloatArray) -> bool:
+    """Tell whether a matrix is positive definite by more than the rounding of another."""
+    sigmas = np.sqrt(np.maximum(np.diag(scale), 0.0))
+    if not np.isfinite(matrix).all() or sigmas.min() <= 0.0:
+        return False
+    scaled = matrix / np.outer(sigmas, sigmas)
+    return bool(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0] > _MIN_RELATIVE_EIGENVALUE)

@@ -24,6 +24,93 @@ _SMALL_BOX = 20_000  # pixels: not worth a closer look
 _BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the cache
 
 
+def render_image(
+    scene: Scene,
+    T_map_cam: FloatArray,
+    camera: PinholeCamera,
+    *,
+    is_antialiased: bool = True,
+    beyond: Plane | None = None,
+) -> SampleArray:
+    """Render a grey image without noise.
+
+    Parameters
+    ----------
+    scene : Scene
+        Rectangles in the `map` frame, metres.
+    T_map_cam : ndarray of float64, shape (4, 4)
+        Maps camera coordinates to the map, metres.
+    camera : PinholeCamera
+    is_antialiased : bool
+        Four samples for the pixels where surfaces meet; otherwise one for each pixel.
+    beyond : (ndarray of float64, ndarray of float64), optional
+        Point and normal of a plane that cuts away what is before it, see `look`.
+
+    Returns
+    -------
+    ndarray of float32, shape (height, width)
+        Grey values, 0 to 255 where the light does not exceed the texture's.
+    """
+    view = look(scene, T_map_cam, camera, beyond=beyond)
+    if not is_antialiased:
+        return _shade_rows(view, find_visible(view))
+    fine = find_visible(refine(view))
+    corners = [np.ascontiguousarray(fine[i::2, j::2]) for i in (0, 1) for j in (0, 1)]
+    image = _shade_rows(view, corners[0])
+    is_mixed = np.any([corner != corners[0] for corner in corners[1:]], axis=0)
+    v, u = np.nonzero(is_mixed)
+    total = np.zeros(len(u), dtype=np.float32)
+    for k, corner in enumerate(corners):
+        rows = (v + (0.5 * (k // 2) - 0.25)).astype(np.float32)
+        columns = (u + (0.5 * (k % 2) - 0.25)).astype(np.float32)
+        total += _shade(view, corner[v, u], columns, rows)
+    image[v, u] = 0.25 * total
+    return image
+
+
+def render_depth(
+    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
+) -> DepthArray:
+    """Render the exact depth at the centre of each pixel.
+
+    Parameters
+    ----------
+    scene : Scene
+        Rectangles in the `map` frame, metres.
+    T_map_cam : ndarray of float64, shape (4, 4)
+        Maps camera coordinates to the map, metres.
+    camera : PinholeCamera
+    beyond : (ndarray of float64, ndarray of float64), optional
+        Point and normal of a plane that cuts away what is before it, see `look`.
+
+    Returns
+    -------
+    ndarray of float32, shape (height, width)
+        Metres along the optical axis, NaN where there is nothing.
+    """
+    view = look(scene, T_map_cam, camera, beyond=beyond)
+    forms = np.vstack([view.inverse_depth, np.full(3, np.nan)])  # the last row: nothing
+    a, b, c = forms[find_visible(view)].transpose(2, 0, 1)
+    u, v = np.arange(camera.width), np.arange(camera.height)[:, np.newaxis]
+    return np.asarray(1.0 / (a * u + b * v + c), dtype=np.float32)
+
+
+def to_uint8(grey: SampleArray) -> ImageArray:
+    """Round and clip grey values.
+
+    Parameters
+    ----------
+    grey : ndarray of float32, shape (h, w)
+        Any values.
+
+    Returns
+    -------
+    ndarray of uint8, shape (h, w)
+        0 to 255.
+    """
+    return np.asarray(cv2.convertScaleAbs(np.maximum(grey, 0.0)), dtype=np.uint8)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
     """The rectangles one camera may see, as linear forms of the pixel (u, v, 1).
@@ -105,11 +192,6 @@ def look(
     )
 
 
-def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the inner products of rows."""
-    return np.asarray(np.einsum("ij,ij->i", first, second))
-
-
 def _faces(scene: Scene, distances: FloatArray) -> BoolArray:
     """Tell which rectangles turn a visible side to the camera, by their distances along normals."""
     return np.asarray((distances > 1e-9) | (scene.is_two_sided & (distances < -1e-9)))
@@ -127,6 +209,11 @@ def _is_in_frustum(corners: FloatArray, camera: PinholeCamera) -> BoolArray:
     u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
     sides = [u + z, camera.width * z - u, v + z, camera.height * z - v, z - _NEAR_M]
     return np.asarray(np.all([np.any(side > 0, axis=1) for side in sides], axis=0))
+
+
+def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the inner products of rows."""
+    return np.asarray(np.einsum("ij,ij->i", first, second))
 
 
 def refine(view: View) -> View:
@@ -274,77 +361,6 @@ def _cut_out(
         mask &= view.scene.atlas.is_opaque(int(view.scene.textures[view.indices[k]]), level, s, t)
 
 
-def render_image(
-    scene: Scene,
-    T_map_cam: FloatArray,
-    camera: PinholeCamera,
-    *,
-    is_antialiased: bool = True,
-    beyond: Plane | None = None,
-) -> SampleArray:
-    """Render a grey image without noise.
-
-    Parameters
-    ----------
-    scene : Scene
-        Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the map, metres.
-    camera : PinholeCamera
-    is_antialiased : bool
-        Four samples for the pixels where surfaces meet; otherwise one for each pixel.
-    beyond : (ndarray of float64, ndarray of float64), optional
-        Point and normal of a plane that cuts away what is before it, see `look`.
-
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-        Grey values, 0 to 255 where the light does not exceed the texture's.
-    """
-    view = look(scene, T_map_cam, camera, beyond=beyond)
-    if not is_antialiased:
-        return _shade_rows(view, find_visible(view))
-    fine = find_visible(refine(view))
-    corners = [np.ascontiguousarray(fine[i::2, j::2]) for i in (0, 1) for j in (0, 1)]
-    image = _shade_rows(view, corners[0])
-    is_mixed = np.any([corner != corners[0] for corner in corners[1:]], axis=0)
-    v, u = np.nonzero(is_mixed)
-    total = np.zeros(len(u), dtype=np.float32)
-    for k, corner in enumerate(corners):
-        rows = (v + (0.5 * (k // 2) - 0.25)).astype(np.float32)
-        columns = (u + (0.5 * (k % 2) - 0.25)).astype(np.float32)
-        total += _shade(view, corner[v, u], columns, rows)
-    image[v, u] = 0.25 * total
-    return image
-
-
-def render_depth(
-    scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
-) -> DepthArray:
-    """Render the exact depth at the centre of each pixel.
-
-    Parameters
-    ----------
-    scene : Scene
-        Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the map, metres.
-    camera : PinholeCamera
-    beyond : (ndarray of float64, ndarray of float64), optional
-        Point and normal of a plane that cuts away what is before it, see `look`.
-
-    Returns
-    -------
-    ndarray of float32, shape (height, width)
-        Metres along the optical axis, NaN where there is nothing.
-    """
-    view = look(scene, T_map_cam, camera, beyond=beyond)
-    forms = np.vstack([view.inverse_depth, np.full(3, np.nan)])  # the last row: nothing
-    a, b, c = forms[find_visible(view)].transpose(2, 0, 1)
-    u, v = np.arange(camera.width), np.arange(camera.height)[:, np.newaxis]
-    return np.asarray(1.0 / (a * u + b * v + c), dtype=np.float32)
-
-
 def _shade_rows(view: View, visible: IndexArray) -> SampleArray:
     """Shade one sample at the centre of each pixel."""
     height, width = view.camera.height, view.camera.width
@@ -384,19 +400,3 @@ def _shade(view: View, visible: IndexArray, u: SampleArray, v: SampleArray) -> S
         grey = scene.light.haze_grey + (grey - scene.light.haze_grey) * clear
     grey[visible == NOTHING] = scene.light.haze_grey
     return np.asarray(grey, dtype=np.float32)
-
-
-def to_uint8(grey: SampleArray) -> ImageArray:
-    """Round and clip grey values.
-
-    Parameters
-    ----------
-    grey : ndarray of float32, shape (h, w)
-        Any values.
-
-    Returns
-    -------
-    ndarray of uint8, shape (h, w)
-        0 to 255.
-    """
-    return np.asarray(cv2.convertScaleAbs(np.maximum(grey, 0.0)), dtype=np.uint8)
