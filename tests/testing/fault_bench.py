@@ -21,7 +21,7 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.run import run_recording
 from gvo.testing.faults import FaultyImage, FaultySource
-from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from tests.testing.catalogue import NamedFault
@@ -99,7 +99,7 @@ def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
     with (out / "frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     poses = {name: read_trajectory(out / f"{name}.txt") for name in ("raw", "causal", "smoothed")}
-    causal, covariances = poses["causal"], _read_covariances(out / "causal_covariance.csv")
+    causal, covariances = poses["causal"], read_covariances(out / "causal_covariance.csv")[1]
     given = [image for image in _until_error(source) if image.given.stream == 0]
     with_pose = {int(row["stamp_ns"]) for row in rows if row["status"] != "skipped"}
     # where a stamp repeats, the first image has the pose
@@ -138,24 +138,11 @@ def _until_error(source: FaultySource) -> Iterator[FaultyImage]:
         yield from source.faulty_images()
 
 
-def _read_covariances(path: Path) -> FloatArray:
-    """Read the upper triangles of a table, stamp first."""
-    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)[:, 1:]
-    covariances = np.zeros((len(table), 6, 6))
-    rows, columns = np.triu_indices(6)
-    covariances[:, rows, columns] = covariances[:, columns, rows] = table
-    return covariances
-
-
 def _errors(
     truth: Trajectory, frames: IntArray, poses: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     true = se3.invert(truth.T_world_cam[frames[0]]) @ truth.T_world_cam[frames]
-    errors = [se3.log(se3.invert(T) @ T_true) for T, T_true in zip(poses, true, strict=True)]
-    floor = 1e-10 * np.eye(6)
-    squares = [
-        error @ np.linalg.solve(covariance + floor, error)
-        for error, covariance in zip(errors, covariances, strict=True)
-    ]
+    errors = se3.log(se3.invert(poses) @ true)
+    solved = np.linalg.solve(covariances + 1e-10 * np.eye(6), errors[..., np.newaxis])
     distances = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
-    return distances, np.sqrt(np.array(squares))
+    return distances, np.sqrt(np.einsum("ni,nij->n", errors, solved))

@@ -62,7 +62,7 @@ TOLD = {
     "disk-fails": "cannot be read on: OSError: Input/output error",
     "image-damaged": "the image is damaged",
     "image-unreadable": "OSError: Input/output error",
-    "image-too-large": "MemoryError: cannot allocate",
+    "image-too-large": "MemoryError: no room",
     "decoder-fails": "bad decode",
     "all-damaged": "the image is damaged",
     "lost": "(frames.csv: coasting, lost)",
