@@ -12,8 +12,8 @@ from scipy import integrate, stats
 from gvo.backend.factors import Factors, Measurement
 from gvo.config import Kernel, WindowConfig
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior
+from tests.backend.walks import seeds
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
 KERNELS: tuple[Kernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 CONSTANTS: dict[Kernel, float] = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
 

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from gvo.backend.motion_model import ConstantVelocity
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray
+from tests.backend.walks import seeds
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STEP_NS = 50_000_000
 
 

@@ -18,8 +18,7 @@ from gvo.backend.validation import (
 )
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior, Prior
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
+from tests.backend.walks import seeds
 
 
 def random_covariance(rng: np.random.Generator) -> FloatArray:

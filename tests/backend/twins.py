@@ -15,8 +15,8 @@ import numpy as np
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, FrameId, PosePrior, PositionPrior, Prior
-from tests.backend.walks import STEP_NS
+from gvo.types import Edge, Estimate, FloatArray, PosePrior, PositionPrior, Prior
+from tests.backend.walks import STEP_NS, number
 
 N = 29  # eight good poses, the one with the fault, twenty good ones
 
@@ -129,11 +129,6 @@ def assert_complete(found: Run, n: int = N) -> None:
     for estimate in [*found.causal, *found.finished]:
         assert_sound(estimate)
         assert estimate.stamp_ns == stamp_of(number(estimate.frame_id))
-
-
-def number(frame_id: FrameId) -> int:
-    assert isinstance(frame_id, int)
-    return frame_id
 
 
 def assert_as_twin(found: Run, twin: Run) -> None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 from gvo.backend.window import SlidingWindow
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Edge, Estimate, FloatArray, FrameId
 
+seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STEP_NS = 100_000_000
 STEP = se3.exp(np.array([0.02, 0.1, -0.01, 0.1, 0.0, 0.5]))
 
@@ -27,52 +29,51 @@ def power(n: int) -> FloatArray:
     return se3.normalize(np.linalg.matrix_power(STEP, n))
 
 
-def walk(config: WindowConfig, n: int) -> SlidingWindow:
-    """Return a window that was given n poses, each seen from the one before."""
-    window = SlidingWindow(config)
-    for frame in range(n):
-        edges = [edge(frame - 1, STEP)] if frame else []
-        window.add_pose(frame, frame * STEP_NS, edges)
-    return window
+def shifted(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
+    return se3.make_transform(np.eye(3), np.array([x, y, z]))
 
 
-def go_on(window: SlidingWindow, start: int, stop: int) -> list[Estimate]:
+def go_on(
+    window: SlidingWindow, start: int, stop: int, step: FloatArray = STEP, sigma: float = 0.01
+) -> list[Estimate]:
     """Add poses, each seen from the one before."""
     return [
-        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)] if frame else [])
+        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, step, sigma)] if frame else [])
         for frame in range(start, stop)
     ]
 
 
+def walk(
+    config: WindowConfig, n: int, step: FloatArray = STEP, sigma: float = 0.01
+) -> SlidingWindow:
+    window = SlidingWindow(config)
+    go_on(window, 0, n, step, sigma)
+    return window
+
+
 @contextmanager
-def failing_updates(*calls: int) -> Iterator[list[int]]:
-    """Let updates of ISAM2 fail at these calls."""
-    original = gtsam.ISAM2.update
+def failing(
+    name: str, calls: Container[int] | None = None, error: type[Exception] = RuntimeError
+) -> Iterator[list[int]]:
+    """Make a method of ISAM2 fail at these calls, or always; give the numbers of all calls."""
+    original = getattr(gtsam.ISAM2, name)
     seen: list[int] = []
 
-    def update(self: Any, *arguments: Any) -> Any:
+    def call(self: Any, *arguments: Any, **options: Any) -> Any:
         seen.append(len(seen))
-        if seen[-1] in calls:
-            raise RuntimeError("Indeterminant linear system detected\nand more lines")
-        return original(self, *arguments)
+        if calls is None or seen[-1] in calls:
+            raise error("Indeterminant linear system detected\nand more lines")
+        return original(self, *arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gtsam.ISAM2, "update", update)
+        patch.setattr(gtsam.ISAM2, name, call)
         yield seen
-
-
-@contextmanager
-def giving_up(*names: str) -> Iterator[None]:
-    """Let methods of ISAM2 fail."""
-
-    def give_up(*_: Any) -> None:
-        raise RuntimeError("Indeterminant linear system detected\nand more lines")
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in names:
-            patch.setattr(gtsam.ISAM2, name, give_up)
-        yield
 
 
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [each.getMessage() for each in caplog.records if each.name.startswith("gvo")]
+
+
+def number(frame_id: FrameId) -> int:
+    assert isinstance(frame_id, int)
+    return frame_id
