@@ -10,9 +10,10 @@ import errno
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import yaml
+if TYPE_CHECKING:
+    import yaml
 
 MAX_TEXT_BYTES = 1 << 28
 """Largest text file, bytes: poses of a day at 30 Hz."""
@@ -149,7 +150,7 @@ class YamlError(Exception):
 
 def load_yaml(
     text: str,
-    loader_class: type[yaml.SafeLoader] = yaml.SafeLoader,
+    loader_class: type[yaml.SafeLoader] | None = None,
     *,
     max_characters: int = MAX_CHARACTERS,
 ) -> Any:  # noqa: ANN401 - YAML
@@ -175,10 +176,12 @@ def load_yaml(
         If it is no YAML, longer than `max_characters`, holds more than `MAX_VALUES` values with
         its aliases expanded, or a number of more than 250 characters.
     """
+    import yaml  # slow to import, and the command line rarely needs it
+
     if len(text) > max_characters:
         raise YamlError(f"{len(text)} characters, expected at most {max_characters}")
     try:
-        loader = loader_class(text)
+        loader = (loader_class or yaml.SafeLoader)(text)
         try:
             return _first_document(loader)
         finally:
@@ -192,7 +195,7 @@ def load_yaml(
 
 def _first_document(loader: yaml.SafeLoader) -> Any:  # noqa: ANN401 - YAML
     while loader.check_node():
-        node = cast(yaml.Node, loader.get_node())  # check_node found one
+        node = cast("yaml.Node", loader.get_node())  # check_node found one
         _count_values(node, {})
         document = loader.construct_document(node)
         if document is not None:
@@ -217,6 +220,8 @@ def _count_values(node: yaml.Node, counted: dict[int, int | None]) -> int:
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:
+    import yaml
+
     if isinstance(node, yaml.MappingNode):
         return [part for pair in node.value for part in pair]
     if isinstance(node, yaml.SequenceNode):
