@@ -1,4 +1,4 @@
-"""Errors that mean a wrong world: a file, a topic, a configuration, a calibration."""
+"""Errors of the input: files, topics, configurations, calibrations."""
 
 from gvo._text import cut
 
@@ -6,10 +6,10 @@ _MAX_MESSAGE = 4000  # characters
 
 
 class GvoError(Exception):
-    """A fault of the input that the user can mend.
+    """An error of the input that the user can correct.
 
-    The message is one line: what, where, expected and got, what to do. Names that come from a
-    file are shown as one line, too: what cannot be seen in them is escaped, an endless one cut.
+    The message is one line: what, where, expected and got, what to do. Names from a file are
+    printed on one line, with invisible characters escaped and long names cut.
     """
 
     def __str__(self) -> str:
@@ -18,16 +18,16 @@ class GvoError(Exception):
 
 
 class RecordingError(GvoError):
-    """A recording is missing, unreadable, or does not hold what is needed."""
+    """A recording is missing, unreadable or incomplete."""
 
 
 class OutputError(RecordingError):
-    """A file of a run could not be written on: no space, no permission, gone.
+    """A file of a run could not be written: no space, no permission, deleted.
 
     Attributes
     ----------
     is_partly : bool
-        Poses were written before; they stand.
+        Poses were written before, and remain.
     """
 
     def __init__(self, message: str, *, is_partly: bool = False) -> None:
@@ -48,7 +48,7 @@ class ConfigurationError(GvoError):
 
 
 class SmoothingError(GvoError):
-    """The window could not take a pose; it stands as it was before."""
+    """The window could not add a pose; it is unchanged."""
 
 
 class TrajectoryError(GvoError):

@@ -18,23 +18,24 @@ Colour: TypeAlias = tuple[int, int, int]
 
 WHITE: Final[Colour] = (255, 255, 255)
 BLACK: Final[Colour] = (0, 0, 0)
-_BITS: Final = 4  # of a pixel's fraction, in OpenCV's drawing
+HEIGHT_PX: Final = 28
+"""Of the colour bar with its numbers."""
+LABEL: Final = "depth [m]"
+
+_BITS: Final = 4  # fractional bits of OpenCV's fixed-point pixels
 _DOT_PX: Final = 2.0
 _ARM_PX: Final = 3.0
-_MAX_PX: Final = 20_000  # keeps OpenCV's integers from running over
+_MAX_PX: Final = 20_000  # keeps OpenCV's integers from overflowing
 _LINE_PX: Final = 16
 _MARGIN_PX: Final = 5
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _FONT_SCALE: Final = 0.45
-LABEL: Final = "depth [m]"
-HEIGHT_PX: Final = 28
-"""Of the bar with its numbers."""
-_DARKEST = 64  # of viridis: what is darker does not stand out of a dark image
+_DARKEST = 64  # of viridis: darker colours vanish in a dark image
 _FAR_DISPARITY_PX = 2.0
-_NEAR_SHARE = 8.0  # of the width of the image, as disparity of the nearest
+_NEAR_SHARE = 8.0  # image width over the disparity of the near end
 _RGBD_M = (0.4, 8.0)
 _UNKNOWN = (16, 16, 16)
-_N_STEPS: Final = 4000  # of 2 mm where the far end is 8 m
+_N_STEPS: Final = 4000  # of 2 mm up to 8 m
 _BAR_MARGIN_PX = 8
 _BAR_PX = 9
 
@@ -54,9 +55,8 @@ def draw_segments(canvas: ImageArray, segments: FloatArray, colour: Colour) -> N
 def draw_dots(
     canvas: ImageArray, pixels: FloatArray, colours: ImageArray | Colour, radius: float = _DOT_PX
 ) -> None:
-    """Draw discs about pixels, shape (n, 2), in one colour or in colours of shape (n, 3)."""
-    # A call of OpenCV for each of hundreds of discs costs more than all else, and holds up the
-    # other threads.
+    """Draw discs at pixels, shape (n, 2), in one colour or in colours of shape (n, 3)."""
+    # hundreds of calls of OpenCV would be the slowest part, and hold up the other threads
     centres = np.rint(np.clip(pixels, -_MAX_PX, _MAX_PX)).astype(np.int64)
     offsets = _disc(radius)
     u, v = (centres[:, np.newaxis] + offsets).reshape(-1, 2).T
@@ -75,7 +75,7 @@ def draw_crosses(canvas: ImageArray, pixels: FloatArray, colour: Colour) -> None
 
 
 def write_lines(canvas: ImageArray, lines: Sequence[str]) -> None:
-    """Write text over a darkened strip in the upper left corner."""
+    """Write lines of text on a darkened strip in the upper left corner."""
     texts = [plain(line) for line in lines]
     if not texts:
         return
@@ -89,7 +89,7 @@ def write_lines(canvas: ImageArray, lines: Sequence[str]) -> None:
 def write(
     canvas: ImageArray, text: str, corner: tuple[int, int], colour: Colour = WHITE
 ) -> tuple[int, int]:
-    """Write text whose lower left corner is given; return where it ends."""
+    """Write text from its lower left corner; return its lower right corner."""
     text = plain(text)
     cv2.putText(canvas, text, corner, _FONT, _FONT_SCALE, colour, 1, cv2.LINE_AA)
     return corner[0] + text_width(text), corner[1]
@@ -101,7 +101,7 @@ def text_width(text: str) -> int:
 
 
 def shortened(text: str, n_pixels: int) -> str:
-    """Return as much of a line as is so wide, with dots where something is left out."""
+    """Return the text cut to a width in pixels, with an ellipsis if cut."""
     if text_width(text) <= n_pixels:
         return text
     n = next((n for n in range(len(text), 0, -1) if text_width(text[:n] + "...") <= n_pixels), 0)
@@ -109,7 +109,7 @@ def shortened(text: str, n_pixels: int) -> str:
 
 
 def plain(text: str) -> str:
-    """Return text with question marks for what the font does not hold."""
+    """Return the text with question marks for characters that are not ASCII."""
     return text.encode("ascii", "replace").decode()
 
 
@@ -126,7 +126,7 @@ class DepthScale:
     Parameters
     ----------
     near_m, far_m : float
-        Depths of the ends; what is beyond has the colour of the end.
+        Depths of the ends; depths beyond take the colour of the end.
     """
 
     near_m: float
@@ -134,7 +134,7 @@ class DepthScale:
 
     @classmethod
     def of(cls, camera: PinholeCamera) -> DepthScale:
-        """Return the scale of a stereo camera, by its disparities, or of an RGB-D camera."""
+        """Return the scale for a stereo camera, by its disparities, or for an RGB-D camera."""
         if not isinstance(camera, StereoCamera):
             return cls(near_m=_RGBD_M[0], far_m=_RGBD_M[1])
         disparities = np.array([camera.width / _NEAR_SHARE, _FAR_DISPARITY_PX])
@@ -142,14 +142,14 @@ class DepthScale:
         return cls(near_m=float(near_m), far_m=float(far_m))
 
     def levels(self, depths: FloatArray | DepthArray) -> ImageArray:
-        """Return rows of the table of colours, 0 to 255, of depths in metres; NaN as far."""
+        """Return the indices into `table` of depths in metres; NaN counts as far."""
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.log(depths / self.far_m) * (255.0 / np.log(self.near_m / self.far_m))
         known = np.nan_to_num(shares, nan=0.0, posinf=255.0, neginf=0.0)
         return np.asarray(np.rint(np.clip(known, 0.0, 255.0)), dtype=np.uint8)
 
     def ticks(self) -> list[float]:
-        """Return round depths between the ends, metres."""
+        """Return round depths within the scale, metres."""
         decades = range(-3, 5)
         candidates = [digit * 10.0**n for n in decades for digit in (1, 2, 5)]
         return [depth for depth in candidates if self.near_m <= depth <= self.far_m]
@@ -180,9 +180,9 @@ def paint_depth(depth: DepthArray, scale: DepthScale, size: tuple[int, int]) -> 
     -------
     ndarray of uint8, shape (height, width, 3)
     """
-    # Neither blended nor rounded: between a near and a far pixel there is nothing.
+    # no interpolation: there is nothing between a near and a far pixel
     resized = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
-    # Logarithms of all pixels would take most of the time: a table by even steps has them ready.
+    # a table over even steps of depth replaces slow logarithms of all pixels
     steps = np.array(resized, dtype=np.float32)
     cv2.patchNaNs(steps, 0.0)
     steps *= _N_STEPS / scale.far_m
@@ -192,7 +192,7 @@ def paint_depth(depth: DepthArray, scale: DepthScale, size: tuple[int, int]) -> 
 
 @lru_cache(maxsize=8)
 def _colours_of_steps(scale: DepthScale) -> ImageArray:
-    """Return the colours of even steps of depth up to the far end, shape (n, 3); 0 is unknown."""
+    """Return the colours of even steps of depth up to the far end, shape (n, 3); 0: unknown."""
     depths = np.arange(1, _N_STEPS + 1) * (scale.far_m / _N_STEPS)
     colours = np.concatenate([np.full((1, 3), _UNKNOWN), table()[scale.levels(depths)]])
     return colours.astype(np.uint8)
@@ -200,7 +200,7 @@ def _colours_of_steps(scale: DepthScale) -> ImageArray:
 
 @lru_cache(maxsize=8)
 def colour_bar(scale: DepthScale, width: int) -> ImageArray:
-    """Return the bar of a scale with its numbers, shape (HEIGHT_PX, width, 3), near at the left."""
+    """Return the colour bar with its numbers, shape (HEIGHT_PX, width, 3), near at the left."""
     bar = np.zeros((HEIGHT_PX, width, 3), dtype=np.uint8)
     left = write(bar, LABEL, (_BAR_MARGIN_PX, HEIGHT_PX - 10))[0] + 2 * _BAR_MARGIN_PX
     right = width - 3 * _BAR_MARGIN_PX
@@ -227,7 +227,7 @@ def _shares(scale: DepthScale) -> FloatArray:
 def in_groups(
     levels: ImageArray, n_groups: int = 32
 ) -> list[tuple[IntArray, tuple[int, int, int]]]:
-    """Return the indices of points of about one level with their colour: a line each has one."""
+    """Group points of similar level: indices and colour of each group."""
     groups = levels.astype(np.int64) * n_groups // 256
     found = []
     for group in np.unique(groups):

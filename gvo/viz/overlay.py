@@ -43,145 +43,90 @@ from gvo.viz.canvas import (
 from gvo.viz.canvas import HEIGHT_PX as FOOTER_PX
 from gvo.viz.palette import INLIERS, OUTLIERS, STATUSES
 
+INLIER_COLOUR: Final = bgr(INLIERS)
+OUTLIER_COLOUR: Final = bgr(OUTLIERS)
 HEADER_PX: Final = 44
 MIN_WIDTH_PX: Final = 640
-"""The text needs it."""
+"""Of a picture: its text needs so much."""
+MAX_WIDTH_PX: Final = 1280
+"""Of a picture, by default."""
 
-_WIDE = 2.0  # an image so much wider than high has its depth below
+_WIDE = 2.0  # least aspect ratio of images whose panels are stacked
 _MARGIN_PX = 8
 _GAP_PX = 18
 _ROWS_PX = (17, 37)
 _DARK_TEXT = frozenset({Status.OK, Status.COASTING})
-INLIER_COLOUR: Final = bgr(INLIERS)
-OUTLIER_COLOUR: Final = bgr(OUTLIERS)
-MAX_WIDTH_PX: Final = 1280
-"""Of a composed picture, where nothing else is asked for."""
-_CHARACTER_PX = 10  # wider than the mean
-_DIMMED = 0.4  # of the grey image below coloured lines
+_CHARACTER_PX = 10  # above the mean width
+_DIMMED = 0.4  # brightness of the image below coloured lines
 _NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
-    """Two panels of one size, one above the other or side by side, a header and a footer.
+def compose_overlay(
+    frame: Frame,
+    result: FrameResult,
+    camera: PinholeCamera,
+    *,
+    index: int | None = None,
+    rate_hz: float | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw the result of one frame: status, flow and depth.
+
+    The first panel shows the flow since the reference of the raw chain (`draw_matches`), the
+    second, below for wide images and at the right for others, the depth of the same points: lines
+    from the left to the right pixel in the colour of the depth for a stereo camera; for an RGB-D
+    camera the depth image in colours, dark where unknown, with the points.
 
     Parameters
     ----------
-    panel : tuple of two int
-        Width and height of a panel, pixels; both even, as encoders want them.
-    scale : float
-        Pixels of a panel per pixel of the image.
-    is_stacked : bool
-        One panel above the other.
+    frame : StereoFrame or RgbdFrame
+    result : FrameResult
+        Of this frame.
+    camera : StereoCamera or PinholeCamera
+        Of the recording.
+    index : int, optional
+        Number of the frame for the header.
+    rate_hz : float, optional
+        Frame rate for the header; from the stage times where omitted.
+    max_width : int
+        Maximum width, pixels; at least 640.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+        BGR, of one even size for all frames of a camera.
+
+    Raises
+    ------
+    ValueError
+        When the image size is not the camera's, or a stereo frame's camera has no baseline.
     """
-
-    panel: tuple[int, int]
-    scale: float
-    is_stacked: bool
-
-    @classmethod
-    def of(cls, camera: PinholeCamera, max_width: int) -> Layout:
-        """Return the layout for the images of a camera.
-
-        Raises
-        ------
-        ValueError
-            When the picture would be too narrow for its text.
-        """
-        if max_width < MIN_WIDTH_PX:
-            raise ValueError(f"max_width must be at least {MIN_WIDTH_PX}, got {max_width}")
-        is_stacked = camera.width >= _WIDE * camera.height
-        n_columns = 1 if is_stacked else 2
-        widest, narrowest = max_width // n_columns, MIN_WIDTH_PX // n_columns
-        width = max(narrowest, min(widest, camera.width)) & ~1
-        scale = width / camera.width
-        height = max(2, round(camera.height * scale) & ~1)
-        return cls(panel=(width, height), scale=scale, is_stacked=is_stacked)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the whole, pixels."""
-        width, height = self.panel
-        across, down = (1, 2) if self.is_stacked else (2, 1)
-        return across * width, HEADER_PX + down * height + FOOTER_PX
-
-    def empty(self) -> ImageArray:
-        """Return a black picture, shape (height, width, 3)."""
-        width, height = self.size
-        return np.zeros((height, width, 3), dtype=np.uint8)
-
-    def panels(self, canvas: ImageArray) -> tuple[ImageArray, ImageArray]:
-        """Return the parts of a picture that are the panels, to be written to."""
-        width, height = self.panel
-        body = canvas[HEADER_PX : canvas.shape[0] - FOOTER_PX]
-        if self.is_stacked:
-            return body[:height], body[height:]
-        return body[:, :width], body[:, width:]
-
-    def scaled(self, pixels: FloatArray) -> FloatArray:
-        """Return where pixels of the image, shape (n, 2), are in a panel."""
-        return np.asarray((pixels + 0.5) * self.scale - 0.5)
+    image = frame.left if isinstance(frame, StereoFrame) else frame.image
+    if image.shape != (camera.height, camera.width):
+        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
+    layout = Layout.of(camera, max_width)
+    canvas = layout.empty()
+    _draw_panels(canvas, layout, frame, result.registration or _NOTHING, camera)
+    _write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
+    _write_footer(canvas, layout, camera, result.reason)
+    return canvas
 
 
-def write_header(
-    canvas: ImageArray,
-    layout: Layout,
-    result: FrameResult | FaultyFrame,
+def compose_faulty(
+    frame: FaultyFrame,
+    camera: PinholeCamera,
     *,
-    index: int | None,
-    rate_hz: float | None = None,
-) -> None:
-    """Write status, number, stamp, counts and rate above the panels."""
-    status = result.status if isinstance(result, FrameResult) else Status.SKIPPED
-    upper, lower = _ROWS_PX
-    u = _write_badge(canvas, status) + _GAP_PX
-    if index is not None:
-        u = write(canvas, f"frame {index}", (u, upper))[0] + _GAP_PX
-    seconds, nanoseconds = divmod(result.stamp_ns, 10**9)
-    write(canvas, f"stamp {seconds}.{nanoseconds // 1000:06d} s", (u, upper))
-    if not isinstance(result, FrameResult):
-        return
-    n_outliers = max(0, result.n_matches - result.n_inliers)
-    u = write(canvas, f"{result.n_matches} matches", (_MARGIN_PX, lower))[0] + _GAP_PX
-    for text, colour in (
-        (f"{result.n_inliers} inliers", bgr(INLIERS)),
-        (f"{n_outliers} outliers", bgr(OUTLIERS)),
-        (f"{result.n_links} links", WHITE),
-    ):
-        u = write(canvas, text, (u, lower), colour)[0] + _GAP_PX
-    rate = _rate_text(result, rate_hz)
-    write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
-
-
-def write_footer(canvas: ImageArray, layout: Layout, camera: PinholeCamera, reason: str) -> None:
-    """Write a reason, and the scale of depth, below the panels."""
-    width, height = layout.size
-    middle = width // 2
-    canvas[height - FOOTER_PX :, middle:] = colour_bar(DepthScale.of(camera), width - middle)
-    text = shortened(reason, middle - 2 * _MARGIN_PX)
-    write(canvas, text, (_MARGIN_PX, height - 10))
-
-
-def _write_badge(canvas: ImageArray, status: Status) -> int:
-    """Write the status in a field of its colour; return where that ends."""
-    text = status.value
-    right = _MARGIN_PX + text_width(text) + 2 * _MARGIN_PX
-    field = canvas[2 : _ROWS_PX[0] + 6, _MARGIN_PX:right]
-    field[:] = bgr(STATUSES[status.value])
-    if status is Status.SKIPPED:  # black on black
-        field[[0, -1]] = WHITE
-        field[:, [0, -1]] = WHITE
-    write(canvas, text, (2 * _MARGIN_PX, _ROWS_PX[0]), BLACK if status in _DARK_TEXT else WHITE)
-    return right
-
-
-def _rate_text(result: FrameResult, rate_hz: float | None) -> str:
-    elapsed_ms = sum(result.stage_ms.values())
-    if rate_hz is None and elapsed_ms > 0.0:
-        rate_hz = 1e3 / elapsed_ms
-    parts = [f"{elapsed_ms:.1f} ms"] if elapsed_ms > 0.0 else []
-    parts += [] if rate_hz is None else [f"{rate_hz:.1f} Hz"]
-    return "   ".join(parts)
+    index: int | None = None,
+    max_width: int = MAX_WIDTH_PX,
+) -> ImageArray:
+    """Draw an unusable frame: dark, with the reason; otherwise as `compose_overlay`."""
+    layout = Layout.of(camera, max_width)
+    canvas = layout.empty()
+    _write_header(canvas, layout, frame, index=index)
+    _write_footer(canvas, layout, camera, "")
+    texts = textwrap.wrap(frame.reason, layout.panel[0] // _CHARACTER_PX)
+    write_lines(layout.panels(canvas)[0], [f"{Status.SKIPPED}: no pose", *texts])
+    return canvas
 
 
 def draw_matches(
@@ -192,21 +137,21 @@ def draw_matches(
     *,
     lines: Sequence[str] = (),
 ) -> ImageArray:
-    """Draw the matches between two images over the later one.
+    """Draw the flow of matches over the current image.
 
-    A line runs from where a point was to where it is now. Inliers end in a blue dot, outliers
-    in an orange cross, drawn above them.
+    Each line leads from the reference to the current pixel. Inliers end in a blue dot, outliers,
+    drawn on top, in an orange cross.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width)
         The current image, grey.
     pixels_reference, pixels_current : ndarray of float64, shape (n, 2)
-        (u, v) of the matches in the earlier and in the current image; pixel (0, 0) is the centre
-        of the first. Matches that are not finite are left out.
+        (u, v) of the matches in the reference and in the current image; pixel (0, 0) is the
+        centre of the first. Matches that are not finite are skipped.
     inliers : ndarray of bool, shape (n,)
     lines : sequence of str
-        Text for the upper left corner; characters that are not ASCII become question marks.
+        Text in the upper left corner; other than ASCII characters become question marks.
 
     Returns
     -------
@@ -236,105 +181,87 @@ def draw_matches(
     return canvas
 
 
-def compose_overlay(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Two panels of equal size, stacked or side by side, between a header and a footer.
+
+    Parameters
+    ----------
+    panel : tuple of two int
+        Width and height of a panel, pixels; even, as video encoders require.
+    scale : float
+        Panel pixels per image pixel.
+    is_stacked : bool
+        Panels are stacked, not side by side.
+    """
+
+    panel: tuple[int, int]
+    scale: float
+    is_stacked: bool
+
+    @classmethod
+    def of(cls, camera: PinholeCamera, max_width: int) -> Layout:
+        """Return the layout for the images of a camera.
+
+        Raises
+        ------
+        ValueError
+            When `max_width` is too narrow for the text.
+        """
+        if max_width < MIN_WIDTH_PX:
+            raise ValueError(f"max_width must be at least {MIN_WIDTH_PX}, got {max_width}")
+        is_stacked = camera.width >= _WIDE * camera.height
+        n_columns = 1 if is_stacked else 2
+        widest, narrowest = max_width // n_columns, MIN_WIDTH_PX // n_columns
+        width = max(narrowest, min(widest, camera.width)) & ~1
+        scale = width / camera.width
+        height = max(2, round(camera.height * scale) & ~1)
+        return cls(panel=(width, height), scale=scale, is_stacked=is_stacked)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, pixels."""
+        width, height = self.panel
+        across, down = (1, 2) if self.is_stacked else (2, 1)
+        return across * width, HEADER_PX + down * height + FOOTER_PX
+
+    def empty(self) -> ImageArray:
+        """Return a black picture, shape (height, width, 3)."""
+        width, height = self.size
+        return np.zeros((height, width, 3), dtype=np.uint8)
+
+    def panels(self, canvas: ImageArray) -> tuple[ImageArray, ImageArray]:
+        """Return the panels of a picture, as writable views."""
+        width, height = self.panel
+        body = canvas[HEADER_PX : canvas.shape[0] - FOOTER_PX]
+        if self.is_stacked:
+            return body[:height], body[height:]
+        return body[:, :width], body[:, width:]
+
+    def scaled(self, pixels: FloatArray) -> FloatArray:
+        """Map pixels of the image, shape (n, 2), to a panel."""
+        return np.asarray((pixels + 0.5) * self.scale - 0.5)
+
+
+def _draw_panels(
+    canvas: ImageArray,
+    layout: Layout,
     frame: Frame,
-    result: FrameResult,
+    found: RelativePose,
     camera: PinholeCamera,
-    *,
-    index: int | None = None,
-    rate_hz: float | None = None,
-    max_width: int = MAX_WIDTH_PX,
-) -> ImageArray:
-    """Draw what one frame gave: status, flow and depth.
-
-    The flow since the frame that the raw chain goes on from is drawn by `draw_matches`. The
-    second part, below for wide images and at the right for others, shows the depth of the same
-    points: for a stereo camera a line from where a point is in the left image to where it is in
-    the right one, in the colour of its depth; for an RGB-D camera the depth image in colours,
-    unknown depth dark, and the points.
-
-    Parameters
-    ----------
-    frame : StereoFrame or RgbdFrame
-    result : FrameResult
-        What it gave.
-    camera : StereoCamera or PinholeCamera
-        Of the recording.
-    index : int, optional
-        Number of the frame, to be told.
-    rate_hz : float, optional
-        Frames per second, to be told; from the milliseconds of the frame where omitted.
-    max_width : int
-        Most pixels in a row; at least 640.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
-        BGR, of one even size for all frames of a camera.
-
-    Raises
-    ------
-    ValueError
-        When a stereo frame comes with a camera without a baseline, or images of another size.
-    """
-    image = frame.left if isinstance(frame, StereoFrame) else frame.image
-    if image.shape != (camera.height, camera.width):
-        raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
-    layout = Layout.of(camera, max_width)
-    found = result.registration or _NOTHING
-    n_told = min(len(found.pixels_current), len(found.points_current))
-    pixels = layout.scaled(found.pixels_current[:n_told])
-    canvas = layout.empty()
-    small = _resized(image, layout.panel)
+) -> None:
     first, second = layout.panels(canvas)
-    first[:] = draw_matches(
-        small,
-        layout.scaled(found.pixels_reference[:n_told]),
-        pixels,
-        found.inliers[:n_told],
-        lines=["flow"],
-    )
-    depths = found.points_current[:n_told, 2]
+    n_shown = min(len(found.pixels_current), len(found.points_current))
+    current = layout.scaled(found.pixels_current[:n_shown])
+    reference = layout.scaled(found.pixels_reference[:n_shown])
+    image = frame.left if isinstance(frame, StereoFrame) else frame.image
+    small = _resized(image, layout.panel)
+    first[:] = draw_matches(small, reference, current, found.inliers[:n_shown], lines=["flow"])
     if isinstance(frame, StereoFrame):
-        second[:] = _disparity_picture(small, pixels, depths, camera, layout)
+        depths = found.points_current[:n_shown, 2]
+        second[:] = _disparity_picture(small, current, depths, camera, layout.scale)
     else:
-        second[:] = _depth_picture(frame, pixels, camera, layout)
-    write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
-    write_footer(canvas, layout, camera, result.reason)
-    return canvas
-
-
-def compose_faulty(
-    frame: FaultyFrame,
-    camera: PinholeCamera,
-    *,
-    index: int | None = None,
-    max_width: int = MAX_WIDTH_PX,
-) -> ImageArray:
-    """Draw a frame that cannot be used: dark, with the reason.
-
-    Parameters
-    ----------
-    frame : FaultyFrame
-    camera : StereoCamera or PinholeCamera
-        Of the recording.
-    index : int, optional
-        Number of the frame, to be told.
-    max_width : int
-        Most pixels in a row; at least 640.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
-        BGR, of the size of the other frames of the camera.
-    """
-    layout = Layout.of(camera, max_width)
-    canvas = layout.empty()
-    write_header(canvas, layout, frame, index=index)
-    write_footer(canvas, layout, camera, "")
-    texts = textwrap.wrap(frame.reason, layout.panel[0] // _CHARACTER_PX)
-    write_lines(layout.panels(canvas)[0], [f"{Status.SKIPPED}: no pose", *texts])
-    return canvas
+        second[:] = _depth_picture(frame, current, camera, layout.panel)
 
 
 def _resized(image: ImageArray, size: tuple[int, int]) -> ImageArray:
@@ -344,11 +271,7 @@ def _resized(image: ImageArray, size: tuple[int, int]) -> ImageArray:
 
 
 def _disparity_picture(
-    image: ImageArray,
-    pixels: FloatArray,
-    depths: FloatArray,
-    camera: PinholeCamera,
-    layout: Layout,
+    image: ImageArray, pixels: FloatArray, depths: FloatArray, camera: PinholeCamera, scale: float
 ) -> ImageArray:
     if not isinstance(camera, StereoCamera):
         raise ValueError("a stereo frame needs a camera with a baseline")
@@ -357,7 +280,7 @@ def _disparity_picture(
     is_known = np.isfinite(pixels).all(axis=1) & (depths > 0.0)
     left, depths = pixels[is_known], depths[is_known]
     right = left.copy()
-    right[:, 0] -= layout.scale * camera.depth_to_disparity(depths)
+    right[:, 0] -= scale * camera.depth_to_disparity(depths)
     segments = np.stack([left, right], axis=1)
     levels = DepthScale.of(camera).levels(depths)
     for indices, colour in in_groups(levels):
@@ -368,11 +291,73 @@ def _disparity_picture(
 
 
 def _depth_picture(
-    frame: RgbdFrame, pixels: FloatArray, camera: PinholeCamera, layout: Layout
+    frame: RgbdFrame, pixels: FloatArray, camera: PinholeCamera, size: tuple[int, int]
 ) -> ImageArray:
-    canvas = paint_depth(frame.depth, DepthScale.of(camera), layout.panel)
+    canvas = paint_depth(frame.depth, DepthScale.of(camera), size)
     known = pixels[np.isfinite(pixels).all(axis=1)]
     draw_dots(canvas, known, BLACK, radius=2.3)
     draw_dots(canvas, known, WHITE, radius=1.0)
     write_lines(canvas, ["depth, and the matched points"])
     return canvas
+
+
+def _write_header(
+    canvas: ImageArray,
+    layout: Layout,
+    result: FrameResult | FaultyFrame,
+    *,
+    index: int | None,
+    rate_hz: float | None = None,
+) -> None:
+    """Write status, number, stamp, counts and rate into the header."""
+    status = result.status if isinstance(result, FrameResult) else Status.SKIPPED
+    upper, lower = _ROWS_PX
+    u = _write_badge(canvas, status) + _GAP_PX
+    if index is not None:
+        u = write(canvas, f"frame {index}", (u, upper))[0] + _GAP_PX
+    seconds, nanoseconds = divmod(result.stamp_ns, 10**9)
+    write(canvas, f"stamp {seconds}.{nanoseconds // 1000:06d} s", (u, upper))
+    if not isinstance(result, FrameResult):
+        return
+    n_outliers = max(0, result.n_matches - result.n_inliers)
+    u = _MARGIN_PX
+    for text, colour in (
+        (f"{result.n_matches} matches", WHITE),
+        (f"{result.n_inliers} inliers", INLIER_COLOUR),
+        (f"{n_outliers} outliers", OUTLIER_COLOUR),
+        (f"{result.n_links} links", WHITE),
+    ):
+        u = write(canvas, text, (u, lower), colour)[0] + _GAP_PX
+    rate = _rate_text(result, rate_hz)
+    write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
+
+
+def _write_footer(canvas: ImageArray, layout: Layout, camera: PinholeCamera, reason: str) -> None:
+    """Write a reason and the depth scale into the footer."""
+    width, height = layout.size
+    middle = width // 2
+    canvas[height - FOOTER_PX :, middle:] = colour_bar(DepthScale.of(camera), width - middle)
+    text = shortened(reason, middle - 2 * _MARGIN_PX)
+    write(canvas, text, (_MARGIN_PX, height - 10))
+
+
+def _write_badge(canvas: ImageArray, status: Status) -> int:
+    """Write the status on its colour; return the right end."""
+    text = status.value
+    right = _MARGIN_PX + text_width(text) + 2 * _MARGIN_PX
+    field = canvas[2 : _ROWS_PX[0] + 6, _MARGIN_PX:right]
+    field[:] = bgr(STATUSES[status.value])
+    if status is Status.SKIPPED:  # black on black
+        field[[0, -1]] = WHITE
+        field[:, [0, -1]] = WHITE
+    write(canvas, text, (2 * _MARGIN_PX, _ROWS_PX[0]), BLACK if status in _DARK_TEXT else WHITE)
+    return right
+
+
+def _rate_text(result: FrameResult, rate_hz: float | None) -> str:
+    elapsed_ms = sum(result.stage_ms.values())
+    if rate_hz is None and elapsed_ms > 0.0:
+        rate_hz = 1e3 / elapsed_ms
+    parts = [f"{elapsed_ms:.1f} ms"] if elapsed_ms > 0.0 else []
+    parts += [] if rate_hz is None else [f"{rate_hz:.1f} Hz"]
+    return "   ".join(parts)

@@ -1,4 +1,4 @@
-"""The colours of all pictures: one meaning each, told apart by colour-blind readers."""
+"""The colours of all pictures: one meaning each, safe for colour-blind readers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
 """Of the three trajectories of a run."""
 OTHERS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
-"""Of estimates of any other name, one after another."""
+"""Of other estimates, in turn."""
 REFERENCE = "#000000"
 INLIERS, OUTLIERS = "#56B4E9", "#E69F00"
 STATUSES = {
@@ -21,7 +21,7 @@ STATUSES = {
     "resumed": "#0072B2",
     "skipped": "#000000",
 }
-"""Of the statuses of frames; they have hatches and rows of their own as well."""
+"""Of the statuses of frames, which have hatches and rows of their own too."""
 HATCHES = {"ok": "", "coasting": "////", "lost": "xxxx", "resumed": "....", "skipped": ""}
 LINKS = {"step": "#0072B2", "keyframe": "#CC79A7", "standstill": "#999999"}
 """Of the kinds of edges."""
@@ -33,7 +33,7 @@ STAGES = {
     "links": "#BCAE6B",
     "window": "#FDEA45",
 }
-"""Of the stages of a frame, from dark to light: they differ in print too."""
+"""Of the stages of a frame, from dark to light: distinct in grey print too."""
 COUNTS = {"keypoints": "#999999", "points": "#0072B2", "matches": "#CC79A7", "inliers": INLIERS}
 
 _LINE_STYLES = ("-", "-.", ":")
@@ -41,7 +41,7 @@ _LINE_STYLES = ("-", "-.", ":")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Style:
-    """How all the lines of one trajectory look, in matplotlib's words."""
+    """Properties of the lines of one trajectory, named as in matplotlib."""
 
     color: str
     linestyle: str = "-"
@@ -53,12 +53,12 @@ REFERENCE_STYLE = Style(color="black", linestyle="--", zorder=3.0)
 
 
 def styles_of(names: Iterable[str]) -> list[Style]:
-    """Return a style per name: the fixed colour of its word, once, or the next free one.
+    """Return a style for each name: the fixed colour of a word in it, once, or the next free one.
 
     Parameters
     ----------
     names : iterable of str
-        "raw", "causal" and "smoothed", also as a word within the name, have fixed colours.
+        Names with the word "raw", "causal" or "smoothed" have fixed colours.
 
     Examples
     --------

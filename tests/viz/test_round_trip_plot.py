@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gvo.errors import RecordingError
+from gvo.errors import TrajectoryError
 from gvo.trajectory.round_trip import RoundTripError, round_trip_error
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz import plots
@@ -63,10 +63,11 @@ def test_a_drive_that_goes_nowhere_can_be_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "still.png").stat().st_size > 0
 
 
-def test_a_folder_that_is_missing_is_named(
+def test_a_file_that_cannot_be_written_is_named(
     errors: dict[str, RoundTripError], tmp_path: Path
 ) -> None:
-    with pytest.raises(RecordingError, match=r"nowhere/a\.png: cannot be written"):
-        plot_round_trip(tmp_path / "nowhere/a.png", errors)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TrajectoryError, match=r"file/a\.png: cannot be written"):
+        plot_round_trip(tmp_path / "file/a.png", errors)
     with pytest.raises(ValueError, match="at least one trajectory"):
         plot_round_trip(tmp_path / "a.png", {})

@@ -1,4 +1,4 @@
-"""The report of any number of estimates beside a reference."""
+"""The report of estimates compared with a reference."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def write_comparison_report(
     align: AlignMode,
     plots: str | Path | None = None,
 ) -> None:
-    """Write a page about estimates beside a reference; equal input gives equal files.
+    """Write the report of estimates compared with a reference; equal input gives equal files.
 
     Parameters
     ----------
     path : str or Path, optional
-        The page; where omitted only the plots are written.
+        HTML file; only the plots are written where omitted.
     truth : Trajectory
         The reference.
     trajectories : mapping of str to Trajectory
@@ -51,18 +51,18 @@ def write_comparison_report(
     evaluations : sequence of Evaluation
         Of the same estimates.
     align : {"none", "origin", "se3", "sim3"}
-        What moves each estimate onto the reference.
+        Alignment of each estimate with the reference.
     plots : str or Path, optional
-        Folder for each plot as PNG and PDF.
+        Folder for the plots as PNG and PDF.
 
     Raises
     ------
     ConfigurationError
         When a file or the folder cannot be written.
     TrajectoryError
-        Where nothing can be associated, or a plot cannot be written.
+        When nothing can be associated, or a plot cannot be written.
     ValueError
-        Where there is no estimate.
+        When there is no estimate.
     """
     if not trajectories:
         raise ValueError("expected at least one estimate")
@@ -70,30 +70,27 @@ def write_comparison_report(
     asked_m = evaluations[0].segments_m if evaluations else None
     world = World.of(truth)
     shown = truth_around(truth, [c.reference for c in compared])
+    names = ", ".join(trajectories)
+    facts = {
+        "Estimates": names,
+        "Poses of the reference": str(len(truth)),
+        "Alignment": align,
+    }
     with settings():
         lines = lines_of(shown, {c.name: c.trajectory for c in compared})
-        sheets = [
-            *path_plots(lines, world),
-            *error_plots(compared, align),
-            drift_plot(compared, asked_m=asked_m),
-        ]
+        sheets = path_plots(lines, world) + error_plots(compared, align)
+        sheets.append(drift_plot(compared, asked_m=asked_m))
         if path is not None:
-            names = ", ".join(trajectories)
-            facts = {"Estimates": names, "Poses of the reference": str(len(truth))}
-            facts["Alignment"] = align
-            body = [
-                "<h1>Comparison of trajectories</h1>",
-                facts_html(facts),
-                table_html(_HEADER, map(_row, evaluations)),
-                *plots_html(sheets, lines, world),
-            ]
+            head = ["<h1>Comparison of trajectories</h1>", facts_html(facts)]
+            table = table_html(_HEADER, map(_row, evaluations))
+            body = [*head, table, *plots_html(sheets, lines, world)]
             write_page(Path(path), f"Comparison: {names}", body)
         if plots is not None:
             write_plots(sheets, Path(plots))
 
 
 def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
-    """Return the part of the truth that the associated poses span."""
+    """Return the ground truth within the span of the associated poses."""
     first_ns = min(int(part.stamps_ns[0]) for part in parts)
     last_ns = max(int(part.stamps_ns[-1]) for part in parts)
     return truth.select((truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns))
@@ -110,5 +107,4 @@ def _row(evaluation: Evaluation) -> list[str]:
         evaluation.r_deg_per_100m,
         evaluation.path_ratio,
     )
-    texts = [number_text(number) for number in numbers]
-    return [evaluation.name, str(evaluation.n), *texts]
+    return [evaluation.name, str(evaluation.n), *map(number_text, numbers)]

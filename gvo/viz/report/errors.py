@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M
 from gvo.types import FloatArray
 from gvo.viz.palette import ESTIMATES, Style, styles_of
+from gvo.viz.plots import plain
 from gvo.viz.report.measures import (
     N_DOF,
     Comparison,
@@ -28,52 +31,58 @@ from gvo.viz.report.sheets import (
     kept_of_curve,
     new_figure,
     plain_decades,
+    time_axes,
 )
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _ROW_HEIGHT = 2.1
-_MANY = 8
 _N_COLUMNS = 350
 _SIGMAS = 3.0
-# below it a value is drawn on the floor of the logarithmic axis
-_FLOOR = 0.01
-# rows of the figure: translations, then rotations
-_PANELS = ((3, "x", "m"), (4, "y", "m"), (5, "z", "m"), (0, "x", "deg"), (1, "y", "deg"))
-_ALL_PANELS = (*_PANELS, (2, "z", "deg"))
+_FLOOR = 0.01  # of the logarithmic axis
+_ALIGNED = {
+    "none": "without alignment",
+    "origin": "with the first poses aligned",
+    "se3": "after SE(3) alignment",
+    "sim3": "after Sim(3) alignment",
+}
+# index into errors, letter and unit: translations in the upper row, rotations below
+_PANELS = (
+    *((3, "x", "m"), (4, "y", "m"), (5, "z", "m")),
+    *((0, "x", "deg"), (1, "y", "deg"), (2, "z", "deg")),
+)
 
 
-def error_plots(comparisons: Sequence[Comparison], align: str) -> list[Plot]:
+def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
     """Return the errors over time and over the distance travelled."""
     first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
     is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
-    moved = "as they are" if align == "none" else f"aligned by {align.upper()}"
     rotations = (
-        " Rotation errors are of the rotation since the first pose."
+        "Rotation errors are those of the rotation since the first pose."
         if any(c.errors_rad is not None for c in comparisons)
-        else " The truth holds no rotations: there are no rotation errors."
+        else "The ground truth holds no rotations: there are no rotation errors."
+    )
+    over_time = _curves(
+        comparisons,
+        lambda c: elapsed(c.reference.stamps_ns, first_ns),
+        "row" if is_by_row else "elapsed [s]",
+    )
+    over_distance = _curves(
+        comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
     )
     return [
         Plot(
             slug="errors_over_time",
-            title="Errors over time",
-            text=f"Position errors of the trajectories, {moved}."
-            f"{rotations} Good curves are low and smooth; a step is a single bad frame.",
-            figure=_curves(
-                comparisons,
-                lambda c: elapsed(c.reference.stamps_ns, first_ns),
-                "row" if is_by_row else "elapsed [s]",
-            ),
+            text=f"Position errors {_ALIGNED[align]}. {rotations} "
+            "Good curves are low and smooth; a step is a single bad frame.",
+            figure=over_time,
         ),
         Plot(
             slug="errors_over_distance",
-            title="Errors over distance travelled",
-            text="The same errors along the true path: a steady slope is drift, in metres per "
-            "metre; where the camera stands, the curve must stand too.",
-            figure=_curves(
-                comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
-            ),
+            text="The same errors over the distance along the true path: a steady slope is drift "
+            "in metres per metre; while the camera stands still, so must the curve.",
+            figure=over_distance,
         ),
     ]
 
@@ -112,47 +121,44 @@ def drift_plot(
     ----------
     comparisons : sequence of Comparison
     asked_m : sequence of float, optional
-        Lengths that were asked for, metres; those that suit the path where omitted.
+        Lengths asked for, metres; lengths that suit the path where omitted.
     """
-    title = "Drift by length of segment"
     path_m = max(float(c.reference.distances()[-1]) for c in comparisons)
-    usual = (KITTI_SEGMENTS_M, SHORT_SEGMENTS_M)
-    is_asked = asked_m is not None and tuple(asked_m) not in usual
+    is_asked = asked_m is not None and tuple(asked_m) not in (KITTI_SEGMENTS_M, SHORT_SEGMENTS_M)
     lengths = tuple(asked_m) if asked_m is not None and is_asked else drift_lengths(path_m)
     found = [(c.name, drift(c, lengths)) for c in comparisons]
-    drifts = [(name, item) for name, item in found if item is not None]
-    if not drifts:
+    n_segments = next((int(item.n_segments[-1]) for _, item in found if item is not None), None)
+    if n_segments is None:
         reason = (
-            "the truth holds positions without rotations, segments cannot be compared"
+            "the ground truth holds no rotations, which segments are compared by"
             if any(c.errors_rad is None for c in comparisons)
             else f"the path of {path_m:.2g} m is too short for segments"
         )
-        return Plot(slug="drift", title=title, text=f"Not drawn: {reason}.")
+        return Plot(slug="drift", text=f"Not drawn: {reason}.")
     origin = (
         "the standard lengths of the KITTI benchmark"
         if lengths == KITTI_SEGMENTS_M
         else "the lengths asked for"
         if is_asked
-        else f"round lengths that suit a path of {path_m:.3g} m"
+        else f"round lengths for a path of {path_m:.3g} m"
     )
-    n_least = int(drifts[0][1].n_segments[-1])
-    text = (
-        f"Mean error over all segments of a length, as KITTI's devkit takes it; {origin}. "
-        "Translation drift falls with the length where noise is random, and is level where a "
-        "scale or a direction is wrong; rotation drift should fall as well. The longest point "
-        f"is the mean of {n_least} overlapping segments."
+    return Plot(
+        slug="drift",
+        text=f"Mean error over all segments of a length, as in KITTI's devkit; {origin}. "
+        "Translation drift falls with the length where errors are random, and stays level where "
+        "scale or heading is biased; rotation drift should fall as well. The longest length is "
+        f"the mean of {n_segments} overlapping segments.",
+        figure=_drift_figure(found),
     )
-    return Plot(slug="drift", title=title, text=text, figure=_drift_figure(found))
 
 
 def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
     figure = new_figure(WIDE, 3.5)
     panels: Any = figure.subplots(1, 2)
     styles = styles_of(name for name, _ in found)
-    for index, ((name, item), style) in enumerate(zip(found, styles, strict=True)):
-        if item is None:
-            continue
-        _draw_drift(panels, name, item, style, marker="osD^vP*X"[index % _MANY])
+    for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
+        if item is not None:
+            _draw_drift(panels, name, item, style, marker=marker)
     panels[0].set(xlabel="length of segment [m]", ylabel="translation error [%]")
     panels[1].set(xlabel="length of segment [m]", ylabel="rotation error [deg/m]")
     for axes in panels:
@@ -164,8 +170,6 @@ def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
 
 
 def _draw_drift(panels: Any, name: str, item: Drift, style: Style, *, marker: str) -> None:  # noqa: ANN401
-    from gvo.viz.plots import plain
-
     looks = {"color": style.color, "linestyle": style.linestyle, "marker": marker, "ms": 4.5}
     panels[0].plot(item.lengths_m, item.translations_pct, label=plain(name), **looks)
     panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
@@ -179,40 +183,42 @@ def covariance_plots(found: Sequence[Consistency], first_ns: int) -> list[Plot]:
     found : sequence of Consistency
         Of causal and smoothed poses, at least one.
     first_ns : int
-        Where the elapsed time is zero.
+        Stamp of elapsed time zero.
     """
-    late_s = (min(int(item.stamps_ns[0]) for item in found) - first_ns) / 1e9
-    step_s = float(np.median(np.diff(found[0].stamps_ns))) / 1e9 if len(found[0].nees) > 1 else 0.0
-    late = (
-        f" The truth begins {late_s:.2g} s after the first pose: the bands hold that time as well, "
-        "the errors do not."
-        if late_s > 3.0 * step_s > 0.0
-        else ""
-    )
     low, high = nees_band()
     return [
         Plot(
             slug="covariance",
-            title="Errors within their covariances",
-            text="Errors of the poses along their own axes, since the first pose, with the band "
-            "of three stated sigmas (filled: smoothed; dashed: causal). Nothing is fitted: the "
-            "first poses are laid onto each other, so noise of the first true pose counts as "
-            f"error, the more the longer the path. {_inside(found)} In a good run 99.7 % are "
-            f"inside, and the errors use more than a tenth of the band. Errors that leave it in "
-            f"the first second and then stay level are those of the first true poses.{late}",
+            text="Pose errors along the axes of each pose, relative to the first pose, with the "
+            "stated 3-sigma bands (filled: smoothed; dashed: causal). The first poses are aligned "
+            "and nothing is fitted, so noise of the first true pose counts as error, the more the "
+            f"longer the path. {_inside(found)} In a consistent run 99.7 % are inside, and the "
+            "errors fill more than a tenth of the band. Errors that leave it within the first "
+            "second and then stay level are those of the first true poses."
+            f"{_late(found, first_ns)}",
             figure=_bands(found, first_ns),
         ),
         Plot(
             slug="nees",
-            title="Normalised squared error (NEES)",
-            text="Error squared over stated covariance, of six degrees of freedom: "
-            f"{N_DOF} on average, and 95 % between {low:.2f} and {high:.1f} (shaded), where the "
-            "covariances are right. Errors of one run are tied to each other over time, so a "
-            "single run may lie off for long. Above the band the run is too sure of itself, "
-            f"below it too modest. {_nees_words(found)}",
+            text="Squared error over stated covariance, with six degrees of freedom: mean "
+            f"{N_DOF}, and 95 % between {low:.2f} and {high:.1f} (shaded), where the covariances "
+            "are consistent. Errors of one run are correlated over time, so a single run may lie "
+            "outside for long. Above the band the estimate is overconfident, below it "
+            f"conservative. {_nees_words(found)}",
             figure=_nees(found, first_ns),
         ),
     ]
+
+
+def _late(found: Sequence[Consistency], first_ns: int) -> str:
+    late_s = (min(int(item.stamps_ns[0]) for item in found) - first_ns) / 1e9
+    step_s = float(np.median(np.diff(found[0].stamps_ns))) / 1e9 if len(found[0].nees) > 1 else 0.0
+    if not late_s > 3.0 * step_s > 0.0:
+        return ""
+    return (
+        f" The ground truth begins {late_s:.2g} s after the first pose: the bands include that "
+        "time, the errors do not."
+    )
 
 
 def _inside(found: Sequence[Consistency]) -> str:
@@ -223,7 +229,7 @@ def _inside(found: Sequence[Consistency]) -> str:
             f"{item.name}: {shares[3:].mean():.1f} % of the position and {shares[:3].mean():.1f} % "
             "of the rotation errors"
         )
-    return f"Inside are, {'; '.join(parts)}."
+    return f"Inside: {'; '.join(parts)}."
 
 
 def _nees_words(found: Sequence[Consistency]) -> str:
@@ -234,21 +240,21 @@ def _nees_words(found: Sequence[Consistency]) -> str:
             f"{item.name}: {within:.1f} % within, {below:.1f} % below, {above:.1f} % above, "
             f"mean {item.nees.mean():.3g}"
         )
-    return f"Here, {'; '.join(parts)}."
+    return f"Here: {'; '.join(parts)}."
 
 
 def _bands(found: Sequence[Consistency], first_ns: int) -> Figure:
     figure = new_figure(WIDE, 5.2)
     panels: Any = figure.subplots(2, 3, sharex=True)
-    for panel, (index, letter, unit) in zip(panels.flat, _ALL_PANELS, strict=True):
+    for panel, (index, letter, unit) in zip(panels.flat, _PANELS, strict=True):
         factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
         for item in found:
             x = elapsed(item.stamps_ns, first_ns)
             _draw_band(panel, item.name, x, _SIGMAS * factor * item.sigmas[:, index])
         for item in found:
-            x, style = elapsed(item.stamps_ns, first_ns), _style(item.name)
+            x = elapsed(item.stamps_ns, first_ns)
             y = factor * item.errors[:, index]
-            draw_curve(panel, x, y, style, label=item.name, n_columns=_N_COLUMNS)
+            draw_curve(panel, x, y, _style(item.name), label=item.name, n_columns=_N_COLUMNS)
         kind = "position" if unit == "m" else "rotation"
         panel.set_ylabel(f"{kind} {letter} [{unit}]")
     for panel in panels[-1]:
@@ -269,17 +275,15 @@ def _draw_band(axes: Any, name: str, x: FloatArray, reach: FloatArray) -> None: 
     colour, label = ESTIMATES[name], f"\u00b13 sigma {name}"
     if len(x) == 1:  # a band of one pose has no area
         axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=colour, marker="_", label=label)
-        return
-    if name == "smoothed":
+    elif name == "smoothed":
         axes.fill_between(x, -reach, reach, color=colour, alpha=0.2, lw=0, label=label)
-        return
-    axes.plot(x, reach, color=colour, ls="--", lw=1.0, label=label)
-    axes.plot(x, -reach, color=colour, ls="--", lw=1.0)
+    else:
+        axes.plot(x, reach, color=colour, ls="--", lw=1.0, label=label)
+        axes.plot(x, -reach, color=colour, ls="--", lw=1.0)
 
 
 def _nees(found: Sequence[Consistency], first_ns: int) -> Figure:
-    figure = new_figure(WIDE, 3.0)
-    axes = figure.subplots()
+    figure, axes = time_axes(3.0, "NEES [-]")
     axes.axhspan(*nees_band(), color="0.9", lw=0, zorder=0.5, label="95 % band")
     axes.axhline(N_DOF, color="black", ls=":", lw=1.0, label="expected: 6")
     for item in found:
@@ -289,7 +293,5 @@ def _nees(found: Sequence[Consistency], first_ns: int) -> Figure:
     plain_decades(axes.yaxis)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, 0.5), 0.7 * _FLOOR), max(high, 120.0))
-    axes.margins(x=0.01)
-    axes.set(xlabel="elapsed [s]", ylabel="NEES [-]")
     arrange(figure, axes)
     return figure

@@ -23,30 +23,35 @@ from gvo.viz.report.sheets import (
     kept_of_dots,
     new_figure,
     plain_decades,
+    time_axes,
 )
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# the ribbon's columns: a single frame is to be seen
-_N_RIBBON = 400
+_N_RIBBON = 400  # columns of the ribbon: a single frame must be visible
 _UNKNOWN = "#999999"
-# below it a value is drawn on the floor of the logarithmic axis
-_FLOOR = 1e-3
-_N_COLUMNS, _N_ROWS = 300, 60
+_FLOOR = 1e-3  # of the logarithmic axis
+_N_COLUMNS, _N_ROWS = 300, 60  # cells for dots
 _MARKERS = {"step": "o", "keyframe": "s", "standstill": "D"}
 _HATCHES = {"step": "", "keyframe": "////", "standstill": "...."}
-# of the histogram: powers of ten
-_DECADES = (-3.0, 3.0)
+_DECADES = (-3.0, 3.0)  # of the histogram: powers of ten
 _N_BINS = 60
-_NONE = "Not drawn: the run wrote no edges whose residuals are known."
 
 
 def status_plot(frames: FrameTable) -> Plot:
     """Return the ribbon of statuses, a row for each that occurs."""
-    title = "Status"
     if len(frames.stamps_ns) == 0:
-        return Plot(slug="status", title=title, text="Not drawn: the run holds no frame.")
+        return Plot(slug="status", text="Not drawn: the run has no frame.")
+    return Plot(
+        slug="status",
+        text="The status of each frame, with a row and the number of frames for each status that "
+        "occurs; single frames are widened to be seen. A good run has one row: ok.",
+        figure=_ribbon(frames),
+    )
+
+
+def _ribbon(frames: FrameTable) -> Figure:
     counts = Counter(frames.statuses)
     names = [*(s for s in STATUSES if counts[s]), *(s for s in counts if s not in STATUSES)]
     figure = new_figure(WIDE, 0.85 + 0.32 * len(names))
@@ -68,15 +73,11 @@ def status_plot(frames: FrameTable) -> Plot:
     axes.margins(x=0.005)
     axes.set_xlabel("elapsed [s]")
     arrange(figure, left=1.15)
-    text = (
-        "What ties each frame to those before it, a row for each status that occurs, with its "
-        "frames; a single frame is widened to be seen. In a good run there is one row: ok."
-    )
-    return Plot(slug="status", title=title, text=text, figure=figure)
+    return figure
 
 
 def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: ANN401
-    """Return start and width of the stretches of a status, each as wide as a column at least."""
+    """Return start and width of each stretch of a status, at least a column wide."""
     extent = max(float(x[-1] - x[0]), 1e-9)
     step = float(np.median(np.diff(x))) if len(x) > 1 else extent
     n_columns = max(1, min(_N_RIBBON, round(extent / step) + 1))
@@ -89,31 +90,26 @@ def _spans(x: FloatArray, is_there: Any) -> list[tuple[float, float]]:  # noqa: 
 
 
 def count_plot(frames: FrameTable) -> Plot:
-    """Return points, matches and inliers per frame."""
-    title = "Features, matches and inliers"
+    """Return keypoints, points, matches and inliers per frame."""
     present = {n: frames.counts[n] for n in COUNTS if n in frames.counts}
     has_pose = np.array([status != "skipped" for status in frames.statuses], dtype=np.bool_)
     if not present or not np.any(has_pose):
-        text = "Not drawn: the run counted none; its edges came from elsewhere."
-        return Plot(slug="counts", title=title, text=text)
-    figure = new_figure(WIDE, 3.0)
-    axes = figure.subplots()
+        return Plot(slug="counts", text="Not drawn: the run has no counts; its edges were given.")
+    figure, axes = time_axes(3.0, "number per frame [-]")
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
     for name, counts in present.items():
         y = np.where(has_pose, counts, np.nan).astype(np.float64)
         if name in ("matches", "inliers"):
-            y[np.argmax(has_pose)] = np.nan  # the first frame has none to be matched with
+            y[np.argmax(has_pose)] = np.nan  # nothing precedes the first frame
         draw_curve(axes, x, y, Style(color=COUNTS[name]), label=name)
-    axes.set(xlabel="elapsed [s]", ylabel="number per frame [-]")
     axes.set_ylim(bottom=0.0)
-    axes.margins(x=0.01)
     arrange(figure, axes)
     text = (
-        "Keypoints found, points with a depth, their matches in the frame before, and those that "
-        "agree with the motion. Good curves lie near each other and far above "
-        f"ransac.min_inliers; {_inlier_words(frames)}"
+        "Keypoints, points with depth, matches with the previous frame, and inliers of the motion. "
+        "Good curves lie near each other and far above ransac.min_inliers; "
+        f"{_inlier_words(frames)}"
     )
-    return Plot(slug="counts", title=title, text=text, figure=figure)
+    return Plot(slug="counts", text=text, figure=figure)
 
 
 def _inlier_words(frames: FrameTable) -> str:
@@ -125,89 +121,92 @@ def _inlier_words(frames: FrameTable) -> str:
     median, fewest = np.median(inliers[is_matched]), inliers[is_matched].min()
     return (
         f"here the median frame has {median:.0f} inliers, {share:.0f} % of its matches, and the "
-        f"worst matched one {fewest}."
+        f"worst matched frame {fewest}."
     )
 
 
 def timing_plot(timings: TimingTable | None) -> Plot:
     """Return the milliseconds per frame, stacked by stage."""
-    title = "Milliseconds per frame"
-    stages = {} if timings is None else timings.stages_ms
-    if timings is None or len(timings.stamps_ns) == 0 or not stages:
-        text = "Not drawn: the run wrote no times of its stages."
-        return Plot(slug="timings", title=title, text=text)
-    table = np.nan_to_num(np.stack(list(stages.values())))
+    if timings is None or len(timings.stamps_ns) == 0 or not timings.stages_ms:
+        return Plot(slug="timings", text="Not drawn: the run has no times of its stages.")
+    table = np.nan_to_num(np.stack(list(timings.stages_ms.values())))
     total = table.sum(axis=0)
+    median, slow = np.quantile(total, [0.5, 0.95])
+    return Plot(
+        slug="timings",
+        text="Wall time of each frame, stacked by stage, with the medians in brackets. The median "
+        f"frame took {median:.1f} ms, 95 % took less than {slow:.1f} ms, the slowest "
+        f"{total.max():.1f} ms. {_rate_words(timings, total)}",
+        figure=_stack(timings, table),
+    )
+
+
+def _stack(timings: TimingTable, table: FloatArray) -> Figure:
+    total = table.sum(axis=0)
+    median, slow = np.quantile(total, [0.5, 0.95])
     x = elapsed(timings.stamps_ns, int(timings.stamps_ns[0]))
     kept = kept_of_curve(x, total, n_columns=N_COLUMNS // 2)
-    median, slow = np.quantile(total, [0.5, 0.95])
-    figure = new_figure(WIDE, 3.2)
-    axes = figure.subplots()
-    parts = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
+    is_one = len(x) == 1  # a stack of one frame has no width
+    at, drawn = (
+        (np.array([-0.5, 0.5]), np.repeat(table, 2, axis=1))
+        if is_one
+        else (x[kept], table[:, kept])
+    )
+    stages = timings.stages_ms
+    labels = [f"{name} ({np.median(row):.1f})" for name, row in zip(stages, table, strict=True)]
     colours = [STAGES.get(name, _UNKNOWN) for name in stages]
-    drawn = table[:, kept] if len(x) > 1 else np.repeat(table, 2, axis=1)
-    at = x[kept] if len(x) > 1 else np.array([-0.5, 0.5])
-    axes.stackplot(at, drawn, labels=parts, colors=colours, step="mid", lw=0)
+    figure, axes = time_axes(3.2, "milliseconds per frame [ms]")
+    axes.stackplot(at, drawn, labels=labels, colors=colours, step="mid", lw=0)
     axes.axhline(median, color="black", lw=1.0, label=f"median {median:.1f}")
     axes.axhline(slow, color="black", lw=1.0, ls=":", label=f"95 %: {slow:.1f}")
-    axes.set(xlabel="elapsed [s]", ylabel="milliseconds per frame [ms]")
     axes.set_ylim(0.0, 1.05 * float(total.max()) or 1.0)
-    axes.margins(x=0.01)
     arrange(figure, axes)
-    text = (
-        "Wall time of the stages of each frame, one on top of the other; in brackets their "
-        f"medians. The median frame took {median:.1f} ms, 95 % took less than {slow:.1f} ms, the "
-        f"slowest {total.max():.1f} ms. {_rate_words(timings, total)}"
-    )
-    return Plot(slug="timings", title=title, text=text, figure=figure)
+    return figure
 
 
 def _rate_words(timings: TimingTable, total: FloatArray) -> str:
     if len(timings.stamps_ns) < 2:
-        return "A good run stays below the time between two frames."
+        return "A good run stays below the frame period."
     period_ms = float(np.median(np.diff(np.sort(timings.stamps_ns)))) / 1e6
     share = 100.0 * float(np.mean(total > period_ms))
     return (
-        f"A good run stays below the time between two frames, {period_ms:.1f} ms; {share:.1f} % "
-        "of the frames took longer."
+        f"A good run stays below the frame period of {period_ms:.1f} ms; {share:.1f} % of the "
+        "frames took longer."
     )
 
 
 def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None) -> list[Plot]:
-    """Return the chi-square of the edges over time and its histogram.
+    """Return the chi-square of the edges over time, and its histogram.
 
     Parameters
     ----------
     edges : EdgeTable or None
     first_ns : int
-        Where the elapsed time is zero.
+        Stamp of elapsed time zero.
     link_factor : float or None
-        `window.link_sigma_factor`, by which the sigmas of links to keyframes are widened.
+        `window.link_sigma_factor`, which inflates the sigmas of links to keyframes.
     """
-    titles = ("Chi-square of the edges", "Distribution of chi-square")
     if edges is None or not np.any(np.isfinite(edges.chi2)):
-        slugs = ("chi2", "chi2_histogram")
-        return [Plot(slug=s, title=t, text=_NONE) for s, t in zip(slugs, titles, strict=True)]
+        reason = "Not drawn: the run has no edges with residuals."
+        return [Plot(slug=slug, text=reason) for slug in ("chi2", "chi2_histogram")]
     bound = chi2_bound(0.95)
     n_refused = int(np.count_nonzero(~edges.is_accepted))
     return [
         Plot(
             slug="chi2",
-            title=titles[0],
-            text="Squared residual of each edge of a frame over its stated covariance, after the "
-            f"window took the frame; values under {_FLOOR:g} lie on the floor. A residual of six "
-            f"degrees of freedom would be {N_DOF} on average and under {bound:.1f} in 95 % of the "
-            f"cases. {_reserve_words(link_factor)} Look for stretches near the bound and for "
-            f"refused edges: {n_refused} of {len(edges.chi2)} here.",
+            text="Squared residual of each edge over its stated covariance, after the window was "
+            f"optimized with its frame; values under {_FLOOR:g} are drawn there. A residual with "
+            f"six degrees of freedom has mean {N_DOF}, and 95 % are under {bound:.1f}. "
+            f"{_reserve_words(link_factor)} Look for stretches near the bound and for refused "
+            f"edges: {n_refused} of {len(edges.chi2)} here.",
             figure=_dots(edges, first_ns, bound),
         ),
         Plot(
             slug="chi2_histogram",
-            title=titles[1],
-            text="The same of the edges that were accepted, beside the density of six degrees of "
-            f"freedom; the outermost bins hold all beyond. {_mean_words(edges, bound)} Bars to "
-            "the left of the curve mean covariances with reserve, bars to the right too small "
-            "ones. Frames with a single edge fit it exactly and are left out.",
+            text="The same of the accepted edges, with the density for six degrees of freedom; "
+            f"the outermost bins include everything beyond. {_mean_words(edges, bound)} Bars left "
+            "of the curve mean conservative covariances, bars right of it too small ones. Frames "
+            "with a single edge fit it exactly and are left out.",
             figure=_histogram(edges, bound),
         ),
     ]
@@ -218,13 +217,13 @@ def _reserve_words(link_factor: float | None) -> str:
     if link_factor is None or link_factor == 1.0:
         return f"{words}."
     return (
-        f"{words}, and the sigmas of links to keyframes are widened by {link_factor:g} "
-        "(window.link_sigma_factor), since links to frames that see the same are not independent."
+        f"{words}, and the sigmas of links to keyframes are inflated by {link_factor:g} "
+        "(window.link_sigma_factor), since links between frames of the same scene are correlated."
     )
 
 
 def _is_free(edges: EdgeTable) -> Any:  # noqa: ANN401
-    """Tell which edges are known, accepted and not alone with their frame."""
+    """Tell which edges have a residual, are accepted and not the only one of their frame."""
     _, inverse = np.unique(edges.stamps_ns, return_inverse=True)
     n_accepted = np.bincount(inverse, weights=edges.is_accepted)[inverse]
     return np.isfinite(edges.chi2) & edges.is_accepted & (n_accepted > 1)
@@ -237,12 +236,11 @@ def _mean_words(edges: EdgeTable, bound: float) -> str:
         if len(values) > 0:
             above = 100.0 * float(np.mean(values > bound))
             parts.append(f"{kind}: mean {values.mean():.2g}, {above:.1f} % above {bound:.1f}")
-    return f"Here, {'; '.join(parts)}." if parts else "No frame here has more than one edge."
+    return f"Here: {'; '.join(parts)}." if parts else "No frame here has more than one edge."
 
 
 def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
-    figure = new_figure(WIDE, 3.2)
-    axes = figure.subplots()
+    figure, axes = time_axes(3.2, "chi-square [-]")
     is_known = np.isfinite(edges.chi2)
     x = elapsed(edges.stamps_ns, first_ns)
     y = np.maximum(np.where(is_known, edges.chi2, 1.0), _FLOOR)
@@ -257,34 +255,24 @@ def _dots(edges: EdgeTable, first_ns: int, bound: float) -> Figure:
     axes.set_yscale("log")
     plain_decades(axes.yaxis)
     axes.set_ylim(0.7 * _FLOOR, max(40.0, 2.0 * float(y.max())))
-    axes.margins(x=0.01)
-    axes.set(xlabel="elapsed [s]", ylabel="chi-square [-]")
     arrange(figure, axes)
     return figure
 
 
 def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) -> None:  # noqa: ANN401
-    if len(x) == 0:
-        return
-    kept = kept_of_dots(x, np.log10(y), n_columns=_N_COLUMNS, n_rows=_N_ROWS)
-    axes.plot(x[kept], y[kept], linestyle="", markeredgewidth=0.8, label=label, **looks)
+    if len(x) > 0:
+        kept = kept_of_dots(x, np.log10(y), n_columns=_N_COLUMNS, n_rows=_N_ROWS)
+        axes.plot(x[kept], y[kept], linestyle="", markeredgewidth=0.8, label=label, **looks)
 
 
 def _histogram(edges: EdgeTable, bound: float) -> Figure:
     figure = new_figure(WIDE, 3.0)
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
-    bins = np.linspace(*_DECADES, _N_BINS + 1)
-    for kind, colour in LINKS.items():
-        values = edges.chi2[is_free & (edges.kinds == kind)]
-        if len(values) == 0:
-            continue
-        shown = np.clip(np.log10(np.maximum(values, 1e-300)), *_DECADES)
-        looks = {"histtype": "stepfilled", "facecolor": colour, "edgecolor": "black"}
-        label, hatch = f"{kind} ({len(values)})", _HATCHES[kind]
-        axes.hist(shown, bins, density=True, alpha=0.5, hatch=hatch, label=label, **looks)
+    for kind in LINKS:
+        _draw_bars(axes, kind, edges.chi2[is_free & (edges.kinds == kind)])
     grid = np.linspace(*_DECADES, 400)
-    # the density of the decimal logarithm
+    # density over the decimal logarithm
     density = chi2_density(10.0**grid) * 10.0**grid * np.log(10.0)
     axes.plot(grid, density, color="black", ls="--", label="chi-square of 6 dof")
     axes.axvline(np.log10(bound), color="black", ls=":", label=f"95 % bound: {bound:.1f}")
@@ -295,3 +283,19 @@ def _histogram(edges: EdgeTable, bound: float) -> Figure:
     axes.set(xlabel="chi-square [-]", ylabel="density per decade [-]")
     arrange(figure, axes)
     return figure
+
+
+def _draw_bars(axes: Any, kind: str, values: FloatArray) -> None:  # noqa: ANN401
+    if len(values) == 0:
+        return
+    axes.hist(
+        np.clip(np.log10(np.maximum(values, 1e-300)), *_DECADES),
+        np.linspace(*_DECADES, _N_BINS + 1),
+        density=True,
+        histtype="stepfilled",
+        facecolor=LINKS[kind],
+        edgecolor="black",
+        alpha=0.5,
+        hatch=_HATCHES[kind],
+        label=f"{kind} ({len(values)})",
+    )

@@ -1,4 +1,4 @@
-"""What the report draws of estimates and their reference, as arrays."""
+"""Errors, drift and consistency of estimates, as arrays to be drawn."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ _N_LENGTHS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """An estimate beside its reference.
+    """An estimate compared with its reference.
 
     Parameters
     ----------
     name : str
         Of the estimate.
     trajectory : Trajectory
-        All its poses, aligned.
+        The whole estimate, aligned.
     reference, estimate : Trajectory
-        The associated poses, n of each, aligned.
+        The n associated poses of each, aligned.
     errors_m : ndarray of float64, shape (n,)
-        Distance of the positions, metres.
+        Position errors, metres.
     errors_rad : ndarray of float64, shape (n,), or None
-        Angle between the rotations since the first associated pose; None where there are none.
+        Angles between the rotations since the first associated pose; None without rotations.
     """
 
     name: str
@@ -55,15 +55,15 @@ class Comparison:
 
 
 def compare(truth: Trajectory, estimate: Trajectory, *, name: str, align: AlignMode) -> Comparison:
-    """Associate and align an estimate, and take its errors pose by pose.
+    """Associate and align an estimate, and compute its error at each pose.
 
-    Rotations are compared since the first associated pose, not by the alignment: that of a
-    straight path leaves the roll about it open.
+    Rotations are compared since the first associated pose, not after alignment, which leaves the
+    roll about a straight path undetermined.
 
     Raises
     ------
     TrajectoryError
-        Where nothing can be associated.
+        When nothing can be associated.
     """
     ref, est = _paired(truth, estimate, name)
     similarity = alignment(ref, est, align)
@@ -88,20 +88,20 @@ def _paired(truth: Trajectory, estimate: Trajectory, name: str) -> tuple[Traject
     except TrajectoryError:
         if truth.stamps_from != "file":
             raise
-        # the file may hold what came from a topic, of another rate and phase
+        # the file may hold poses of a topic, of another rate and phase
         return pair(replace(truth, stamps_from="topic"), estimate, name=name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drift:
-    """Mean errors over segments of the path, by their length.
+    """Mean errors over segments of the path, by length.
 
     Parameters
     ----------
     lengths_m : ndarray of float64, shape (k,)
         Metres.
     translations_pct : ndarray of float64, shape (k,)
-        % of the length.
+        Percent of the length.
     rotations_deg_per_m : ndarray of float64, shape (k,)
     n_segments : ndarray of int64, shape (k,)
     """
@@ -113,7 +113,7 @@ class Drift:
 
 
 def drift_lengths(path_m: float) -> tuple[float, ...]:
-    """Return the lengths of the segments that suit a path.
+    """Return the segment lengths for a path.
 
     Parameters
     ----------
@@ -123,8 +123,8 @@ def drift_lengths(path_m: float) -> tuple[float, ...]:
     Returns
     -------
     tuple of float
-        KITTI's 100 to 800 m where the path is longer than that; else round numbers up to four
-        fifths of the path; none where there is no path to speak of.
+        KITTI's 100 to 800 m for a longer path, else round numbers up to four fifths of it; none
+        for a path under 0.1 m.
 
     Examples
     --------
@@ -144,10 +144,10 @@ def drift_lengths(path_m: float) -> tuple[float, ...]:
 
 
 def drift(comparison: Comparison, lengths_m: Sequence[float]) -> Drift | None:
-    """Return the drift by length; None where no segment fits."""
+    """Return the drift by length; None if no segment fits."""
     n = len(comparison.reference)
     is_standard = tuple(lengths_m) == KITTI_SEGMENTS_M
-    # a path in a room has many poses: the starts are spread evenly over them
+    # a path in a room has many poses: starts are spread evenly
     step = KITTI_STEP if is_standard else max(1, n // _MAX_STARTS)
     rows = []
     for length in lengths_m:
@@ -170,19 +170,19 @@ def drift(comparison: Comparison, lengths_m: Sequence[float]) -> Drift | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Consistency:
-    """Errors of poses beside their stated covariances.
+    """Errors of poses with their stated covariances.
 
     Parameters
     ----------
     name : str
     stamps_ns : ndarray of int64, shape (n,)
     errors : ndarray of float64, shape (n, 6)
-        (rx, ry, rz, tx, ty, tz) in the frame of each pose, radians and metres: what its pose must
-        be perturbed by from the right to become the true one.
+        (rx, ry, rz, tx, ty, tz), radians and metres: right perturbations of the poses that give
+        the true ones.
     sigmas : ndarray of float64, shape (n, 6)
         Stated standard deviations.
     nees : ndarray of float64, shape (n,)
-        Squared norm of the whitened errors: 6 on average where the covariances are right.
+        Squared Mahalanobis norms of the errors: 6 on average for consistent covariances.
     """
 
     name: str
@@ -192,7 +192,7 @@ class Consistency:
     nees: FloatArray
 
     def share_inside(self, n_sigmas: float) -> FloatArray:
-        """Return the share of the errors within so many sigmas, shape (6,)."""
+        """Return the share of errors within a number of sigmas, shape (6,)."""
         return np.asarray(np.mean(np.abs(self.errors) <= n_sigmas * self.sigmas, axis=0))
 
     def share_of_nees(self) -> tuple[float, float, float]:
@@ -203,33 +203,33 @@ class Consistency:
 
 
 def nees_band() -> tuple[float, float]:
-    """Return the bounds that 95 % of chi-square values of 6 degrees of freedom lie between."""
+    """Return the central 95 % interval of chi-square with 6 degrees of freedom."""
     return chi2_bound(0.025), chi2_bound(0.975)
 
 
 def chi2_bound(share: float) -> float:
-    """Return what a share of chi-square values of 6 degrees of freedom lies below.
+    """Return a quantile of chi-square with 6 degrees of freedom.
 
     Examples
     --------
     >>> round(chi2_bound(0.95), 3)
     12.592
     """
-    # scipy.stats knows it too, but takes longer to import than the report to write
+    # scipy.stats takes longer to import than the report to write
     return 2.0 * float(gammaincinv(0.5 * N_DOF, share))
 
 
 def chi2_density(values: FloatArray) -> FloatArray:
-    """Return the density of chi-square values of 6 degrees of freedom."""
+    """Return the density of chi-square with 6 degrees of freedom."""
     return np.asarray(values**2 * np.exp(-0.5 * values) / 16.0)
 
 
 def consistency(truth: Trajectory, estimate: Trajectory, *, name: str) -> Consistency | None:
     """Compare errors with covariances.
 
-    The covariances are of motions since the first pose, which is known; so the first poses are
-    laid onto each other, and nothing is fitted. The truth is interpolated at the stamps of the
-    estimate: a difference of milliseconds must not count as an error.
+    The covariances are those of the motion since the first pose, so the first poses are aligned
+    and nothing is fitted. The truth is interpolated at the stamps of the estimate, lest a
+    difference of milliseconds count as an error.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def consistency(truth: Trajectory, estimate: Trajectory, *, name: str) -> Consis
     Returns
     -------
     Consistency or None
-        Without the first pose; None where nothing is left.
+        Without the first pose; None if no pose is left.
     """
     if estimate.covariances is None or not truth.has_rotations or not estimate.has_rotations:
         return None
@@ -276,7 +276,7 @@ def _at_stamps_of(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, 
 
 
 def _is_positive(covariances: FloatArray) -> BoolArray:
-    # in units of the sigmas, or a millimetre would look like nothing beside a radian
+    # normalized by the sigmas: metres and radians have different scales
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     scales = np.sqrt(np.where(variances > 0.0, variances, 1.0))
     unit = covariances / (scales[:, :, np.newaxis] * scales[:, np.newaxis])

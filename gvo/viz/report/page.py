@@ -1,4 +1,4 @@
-"""The page: head, tables, plots, all in one file without outside links."""
+"""The HTML page: head, tables and plots in one file without external links."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _DASHES = {"-": "", "--": "6 4", "-.": "6 3 1 3", ":": "2 3"}
 
 
 def write_page(path: Path, title: str, body: Iterable[str]) -> None:
-    """Write a page.
+    """Write an HTML page.
 
     Parameters
     ----------
     path : Path
-        Replaced where it exists.
+        Replaced if it exists.
     title : str
     body : iterable of str
-        HTML, with all texts escaped.
+        HTML, with all text escaped.
 
     Raises
     ------
     ConfigurationError
-        When the name is not that of a page, or the file cannot be written.
+        When the suffix is not .html or .htm, or the file cannot be written.
     """
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigurationError(
@@ -58,7 +58,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
 def plots_html(
     plots: Sequence[Plot], lines: Sequence[Line] = (), world: World | None = None
 ) -> list[str]:
-    """Return the sections of the plots; that in space can be turned where there are lines."""
+    """Return the sections of the plots; the one in space rotates if lines are given."""
     parts = []
     is_open = False
     for plot in plots:
@@ -82,14 +82,14 @@ def _section(plot: Plot) -> str:
 
 
 def _turning(plot: Plot, lines: Sequence[Line], world: World) -> str:
-    """Return the view in space: a canvas where scripts run, the standing one elsewhere."""
+    """Return the view in space: a canvas if scripts run, else the still figure."""
     legend = "".join(_legend_entry(line) for line in lines)
     return f"""<section id="{plot.slug}">
 <h2>{escape(plot.title)}</h2>
 <p class="note">{escape(plot.text)}</p>
 <div id="turning">
-<p class="note">Drag to turn; arrow keys turn as well, + and - or the wheel (after a click) come
-nearer and go farther, a double click or Home starts anew.</p>
+<p class="note">Drag or use the arrow keys to rotate, + and - or the wheel (after a click) to zoom,
+double-click or Home to reset.</p>
 <div class="panel"><canvas id="scene" tabindex="0" role="img"
 aria-label="{escape(plot.title)}"></canvas>
 <ul class="legend">{legend}</ul></div>
@@ -111,26 +111,24 @@ def _legend_entry(line: Line) -> str:
 
 
 def table_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table whose first column holds names, all others numbers."""
-    head = "".join(_cell("th", text, is_name=n == 0) for n, text in enumerate(header))
-    body = "".join(
-        "<tr>" + "".join(_cell("td", text, is_name=n == 0) for n, text in enumerate(row)) + "</tr>"
-        for row in rows
-    )
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    """Return a table with names in the first column, numbers in the others."""
+    body = "".join(_row("td", row) for row in rows)
+    table = f"<table><thead>{_row('th', header)}</thead><tbody>{body}</tbody></table>"
     return f'<div class="scroll">{table}</div>'
 
 
+def _row(tag: str, texts: Sequence[str]) -> str:
+    cells = "".join(_cell(tag, text, is_name=n == 0) for n, text in enumerate(texts))
+    return f"<tr>{cells}</tr>"
+
+
 def _cell(tag: str, text: str, *, is_name: bool) -> str:
-    return (
-        f"<{tag}>{escape(text)}</{tag}>"
-        if is_name
-        else f'<{tag} class="number">{escape(text)}</{tag}>'
-    )
+    kind = "" if is_name else ' class="number"'
+    return f"<{tag}{kind}>{escape(text)}</{tag}>"
 
 
 def facts_html(facts: Mapping[str, str]) -> str:
-    """Return a table of facts by name; those without a text are left out."""
+    """Return a table of facts by name, without empty ones."""
     rows = "".join(
         f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
         for name, text in facts.items()
@@ -140,7 +138,7 @@ def facts_html(facts: Mapping[str, str]) -> str:
 
 
 def list_html(title: str, items: Iterable[str], *, kind: str = "") -> str:
-    """Return a titled list; nothing where there are no items."""
+    """Return a titled list; empty without items."""
     entries = "".join(f"<li>{escape(item)}</li>" for item in items)
     if not entries:
         return ""
@@ -150,7 +148,7 @@ def list_html(title: str, items: Iterable[str], *, kind: str = "") -> str:
 def configuration_html(
     configuration: Mapping[str, Any], defaults: Mapping[str, Mapping[str, Any]]
 ) -> str:
-    """Return all sections; what differs from its default is marked, the default beside it."""
+    """Return all parameters by section; changed ones are marked, with their defaults."""
     sections = [
         _configuration_section(name, section, defaults.get(name, {}))
         for name, section in configuration.items()
@@ -158,9 +156,8 @@ def configuration_html(
     ]
     if not sections:
         return ""
-    intro = "Marked are the parameters that differ from their defaults."
     return (
-        f'<h2>Configuration</h2>\n<p class="note">{intro}</p>\n'
+        '<h2>Configuration</h2>\n<p class="note">Changed parameters are marked.</p>\n'
         f'<div class="configuration">{"".join(sections)}</div>'
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.palette import REFERENCE_STYLE, Style, styles_of
-from gvo.viz.plots import is_of_camera, plain
+from gvo.viz.plots import HOLLOW, is_of_camera, plain
 from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left, new_figure
 
 if TYPE_CHECKING:
@@ -21,24 +21,23 @@ if TYPE_CHECKING:
 _HEIGHT = 4.8
 _MIN_EXTENT_M = 1e-3
 _MAX_SHOWN_M = 1e4
-# a long box, seen from a corner, must not leave its axes
-_SPACE_LABEL_PAD = 9.0  # points; numbers of four signs stand between the axis and its label
-_SPACE_ZOOM = 0.78
+_SPACE_LABEL_PAD = 9.0  # points; leaves room for numbers of four characters
+_SPACE_ZOOM = 0.78  # a long box, seen from a corner, must stay within its axes
 _DASHES = {"-": [], "--": [7, 5], "-.": [7, 4, 2, 4], ":": [2, 4]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Which axes of the world lie on the ground and which points up.
+    """Horizontal and vertical axes of the world.
 
     Parameters
     ----------
     ground : tuple of two int
-        The axes to the right and to the top when looking from above.
+        Horizontal axes: right and up in the view from above.
     up : int
-        The third axis.
+        Vertical axis.
     is_up_negative : bool
-        It points down, as the y axis of a camera.
+        The vertical axis points down, as y of a camera.
     """
 
     ground: tuple[int, int]
@@ -47,22 +46,22 @@ class World:
 
     @classmethod
     def of(cls, reference: Trajectory) -> World:
-        """Tell by the first pose: the world of a camera has y down, any other z up."""
+        """Return y down for a world with camera axes, else z up."""
         if is_of_camera(reference):
             return cls(ground=(0, 2), up=1, is_up_negative=True)
         return cls(ground=(0, 1), up=2, is_up_negative=False)
 
     @property
     def words(self) -> str:
-        """What was taken for up."""
+        """The axes, as a sentence."""
         if self.is_up_negative:
             return "The world is that of the first camera: x right, y down, z forward."
-        return "The z axis of the world is taken for up."
+        return "The z axis of the world is assumed to point up."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Line:
-    """A path for display: positions, shape (n, 3), metres, rows of NaN are gaps."""
+    """A path for display: positions, shape (n, 3), metres, with rows of NaN at gaps."""
 
     name: str
     points: FloatArray
@@ -70,7 +69,7 @@ class Line:
 
 
 def lines_of(reference: Trajectory | None, estimates: Mapping[str, Trajectory]) -> list[Line]:
-    """Return what is drawn of trajectories in one world; the reference comes first."""
+    """Return the paths of trajectories in one world, the reference first."""
     lines = []
     if reference is not None:
         points = display_path(reference)
@@ -82,53 +81,54 @@ def lines_of(reference: Trajectory | None, estimates: Mapping[str, Trajectory]) 
 
 def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     """Return the views from above, from the side and in space."""
-    about = "Both axes have one scale; the circle is the start."
-    has_truth = any(line.name == "truth" for line in lines)
-    good = (
-        "In a good run the lines cannot be told from the dashed truth at this scale."
-        if has_truth
-        else "Without truth look for jumps and for a path that cannot be what was driven."
-    )
+    scale = "Both axes have one scale; the circle is the start."
+    views = _Views.of(lines)
     points = np.concatenate([line.points for line in lines])
-    low = np.nanmin(points, axis=0)
-    extents = np.nanmax(points, axis=0) - low
-    # Numbers of a map grid would not have room on the axes.
-    origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
-    near = _Views(
-        lines=[replace(line, points=line.points - origin) for line in lines],
-        labels=[_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)],
-    )
+    extents = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
     along = max(world.ground, key=lambda axis: extents[axis])
     return [
         Plot(
             slug="above",
-            title="From above",
-            text=f"{world.words} {about} {good}",
-            figure=_view(near, world.ground, is_flipped=False),
+            text=f"{world.words} {scale} {_good_words(lines)}",
+            figure=_view(views, world.ground, is_flipped=False),
             is_half=True,
         ),
         Plot(
             slug="side",
-            title="From the side",
-            text=f"{about} Odometry drifts in height first: look for a slow climb or sink.",
-            figure=_view(near, (along, world.up), is_flipped=world.is_up_negative),
+            text=f"{scale} Odometry drifts in height first: look for a slow climb or descent.",
+            figure=_view(views, (along, world.up), is_flipped=world.is_up_negative),
             is_half=True,
         ),
         Plot(
             slug="space",
-            title="In space",
-            text="The same lines; all three axes have one scale.",
-            figure=_space(near, world),
+            text="The same paths; all three axes have one scale.",
+            figure=_space(views, world),
         ),
     ]
 
 
+def _good_words(lines: Sequence[Line]) -> str:
+    if any(line.name == "truth" for line in lines):
+        return "In a good run the estimates lie on the dashed ground truth at this scale."
+    return "Without ground truth, look for jumps and for a path that cannot be what was driven."
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Views:
-    """What is drawn, in metres from where the axes begin, and the labels of the axes."""
+    """Lines shifted to the origin of the axes, and the labels of the axes."""
 
     lines: Sequence[Line]
     labels: Sequence[str]
+
+    @classmethod
+    def of(cls, lines: Sequence[Line]) -> _Views:
+        """Shift coordinates of a map grid: the axes have no room for them."""
+        low = np.nanmin(np.concatenate([line.points for line in lines]), axis=0)
+        origin = np.where(np.abs(low) >= _MAX_SHOWN_M, np.round(low, -3), 0.0)
+        return cls(
+            lines=[replace(line, points=line.points - origin) for line in lines],
+            labels=[_label(axis, shift) for axis, shift in zip("xyz", origin, strict=True)],
+        )
 
 
 def _label(axis: str, origin: float) -> str:
@@ -138,11 +138,9 @@ def _label(axis: str, origin: float) -> str:
 
 
 def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Any:  # noqa: ANN401
-    figure, lines = new_figure(HALF, _HEIGHT), views.lines
+    figure = new_figure(HALF, _HEIGHT)
     axes = figure.subplots()
-    for line in lines:
-        axes.plot(*line.points[:, plane].T, label=plain(line.name), **asdict(line.style))
-    _mark_start(axes, lines[0].points[:1, plane].T)
+    _draw_lines(axes, views.lines, plane)
     axes.set(xlabel=views.labels[plane[0]], ylabel=views.labels[plane[1]])
     arrange(figure, axes)
     _set_equal(axes, figure.get_size_inches() * axes.get_position().size)
@@ -152,12 +150,14 @@ def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Any:  #
     return figure
 
 
-def _mark_start(axes: Any, start: Any) -> None:  # noqa: ANN401
-    axes.plot(*start, "o", mfc="white", mec="black", zorder=4.0, label="start", linestyle="")
+def _draw_lines(axes: Any, lines: Sequence[Line], order: tuple[int, ...]) -> None:  # noqa: ANN401
+    for line in lines:
+        axes.plot(*line.points[:, order].T, label=plain(line.name), **asdict(line.style))
+    axes.plot(*lines[0].points[:1, order].T, "o", label="start", **HOLLOW)
 
 
 def _set_equal(axes: Axes, size: FloatArray) -> None:
-    """Choose limits of one scale that fill axes of a size in inches."""
+    """Set limits of one scale that fill axes of a size in inches."""
     low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
     centre, extents = 0.5 * (low + high), np.maximum(high - low, _MIN_EXTENT_M)
     half = 0.54 * size * float(np.max(extents / size))
@@ -167,27 +167,16 @@ def _set_equal(axes: Axes, size: FloatArray) -> None:
 
 
 def _space(views: _Views, world: World) -> Any:  # noqa: ANN401
-    figure, lines = new_figure(HALF * 1.2, HALF), views.lines
+    figure = new_figure(HALF * 1.2, HALF)
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
-    for line in lines:
-        axes.plot(*line.points[:, order].T, label=plain(line.name), **asdict(line.style))
-    _mark_start(axes, lines[0].points[:1, order].T)
-    points = np.concatenate([line.points for line in lines])[:, order]
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    # thin boxes keep some room, or their labels lie on top of each other
-    half = 0.54 * np.maximum(high - low, max(0.4 * float(np.max(high - low)), _MIN_EXTENT_M))
-    limits = zip(0.5 * (low + high), half, strict=True)
-    for setter, (centre, reach) in zip(
-        (axes.set_xlim, axes.set_ylim, axes.set_zlim), limits, strict=True
-    ):
-        setter(centre - reach, centre + reach)
+    _draw_lines(axes, views.lines, order)
+    _set_box(axes, np.concatenate([line.points for line in views.lines])[:, order])
     names = [views.labels[axis] for axis in order]
     axes.set(xlabel=names[0], ylabel=names[1], zlabel=names[2])
     axes.locator_params(nbins=5)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.labelpad = _SPACE_LABEL_PAD
-    axes.set_box_aspect(half, zoom=_SPACE_ZOOM)
     if world.is_up_negative:
         axes.invert_zaxis()
     axes.view_init(elev=28, azim=-62)
@@ -196,8 +185,18 @@ def _space(views: _Views, world: World) -> Any:  # noqa: ANN401
     return figure
 
 
+def _set_box(axes: Any, points: FloatArray) -> None:  # noqa: ANN401
+    """Set limits of one scale on three axes."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    # thin boxes keep some room, or their labels overlap
+    half = 0.54 * np.maximum(high - low, max(0.4 * float(np.max(high - low)), _MIN_EXTENT_M))
+    limits = np.stack([0.5 * (low + high) - half, 0.5 * (low + high) + half], axis=1)
+    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
+    axes.set_box_aspect(half, zoom=_SPACE_ZOOM)
+
+
 def scene_json(lines: Sequence[Line], world: World) -> str:
-    """Return the lines for the view that can be turned: safe within a script of a page."""
+    """Return the lines of the rotatable view as JSON that is safe within a script element."""
     points = np.concatenate([line.points for line in lines])
     extent = float(np.nanmax(np.ptp(points[np.isfinite(points[:, 0])], axis=0)))
     n_decimals = max(0, 4 - int(np.floor(np.log10(max(extent, _MIN_EXTENT_M)))))

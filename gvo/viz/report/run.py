@@ -29,14 +29,8 @@ from gvo.viz.report.page import (
 from gvo.viz.report.paths import Line, World, lines_of, path_plots
 from gvo.viz.report.sheets import Plot, settings, write_plots
 
-_TRUTH_SECTIONS = {
-    "errors_over_time": "Errors over time",
-    "errors_over_distance": "Errors over distance travelled",
-    "drift": "Drift by length of segment",
-    "covariance": "Errors within their covariances",
-    "nees": "Normalised squared error (NEES)",
-}
-_PATH_SECTIONS = {"above": "From above", "side": "From the side", "space": "In space"}
+_ERROR_PLOTS = ("errors_over_time", "errors_over_distance", "drift")
+_COVARIANCE_PLOTS = ("covariance", "nees")
 _ERROR_HEADER = (
     "estimate",
     "poses",
@@ -52,16 +46,16 @@ _ERROR_KEYS = ("ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
 def write_run_report(
     path: str | Path, record: RunRecord, *, plots: str | Path | None = None
 ) -> None:
-    """Write a page about a run; equal input gives equal files.
+    """Write the report of a run; equal input gives equal files.
 
     Parameters
     ----------
     path : str or Path
-        The page, replaced where it exists.
+        HTML file, replaced if it exists.
     record : RunRecord
-        From `read_run`; also of a run that has not ended.
+        From `read_run`; the run may be unfinished.
     plots : str or Path, optional
-        Folder for each plot as PNG and PDF.
+        Folder for the plots as PNG and PDF.
 
     Raises
     ------
@@ -82,7 +76,7 @@ def write_run_report(
             timing_plot(record.timings),
             *edge_plots(record.edges, _first_ns(record), _link_factor(record.summary)),
         ]
-        # The page first: it shall be there where the folder cannot be written.
+        # The page first: it must exist even if the folder cannot be written.
         body = [*_head(record), *plots_html(sheets, lines, world), *_tail(record)]
         write_page(Path(path), f"gvo: {record.name}", body)
         if plots is not None:
@@ -92,7 +86,7 @@ def write_run_report(
 def _compare(
     record: RunRecord, estimates: Mapping[str, Trajectory]
 ) -> tuple[list[Comparison], str]:
-    """Return the comparisons; where there are none, why."""
+    """Return the comparisons with the ground truth, or why there are none."""
     if record.truth is None or not estimates:
         found = str(record.summary.get("ground_truth") or "")
         return [], found.removeprefix("none: ") or "the run has no ground truth"
@@ -119,8 +113,8 @@ def _lines(
 def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
     if world is not None:
         return path_plots(lines, world)
-    text = "Not drawn: the run holds no pose."
-    return [Plot(slug=slug, title=title, text=text) for slug, title in _PATH_SECTIONS.items()]
+    text = "Not drawn: the run has no poses."
+    return [Plot(slug=slug, text=text) for slug in ("above", "side", "space")]
 
 
 def _truth_plots(
@@ -130,8 +124,8 @@ def _truth_plots(
     reason: str,
 ) -> list[Plot]:
     if not compared or record.truth is None:
-        text = f"Not drawn: errors need true poses, and {_sentence(reason)}"
-        return [Plot(slug=slug, title=title, text=text) for slug, title in _TRUTH_SECTIONS.items()]
+        text = f"Not drawn: errors need ground truth, and {reason.removesuffix('.')}."
+        return [Plot(slug=slug, text=text) for slug in (*_ERROR_PLOTS, *_COVARIANCE_PLOTS)]
     return [
         *error_plots(compared, "se3"),
         drift_plot(compared),
@@ -139,26 +133,20 @@ def _truth_plots(
     ]
 
 
-def _sentence(reason: str) -> str:
-    return reason if reason.endswith(".") else f"{reason}."
-
-
 def _covariance_plots(
     truth: Trajectory, estimates: Mapping[str, Trajectory], first_ns: int
 ) -> list[Plot]:
-    wanted = [estimates[name] for name in ("causal", "smoothed") if name in estimates]
     names = [name for name in ("causal", "smoothed") if name in estimates]
-    results = [consistency(truth, t, name=name) for name, t in zip(names, wanted, strict=True)]
+    results = [consistency(truth, estimates[name], name=name) for name in names]
     found = [result for result in results if result is not None]
     if found:
         return covariance_plots(found, first_ns)
     text = (
-        "Not drawn: the truth holds positions without rotations, covariances are of poses."
+        "Not drawn: the ground truth holds no rotations, and covariances are of poses."
         if not truth.has_rotations
-        else "Not drawn: no two poses have a true pose and a covariance beside them."
+        else "Not drawn: fewer than two poses have a true pose and a covariance."
     )
-    slugs = ("covariance", "nees")
-    return [Plot(slug=slug, title=_TRUTH_SECTIONS[slug], text=text) for slug in slugs]
+    return [Plot(slug=slug, text=text) for slug in _COVARIANCE_PLOTS]
 
 
 def _first_ns(record: RunRecord) -> int:
@@ -176,8 +164,8 @@ def _head(record: RunRecord) -> list[str]:
     parts = [f"<h1>{escape(record.name)}</h1>"]
     if not record.is_finished:
         parts.append(
-            '<p class="absent">This run has not ended: it goes on, or it was interrupted. '
-            "Shown is what was written so far.</p>"
+            '<p class="absent">This run has not ended: it is running or was interrupted. '
+            "The report shows what was written so far.</p>"
         )
     parts.append(list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
     parts.append(facts_html(_facts(record)))
@@ -188,8 +176,7 @@ def _head(record: RunRecord) -> list[str]:
 
 
 def _error_row(row: Mapping[str, Any]) -> list[str]:
-    numbers = [row.get(key) for key in _ERROR_KEYS]
-    texts = [number_text(number) for number in numbers]
+    texts = [number_text(row.get(key)) for key in _ERROR_KEYS]
     return [str(row.get("name", "")), str(row.get("n", "")), *texts]
 
 
@@ -206,7 +193,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Segments": _segment_words(summary.get("segments", ())),
         "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
         "Ground truth": str(summary.get("ground_truth", "")),
-        "Learnt of the rig": _rig_words(summary.get("rig_offsets")),
+        "Learnt calibration errors": _rig_words(summary.get("rig_offsets")),
         "Median per frame": _median_words(summary.get("median_ms")),
         "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
         "Version": _version(summary),
@@ -233,15 +220,12 @@ def _duration(record: RunRecord) -> str:
 
 
 def _rig_words(offsets: Mapping[str, Any] | None) -> str:
-    if not offsets:
-        return ""
-    known = {key: value for key, value in offsets.items() if value is not None}
+    known = {key: value for key, value in (offsets or {}).items() if value is not None}
     words = []
     if "disparity_px" in known:
-        sigma = (
-            f" (sigma {known['disparity_sigma_px']:.3f})" if "disparity_sigma_px" in known else ""
-        )
-        words.append(f"disparities too large by {known['disparity_px']:.3f} px{sigma}")
+        sigma = known.get("disparity_sigma_px")
+        suffix = "" if sigma is None else f" (sigma {sigma:.3f})"
+        words.append(f"disparities too large by {known['disparity_px']:.3f} px{suffix}")
     if "row_px" in known:
         words.append(f"rows of the right image too large by {known['row_px']:.3f} px")
     return ", ".join(words)
