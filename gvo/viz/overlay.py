@@ -26,6 +26,7 @@ from gvo.types import (
 from gvo.viz.canvas import (
     BLACK,
     WHITE,
+    Colour,
     DepthScale,
     bgr,
     colour_bar,
@@ -312,24 +313,33 @@ def _write_header(
     """Write status, number, stamp, counts and rate into the header."""
     status = result.status if isinstance(result, FrameResult) else Status.SKIPPED
     upper, lower = _ROWS_PX
-    u = _write_badge(canvas, status) + _GAP_PX
-    if index is not None:
-        u = write(canvas, f"frame {index}", (u, upper))[0] + _GAP_PX
     seconds, nanoseconds = divmod(result.stamp_ns, 10**9)
-    write(canvas, f"stamp {seconds}.{nanoseconds // 1000:06d} s", (u, upper))
-    if not isinstance(result, FrameResult):
-        return
+    texts = [] if index is None else [f"frame {index}"]
+    texts.append(f"stamp {seconds}.{nanoseconds // 1000:06d} s")
+    start = _write_badge(canvas, status) + _GAP_PX
+    _write_row(canvas, [(text, WHITE) for text in texts], (start, upper))
+    if isinstance(result, FrameResult):
+        _write_row(canvas, _counts(result), (_MARGIN_PX, lower))
+        rate = _rate_text(result, rate_hz)
+        write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
+
+
+def _write_row(
+    canvas: ImageArray, texts: Sequence[tuple[str, Colour]], corner: tuple[int, int]
+) -> None:
+    u, v = corner
+    for text, colour in texts:
+        u = write(canvas, text, (u, v), colour)[0] + _GAP_PX
+
+
+def _counts(result: FrameResult) -> list[tuple[str, Colour]]:
     n_outliers = max(0, result.n_matches - result.n_inliers)
-    u = _MARGIN_PX
-    for text, colour in (
+    return [
         (f"{result.n_matches} matches", WHITE),
         (f"{result.n_inliers} inliers", INLIER_COLOUR),
         (f"{n_outliers} outliers", OUTLIER_COLOUR),
         (f"{result.n_links} links", WHITE),
-    ):
-        u = write(canvas, text, (u, lower), colour)[0] + _GAP_PX
-    rate = _rate_text(result, rate_hz)
-    write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
+    ]
 
 
 def _write_footer(canvas: ImageArray, layout: Layout, camera: PinholeCamera, reason: str) -> None:

@@ -235,7 +235,8 @@ def _finish_round_trip_view(view: Axes, error: RoundTripError) -> None:
     _set_view(view, (0, 2))
     view.set_title("from above")
     view.margins(0.08)
-    grey, hollow = "#555555", {"color": "none", "mfc": "white", "mec": "black"}
+    grey = "#555555"
+    hollow: dict[str, Any] = {"color": "none", "mfc": "white", "mec": "black"}
     keys = [
         Line2D([], [], color=grey, linestyle="-", label="forward"),
         Line2D([], [], color=grey, linestyle="--", label="backward"),

@@ -56,35 +56,36 @@ _PANELS = (
 
 def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plot]:
     """Return the errors over time and over the distance travelled."""
-    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
-    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
     rotations = (
         "Rotation errors are those of the rotation since the first pose."
         if any(c.errors_rad is not None for c in comparisons)
         else "The ground truth holds no rotations: there are no rotation errors."
-    )
-    over_time = _curves(
-        comparisons,
-        lambda c: elapsed(c.reference.stamps_ns, first_ns),
-        "row" if is_by_row else "elapsed [s]",
-    )
-    over_distance = _curves(
-        comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
     )
     return [
         Plot(
             slug="errors_over_time",
             text=f"Position errors {_ALIGNED[align]}. {rotations} "
             "Good curves are low and smooth; a step is a single bad frame.",
-            figure=over_time,
+            figure=_curves_over_time(comparisons),
         ),
         Plot(
             slug="errors_over_distance",
             text="The same errors over the distance along the true path: a steady slope is drift "
             "in metres per metre; while the camera stands still, so must the curve.",
-            figure=over_distance,
+            figure=_curves(comparisons, _distances, "distance travelled [m]"),
         ),
     ]
+
+
+def _curves_over_time(comparisons: Sequence[Comparison]) -> Figure:
+    first_ns = min(int(c.reference.stamps_ns[0]) for c in comparisons)
+    is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
+    label = "row" if is_by_row else "elapsed [s]"
+    return _curves(comparisons, lambda c: elapsed(c.reference.stamps_ns, first_ns), label)
+
+
+def _distances(comparison: Comparison) -> FloatArray:
+    return comparison.reference.distances()
 
 
 def _curves(
@@ -135,13 +136,9 @@ def drift_plot(
             else f"the path of {path_m:.2g} m is too short for segments"
         )
         return Plot(slug="drift", text=f"Not drawn: {reason}.")
-    origin = (
-        "the standard lengths of the KITTI benchmark"
-        if lengths == KITTI_SEGMENTS_M
-        else "the lengths asked for"
-        if is_asked
-        else f"round lengths for a path of {path_m:.3g} m"
-    )
+    origin = "the lengths asked for" if is_asked else f"round lengths for a path of {path_m:.3g} m"
+    if lengths == KITTI_SEGMENTS_M:
+        origin = "the standard lengths of the KITTI benchmark"
     return Plot(
         slug="drift",
         text=f"Mean error over all segments of a length, as in KITTI's devkit; {origin}. "

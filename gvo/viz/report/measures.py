@@ -159,12 +159,12 @@ def drift(comparison: Comparison, lengths_m: Sequence[float]) -> Drift | None:
             rows.append((length, 100.0 * float(np.mean(shares)), mean_deg, len(shares)))
     if not rows:
         return None
-    table = np.array(rows, dtype=np.float64)
+    lengths, translations, rotations, counts = np.array(rows, dtype=np.float64).T
     return Drift(
-        lengths_m=table[:, 0],
-        translations_pct=table[:, 1],
-        rotations_deg_per_m=table[:, 2],
-        n_segments=table[:, 3].astype(np.int64),
+        lengths_m=lengths,
+        translations_pct=translations,
+        rotations_deg_per_m=rotations,
+        n_segments=counts.astype(np.int64),
     )
 
 

@@ -362,7 +362,7 @@ def kept_of_dots(x: FloatArray, y: FloatArray, *, n_columns: int, n_rows: int) -
 
 def _cells(values: FloatArray, n_cells: int) -> IntArray:
     extent = float(np.ptp(values)) or 1.0
-    return np.rint((values - values.min()) / extent * n_cells).astype(np.int64)
+    return np.asarray(np.rint((values - values.min()) / extent * n_cells), dtype=np.int64)
 
 
 def display_path(trajectory: Trajectory) -> FloatArray:
