@@ -239,13 +239,13 @@ class RunStatistics:
             )
         if self.mount_travel_m > _MAX_MOUNT_TRAVEL_M:
             warnings.append(
-                f"tf moves the camera by {self.mount_travel_m:.1f} m in the frame asked for: a "
+                f"tf moves the camera by {self.mount_travel_m:.1f} m in the base frame: a "
                 "frame that stands in the world has no trajectory; ask for one of the robot, and "
                 "name the fixed one by --world"
             )
         if self.n_guessed:
             warnings.append(
-                f"tf does not say where the camera is in the frame asked for at {self.n_guessed} "
+                f"tf does not say where the camera is on the base frame at {self.n_guessed} "
                 "stamps: what it says at the nearest one was taken"
             )
         return warnings

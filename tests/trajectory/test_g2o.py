@@ -1,4 +1,4 @@
-"""Lines of g2o against GTSAM's own parser, and there and back."""
+"""Lines of g2o against GTSAM's own parser, written and read back."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Poses in the frame asked for, against composition by hand and sampled covariances."""
+"""Poses of the base frame, against composition by hand and sampled covariances."""
 
 from collections.abc import Sequence
 
