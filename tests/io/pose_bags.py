@@ -25,7 +25,7 @@ FIX = "sensor_msgs/msg/NavSatFix"
 class PoseBag:
     """Collects messages, then writes them in the order they came in.
 
-    The name of the file decides about ROS 1 (`.bag`) or ROS 2 (`.mcap`).
+    The name of the file decides about ROS 1 (`.bag`) or ROS 2 (`.mcap`, `.db3`).
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,6 +79,7 @@ class PoseBag:
         parent: str = "map",
         child: str = "base",
         norm: float = 1.0,
+        covariance: FloatArray | None = None,
     ) -> None:
         header = self._header(stamp_ns, parent)
         quaternion = norm * Rotation.from_matrix(T[:3, :3]).as_quat()
@@ -92,10 +93,8 @@ class PoseBag:
         elif type_ == STAMPED:
             message = self._make(type_, header=header, pose=pose)
         else:
-            covariance = np.zeros(36)
-            spread = self._make(
-                "geometry_msgs/PoseWithCovariance", pose=pose, covariance=covariance
-            )
+            numbers = np.zeros(36) if covariance is None else covariance.ravel()
+            spread = self._make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=numbers)
             more = {} if type_ == WITH_COVARIANCE else self._odometry_fields(child)
             message = self._make(type_, header=header, pose=spread, **more)
         self._messages.append((topic, type_, message))
@@ -134,7 +133,9 @@ class PoseBag:
         writer: Any = Writer1(self._path) if self._is_ros1 else None
         if writer is None:
             folder = self._path.with_suffix("")
-            writer = Writer2(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+            is_mcap = self._path.suffix == ".mcap"
+            plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
+            writer = Writer2(folder, version=8, storage_plugin=plugin)
         serialize = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         with writer:
             connections: dict[str, Any] = {}

@@ -1,14 +1,16 @@
-"""What single messages of a bag say."""
+"""Messages written into bags, compressed ones too."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import ConnectionExtRosbag1, ConnectionExtRosbag2, QosDurability
 
+from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.convert.bag_messages import (
     BagWriter,
@@ -17,6 +19,10 @@ from gvo.io.convert.bag_messages import (
     write_camera_info,
     write_transforms,
 )
+from gvo.io.convert.bag_writer import write_bag
+from gvo.io.images import encode_image
+from gvo.io.opening import open_recording
+from tests.io.conftest import Item, Tiny
 
 _NAMES = pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
 _CAMERA = PinholeCamera(fx=50.1, fy=50.3, cx=23.7, cy=15.9, width=48, height=32)
@@ -64,3 +70,77 @@ def test_static_transforms_are_kept_for_those_who_come_late(tmp_path: Path, name
         (offered,) = static.offered_qos_profiles
         assert offered.durability == QosDurability.TRANSIENT_LOCAL
         assert moving.offered_qos_profiles == []
+
+
+def _messages(path: Path, topic: str) -> list[Any]:
+    with AnyReader([path]) as reader:
+        connections = [one for one in reader.connections if one.topic == topic]
+        return [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in reader.messages(connections)
+        ]
+
+
+@_NAMES
+@pytest.mark.parametrize("is_color", [False, True])
+def test_png_images_are_what_opencv_decodes(
+    tiny: Tiny, tmp_path: Path, name: str, is_color: bool
+) -> None:
+    images = [tiny.texture(n, is_color=is_color) for n in range(4)]
+    items: list[Item] = [(n % 2, 10 + n // 2, pixels) for n, pixels in enumerate(images)]
+    write_bag(tiny.stereo(items), tmp_path / name, compress=True)
+    for side, mine in (("left", images[::2]), ("right", images[1::2])):
+        messages = _messages(tmp_path / name, f"/stereo/{side}/image_rect/compressed")
+        for message, pixels in zip(messages, mine, strict=True):
+            decoded = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(decoded, pixels)
+            assert message.format.startswith("bgr8; png" if is_color else "mono8; png")
+    read = [image.load() for image in open_recording(tmp_path / name).images()]
+    for pixels, expected in zip(read, images, strict=True):
+        np.testing.assert_array_equal(pixels, expected)
+
+
+@_NAMES
+def test_depth_comes_back_bit_by_bit_whatever_the_later_images_hold(
+    tiny: Tiny, tmp_path: Path, name: str
+) -> None:
+    rng = np.random.default_rng(1)
+    millimetres = (rng.integers(1, 9000, (32, 48)) / 1000).astype(np.float32)
+    millimetres[:4] = np.nan
+    far = millimetres.copy()
+    far[9, 9] = 70.0
+    between = rng.uniform(0.3, 4, (32, 48)).astype(np.float32)
+    unknown = np.full((32, 48), np.nan, dtype=np.float32)
+    depths = [millimetres, far, between, unknown]
+    items: list[Item] = [
+        item
+        for n, depth in enumerate(depths)
+        for item in ((0, 10 + n, tiny.texture(n)), (1, 10 + n, depth))
+    ]
+    written = write_bag(tiny.rgbd(items), tmp_path / name, compress=True)
+    assert written.skipped == ()
+    read = [image.load() for image in open_recording(tmp_path / name).images() if image.stream]
+    for depth, expected in zip(read, depths, strict=True):
+        np.testing.assert_array_equal(depth, expected)
+    messages = _messages(tmp_path / name, "/camera/depth/image/compressedDepth")
+    formats = [message.format.split(";")[0] for message in messages]
+    assert formats == ["16UC1", "32FC1", "32FC1", "16UC1"]
+    # As the transport has it: 12 bytes before the PNG.
+    png = cv2.imdecode(messages[0].data[12:], cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(png, np.round(1000 * np.nan_to_num(millimetres)))
+
+
+@_NAMES
+def test_depth_that_is_not_of_millimetres_stays_as_it_is(
+    tiny: Tiny, tmp_path: Path, name: str
+) -> None:
+    fault = RecordingError("depth.png: damaged")
+    items: list[Item] = [(0, 1, tiny.texture(0)), (1, 1, fault), (0, 2, tiny.texture(1))]
+    write_bag(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)
+    (message,) = _messages(tmp_path / name, "/camera/depth/image")
+    assert message.encoding == "32FC1"
+
+
+def test_what_png_cannot_hold_is_refused() -> None:
+    with pytest.raises((RecordingError, cv2.error)):
+        encode_image(np.zeros((0, 3), np.uint8), ".png")

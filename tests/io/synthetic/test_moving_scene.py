@@ -19,8 +19,16 @@ def looking_north(x: float, y: float, z: float = 1.3) -> np.ndarray:
     return se3.make_transform(LEVEL, np.array([x, y, z]))
 
 
-@pytest.mark.parametrize("world", ["traffic", "facade", "mirror", "wall"])
-@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize(
+    ("world", "sensor"),
+    [
+        ("traffic", "rgbd"),
+        ("facade", "stereo"),
+        ("mirror", "stereo"),
+        ("mirror", "rgbd"),
+        ("wall", "rgbd"),
+    ],
+)
 def test_frames_depend_neither_on_one_another_nor_on_the_length(world, sensor) -> None:  # type: ignore[no-untyped-def]
     long = list(SyntheticRecording(world, sensor, n_frames=60, scale=0.1).images())
     short = list(SyntheticRecording(world, sensor, n_frames=51, scale=0.1).images())

@@ -1,28 +1,23 @@
-"""Topics of poses in bags of both generations, written here and recorded."""
+"""Poses and positions out of topics."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.bag.poses import POSE_TYPES, find_topics, open_streams
-from gvo.io.bag.reader import BagReader, typestore
+from gvo.io.bag.poses import POSE_TYPES, Positions, find_topics, open_streams, read_positions
+from gvo.io.bag.reader import BagReader
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseSample
 from gvo.types import FloatArray
-from tests.io.pose_bags import PoseBag
+from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, PoseBag
 
-ODOMETRY, WITH_COVARIANCE, STAMPED, TRANSFORM = POSE_TYPES
 N = 4
 
 
@@ -36,69 +31,13 @@ def covariance_ros(n: int) -> FloatArray:
     return np.asarray(0.01 * (n + 1) * (A @ A.T + np.eye(6)))
 
 
-class Maker:
-    """Makes messages of one generation of ROS."""
-
-    def __init__(self, *, is_ros1: bool) -> None:
-        self.store = typestore(is_ros1=is_ros1)
-        self._types: dict[str, Any] = self.store.types
-        self._sequence = {"seq": 0} if is_ros1 else {}
-
-    def header(self, n: int) -> Any:
-        stamp = self._types["builtin_interfaces/msg/Time"](sec=10 + n, nanosec=7)
-        return self._types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **self._sequence)
-
-    def pose(self, n: int, scale: float = 1.0) -> Any:
-        T = pose(n)
-        q = scale * Rotation.from_matrix(T[:3, :3]).as_quat()
-        return self._types["geometry_msgs/msg/Pose"](
-            position=self._types["geometry_msgs/msg/Point"](x=T[0, 3], y=T[1, 3], z=T[2, 3]),
-            orientation=self._types["geometry_msgs/msg/Quaternion"](x=q[0], y=q[1], z=q[2], w=q[3]),
-        )
-
-    def message(self, type_: str, n: int, scale: float = 1.0) -> Any:
-        if type_ == STAMPED:
-            return self._types[type_](header=self.header(n), pose=self.pose(n, scale))
-        if type_ == TRANSFORM:
-            pose = self.pose(n, scale)
-            return self._types[type_](
-                header=self.header(n),
-                child_frame_id="base",
-                transform=self._types["geometry_msgs/msg/Transform"](
-                    translation=self._types["geometry_msgs/msg/Vector3"](**vars(pose.position)),
-                    rotation=pose.orientation,
-                ),
-            )
-        with_covariance = self._types["geometry_msgs/msg/PoseWithCovariance"](
-            pose=self.pose(n, scale), covariance=covariance_ros(n).ravel()
-        )
-        if type_ == WITH_COVARIANCE:
-            return self._types[type_](header=self.header(n), pose=with_covariance)
-        zero = self._types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-        twist = self._types["geometry_msgs/msg/TwistWithCovariance"](
-            twist=self._types["geometry_msgs/msg/Twist"](linear=zero, angular=zero),
-            covariance=np.zeros(36),
-        )
-        return self._types[type_](
-            header=self.header(n), child_frame_id="base", pose=with_covariance, twist=twist
-        )
-
-
-def write(path: Path, topics: dict[str, str], spoil: Callable[[int], float] | None = None) -> Path:
-    is_ros1 = path.suffix == ".bag"
-    maker = Maker(is_ros1=is_ros1)
-    writer: Any = Writer1(path) if is_ros1 else None
-    if writer is None:
-        plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-        writer = Writer2(path.with_suffix(""), version=8, storage_plugin=plugin)
-    with writer:
-        for name, type_ in topics.items():
-            connection = writer.add_connection(name, type_, typestore=maker.store)
-            serialize = maker.store.serialize_ros1 if is_ros1 else maker.store.serialize_cdr
-            for n in range(N):
-                message = maker.message(type_, n, 1.0 if spoil is None else spoil(n))
-                writer.write(connection, n, serialize(message, type_))
-    return path if is_ros1 else path.with_suffix("") / path.name
+def write(path: Path, topics: dict[str, str], norms: Sequence[float] = (1.0,) * N) -> Path:
+    bag = PoseBag(path)
+    for name, type_ in topics.items():
+        for n, norm in enumerate(norms):
+            stamp_ns, covariance = (10 + n) * 10**9 + 7, covariance_ros(n)
+            bag.pose(name, type_, stamp_ns, pose(n), norm=norm, covariance=covariance)
+    return bag.write()
 
 
 def read(path: Path, *names: str) -> tuple[list[PoseSample], InputFaults]:
@@ -146,7 +85,7 @@ def test_conversion_from_ros_order_undoes_the_published_formula(seed: int) -> No
 
 
 def test_messages_without_a_rotation_are_skipped_and_counted(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.bag", {"/poses": STAMPED}, lambda n: 0.0 if n == 1 else 1.0)
+    path = write(tmp_path / "a.bag", {"/poses": STAMPED}, norms=(1.0, 0.0, 1.0, 1.0))
     samples, faults = read(path)
     assert len(samples) == N - 1
     (warning,) = faults.warnings()
@@ -191,3 +130,60 @@ def test_a_topic_tells_its_frames_and_keeps_to_them(tmp_path: Path) -> None:
     assert [sample.stamp_ns for sample in stream.samples(faults)] == [0, 1, 3]
     assert (stream.parent_frame, stream.child_frame) == ("room", "drone")
     assert "wand in room in place of drone in room" in faults.warnings()[0]
+
+
+NAN, INF = float("nan"), float("inf")
+HELSINKI = (60.0, 25.0, 30.0)
+# of latitude there: one over the meridian's radius of curvature, a (1 - e^2) / (1 - 3/4 e^2)^1.5
+METRE_DEG = np.degrees(1.0 / 6383453.857)
+
+
+def read_places(path: Path) -> tuple[Positions, InputFaults]:
+    faults = InputFaults()
+    reader = BagReader(path)
+    return read_positions(reader, reader.topics[0], faults), faults
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_fixes_are_east_north_and_up_of_the_first_one(tmp_path: Path, name: str) -> None:
+    bag = PoseBag(tmp_path / name)
+    for n in (0, 2, 1):
+        place = (60.0 + n * METRE_DEG, 25.0, 30.0 + 2.0 * n)
+        bag.fix(n * 10**9 + 7, place, frame="/gps_link")
+    found, faults = read_places(bag.write())
+    assert found.stamps_ns.tolist() == [7, 10**9 + 7, 2 * 10**9 + 7]
+    np.testing.assert_allclose(found.positions, [[0, n, 2 * n] for n in range(3)], atol=1e-3)
+    assert (found.child_frame, found.parent_frame) == ("gps_link", "")
+    assert found.origin == "east, north, up of 60.0000000 deg, 25.0000000 deg, 30.00 m"
+    assert not faults
+
+
+def test_what_is_no_fix_is_skipped_and_counted_and_is_no_origin(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.mcap")
+    bag.fix(0, [1.0, 2.0, 3.0], status=-1)
+    for n, spoilt in enumerate([(NAN, 25, 0), (60, INF, 0), (60, 25, NAN), (91, 25, 0)], start=1):
+        bag.fix(n, spoilt)
+    bag.fix(5, HELSINKI, status=2)
+    found, faults = read_places(bag.write())
+    assert found.stamps_ns.tolist() == [5]
+    np.testing.assert_array_equal(found.positions, [[0.0, 0.0, 0.0]])
+    (warning,) = faults.warnings()
+    assert warning.startswith("5 messages hold no position and were skipped; the first: /fix at 0")
+    assert "status -1" in warning
+
+
+def test_a_topic_without_any_fix_is_refused(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    bag.fix(0, HELSINKI, status=-1)
+    with pytest.raises(RecordingError, match="/fix: holds no position: 1 messages"):
+        read_places(bag.write())
+
+
+def test_points_are_positions_in_their_frame(tmp_path: Path) -> None:
+    bag = PoseBag(tmp_path / "a.bag")
+    bag.point("/leica/position", 1, (1.0, 2.0, 3.0), frame="room")
+    bag.point("/leica/position", 2, (NAN, 2.0, 3.0), frame="room")
+    found, faults = read_places(bag.write())
+    np.testing.assert_array_equal(found.positions, [[1.0, 2.0, 3.0]])
+    assert (found.child_frame, found.parent_frame, found.origin) == ("", "room", "")
+    assert len(faults.warnings()) == 1

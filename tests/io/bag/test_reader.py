@@ -199,10 +199,10 @@ def test_a_file_that_the_metadata_do_not_name_is_left_out(tmp_path: Path) -> Non
     assert reader.notes == ["bag: stray.mcap is left out: metadata.yaml does not name it"]
 
 
-_WRITTEN = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 2)), min_size=3, max_size=40)
+_WRITTEN = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 2)), min_size=3, max_size=20)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(written=_WRITTEN)
 def test_several_bags_are_merged_by_the_time_of_recording(
     tmp_path_factory: pytest.TempPathFactory, written: list[tuple[int, int]]

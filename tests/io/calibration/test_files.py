@@ -444,9 +444,7 @@ def _outcome(path: Path, sensor: Any) -> CameraSet | str:
         return str(error)
 
 
-@settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_stands_at_any_place_gives_cameras_or_one_line(
     tmp_path: Path, data: st.DataObject

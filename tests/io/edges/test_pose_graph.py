@@ -1,4 +1,4 @@
-"""Pose graphs as events: every measurement once, each pose with its first connection."""
+"""Pose graphs read as events, and written with smoothed poses."""
 
 from pathlib import Path
 
@@ -8,12 +8,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gvo.errors import TrajectoryError
+from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import EdgeEvent, Event, PoseEvent
-from gvo.io.edges.pose_graph import PoseGraphSource
+from gvo.io.edges.pose_graph import GRAPH, GraphFile, PoseGraphSource
 from gvo.trajectory.g2o import format_edge, format_vertex
-from gvo.types import FloatArray, PosePrior
+from gvo.types import Estimate, FloatArray, PosePrior
 
 
 def translation(x: float) -> FloatArray:
@@ -213,3 +213,43 @@ def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: P
     assert describe(next(events)) == ("pose", 0)
     with pytest.raises(TrajectoryError, match=r"graph\.g2o:3"):
         list(events)
+
+
+def estimate(number: int, stamp_ns: int) -> Estimate:
+    T = np.eye(4)
+    T[0, 3] = number
+    return Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=np.eye(6), frame_id=number)
+
+
+def test_vertices_come_by_their_stamps_then_the_measurements(tmp_path: Path) -> None:
+    graph = GraphFile(tmp_path / "new")
+    graph.add([estimate(7, 300), estimate(5, 20)])
+    graph.add([estimate(6, 100)])
+    graph.close(["EDGE_SE3:QUAT 5 6", "EDGE_SE3:QUAT 6 7"])
+    lines = (tmp_path / "new" / GRAPH).read_text().splitlines()
+    assert [line.split()[:3] for line in lines[:3]] == [
+        ["VERTEX_SE3:QUAT", str(number), f"{number}.0"] for number in (5, 6, 7)
+    ]
+    assert lines[3:] == ["EDGE_SE3:QUAT 5 6", "EDGE_SE3:QUAT 6 7"]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == [GRAPH]
+
+
+def test_the_file_of_an_earlier_run_is_gone_from_the_start(tmp_path: Path) -> None:
+    (tmp_path / GRAPH).write_text("old\n")
+    graph = GraphFile(tmp_path)
+    assert not (tmp_path / GRAPH).exists()
+    graph.close([])
+    assert (tmp_path / GRAPH).read_text() == ""
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordingError, match=f"{GRAPH}: cannot be written"):
+        GraphFile(tmp_path / "file")
+
+
+def test_a_file_that_cannot_be_finished_is_told(tmp_path: Path) -> None:
+    graph = GraphFile(tmp_path)
+    (tmp_path / GRAPH).mkdir()
+    with pytest.raises(RecordingError, match=f"{GRAPH}: cannot be written"):
+        graph.close([])
