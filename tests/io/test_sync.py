@@ -14,9 +14,11 @@ from rosbags.rosbag1 import Reader, Writer
 import gvo
 from gvo.errors import RecordingError
 from gvo.io.bag.reader import typestore
+from gvo.io.convert.bag_writer import write_bag
 from gvo.io.recording import Source, StampedImage
 from gvo.io.sync import StampFilter, pair_images
 from gvo.types import FaultyFrame
+from tests.io.conftest import Item, Tiny
 
 _LIMIT = 20
 _QUEUE = 100
@@ -377,11 +379,16 @@ def _pairs_of(source: Source) -> list[tuple[int, int] | str]:
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
 def test_the_clock_of_the_recording_does_not_matter(
-    room_bag: Path, tmp_path: Path, delay_s: float
+    tiny: Tiny, tmp_path: Path, delay_s: float
 ) -> None:
     """Log times two years off, by a slow clock, depth later than colour."""
+    items: list[Item] = []
+    for n in range(20):
+        items.append((0, 10**9 + n * 33_333_333, tiny.texture(n)))
+        items.append((1, 10**9 + n * 33_333_333 + n % 5 * 4_000_000, tiny.depth(n)))
+    path = write_bag(tiny.rgbd(items), tmp_path / "room.bag").path
     store = typestore(is_ros1=True)
-    with Reader(room_bag) as reader, Writer(tmp_path / "late.bag") as writer:
+    with Reader(path) as reader, Writer(tmp_path / "late.bag") as writer:
         connections = {
             connection.id: writer.add_connection(
                 connection.topic, connection.msgtype, typestore=store
@@ -391,7 +398,7 @@ def test_the_clock_of_the_recording_does_not_matter(
         for connection, log_time_ns, data in reader.messages():
             late_ns = 63_000_000 * 10**9 + int(delay_s * 1e9) * ("depth" in connection.topic)
             writer.write(connections[connection.id], log_time_ns * 9 // 10 + late_ns, data)
-    expected = _pairs_of(gvo.open_recording(room_bag))
+    expected = _pairs_of(gvo.open_recording(path))
     assert len(expected) == 20
     assert all(isinstance(pair, tuple) for pair in expected)
     assert _pairs_of(gvo.open_recording(tmp_path / "late.bag")) == expected
