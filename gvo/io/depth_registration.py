@@ -145,7 +145,7 @@ def _check_rigid(T: FloatArray) -> None:
 
 
 def _is_done(color: Calibration, view: DepthView) -> bool:
-    """Tell whether each pixel of depth belongs to that of the rectified colour image already."""
+    """Tell whether the depth is registered to the rectified colour image already."""
     depth = view.calibration
     return (
         np.allclose(view.T_color_depth, np.eye(4), rtol=0, atol=1e-9)

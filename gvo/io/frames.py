@@ -93,7 +93,7 @@ def paired(
     *,
     limit_ms: float | None = None,
 ) -> Iterator[Pair | FaultyFrame]:
-    """Decide which images make one frame, see `pair_images`.
+    """Pair the images of a recording as configured, see `pair_images`.
 
     Parameters
     ----------
@@ -313,13 +313,7 @@ def _is_same(first: ImageArray, second: ImageArray) -> bool:
 
 
 def make_preparers(info: RecordingInfo) -> _Preparers:
-    """Return what makes the raw images of both streams those of frames.
-
-    Parameters
-    ----------
-    info : RecordingInfo
-        Of the recording. Depth of a camera of its own is registered to the colour camera.
-    """
+    """Return the preparers of both streams; depth of another camera is registered to colour."""
     first = ImagePreparer(info.calibrations[0])
     if info.sensor == "stereo":
         return first, ImagePreparer(info.calibrations[1])
@@ -327,7 +321,7 @@ def make_preparers(info: RecordingInfo) -> _Preparers:
 
 
 class ImagePreparer:
-    """Make raw pixels of one stream what a frame holds: checked, grey, rectified.
+    """Prepare raw pixels of one stream for a frame: check, make grey, rectify.
 
     Parameters
     ----------

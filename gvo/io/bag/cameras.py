@@ -48,7 +48,7 @@ class BagCamera:
     stamp_ns : int
         Of the first message, nanoseconds.
     notes : tuple of str
-        What was made up, a line each.
+        What was assumed, a line each.
     """
 
     image: Topic

@@ -183,15 +183,21 @@ def make_rgbd_calibration(fields: CameraFields, *, is_rectified: bool) -> Calibr
     return calibration
 
 
-def check_camera(calibration: Calibration, where: str) -> None:
-    """Refuse a calibration whose rectified camera is none, naming where it comes from.
+def rectified_calibration(P: FloatArray, *, width: int, height: int) -> Calibration:
+    """Return the calibration of rectified images that P, shape (3, 4), alone describes."""
+    return Calibration(
+        width=width,
+        height=height,
+        K=P[:, :3].copy(),
+        D=np.zeros(5),
+        R=np.eye(3),
+        P=P,
+        is_rectified=True,
+    )
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of one camera.
-    where : str
-        File or topic, for the message.
+
+def check_camera(calibration: Calibration, where: str) -> None:
+    """Check the size and the intrinsics of a rectified camera; messages begin with `where`.
 
     Raises
     ------
@@ -286,7 +292,7 @@ def _alternatives(counts: set[int]) -> str:
 
 
 def read_numbers(values: object, what: str) -> FloatArray:
-    """Return what a file or message holds as an array of one dimension.
+    """Read the numbers of a file or message as a flat array.
 
     Parameters
     ----------
@@ -302,7 +308,7 @@ def read_numbers(values: object, what: str) -> FloatArray:
     Raises
     ------
     CalibrationError
-        When they are none, not finite, or larger than any calibration holds.
+        When they are no numbers, not finite, or larger than any calibration holds.
     """
     try:
         numbers = np.array(cast(ArrayLike, values), dtype=np.float64).ravel()

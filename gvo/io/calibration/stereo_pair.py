@@ -55,7 +55,7 @@ def stereo_baseline(calibrations: tuple[Calibration, Calibration], where: str) -
 def pair_of_extrinsics(
     raw: tuple[Calibration, Calibration], T_left_right: FloatArray, where: str
 ) -> tuple[Calibration, Calibration]:
-    """Return a pair as two raw cameras and the transform between them make it.
+    """Rectify a pair of raw cameras by the transform between them.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def pair_of_extrinsics(
 def pair_of_baseline(
     rectified: tuple[Calibration, Calibration], T_left_right: FloatArray, where: str
 ) -> tuple[Calibration, Calibration]:
-    """Return a rectified pair whose P do not hold the baseline with it set.
+    """Set the baseline of a rectified pair by the transform between the cameras.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Recordings as bags."""
+"""Write recordings as bags."""
 
 from __future__ import annotations
 
@@ -72,17 +72,13 @@ def write_bag(
 
     Parameters
     ----------
-    source : Source
-        The recording.
+    source, rectify, progress
+        As of `gvo.io.convert.convert.convert`.
     path : str or Path
         `.bag`: ROS 1. `.mcap` or `.db3`: a single file of ROS 2. No suffix: a ROS 2 bag folder.
-    rectify : bool
-        Write raw images rectified and grey, as the frames hold them.
     compress : bool
         Write images as PNG, topics `.../compressed`; and depth, where the first image is of
         whole millimetres, as `.../compressedDepth`. Other depth stays as it is.
-    progress : callable, optional
-        Called with the number of images written so far.
 
     Returns
     -------

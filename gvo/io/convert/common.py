@@ -15,6 +15,7 @@ from gvo.errors import GvoError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.bag.source import BagSource
+from gvo.io.calibration.camera_info import rectified_calibration
 from gvo.io.frames import ImagePreparer, make_preparers
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.trajectory.trajectory import Trajectory
@@ -52,7 +53,7 @@ class Conversion:
 
 
 class LeftOut:
-    """What a conversion leaves out, in as few lines as tell it."""
+    """Collects what a conversion leaves out, and why."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -93,7 +94,7 @@ def check_new(path: Path) -> None:
 
 
 def check_images(n_images: tuple[int, int], source: Source, left_out: LeftOut) -> None:
-    """Refuse what no recording can be read from again.
+    """Check that there are images of both streams, as every reader needs.
 
     Raises
     ------
@@ -152,20 +153,12 @@ def plan_images(info: RecordingInfo, *, rectify: bool) -> tuple[_Calibrations, _
     preparers = first if is_rectifying else None, second if is_rectifying or is_moved else None
     if is_raw and not is_rectifying:
         return info.calibrations, preparers
-    return tuple(map(_ideal, info.calibrations)), preparers
-
-
-def _ideal(calibration: Calibration) -> Calibration:
-    """Return the calibration of rectified images without K and R of the raw camera."""
-    return Calibration(
-        width=calibration.width,
-        height=calibration.height,
-        K=calibration.P[:, :3].copy(),
-        D=np.zeros(5),
-        R=np.eye(3),
-        P=calibration.P,
-        is_rectified=True,
+    # without K and R of the raw camera: the same for all who read it
+    ideal = (
+        rectified_calibration(raw.P, width=raw.width, height=raw.height)
+        for raw in info.calibrations
     )
+    return tuple(ideal), preparers
 
 
 def load_image(

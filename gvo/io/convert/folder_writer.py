@@ -39,19 +39,13 @@ def write_folder(
 
     Parameters
     ----------
-    source : Source
-        The recording.
+    source, rectify, config, progress
+        As of `gvo.io.convert.convert.convert`.
     path : str or Path
         Folder to make.
     layout : {"kitti", "euroc", "tum"}, optional
         `tum` for RGB-D; for stereo `euroc` where the images are raw and stay so, else `kitti`,
         which holds rectified pairs only: unpaired images are left out.
-    rectify : bool
-        Write raw images rectified and grey, as the frames hold them.
-    config : Config, optional
-        Of which `sync` matters, for the pairs of KITTI.
-    progress : callable, optional
-        Called with the number of images written so far.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The layouts of KITTI, EuRoC, TUM."""
+"""Folders written in the layouts of KITTI, EuRoC and TUM."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from gvo._text import cut
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.calibration.camera_info import check_camera
+from gvo.io.calibration.camera_info import check_camera, rectified_calibration
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.calibration.stereo_pair import stereo_baseline
 from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamped_rows
@@ -174,16 +174,7 @@ def _rectified(
 ) -> Calibration:
     if key not in projections:
         raise CalibrationError(f"{path}: lacks {key}")
-    P = projections[key]
-    calibration = Calibration(
-        width=size[0],
-        height=size[1],
-        K=P[:, :3].copy(),
-        D=np.zeros(5),
-        R=np.eye(3),
-        P=P,
-        is_rectified=True,
-    )
+    calibration = rectified_calibration(projections[key], width=size[0], height=size[1])
     check_camera(calibration, f"{path}: {key}")
     return calibration
 

@@ -79,7 +79,7 @@ class InputFaults:
 
 
 class EdgeSource(Protocol):
-    """Where edges come from.
+    """A source of poses and edges.
 
     Attributes
     ----------

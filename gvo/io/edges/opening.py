@@ -50,7 +50,7 @@ def open_edges(
     for path in inputs:
         if not exists(path):
             raise TrajectoryError(f"{path}: does not exist; {_KINDS}")
-    bags = [path for path in inputs if _is_bag(path)]
+    bags = [path for path in inputs if path.is_dir() or path.suffix in BAG_SUFFIXES]
     if topics and not bags:
         raise ConfigurationError(
             f"--topic {topics[0]}: names a topic of a bag, {inputs[0]} is none"
@@ -104,12 +104,6 @@ def _spread(sigmas: Sequence[StepSigma], streams: Sequence[PoseStream]) -> list[
             "once, or once for each in their order"
         )
     return list(sigmas) if len(sigmas) > 1 else [*(sigmas or [StepSigma()])] * len(streams)
-
-
-def _is_bag(path: Path) -> bool:
-    if path.is_dir():
-        return True
-    return path.suffix in BAG_SUFFIXES
 
 
 def _is_pose_graph(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""SyntheticRecording, sensor noise."""
+"""Rendered recordings, and the noise of their sensors."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _scale(camera: PinholeCamera, scale: float) -> PinholeCamera:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _World:
     """A scene, a motion through it, and the cameras that fit."""
 
@@ -211,34 +211,22 @@ class _World:
     max_depth_m: float
 
 
-def _by_car(
-    build: Callable[[int], Scene | MovingScene], move: Callable[[FloatArray], FloatArray]
-) -> _World:
-    return _World(
-        build=build,
-        move=move,
-        camera=PinholeCamera(
-            fx=707.0912, fy=707.0912, cx=601.8873, cy=183.1104, width=1226, height=370
-        ),
-        baseline=0.53715,
-        rate_hz=10,
-        max_depth_m=80.0,
-    )
-
-
-def _by_hand(
-    build: Callable[[int], Scene | MovingScene], move: Callable[[FloatArray], FloatArray]
-) -> _World:
-    return _World(
-        build=build,
-        move=move,
-        camera=PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480),
-        baseline=0.11,
-        rate_hz=30,
-        max_depth_m=8.0,
-    )
-
-
+_by_car = partial(
+    _World,
+    camera=PinholeCamera(
+        fx=707.0912, fy=707.0912, cx=601.8873, cy=183.1104, width=1226, height=370
+    ),
+    baseline=0.53715,
+    rate_hz=10,
+    max_depth_m=80.0,
+)
+_by_hand = partial(
+    _World,
+    camera=PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480),
+    baseline=0.11,
+    rate_hz=30,
+    max_depth_m=8.0,
+)
 _WORLDS = {
     "driving": _by_car(street, drive),
     "handheld": _by_hand(room, look_around),
@@ -251,7 +239,7 @@ _WORLDS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorNoise:
-    """The faults of the sensor.
+    """Noise and limits of the sensor.
 
     Parameters
     ----------
