@@ -19,7 +19,6 @@ from gvo.types import (
     Edge,
     Estimate,
     FloatArray,
-    FrameId,
     GraphEdge,
     PosePrior,
     PositionPrior,
@@ -27,10 +26,7 @@ from gvo.types import (
     Rejected,
     Status,
 )
-from tests.backend.walks import STEP, STEP_NS, edge, power
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-
+from tests.backend.walks import STEP, STEP_NS, edge, go_on, number, power, seeds, shifted, walk
 
 KERNELS = ["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 
@@ -62,11 +58,6 @@ def measure(
     return Edge(reference_id=i, T_reference_frame=T, covariance=covariance)
 
 
-def number(frame_id: FrameId) -> int:
-    assert isinstance(frame_id, int)
-    return frame_id
-
-
 def make_kernel(kernel: str, threshold: float | None = None) -> Any:
     makers: dict[str, Any] = {
         "huber": gtsam.noiseModel.mEstimator.Huber,
@@ -95,6 +86,16 @@ def prior_factor(frame: int, prior: Prior) -> Any:
     if isinstance(prior, PosePrior):
         return gtsam.PriorFactorPose3(frame, gtsam.Pose3(prior.T_world_frame), noise)
     return gtsam.GPSFactor(frame, prior.position_world, noise)
+
+
+def net(
+    poses: Sequence[FloatArray], rng: np.random.Generator, sigma: float, *, n_back: int = 1
+) -> list[list[Edge]]:
+    """Return for each pose edges to the few before it."""
+    return [
+        [measure(poses, i, frame, rng, sigma) for i in range(max(frame - n_back, 0), frame)]
+        for frame in range(len(poses))
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +167,7 @@ def values_of(poses: Mapping[Any, FloatArray]) -> gtsam.Values:
 
 def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
     parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setRelativeErrorTol(1e-15)
     parameters.setAbsoluteErrorTol(1e-15)
     parameters.setMaxIterations(200)
@@ -268,10 +270,37 @@ def test_each_answer_is_the_batch_optimum_of_what_was_known(seed: int, with_prio
         assert_equal_covariances(causal[n - 1].covariance, covariance, 1e-3)
 
 
+def test_late_measurements_are_polished_with_the_others_and_the_gain_is_told() -> None:
+    window = walk(WindowConfig(size=None, kernel="none"), 5)
+    loop = edge(0, se3.normalize(power(4) @ se3.exp(np.full(6, 0.02))))
+    place = PositionPrior(position_world=power(2)[:3, 3] + 0.05, covariance=1e-4 * np.eye(3))
+    assert isinstance(window.add_edge(4, loop), Estimate)
+    assert isinstance(window.add_prior(2, place), Estimate)
+    smoothed = window.finish()
+    problem = Problem(
+        poses=[power(frame) for frame in range(5)],
+        edges=[[], *([edge(frame - 1, STEP)] for frame in range(1, 5))],
+        late_edges={4: [(4, loop)]},
+        late_priors={4: [(2, place)]},
+    )
+    optimum, _ = batch(problem)
+    for frame, each in enumerate(smoothed):
+        expected = optimum.atPose3(frame).matrix()
+        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-4)
+    assert window.batch_result is not None
+    assert window.batch_result.error_after == pytest.approx(build(problem).error(optimum), rel=1e-4)
+    assert window.batch_result.error_after > 1.0
+    assert window.batch_result.as_json() == {
+        "error_isam2": window.batch_result.error_before,
+        "error": window.batch_result.error_after,
+        "iterations": window.batch_result.n_iterations,
+    }
+
+
 def test_a_late_loop_answers_with_the_pose_it_moved() -> None:
     rng = np.random.default_rng(1)
     poses = wander(rng, 30)
-    edges = [[], *([measure(poses, i - 1, i, rng, 1e-4)] for i in range(1, 30))]
+    edges = net(poses, rng, 1e-4)
     problem = Problem(poses=poses, edges=edges)
     window = SlidingWindow(WindowConfig(size=None, kernel="none"))
     feed(window, problem)
@@ -292,11 +321,7 @@ def small_window(seed: int, size: int | None) -> tuple[SlidingWindow, Problem]:
     """Return a window of very good measurements, fed with short links alone."""
     rng = np.random.default_rng(seed)
     poses = wander(rng, 25)
-    edges: list[list[Edge]] = [[]]
-    for frame in range(1, 25):
-        references = range(max(frame - 3, 0), frame)
-        edges.append([measure(poses, i, frame, rng, 2e-5) for i in references])
-    problem = Problem(poses=poses, edges=edges)
+    problem = Problem(poses=poses, edges=net(poses, rng, 2e-5, n_back=3))
     window = SlidingWindow(WindowConfig(size=size, kernel="none"))
     feed(window, problem)
     return window, problem
@@ -346,23 +371,6 @@ def test_relative_poses_carry_the_joint_covariance(
     # Far less than two independent poses would give.
     assert np.trace(edge.covariance) < 0.5 * np.trace(window.covariance(b))
     assert_equal_covariances(edge.covariance, covariance, 2e-3)
-
-
-def test_the_relative_pose_of_a_single_edge_is_the_edge() -> None:
-    rng = np.random.default_rng(4)
-    poses = wander(rng, 12)
-    edges = [[], *([measure(poses, i - 1, i, rng, 0.01)] for i in range(1, 12))]
-    window = SlidingWindow(WindowConfig(size=4))
-    feed(window, Problem(poses=poses, edges=edges))
-    found = window.relative_pose(10, 11)
-    np.testing.assert_allclose(found.T_reference_frame, edges[11][0].T_reference_frame, atol=1e-6)
-    assert_equal_covariances(found.covariance, edges[11][0].covariance, 1e-3)
-    back = window.relative_pose(11, 10)
-    np.testing.assert_allclose(
-        back.T_reference_frame, np.linalg.inv(found.T_reference_frame), atol=1e-9
-    )
-    Ad = se3.adjoint(found.T_reference_frame)
-    assert_equal_covariances(back.covariance, Ad @ found.covariance @ Ad.T, 1e-3)
 
 
 def expected_factor(problem: Problem, edge: GraphEdge, kernel: str) -> tuple[Any, Any]:
@@ -468,13 +476,10 @@ def test_edges_that_agree_within_the_kernel_give_their_mean_in_any_order(
 ) -> None:
     window = SlidingWindow(WindowConfig(kernel=kernel))
     window.add_pose(0, 0, [])
-    edges = []
-    for x in (-0.0025, 0.0025, 0.0015):  # 2.5 sigma at most from their mean
-        T = np.eye(4)
-        T[0, 3] = x
-        edges.append(Edge(reference_id=0, T_reference_frame=T, covariance=1e-6 * np.eye(6)))
+    # 2.5 sigma at most from their mean
+    edges = [edge(0, shifted(x), 1e-3) for x in (-0.0025, 0.0025, 0.0015)]
     estimate = window.add_pose(1, 1, [edges[i] for i in order])
-    assert [edge.weight for edge in window.graph() if edge.reference_id == 0] == [1.0, 1.0, 1.0]
+    assert [each.weight for each in window.graph() if each.reference_id == 0] == [1.0, 1.0, 1.0]
     assert estimate.T_world_cam[0, 3] == pytest.approx(0.0005, abs=2e-5)
 
 
@@ -483,15 +488,9 @@ def test_an_edge_may_have_its_own_kernel(kernel: Any) -> None:
     def second_pose(ours: Any, windows: Any) -> list[float]:
         window = SlidingWindow(WindowConfig(kernel=windows, gate=None))
         window.add_pose(0, 0, [])
-        edges = []
-        for x in (0.0, 0.01, 0.09):
-            T = np.eye(4)
-            T[0, 3] = x
-            edges.append(
-                Edge(reference_id=0, T_reference_frame=T, covariance=1e-4 * np.eye(6), kernel=ours)
-            )
+        edges = [replace(edge(0, shifted(x)), kernel=ours) for x in (0.0, 0.01, 0.09)]
         window.add_pose(1, 1, edges)
-        return [edge.weight for edge in window.graph() if edge.reference_id == 0]
+        return [each.weight for each in window.graph() if each.reference_id == 0]
 
     assert second_pose(kernel, "none") == pytest.approx(second_pose(None, kernel), rel=1e-9)
     assert second_pose("none", kernel) == [1.0, 1.0, 1.0]
@@ -518,10 +517,7 @@ def make_gross(
 ) -> Gross:
     rng = np.random.default_rng(seed)
     poses = wander(rng, 9)
-    fed = [
-        [measure(poses, i, frame, rng, sigma) for i in range(max(frame - 3, 0), frame)]
-        for frame in range(8)
-    ]
+    fed = net(poses[:8], rng, sigma, n_back=3)
     edges = [measure(poses, i, 8, rng, 1e-3) for i in range(8 - n_edges, 8)]
     wrong = se3.normalize(edges[place].T_reference_frame @ se3.exp(offset))
     edges[place] = replace(edges[place], T_reference_frame=wrong)
@@ -562,41 +558,23 @@ def test_one_gross_outlier_is_refused_wherever_it_stands(
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-@pytest.mark.parametrize("size", [1.0, 10.0, 1000.0])
-@pytest.mark.parametrize("sigma", [1e-4, 1e-2])
-def test_a_gross_outlier_is_refused_in_sure_and_unsure_windows(
-    place: int, size: float, sigma: float
+@pytest.mark.parametrize(
+    ("size", "sigma", "kernel"), [(1.0, 1e-2, "none"), (1000.0, 1e-4, "none"), (1.0, 1e-3, "huber")]
+)
+def test_a_gross_outlier_is_refused_in_sure_and_unsure_windows_and_under_a_kernel(
+    place: int, size: float, sigma: float, kernel: str
 ) -> None:
     offset = np.array([0.0, 0.0, 0.0, size, 0.0, 0.0])
-    assert_refused(make_gross(0, place, 3, offset, sigma), "none", 1e-4)
-
-
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_gross_outlier_that_is_refused_leaves_no_trace_under_a_kernel(place: int) -> None:
-    offset = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
-    assert_refused(make_gross(0, place, 3, offset), "huber", 1e-4)
-
-
-def test_without_a_gate_nothing_is_gated() -> None:
-    window = SlidingWindow(WindowConfig(gate=None, kernel="huber"))
-    window.add_pose(0, 0, [])
-    moved = np.eye(4)
-    moved[0, 3] = 0.5
-    edges = [
-        Edge(reference_id=0, T_reference_frame=T, covariance=1e-4 * np.eye(6))
-        for T in (np.eye(4), moved, np.eye(4))
-    ]
-    assert window.add_pose(1, 1, edges).rejected == ()
-    assert (window.counts.n_gated, window.counts.n_edges) == (0, 3)
+    assert_refused(make_gross(0, place, 3, offset, sigma), kernel, 1e-4)
 
 
 @settings(max_examples=5)
 @given(seed=seeds)
 def test_edges_whose_covariance_is_true_are_not_refused(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    poses = wander(rng, 200)
+    poses = wander(rng, 80)
     window = SlidingWindow(WindowConfig(size=6))
-    for frame in range(200):
+    for frame in range(80):
         sigma = 10 ** rng.uniform(-4, -1.5)
         references = range(max(frame - 4, 0), frame)
         edges = [measure(poses, i, frame, rng, sigma) for i in references]
@@ -608,14 +586,11 @@ def drifting(seed: int, n: int) -> tuple[list[FloatArray], list[list[Edge]], Edg
     """Return poses, a noisy chain with short links, and a good edge from the first to the last."""
     rng = np.random.default_rng(seed)
     poses = wander(rng, n)
-    edges: list[list[Edge]] = [[]]
-    for frame in range(1, n):
-        references = range(max(frame - 2, 0), frame)
-        edges.append([measure(poses, i, frame, rng, 0.01) for i in references])
+    edges = net(poses, rng, 0.01, n_back=2)
     return poses, edges, measure(poses, 0, n - 1, rng, 1e-3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_loop_closure_after_long_drift_is_not_refused_with_a_pose(seed: int) -> None:
     poses, edges, loop = drifting(seed, 300)
     window = SlidingWindow(WindowConfig(size=5))
@@ -636,7 +611,7 @@ def test_a_loop_closure_after_long_drift_is_not_refused_with_a_pose(seed: int) -
     np.testing.assert_allclose(expected, poses[299], atol=0.01)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_loop_closure_after_long_drift_is_not_refused_later(seed: int) -> None:
     poses, edges, loop = drifting(seed, 150)
     window = SlidingWindow(WindowConfig(size=None))
@@ -646,30 +621,6 @@ def test_a_loop_closure_after_long_drift_is_not_refused_later(seed: int) -> None
     assert not isinstance(answer, Rejected)
     np.testing.assert_allclose(answer.T_world_cam, poses[149], atol=0.1)
     np.testing.assert_allclose(window.finish()[149].T_world_cam, poses[149], atol=0.01)
-
-
-def test_a_known_start_places_the_first_pose() -> None:
-    start = se3.exp(np.array([0.3, -0.2, 0.1, 4.0, 5.0, 6.0]))
-    prior = PosePrior(
-        T_world_frame=start, covariance=random_covariance(np.random.default_rng(0), 0.1)
-    )
-    window = SlidingWindow(WindowConfig(size=5))
-    first = window.add_pose("a", 0, [], prior)
-    np.testing.assert_allclose(first.T_world_cam, start, atol=1e-9)
-    assert_equal_covariances(first.covariance, prior.covariance, 1e-6)
-    assert (first.status, first.rejected) == (Status.OK, ())
-
-
-def test_a_known_position_leaves_the_first_orientation_open() -> None:
-    covariance = random_covariance(np.random.default_rng(1), 0.1, 3)
-    prior = PositionPrior(position_world=np.array([4.0, 5.0, 6.0]), covariance=covariance)
-    window = SlidingWindow(WindowConfig(size=5))
-    first = window.add_pose("a", 0, [], prior)
-    np.testing.assert_allclose(first.T_world_cam[:3, 3], [4.0, 5.0, 6.0], atol=1e-9)
-    np.testing.assert_allclose(first.T_world_cam[:3, :3], np.eye(3), atol=1e-9)
-    expected = np.zeros((6, 6))
-    expected[:3, :3], expected[3:, 3:] = np.eye(3), covariance
-    assert_equal_covariances(first.covariance, expected, 1e-6)
 
 
 def test_without_a_prior_the_first_pose_is_the_identity_and_nearly_sure() -> None:
@@ -683,7 +634,7 @@ def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) ->
     rng = np.random.default_rng(8)
     T_world_start = se3.exp(np.array([0.2, 0.6, -0.3, 10.0, -4.0, 2.0]))
     poses = [T_world_start @ T for T in wander(rng, 80)]
-    edges = [[], *([measure(poses, i - 1, i, rng, 2e-3)] for i in range(1, 80))]
+    edges = net(poses, rng, 2e-3)
     priors: dict[int, Prior] = {
         frame: PositionPrior(
             position_world=poses[frame][:3, 3] + 0.01 * rng.normal(size=3),
@@ -704,13 +655,13 @@ def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) ->
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize(("size", "n"), [(2, 300), (5, 1000), (None, 300)])
+@pytest.mark.parametrize(("size", "n"), [(2, 100), (5, 200), (None, 100)])
 def test_smoothing_consecutive_edges_returns_the_chain(
     kernel: Any, size: int | None, n: int
 ) -> None:
     rng = np.random.default_rng(n)
     poses = wander(rng, n)
-    edges = [[], *([measure(poses, i - 1, i, rng, 0.02)] for i in range(1, n))]
+    edges = net(poses, rng, 0.02)
     window = SlidingWindow(WindowConfig(size=size, kernel=kernel))
     causal = feed(window, Problem(poses=poses, edges=edges))
     smoothed = window.pop_finished() + window.finish()
@@ -723,23 +674,6 @@ def test_smoothing_consecutive_edges_returns_the_chain(
 
 
 # Keyframes that come and go.
-
-
-def test_marginals_carry_on_what_left_the_window() -> None:
-    # The last pose hangs on everything before it, though only three poses are left.
-    rng = np.random.default_rng(7)
-    poses = wander(rng, 40)
-    edges: list[list[Edge]] = [[]]
-    for frame in range(1, 40):
-        references = [frame - 1] if frame == 1 else [frame - 1, frame - 2]
-        edges.append([measure(poses, i, frame, rng, 2e-4) for i in references])
-    causal = feed(
-        SlidingWindow(WindowConfig(size=3, kernel="none")), Problem(poses=poses, edges=edges)
-    )
-    optimum, marginals = batch(Problem(poses=poses, edges=edges))
-    np.testing.assert_allclose(causal[-1].T_world_cam, optimum.atPose3(39).matrix(), atol=1e-5)
-    ratio = np.diag(causal[-1].covariance) / np.diag(marginals.marginalCovariance(39))
-    np.testing.assert_allclose(ratio, 1.0, atol=0.01)
 
 
 def random_soak(
@@ -775,7 +709,7 @@ def random_soak(
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_keyframes_may_come_and_go_for_hundreds_of_poses(seed: int) -> None:
-    n = 300
+    n = 200
     poses, edges, finished, largest = random_soak(seed, n, n_kept_limit=6)
     # Each pose is handed over exactly once.
     assert sorted(number(estimate.frame_id) for estimate in finished) == list(range(n))
@@ -799,44 +733,25 @@ def test_keyframes_may_come_and_go_for_hundreds_of_poses(seed: int) -> None:
 N = 9
 
 
-ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
-
-
 def optimum_of(
-    start: PosePrior, edges: Sequence[tuple[int, Edge]], poses: Sequence[FloatArray]
-) -> tuple[gtsam.Values, FloatArray]:
-    """Return the least squares of a start and edges (frame, edge), and all poses' covariance.
-
-    By GTSAM's batch with QR, and a QR decomposition of the whole Jacobian.
-    """
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise = gtsam.noiseModel.Gaussian.Covariance(start.covariance)
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start.T_world_frame), noise))
-    for frame, each in edges:
-        assert isinstance(each.reference_id, int)
-        noise = gtsam.noiseModel.Gaussian.Covariance(each.covariance)
-        T = gtsam.Pose3(each.T_reference_frame)
-        graph.add(gtsam.BetweenFactorPose3(each.reference_id, frame, T, noise))
-    for frame, pose in enumerate(poses):
-        values.insert(frame, gtsam.Pose3(pose))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    parameters.setRelativeErrorTol(1e-14)
-    parameters.setAbsoluteErrorTol(0.0)
-    optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    J, _ = graph.linearize(optimum).jacobian()
-    R_inverse = np.linalg.inv(np.linalg.qr(J, mode="r"))
-    return optimum, R_inverse @ R_inverse.T
+    poses: Mapping[Any, FloatArray], edges: Sequence[tuple[int, Edge]], start: Prior | None = None
+) -> tuple[gtsam.Values, gtsam.NonlinearFactorGraph]:
+    """Return the least squares of edges (frame, edge), from these poses, and their graph."""
+    priors: dict[int, Prior] = {} if start is None else {0: start}
+    without: list[list[Edge]] = [[] for _ in poses]
+    problem = Problem(
+        poses=[*poses.values()], edges=without, late_edges={0: [*edges]}, priors=priors
+    )
+    graph = build(problem)
+    return optimise(graph, values_of(poses)), graph
 
 
 def drifted_chain(turn_rad: float) -> tuple[SlidingWindow, list[tuple[int, Edge]], FloatArray]:
     """Return a window that holds N poses whose steps turn too far, their edges, the true end."""
     wrong_step = se3.normalize(STEP @ se3.exp(np.array([0.0, turn_rad / N, 0.0, 0.0, 0.0, 0.0])))
     edges = [(frame, edge(frame - 1, wrong_step, 0.1)) for frame in range(1, N)]
-    window = SlidingWindow(WindowConfig(size=N + 3, kernel="none", gate=None))
-    window.add_pose(0, 0, [])
-    for frame, each in edges:
-        window.add_pose(frame, frame * STEP_NS, [each])
+    config = WindowConfig(size=N + 3, kernel="none", gate=None)
+    window = walk(config, N, wrong_step, 0.1)
     return window, edges, power(N - 1)
 
 
@@ -847,7 +762,7 @@ def test_a_loop_with_a_large_turn_is_closed_when_the_call_returns(turn_rad: floa
     loop = edge(0, T_end, 1e-3)
     answer = window.add_edge(N - 1, loop)
     assert isinstance(answer, Estimate)
-    optimum, _ = optimum_of(ORIGIN, [*edges, (N - 1, loop)], list(before.values()))
+    optimum, _ = optimum_of(before, [*edges, (N - 1, loop)])
     moved = se3.invert(before[N - 1]) @ optimum.atPose3(N - 1).matrix()
     assert se3.rotation_angle(moved) > 0.4
     np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N - 1).matrix(), atol=1e-4)
@@ -856,25 +771,19 @@ def test_a_loop_with_a_large_turn_is_closed_when_the_call_returns(turn_rad: floa
 
 
 @pytest.mark.parametrize("turn_rad", [0.6, -1.2])
-def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once(turn_rad: float) -> None:
+@pytest.mark.parametrize("sigma", [0.3, 1e-3])
+def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once_with_the_others(
+    turn_rad: float, sigma: float
+) -> None:
     # It starts where one of its edges leads, and ends where both pull alike.
     window, edges, _ = drifted_chain(turn_rad)
     before = window.poses()
-    arriving = [edge(0, power(N), 0.3), edge(N - 1, STEP, 0.1)]
+    arriving = [edge(0, power(N), sigma), edge(N - 1, STEP, 0.1)]
     answer = window.add_pose(N, N * STEP_NS, arriving)
     assert answer.rejected == ()
     everything = [*edges, *((N, each) for each in arriving)]
-    optimum, _ = optimum_of(ORIGIN, everything, [*before.values(), power(N)])
-    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N).matrix(), atol=1e-4)
-
-
-def test_a_pose_that_closes_a_loop_with_a_large_turn_settles_the_others_too() -> None:
-    window, edges, _ = drifted_chain(-1.2)
-    before = window.poses()
-    arriving = [edge(0, power(N), 1e-3), edge(N - 1, STEP, 0.1)]
-    window.add_pose(N, N * STEP_NS, arriving)
-    everything = [*edges, *((N, each) for each in arriving)]
-    optimum, _ = optimum_of(ORIGIN, everything, [*before.values(), power(N)])
+    optimum, _ = optimum_of(before | {N: power(N)}, everything)
+    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N).matrix(), atol=2e-4)
     for frame, T in enumerate(window.poses().values()):
         np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
 
@@ -899,21 +808,26 @@ def test_a_whole_graph_takes_sigmas_at_which_cholesky_gives_up(
     assert counts.n_restored >= 1  # there was something to survive
     assert (counts.n_rejected, counts.n_coasting, counts.n_rebuilt) == (0, 0, 0)
     assert (counts.n_edges, len(window.graph())) == (len(edges), len(edges) + 1)
-    optimum, covariance = optimum_of(start, edges, [power(frame) for frame in range(N)])
+    optimum, graph = optimum_of({frame: power(frame) for frame in range(N)}, edges, start)
+    J, _ = graph.linearize(optimum).jacobian()
+    R_inverse = np.linalg.inv(np.linalg.qr(J, mode="r"))
+    covariance = R_inverse @ R_inverse.T
     relative = window.relative_pose(0, N - 1)
     np.testing.assert_allclose(relative.T_reference_frame, power(N - 1), atol=1e-6 * N)
     np.testing.assert_allclose(window.pose(N - 1), optimum.atPose3(N - 1).matrix(), atol=1e-4)
     expected = covariance[-6:, -6:]
-    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(window.covariance(N - 1) / scale, expected / scale, atol=1e-3)
+    assert_equal_covariances(window.covariance(N - 1), expected, 1e-3)
+    for frame, each in enumerate(window.finish()):
+        np.testing.assert_allclose(each.T_world_cam, power(frame), atol=1e-4)
+    assert window.batch_result is not None
+    assert window.batch_result.error_after == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_late_edge_at_which_cholesky_gives_up_is_taken() -> None:
     start = PosePrior(T_world_frame=np.eye(4), covariance=1e4 * np.eye(6))
     window = SlidingWindow(WindowConfig(size=None, kernel="none"))
     window.add_pose(0, 0, [], start)
-    for frame in range(1, N):
-        window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP, 1.0)])
+    go_on(window, 1, N, sigma=1.0)
     assert window.counts.n_restored == 0
     answer = window.add_edge(N - 1, edge(0, power(N - 1), 1e-6))
     assert isinstance(answer, Estimate), answer

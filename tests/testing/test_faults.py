@@ -156,7 +156,9 @@ def test_pixels_of_affected_images_change_and_of_no_others(fault: Fault) -> None
 )
 def test_faults_of_depth_leave_colour_alone_and_those_of_light_depth(fault: Fault) -> None:
     sound = Small("rgbd")
-    source = FaultySource(sound, replace(fault, first=0, end=None, every=1, streams=(1,)), made.Black())
+    source = FaultySource(
+        sound, replace(fault, first=0, end=None, every=1, streams=(1,)), made.Black()
+    )
     now, before = load(source, 3, 1), sound.pixels(3, 1)
     assert now.dtype != before.dtype or not np.array_equal(now, before, equal_nan=True)
     assert not load(source, 3, 0).any()

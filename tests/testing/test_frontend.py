@@ -109,8 +109,9 @@ def believing(name: str) -> Spoilt:
 
     def believe(result: Result, prior: MotionPrior | None) -> Result:
         T = getattr(prior, name, None)
-        is_asked = isinstance(result, RelativePose) and T is not None
-        return replace(result, T_reference_current=T.copy()) if is_asked else result
+        if isinstance(result, Failure) or T is None:
+            return result
+        return replace(result, T_reference_current=T.copy())
 
     return Spoilt(believe)
 
