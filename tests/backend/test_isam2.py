@@ -1,7 +1,6 @@
 """The pose graph itself: iterations, marginalization, restoring, covariances."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import gtsam
@@ -13,10 +12,10 @@ from hypothesis import strategies as st
 from gvo.backend.batch import optimize_batch
 from gvo.backend.isam2 import PoseGraph, definite, first_line
 from gvo.errors import SmoothingError
-from gvo.geometry import se3
 from gvo.types import FloatArray
+from tests.backend import walks
 
-STEP = gtsam.Pose3(se3.exp(np.array([0.02, 0.1, -0.01, 0.1, 0.0, 0.5])))
+STEP = gtsam.Pose3(walks.STEP)
 ORIGIN = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
 
 
@@ -39,7 +38,7 @@ def values_of(poses: dict[int, gtsam.Pose3]) -> gtsam.Values:
 
 
 def power(n: int) -> gtsam.Pose3:
-    return gtsam.Pose3(se3.normalize(np.linalg.matrix_power(STEP.matrix(), n)))
+    return gtsam.Pose3(walks.power(n))
 
 
 def chain(n: int, sigma: float = 0.1, *, is_whole: bool = False) -> PoseGraph:
@@ -65,26 +64,12 @@ def step_left(graph: PoseGraph) -> float:
     return max(float(np.abs(step.at(key)).max()) for key in graph.values().keys())  # noqa: SIM118
 
 
-@contextmanager
-def counted(name: str) -> Iterator[list[tuple[Any, ...]]]:
-    """Count the calls of a method of ISAM2."""
-    original, calls = getattr(gtsam.ISAM2, name), []
-
-    def call(self: Any, *arguments: Any) -> Any:
-        calls.append(arguments)
-        return original(self, *arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gtsam.ISAM2, name, call)
-        yield calls
-
-
 @pytest.mark.parametrize(("turn_rad", "is_far"), [(0.0, False), (0.01, False), (1.0, True)])
 def test_a_graph_is_iterated_if_an_update_moved_it_far(turn_rad: float, is_far: bool) -> None:
     graph = chain(6)
     before = {5: graph.pose3(5)}
     graph.update(loop_of(6, turn_rad), gtsam.Values())
-    with counted("update") as calls:
+    with walks.failing("update", []) as calls:
         answer = graph.iterate(before)
     assert answer is is_far
     assert bool(calls) == is_far
@@ -94,7 +79,7 @@ def test_a_graph_is_iterated_if_an_update_moved_it_far(turn_rad: float, is_far: 
 
 def test_a_whole_graph_is_not_iterated_and_may_have_moved() -> None:
     graph = chain(6, is_whole=True)
-    with counted("update") as calls:
+    with walks.failing("update", []) as calls:
         assert graph.iterate({5: gtsam.Pose3()}) is True
     assert calls == []
 
@@ -252,9 +237,6 @@ def test_a_batch_goes_on_until_the_error_converges() -> None:
 # Covariances as GTSAM gives them: with the traces of rounding, and with worse.
 
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-
-
 def correlations(rng: np.random.Generator, least: float) -> FloatArray:
     """Return a matrix with ones on its diagonal and about this least eigenvalue."""
     factor = rng.normal(size=(6, 5))
@@ -264,7 +246,7 @@ def correlations(rng: np.random.Generator, least: float) -> FloatArray:
     return np.asarray((flat + least * np.eye(6)) / (1.0 + least))
 
 
-@given(seed=seeds, exponent=st.floats(-9.0, -7.0))
+@given(seed=walks.seeds, exponent=st.floats(-9.0, -7.0))
 def test_a_little_less_than_definite_is_mended_and_keeps_what_it_says(
     seed: int, exponent: float
 ) -> None:
@@ -281,7 +263,7 @@ def test_a_little_less_than_definite_is_mended_and_keeps_what_it_says(
     np.testing.assert_allclose(eigenvalues[1:], np.linalg.eigvalsh(spoilt)[1:], atol=1e-12)
 
 
-@given(seed=seeds)
+@given(seed=walks.seeds)
 def test_a_definite_one_is_only_made_symmetric(seed: int) -> None:
     rng = np.random.default_rng(seed)
     factor = rng.normal(size=(6, 6))
