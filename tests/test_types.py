@@ -1,7 +1,5 @@
 """The values that travel between the stages."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from gvo.types import (
     Edge,
     Estimate,
     Failure,
-    FaultyFrame,
     Observations,
     RelativePose,
     RgbdFrame,
@@ -77,18 +74,6 @@ def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
         assert array[0, 0] == 1.0
         with pytest.raises(ValueError, match="read-only"):
             array[0, 0] = 2.0
-
-
-def test_frames_of_stamp_zero_are_frames() -> None:
-    assert StereoFrame(stamp_ns=0, left=grey(2, 3), right=grey(2, 3)).stamp_ns == 0
-    depth = np.zeros((2, 3), dtype=np.float32)
-    assert RgbdFrame(stamp_ns=0, image=grey(2, 3), depth=depth).stamp_ns == 0
-
-
-def test_values_cannot_be_changed() -> None:
-    faulty = FaultyFrame(stamp_ns=1, reason="empty image")
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        faulty.stamp_ns = 2  # type: ignore[misc]
 
 
 def test_observations_count_their_points() -> None:

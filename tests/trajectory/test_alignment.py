@@ -18,22 +18,9 @@ from gvo.trajectory.alignment import (
     pair,
 )
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
+from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
 stamp_lists = st.lists(st.integers(0, 200), min_size=1, max_size=30, unique=True).map(sorted)
-
-
-def still(stamps_ns: list[int], stamps_from: StampsFrom = "file") -> Trajectory:
-    return Trajectory(
-        stamps_ns=np.array(stamps_ns),
-        T_world_cam=np.tile(np.eye(4), (len(stamps_ns), 1, 1)),
-        stamps_from=stamps_from,
-    )
-
-
-def random_trajectory(seed: int, n: int = 12) -> Trajectory:
-    twists = np.random.default_rng(seed).normal(size=(n, 6))
-    return Trajectory(stamps_ns=np.arange(n), T_world_cam=se3.exp(twists))
 
 
 def random_similarity(seed: int) -> Similarity:
@@ -90,35 +77,25 @@ def test_poses_without_stamps_are_associated_row_by_row(
     assert rows.tolist() == columns.tolist() == list(range(5))
 
 
-@pytest.mark.parametrize(("n_reference", "n_estimate"), [(5, 3), (3, 5)])
-def test_unequal_numbers_of_poses_without_stamps_are_refused(
-    n_reference: int, n_estimate: int
-) -> None:
-    # One row missing in the middle would shift all after it.
-    reference = still(list(range(n_reference)), "rows")
-    with pytest.raises(TrajectoryError, match=rf"{n_estimate} poses without.*{n_reference}:"):
-        associate(reference, still(list(range(n_estimate)), "rows"))
-
-
-def test_an_equal_number_of_poses_does_not_make_up_for_missing_stamps() -> None:
-    with pytest.raises(TrajectoryError, match="without stamps"):
-        associate(still([0, 1], "file"), still([0, 1], "rows"))
-
-
 @pytest.mark.parametrize(
-    ("origins", "match"),
+    ("n_reference", "n_estimate", "origins", "match"),
     [
-        (("file", "rows"), "^raw holds rows of poses without stamps.*with the reference"),
-        (("rows", "file"), "^the reference holds rows of poses without stamps.*with raw"),
-        (("times", "rows"), "^raw holds rows"),
+        # One row missing in the middle would shift all after it.
+        (5, 3, ("rows", "rows"), "3 poses without.*5:"),
+        (3, 5, ("rows", "rows"), "5 poses without.*3:"),
+        # An equal number of poses does not make up for missing stamps.
+        (2, 2, ("file", "rows"), "^raw holds rows of poses without stamps.*with the reference"),
+        (3, 2, ("rows", "file"), "^the reference holds rows of poses without stamps.*with raw"),
+        (3, 2, ("times", "rows"), "^raw holds rows.*times.txt"),
     ],
 )
-def test_poses_without_stamps_cannot_meet_stamped_ones(
-    origins: tuple[StampsFrom, StampsFrom], match: str
+def test_poses_without_stamps_meet_neither_more_nor_fewer_nor_stamped_ones(
+    n_reference: int, n_estimate: int, origins: tuple[StampsFrom, StampsFrom], match: str
 ) -> None:
-    with pytest.raises(TrajectoryError, match=match) as caught:
-        associate(still([0, 1, 2], origins[0]), still([0, 1], origins[1]), name="raw")
-    assert "times.txt" in str(caught.value)
+    reference = still([*range(n_reference)], origins[0])
+    estimate = still([*range(n_estimate)], origins[1])
+    with pytest.raises(TrajectoryError, match=match):
+        associate(reference, estimate, name="raw")
 
 
 @given(seeds)
@@ -169,35 +146,27 @@ def test_mirrored_points_are_aligned_by_a_rotation() -> None:
         assert np.linalg.det(found.T_a_b[:3, :3]) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_poses_on_a_line_are_aligned_as_well(n: int) -> None:
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, 3] = np.arange(n)[:, np.newaxis] * [1.0, 2.0, 0.5]
-    line = Trajectory(stamps_ns=np.arange(n), T_world_cam=poses)
-    moved = random_similarity(4)
-    reference = Similarity(T_a_b=moved.T_a_b).apply(line)
-    aligned = alignment(reference, line, "se3").apply(line)
-    np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-9)
-
-
-@pytest.mark.parametrize("mode", ["se3", "sim3"])
-def test_a_nearly_straight_path_is_aligned_exactly(mode: AlignMode) -> None:
+@pytest.mark.parametrize(
+    ("n", "across_m", "mode"),
+    [(1, 0.0, "se3"), (2, 0.0, "se3"), (5, 0.0, "se3"), (50, 1e-3, "se3"), (50, 1e-3, "sim3")],
+)
+def test_poses_on_a_line_or_nearly_so_are_aligned_exactly(
+    n: int, across_m: float, mode: AlignMode
+) -> None:
     """A drive of 100 m that leaves its line by millimetres still tells which side is up."""
     rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (50, 1, 1))
-    poses[:, :3, 3] = rng.normal(size=(50, 3)) * [100.0, 1e-3, 2e-3]
-    path = Trajectory(stamps_ns=np.arange(50), T_world_cam=poses)
-    moved = random_similarity(4)
-    reference = Similarity(T_a_b=moved.T_a_b).apply(path)
+    positions = rng.normal(size=(n, 3)) * [100.0, across_m, 2.0 * across_m]
+    path = Trajectory(stamps_ns=np.arange(n), T_world_cam=unturned(positions))
+    reference = Similarity(T_a_b=random_similarity(4).T_a_b).apply(path)
     aligned = alignment(reference, path, mode).apply(path)
     np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-6)
 
 
 def test_a_scale_needs_motion() -> None:
-    with pytest.raises(TrajectoryError, match="no scale"):
-        alignment(random_trajectory(0, 3), still([0, 1, 2]), "sim3")
-    with pytest.raises(TrajectoryError, match="no scale"):
-        alignment(still([0, 1, 2]), random_trajectory(0, 3), "sim3")
+    pair_of = [random_trajectory(0, 3), still([0, 1, 2])]
+    for reference, estimate in (pair_of, pair_of[::-1]):
+        with pytest.raises(TrajectoryError, match="no scale"):
+            alignment(reference, estimate, "sim3")
 
 
 def test_wrong_use_of_alignment_is_refused() -> None:
@@ -292,11 +261,9 @@ def test_files_are_associated_as_ever_and_single_poses_as_well() -> None:
 def test_topics_of_other_clocks_are_refused() -> None:
     with pytest.raises(TrajectoryError, match=r"^raw and the reference .* 250 ms apart"):
         pair(circle(np.arange(5)), circle(np.arange(5) + 10**12), name="raw")
-    nothing = circle(np.empty(0, dtype=np.int64))
-    with pytest.raises(TrajectoryError, match="holds no poses"):
-        pair(nothing, circle(np.arange(5)))
-    with pytest.raises(TrajectoryError, match="without stamps"):
-        pair(circle(np.arange(5)), circle(np.arange(5), "rows"))
+    for other, match in ((still([]), "holds no poses"), (still([0], "rows"), "without stamps")):
+        with pytest.raises(TrajectoryError, match=match):
+            pair(circle(np.arange(5)), other)
 
 
 def test_positions_without_rotations_are_aligned_but_not_by_their_first_pose() -> None:

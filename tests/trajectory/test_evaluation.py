@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
@@ -19,8 +20,7 @@ from gvo.trajectory.alignment import AlignMode, Similarity
 from gvo.trajectory.evaluation import Evaluation, evaluate, relative_errors, segment_errors
 from gvo.trajectory.formats import read_trajectory, write_kitti, write_tum
 from gvo.trajectory.trajectory import Trajectory
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
+from tests.trajectory.paths import seeds, straight
 
 
 def drive(n: int, step_m: float = 1.0, *, seed: int = 0) -> Trajectory:
@@ -41,12 +41,6 @@ def disturbed(trajectory: Trajectory, *, seed: int = 1, sigma: float = 0.005) ->
     for step, error in zip(se3.invert(T[:-1]) @ T[1:], se3.exp(twists[1:]), strict=True):
         poses.append(poses[-1] @ step @ error)
     return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_cam=np.array(poses))
-
-
-def straight(n: int, step_m: float) -> Trajectory:
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, 2, 3] = np.arange(n) * step_m
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=poses)
 
 
 def measures(evaluation: Evaluation) -> list[float | None]:
@@ -72,6 +66,20 @@ def run_evo(folder: Path, *arguments: str | Path) -> float:
     )
     with zipfile.ZipFile(results) as archive:
         return float(json.loads(archive.read("stats.json"))["rmse"])
+
+
+def assert_as_evo(
+    evaluation: Evaluation, kind: str, files: Sequence[Path], ape: Sequence[str], rpe: Sequence[str]
+) -> None:
+    """Compare with what the programs of evo say of a reference and an estimate."""
+    folder = files[1].parent
+    expected = [
+        run_evo(folder, "evo_ape", kind, *files, *ape),
+        run_evo(folder, "evo_rpe", kind, *files, *rpe),
+        run_evo(folder, "evo_rpe", kind, *files, *rpe, "-r", "angle_deg"),
+    ]
+    found = [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg]
+    assert found == pytest.approx(expected, abs=1e-6)
 
 
 def without_ties(reference: Trajectory, estimate: Trajectory) -> Trajectory:
@@ -105,26 +113,23 @@ def devkit_errors(
     return 100.0 * float(np.mean(t_errors)), 100.0 * float(np.rad2deg(np.mean(r_errors)))
 
 
-@pytest.mark.parametrize(("n", "step_m"), [(200, 0.5), (700, 2.0)])
-def test_segment_errors_are_those_of_the_devkit(n: int, step_m: float) -> None:
+@pytest.mark.parametrize(
+    ("n", "step_m", "lengths", "step", "options"),
+    [
+        (200, 0.5, [20.0, 50.0], 1, {}),
+        (700, 2.0, [100.0 * k for k in range(1, 9)], 10, {}),
+        (150, 1.0, [30.0], 7, {"segments": [30.0], "segment_step": 7}),
+    ],
+)
+def test_segment_errors_are_those_of_the_devkit(
+    n: int, step_m: float, lengths: list[float], step: int, options: dict[str, Any]
+) -> None:
     reference = drive(n, step_m)
     estimate = disturbed(reference)
-    is_long = n * step_m > 800
-    lengths = [100.0 * k for k in range(1, 9)] if is_long else [20.0, 50.0]
-    expected = devkit_errors(
-        reference.T_world_cam, estimate.T_world_cam, lengths, 10 if is_long else 1
-    )
-    evaluation = evaluate(reference, estimate, name="estimate")
+    expected = devkit_errors(reference.T_world_cam, estimate.T_world_cam, lengths, step)
+    evaluation = evaluate(reference, estimate, name="estimate", **options)
     assert (evaluation.t_pct, evaluation.r_deg_per_100m) == pytest.approx(expected, rel=1e-7)
     assert evaluation.segments_m == tuple(lengths)
-
-
-def test_lengths_and_step_of_the_segments_can_be_given() -> None:
-    reference = drive(150)
-    estimate = disturbed(reference)
-    expected = devkit_errors(reference.T_world_cam, estimate.T_world_cam, [30.0], 7)
-    evaluation = evaluate(reference, estimate, name="e", segments=[30.0], segment_step=7)
-    assert (evaluation.t_pct, evaluation.r_deg_per_100m) == pytest.approx(expected, rel=1e-7)
 
 
 def test_a_segment_ends_at_the_first_pose_beyond_its_length() -> None:
@@ -199,14 +204,23 @@ def test_the_segments_of_kitti_are_for_paths_as_long_as_the_longest_of_them() ->
         assert evaluation.n_segments == sum(fitting)
 
 
-def test_an_estimate_that_stands_is_measured_and_a_reference_that_stands_gives_no_ratio() -> None:
-    moving, standing = straight(30, 1.0), straight(30, 0.0)
-    assert evaluate(moving, standing, name="e", align="origin").path_ratio == 0.0
-    assert evaluate(standing, moving, name="e", align="origin").path_ratio is None
-    assert evaluate(straight(11, 2e-7), straight(11, 1e-7), name="e").path_ratio == pytest.approx(
-        0.5
-    )
-    assert evaluate(straight(11, 0.9e-7), straight(11, 1e-7), name="e").path_ratio is None
+@pytest.mark.parametrize(
+    ("reference_m", "estimate_m", "ratio"),
+    [
+        (10.0, 0.0, 0.0),
+        (0.0, 10.0, None),
+        (2e-6, 1e-6, 0.5),
+        (0.9e-6, 1e-6, None),
+        (1e-6, 1e-6, None),  # a path of a micrometre is no motion
+        (1.001e-6, 1.001e-6, 1.0),
+    ],
+)
+def test_the_ratio_of_paths_needs_a_reference_that_moves(
+    reference_m: float, estimate_m: float, ratio: float | None
+) -> None:
+    reference, estimate = straight(2, reference_m), straight(2, estimate_m)
+    found = evaluate(reference, estimate, name="e", align="none")
+    assert found.path_ratio == pytest.approx(ratio)
 
 
 def test_what_cannot_be_measured_is_none() -> None:
@@ -239,7 +253,7 @@ def test_wrong_use_is_refused() -> None:
 def test_stamps_may_differ_by_what_is_allowed_and_no_more() -> None:
     reference = drive(30)
     late = Trajectory(stamps_ns=reference.stamps_ns + 12_000_000, T_world_cam=reference.T_world_cam)
-    with pytest.raises(TrajectoryError, match="share no stamps"):
+    with pytest.raises(TrajectoryError, match=r"^late and the reference share no stamps"):
         evaluate(reference, late, name="late")
     found = evaluate(reference, late, name="late", max_difference_ns=12_000_000)
     assert found.n == 30
@@ -271,20 +285,6 @@ def test_pairs_as_far_apart_as_the_trajectory_is_long_are_none() -> None:
     assert evaluate(straight(5, 1.0), straight(5, 1.1), name="e", rpe_delta=5).rpe_m is None
 
 
-def test_a_path_of_a_micrometre_is_no_motion() -> None:
-    still = straight(2, 1e-6)
-    assert float(still.distances()[-1]) == 1e-6
-    assert evaluate(still, still, name="e", align="none").path_ratio is None
-    moving = straight(2, 1.001e-6)
-    assert evaluate(moving, moving, name="e", align="none").path_ratio == pytest.approx(1.0)
-
-
-def test_an_estimate_of_another_recording_is_named() -> None:
-    other = Trajectory(stamps_ns=np.arange(3), T_world_cam=np.tile(np.eye(4), (3, 1, 1)))
-    with pytest.raises(TrajectoryError, match=r"^raw and the reference share no stamps"):
-        evaluate(drive(10), other, name="raw")
-
-
 @pytest.mark.parametrize(("align", "option"), [("se3", "-a"), ("sim3", "-as")])
 def test_ate_and_rpe_are_those_of_evo_on_tum_files(
     tmp_path: Path, align: AlignMode, option: str
@@ -296,15 +296,7 @@ def test_ate_and_rpe_are_those_of_evo_on_tum_files(
     write_tum(files[0], reference)
     write_tum(files[1], shifted)
     evaluation = evaluate(*map(read_trajectory, files), name="e", align=align)
-    rpe = ["-d", "1", "-u", "f", option]
-    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
-        [
-            run_evo(tmp_path, "evo_ape", "tum", *files, option),
-            run_evo(tmp_path, "evo_rpe", "tum", *files, *rpe),
-            run_evo(tmp_path, "evo_rpe", "tum", *files, *rpe, "-r", "angle_deg"),
-        ],
-        abs=1e-6,
-    )
+    assert_as_evo(evaluation, "tum", files, [option], ["-d", "1", "-u", "f", option])
 
 
 def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
@@ -314,14 +306,7 @@ def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
     write_kitti(files[1], disturbed(reference))
     evaluation = evaluate(*map(read_trajectory, files), name="e", align="origin", rpe_delta=3)
     rpe = ["--align_origin", "-d", "3", "-u", "f", "--all_pairs"]
-    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
-        [
-            run_evo(tmp_path, "evo_ape", "kitti", *files, "--align_origin"),
-            run_evo(tmp_path, "evo_rpe", "kitti", *files, *rpe),
-            run_evo(tmp_path, "evo_rpe", "kitti", *files, *rpe, "-r", "angle_deg"),
-        ],
-        abs=1e-6,
-    )
+    assert_as_evo(evaluation, "kitti", files, rpe[:1], rpe)
 
 
 @pytest.mark.recorded
@@ -335,20 +320,14 @@ def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
 def test_ate_and_rpe_of_published_trajectories_are_those_of_evo(
     gvo_data: Path, tmp_path: Path, reference: str, estimate: str, kind: str
 ) -> None:
-    files = [gvo_data / "trajectories" / f"{name}.txt" for name in (reference, estimate)]
+    truth, found = (gvo_data / "trajectories" / f"{name}.txt" for name in (reference, estimate))
+    kept = read_trajectory(found)
     if kind == "tum":
-        kept = without_ties(*map(read_trajectory, files))
-        files[1] = tmp_path / "estimate.txt"
-        write_tum(files[1], kept)
+        kept = without_ties(read_trajectory(truth), kept)
+    files = truth, tmp_path / "estimate.txt"
+    (write_tum if kind == "tum" else write_kitti)(files[1], kept)
     evaluation = evaluate(*map(read_trajectory, files), name=estimate)
-    assert [evaluation.ate_m, evaluation.rpe_m, evaluation.rpe_deg] == pytest.approx(
-        [
-            run_evo(tmp_path, "evo_ape", kind, *files, "-a"),
-            run_evo(tmp_path, "evo_rpe", kind, *files),
-            run_evo(tmp_path, "evo_rpe", kind, *files, "-r", "angle_deg"),
-        ],
-        abs=1e-6,
-    )
+    assert_as_evo(evaluation, kind, files, ["-a"], [])
 
 
 @pytest.mark.recorded
@@ -372,10 +351,8 @@ def test_published_figures_are_met(
     evaluation = evaluate(truth, result, name=estimate)
     ate_m, t_pct, r_deg_per_100m = expected
     assert evaluation.ate_m == pytest.approx(ate_m, rel=3e-3)
-    assert evaluation.t_pct == (None if t_pct is None else pytest.approx(t_pct, abs=5e-4))
-    assert evaluation.r_deg_per_100m == (
-        None if r_deg_per_100m is None else pytest.approx(r_deg_per_100m, abs=5e-4)
-    )
+    assert evaluation.t_pct == pytest.approx(t_pct, abs=5e-4)
+    assert evaluation.r_deg_per_100m == pytest.approx(r_deg_per_100m, abs=5e-4)
 
 
 def test_against_positions_the_place_is_measured_and_no_rotation() -> None:

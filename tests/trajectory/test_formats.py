@@ -23,59 +23,31 @@ from gvo.trajectory.formats import (
     write_tum,
 )
 from gvo.trajectory.trajectory import Trajectory
+from tests.trajectory.paths import random_trajectory, seeds
 
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
 GOOD = "1.0 0 0 0 0 0 0 1\n"
 
 
-def random_trajectory(seed: int, n: int = 8) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    factors = rng.normal(size=(n, 6, 6)) * 1e-3
-    return Trajectory(
-        stamps_ns=np.cumsum(rng.integers(1, 2 * 10**17, n)),
-        T_world_cam=se3.exp(rng.normal(size=(n, 6)) * [2, 2, 2, 500, 500, 500]),
-        covariances=factors @ factors.transpose(0, 2, 1),
-    )
-
-
 @given(seeds)
-def test_a_tum_file_gives_back_stamps_exactly_and_poses_to_nanometres(
+def test_files_give_back_stamps_and_covariances_exactly_and_poses_to_nanometres(
     tmp_path_factory: pytest.TempPathFactory, seed: int
 ) -> None:
-    path = tmp_path_factory.mktemp("tum") / "trajectory.txt"
-    trajectory = random_trajectory(seed)
-    write_tum(path, trajectory)
-    back = read_trajectory(path)
-    np.testing.assert_array_equal(back.stamps_ns, trajectory.stamps_ns)
-    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
-    assert back.stamps_from == "file"
-
-
-@given(seeds)
-def test_a_kitti_file_gives_back_the_poses(
-    tmp_path_factory: pytest.TempPathFactory, seed: int
-) -> None:
-    path = tmp_path_factory.mktemp("kitti") / "00.txt"
-    trajectory = random_trajectory(seed)
-    write_kitti(path, trajectory)
-    back = read_trajectory(path)
-    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
-    assert back.stamps_from == "rows"
-    assert back.stamps_ns.tolist() == [n * 10**9 for n in range(8)]
-
-
-@given(seeds)
-def test_covariances_come_back_without_loss(
-    tmp_path_factory: pytest.TempPathFactory, seed: int
-) -> None:
-    path = tmp_path_factory.mktemp("covariances") / "covariances.csv"
-    trajectory = random_trajectory(seed)
-    write_covariances(path, trajectory)
-    stamps_ns, covariances = read_covariances(path)
+    folder = tmp_path_factory.mktemp("files")
+    trajectory = random_trajectory(seed, 8, size_m=500.0)
+    for write, stamps_from, expected_ns in (
+        (write_tum, "file", trajectory.stamps_ns),
+        (write_kitti, "rows", 10**9 * np.arange(8)),
+    ):
+        write(folder / "00.txt", trajectory)
+        back = read_trajectory(folder / "00.txt")
+        np.testing.assert_array_equal(back.stamps_ns, expected_ns)
+        np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+        assert back.stamps_from == stamps_from
+    write_covariances(folder / "covariances.csv", trajectory)
+    stamps_ns, covariances = read_covariances(folder / "covariances.csv")
     assert trajectory.covariances is not None
     np.testing.assert_array_equal(stamps_ns, trajectory.stamps_ns)
-    upper = np.triu(trajectory.covariances)
-    np.testing.assert_array_equal(np.triu(covariances), upper)
+    np.testing.assert_array_equal(np.triu(covariances), np.triu(trajectory.covariances))
     np.testing.assert_array_equal(covariances, covariances.transpose(0, 2, 1))
 
 

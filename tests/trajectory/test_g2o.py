@@ -7,7 +7,6 @@ import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
@@ -20,6 +19,7 @@ from gvo.trajectory.g2o import (
     format_vertex,
     parse_line,
 )
+from tests.trajectory.paths import seeds
 
 EXAMPLES = (
     "sphere2500.txt",
@@ -27,7 +27,6 @@ EXAMPLES = (
     "pose3example.txt",
     "pose3example-offdiagonal.txt",
 )
-seeds = st.integers(0, 2**32 - 1)
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The trajectory value: checks, frames, interpolation."""
 
 from decimal import Decimal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,19 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory, format_stamp
-from gvo.types import Estimate
-
-seeds = st.integers(min_value=0, max_value=2**32 - 1)
-
-
-def random_trajectory(seed: int, n: int = 12, *, with_covariances: bool = False) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    factors = rng.normal(size=(n, 6, 6))
-    return Trajectory(
-        stamps_ns=1_305_031_101_000_000_000 + np.cumsum(rng.integers(1, 10**9, n)),
-        T_world_cam=se3.exp(rng.normal(size=(n, 6))),
-        covariances=factors @ factors.transpose(0, 2, 1) if with_covariances else None,
-    )
+from gvo.types import Estimate, FloatArray
+from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
 
 def test_arrays_are_copies_that_nobody_can_write_to() -> None:
@@ -37,49 +27,44 @@ def test_arrays_are_copies_that_nobody_can_write_to() -> None:
             array[0] = 1
 
 
+def at(place: tuple[int, int, int], value: float) -> FloatArray:
+    array = np.zeros((3, 4, 4))
+    array[place] = value
+    return array
+
+
 def test_a_trajectory_may_be_empty() -> None:
-    empty = Trajectory(stamps_ns=np.array([], dtype=np.int64), T_world_cam=np.empty((0, 4, 4)))
+    empty = still([])
     assert len(empty) == len(empty.distances()) == len(empty.interpolate(np.array([1]))) == 0
 
 
 @pytest.mark.parametrize(
-    ("stamps", "match"),
+    ("changes", "match"),
     [
-        ([0, 2, 2], "after index 1"),
-        ([0, 3, 2], "after index 1"),
-        ([0.0, 1.0, 2.0], "integers"),
-        ([[0, 1, 2]], "shape"),
-        ([0, 1], "T_world_cam must have shape"),
+        ({"stamps_ns": np.array([0, 2, 2])}, "after index 1"),
+        ({"stamps_ns": np.array([0, 3, 2])}, "after index 1"),
+        ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "integers"),
+        ({"stamps_ns": np.array([[0, 1, 2]])}, "shape"),
+        ({"stamps_ns": np.array([0, 1])}, "T_world_cam must have shape"),
+        ({"covariances": np.zeros((3, 3, 3))}, "covariances must have shape"),
+        ({"covariances": np.zeros((3, 6, 6)), "has_rotations": False}, "identities and no cov"),
+        ({"T_world_cam": se3.exp(np.full((3, 6), 0.1)), "has_rotations": False}, "identities and"),
+        *(
+            ({"T_world_cam": np.tile(np.eye(4), (3, 1, 1)) + at(place, value)}, match)
+            for place, value, match in [
+                ((1, 0, 3), np.nan, "finite"),
+                ((1, 0, 3), np.inf, "finite"),
+                ((1, 0, 0), -2.0, r"\[1\] holds no rotation"),
+                ((1, 0, 0), 0.1, r"\[1\] holds no rotation"),
+                ((1, 3, 3), 1.0, r"\[1\] must have .* last row"),
+            ]
+        ),
     ],
 )
-def test_wrong_stamps_are_refused(stamps: list[int], match: str) -> None:
+def test_what_is_no_trajectory_is_refused(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(ValueError, match=match):
-        Trajectory(stamps_ns=np.array(stamps), T_world_cam=np.tile(np.eye(4), (3, 1, 1)))
-
-
-@pytest.mark.parametrize(
-    ("position", "value", "match"),
-    [
-        ((1, 0, 3), np.nan, "finite"),
-        ((1, 0, 3), np.inf, "finite"),
-        ((1, 0, 0), -1.0, r"\[1\] holds no rotation"),
-        ((1, 0, 0), 1.1, r"\[1\] holds no rotation"),
-        ((1, 3, 3), 2.0, r"\[1\] must have .* last row"),
-    ],
-)
-def test_a_matrix_that_is_no_pose_is_refused(
-    position: tuple[int, int, int], value: float, match: str
-) -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[position] = value
-    with pytest.raises(ValueError, match=match):
-        Trajectory(stamps_ns=np.arange(3), T_world_cam=poses)
-
-
-def test_covariances_of_another_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match="covariances must have shape"):
         Trajectory(
-            stamps_ns=np.arange(1), T_world_cam=np.eye(4)[None], covariances=np.zeros((1, 3, 3))
+            **{"stamps_ns": np.arange(3), "T_world_cam": np.tile(np.eye(4), (3, 1, 1))} | changes
         )
 
 
@@ -91,15 +76,14 @@ def test_a_stamp_is_written_without_loss(stamp_ns: int) -> None:
 
 
 def test_distances_add_up_the_steps() -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[1:, :3, 3] = [[3.0, 4.0, 0.0], [3.0, 4.0, 2.0]]
+    poses = unturned(np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 2.0]]))
     trajectory = Trajectory(stamps_ns=np.arange(3), T_world_cam=poses)
     assert trajectory.distances().tolist() == [0.0, 5.0, 7.0]
 
 
 @given(seeds)
 def test_changing_the_frame_back_and_forth_changes_nothing(seed: int) -> None:
-    trajectory = random_trajectory(seed, with_covariances=True)
+    trajectory = random_trajectory(seed)
     T_cam_body = se3.exp(np.random.default_rng(seed + 1).normal(size=6))
     back = trajectory.transformed(T_cam_body).transformed(se3.invert(T_cam_body))
     assert trajectory.covariances is not None
@@ -160,7 +144,7 @@ def test_nothing_is_extrapolated() -> None:
 
 
 def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
-    trajectory = random_trajectory(1, with_covariances=True)
+    trajectory = random_trajectory(1)
     chosen = trajectory.select([2, 5])
     assert trajectory.covariances is not None
     assert chosen.covariances is not None
@@ -210,6 +194,8 @@ def test_positions_without_rotations_stay_so_wherever_they_go(seed: int) -> None
 
 
 def test_without_rotations_only_the_point_itself_is_known() -> None:
+    with pytest.raises(ValueError, match=r"shape \(n, 3\)"):
+        Trajectory.of_positions(np.arange(2), np.zeros((2, 2)))
     found = positions_only()
     turned = found.transformed(se3.exp(np.array([0.3, 0.2, 0.1, 0.0, 0.0, 0.0])))
     np.testing.assert_array_equal(turned.T_world_cam, found.T_world_cam)
@@ -217,26 +203,9 @@ def test_without_rotations_only_the_point_itself_is_known() -> None:
         found.transformed(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])))
 
 
-def test_positions_come_without_rotations_and_covariances() -> None:
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    turned = se3.exp(np.full((2, 6), 0.1))
-    stamps_ns = np.arange(2)
-    with pytest.raises(ValueError, match="identities and no covariances"):
-        Trajectory(stamps_ns=stamps_ns, T_world_cam=turned, has_rotations=False)
-    with pytest.raises(ValueError, match="identities and no covariances"):
-        Trajectory(
-            stamps_ns=stamps_ns,
-            T_world_cam=poses,
-            covariances=np.tile(np.eye(6), (2, 1, 1)),
-            has_rotations=False,
-        )
-    with pytest.raises(ValueError, match=r"shape \(n, 3\)"):
-        Trajectory.of_positions(stamps_ns, np.zeros((2, 2)))
-
-
 @given(seeds)
 def test_another_world_changes_neither_steps_nor_covariances(seed: int) -> None:
-    trajectory = random_trajectory(seed, with_covariances=True)
+    trajectory = random_trajectory(seed)
     moved = trajectory.moved(se3.exp(np.random.default_rng(seed).normal(size=6)))
     steps = [se3.invert(T[:-1]) @ T[1:] for T in (trajectory.T_world_cam, moved.T_world_cam)]
     np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)
@@ -250,9 +219,9 @@ def test_a_trajectory_prints_as_one_line() -> None:
     positions = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])
     known = Trajectory.of_positions(stamps_ns, positions)
     assert str(known) == "Trajectory(2 poses, 1.0 s from 0.500000000, 5.00 m, positions alone)"
-    T = se3.make_transform(np.tile(np.eye(3), (2, 1, 1)), positions)
+    covariances = np.tile(np.eye(6), (2, 1, 1))
     whole = Trajectory(
-        stamps_ns=stamps_ns, T_world_cam=T, covariances=np.tile(np.eye(6), (2, 1, 1))
+        stamps_ns=stamps_ns, T_world_cam=unturned(positions), covariances=covariances
     )
     assert repr(whole).endswith("5.00 m, with covariances)")
     assert str(known.select([])) == "Trajectory(no poses)"
