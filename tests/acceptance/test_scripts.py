@@ -31,30 +31,32 @@ def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+def output(name: str, *arguments: object) -> list[str]:
+    """Return the lines of a script that ends well."""
+    answer = run(name, *arguments)
+    assert answer.returncode == 0, answer.stderr
+    return answer.stdout.splitlines()
+
+
 def test_run_and_compare_a_bag(room_bag: Path, tmp_path: Path) -> None:
-    ran = run("run_bag", room_bag, tmp_path, "--set", "window.n_links=2")
-    assert ran.returncode == 0, ran.stderr
-    assert "smoothed" in ran.stdout
+    ran = output("run_bag", room_bag, tmp_path, "--set", "window.n_links=2")
+    assert "smoothed" in "".join(ran)
     files = [tmp_path / "raw.txt", tmp_path / "smoothed.txt"]
-    compared = run("compare_trajectories", room_bag, *files, "--plot", tmp_path / "plot.png")
-    assert compared.returncode == 0, compared.stderr
-    assert len(compared.stdout.splitlines()) == 4
+    compared = output("compare_trajectories", room_bag, *files, "--plot", tmp_path / "plot.png")
+    assert len(compared) == 4
     assert (tmp_path / "plot.png").exists()
 
 
 def test_a_rendered_bag_can_be_run(tmp_path: Path) -> None:
     options = ["--world", "handheld", "--sensor", "rgbd", "--frames", 3]
-    made = run("make_demo_bag", tmp_path / "room.bag", *options)
-    assert made.returncode == 0, made.stderr
+    output("make_demo_bag", tmp_path / "room.bag", *options)
     source = gvo.open_recording(tmp_path / "room.bag")
     assert source.info.n_images == 3
     assert source.ground_truth() is not None
 
 
 def test_reading_is_timed_against_the_bare_loop(drive_bag: Path, room_bag: Path) -> None:
-    answer = run("benchmark_reading", drive_bag, room_bag, "--rounds", 1)
-    assert answer.returncode == 0, answer.stderr
-    rows = table(answer.stdout.splitlines(), "bag")
+    rows = table(output("benchmark_reading", drive_bag, room_bag, "--rounds", 1), "bag")
     assert [rows[name][0] for name in ("drive.mcap", "room.bag")] == ["40", "40"]
     for _, bare_ms, frames_ms, ratio in rows.values():
         assert min(float(bare_ms), float(frames_ms), float(ratio)) > 0.0
@@ -71,9 +73,7 @@ def table(lines: list[str], first: str) -> dict[str, list[str]]:
 @pytest.fixture(scope="module")
 def benchmark_lines(drive_bag: Path) -> list[str]:
     """Return what the benchmark prints about a rendered drive."""
-    measured = run("benchmark", drive_bag, "--rounds", 1)
-    assert measured.returncode == 0, measured.stderr
-    return measured.stdout.splitlines()
+    return output("benchmark", drive_bag, "--rounds", 1, "--ablation")
 
 
 def test_the_benchmark_prints_errors_and_stages(benchmark_lines: list[str]) -> None:
@@ -100,10 +100,8 @@ def test_the_benchmark_compares_the_whole_run_with_the_yardstick(
     assert ratios[3] == pytest.approx(wall_ms / yardstick[0], rel=0.05)
 
 
-def test_the_ablation_leaves_out_what_its_rows_say(drive_bag: Path) -> None:
-    measured = run("benchmark", drive_bag, "--rounds", 1, "--ablation")
-    assert measured.returncode == 0, measured.stderr
-    rows = table(measured.stdout.splitlines(), "settings")
+def test_the_ablation_leaves_out_what_its_rows_say(benchmark_lines: list[str]) -> None:
+    rows = table(benchmark_lines, "settings")
     assert rows["as set"] == rows["refined"]
     assert rows["plain Umeyama"] != rows["weighted Umeyama"] != rows["refined"]
     chain = rows["without links to keyframes"]
@@ -112,9 +110,7 @@ def test_the_ablation_leaves_out_what_its_rows_say(drive_bag: Path) -> None:
 
 def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
     options = ["--set", "frontend.kind=klt", "--rounds", 1, "--ablation"]
-    measured = run("benchmark", room_bag, *options)
-    assert measured.returncode == 0, measured.stderr
-    rows = table(measured.stdout.splitlines(), "settings")
+    rows = table(output("benchmark", room_bag, *options), "settings")
     assert not any("disparity" in name for name in rows)
     assert [name for name in rows if "frontend" in name] == ["frontend.kind=descriptor"]
     # only the truth has no error: those of a trajectory are measured, not copied
@@ -122,17 +118,14 @@ def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
 
 
 def test_the_benchmark_compares_the_window_with_gtsam_alone() -> None:
-    measured = run("benchmark", "--window", 1000)
-    assert measured.returncode == 0, measured.stderr
-    rows = [line.split() for line in measured.stdout.splitlines()[1:]]
+    measured = output("benchmark", "--window", 1000)
+    rows = [line.split() for line in measured[1:]]
     assert [row[0] for row in rows] == ["nearest", "random", "farthest"]
     assert all(float(number) > 0.0 for row in rows for number in row[1:])
 
 
 def test_the_edges_of_a_run_are_smoothed_in_other_ways(room_bag: Path) -> None:
-    compared = run("benchmark_window", room_bag)
-    assert compared.returncode == 0, compared.stderr
-    rows = table(compared.stdout.splitlines(), "smoothing")
+    rows = table(output("benchmark_window", room_bag), "smoothing")
     assert list(rows) == ["window", "full iSAM2", "batch LM"]
     numbers = {name: [float(cell) for cell in row] for name, row in rows.items()}
     least = numbers["batch LM"]
@@ -143,14 +136,13 @@ def test_the_edges_of_a_run_are_smoothed_in_other_ways(room_bag: Path) -> None:
         assert 0.0 <= off_m < 0.01
         assert ate_m == pytest.approx(least[3], abs=0.01)
         assert ms_per_pose > 0.0
-    whole = run("benchmark_window", room_bag, "--set", "window.size=null")
-    assert list(table(whole.stdout.splitlines(), "smoothing")) == ["full iSAM2", "batch LM"]
+    whole = output("benchmark_window", room_bag, "--set", "window.size=null")
+    assert list(table(whole, "smoothing")) == ["full iSAM2", "batch LM"]
 
 
 @pytest.mark.recorded
 def test_a_data_set_folder_becomes_a_bag(gvo_data: Path, tmp_path: Path) -> None:
-    converted = run("convert_dataset", gvo_data / "euroc_mh01_start", tmp_path / "e.mcap")
-    assert converted.returncode == 0, converted.stderr
+    output("convert_dataset", gvo_data / "euroc_mh01_start", tmp_path / "e.mcap")
     assert gvo.open_recording(tmp_path / "e.mcap").info.n_images == 50
 
 
@@ -160,9 +152,8 @@ def test_edges_of_a_table_are_smoothed(tmp_path: Path) -> None:
     rows.append(f"c,200000000,a,{row.format(2.1)}")
     path = tmp_path / "edges.csv"
     path.write_text("\n".join(rows) + "\n")
-    smoothed = run("smooth_edges", path)
-    assert smoothed.returncode == 0, smoothed.stderr
-    lines = [line for line in smoothed.stdout.splitlines() if line.startswith("smoothed")]
+    smoothed = output("smooth_edges", path)
+    lines = [line for line in smoothed if line.startswith("smoothed")]
     assert [line.split()[1] for line in lines] == ["a", "b", "c"]
     # two thirds of the disagreement of 0.1 m go to the chain, which is twice as unsure
     assert "2.0667" in lines[-1]
@@ -180,21 +171,18 @@ def write_poses(path: Path, *, scale: float = 1.0) -> Path:
 def test_a_pose_stream_is_smoothed_with_loops(tmp_path: Path) -> None:
     drifting = write_poses(tmp_path / "drifting.txt", scale=1.02)
     true = write_poses(tmp_path / "true.txt")
-    alone = run("smooth_pose_stream", drifting)
-    assert alone.returncode == 0, alone.stderr
-    assert "61 poses; the last one is 0.00 m from the odometry's" in alone.stdout
-    tied = run("smooth_pose_stream", drifting, "--loops", true)
-    assert tied.returncode == 0, tied.stderr
-    moved = float(tied.stdout.splitlines()[-1].split("last one is ")[1].split(" m")[0])
+    alone = output("smooth_pose_stream", drifting)
+    assert "61 poses; the last one is 0.00 m from the odometry's" in " ".join(alone)
+    tied = output("smooth_pose_stream", drifting, "--loops", true)
+    moved = float(tied[-1].split("last one is ")[1].split(" m")[0])
     assert moved > 0.3
 
 
 def test_two_trajectories_are_fused_and_compared(tmp_path: Path) -> None:
     true = write_poses(tmp_path / "true.txt")
     paths = [write_poses(tmp_path / f"{s}.txt", scale=s) for s in (0.96, 1.02)]
-    fused = run("fuse_trajectories", true, *paths, "--out", tmp_path / "out")
-    assert fused.returncode == 0, fused.stderr
-    rows = {line.split()[0]: line.split() for line in fused.stdout.splitlines()[2:]}
+    fused = output("fuse_trajectories", true, *paths, "--out", tmp_path / "out")
+    rows = {line.split()[0]: line.split() for line in fused[2:]}
     assert set(rows) == {"0.96", "1.02", "smoothed"}
     assert float(rows["smoothed"][3]) < float(rows["1.02"][3]) < float(rows["0.96"][3])
 
@@ -243,9 +231,8 @@ def test_bad_input_is_told_without_a_traceback(name: str, arguments: list[str]) 
 def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at() -> None:
     # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of one they spread more.
     kinds = "descriptor", "klt"
-    measured = run("consistency", "--seeds", "10", "--frontends", *kinds)
-    assert measured.returncode == 0, measured.stderr
-    rows = [line.split() for line in measured.stdout.splitlines()[1:]]
+    measured = output("consistency", "--seeds", "10", "--frontends", *kinds)
+    rows = [line.split() for line in measured[1:]]
     assert [row[:3] for row in rows] == [
         [world, kind, estimate]
         for world in ("drive", "room", "stereo_room")

@@ -146,6 +146,17 @@ def test_misuse_is_a_line_before_anything_begins(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:x", ""])
+def test_no_scheduler_is_a_line(
+    bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, address: str
+) -> None:
+    monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
+    answer = command("batch", bags, "--out", tmp_path / "out", "--scheduler", address)
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert f"{address}: no scheduler of Dask answers" in answer.err
+
+
 def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").touch()
     answer = command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out")

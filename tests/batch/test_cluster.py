@@ -60,24 +60,6 @@ def test_tasks_spread_over_the_workers(cluster: Cluster, bags: Path, tmp_path: P
 
 
 @pytest.mark.acceptance
-def test_recordings_and_results_are_found_by_their_urls(
-    cluster: Cluster,
-    bags: Path,
-    tmp_path: Path,
-    command: Command,
-    run_alone: Callable[[Path], Path],
-) -> None:
-    arguments = [f"file://{bags}/walk0.mcap", "--out", f"file://{tmp_path}/out", "--no-report"]
-    for _ in range(2):
-        answer = command("batch", *arguments, "--scheduler", cluster.address)
-        assert answer.code == 0, answer.err
-        assert_same_run(tmp_path / "out" / "walk0", run_alone(bags / "walk0.mcap"))
-        before = state_of(tmp_path / "out" / "walk0")
-    assert state_of(tmp_path / "out" / "walk0") == before
-    assert "complete, found" in answer.err
-
-
-@pytest.mark.acceptance
 def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
     cluster: Cluster,
     bags: Path,
@@ -195,16 +177,6 @@ def test_a_worker_with_another_disk_or_version_says_so(
         cluster.close()
     expected = f"the worker has gvo 0, the client {gvo.__version__}: install one"
     assert table["reason"].tolist() == [expected] * 3
-
-
-def test_no_scheduler_is_a_line(
-    bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
-    answer = command("batch", bags, "--out", tmp_path / "out", "--scheduler", NOWHERE)
-    assert answer.code == 2
-    assert answer.err.startswith(f"gvo: error: {NOWHERE}: no scheduler of Dask answers")
-    assert answer.err.count("\n") == 1
 
 
 @pytest.mark.acceptance

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,6 +11,7 @@ import pytest
 from gvo.batch.effects import ERROR, comparable, relative, value_medians
 from gvo.batch.results import to_frame
 from gvo.batch.rows import BatchRow
+from tests.batch.rows import complete, failed
 
 SIZES, KINDS = (5, 10, 20), ("orb", "klt")
 RATIOS = {5: 1.0, 10: 2.0, 20: 1.5, "orb": 1.0, "klt": 1.1}
@@ -20,15 +20,10 @@ RATIOS = {5: 1.0, 10: 2.0, 20: 1.5, "orb": 1.0, "klt": 1.1}
 def crossed(n_recordings: int) -> list[BatchRow]:
     """Return every recording with every pair of values; errors are products of what is planted."""
     return [
-        BatchRow(
+        complete(
             recording=f"recording {number}",
             variant=f"{size} {kind}",
-            status="complete",
-            source="",
-            folder="",
             parameters={"frontend.kind": kind, "window.size": size},
-            frames=100,
-            coverage_percent=100.0,
             ate_smoothed_m=10.0**number * RATIOS[size] * RATIOS[kind],
             frame_ms=5.0 / RATIOS[size],
         )
@@ -37,9 +32,7 @@ def crossed(n_recordings: int) -> list[BatchRow]:
 
 
 def failing(rows: Sequence[BatchRow], fails: Callable[[BatchRow], bool]) -> list[BatchRow]:
-    names = ("frames", "coverage_percent", "ate_smoothed_m", "frame_ms")
-    nothing: dict[str, Any] = dict.fromkeys(names)
-    return [replace(row, status="failed", **nothing) if fails(row) else row for row in rows]
+    return [failed(row) if fails(row) else row for row in rows]
 
 
 def medians(effect: pd.DataFrame, measure: str = "error") -> list[float]:

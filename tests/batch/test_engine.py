@@ -15,7 +15,7 @@ import pytest
 from distributed import Client
 
 import gvo
-from gvo.batch.engine import BatchProgress, ClusterError, Engine, connected
+from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.recordings import NamedRecording
 from gvo.batch.rows import BatchRow
 from gvo.batch.running import make_tasks
@@ -157,17 +157,6 @@ def test_an_engine_runs_again(near: Client, options: TaskOptions) -> None:
     engine = Engine(near, options)
     for _ in range(2):
         assert len(list(engine.run(missing(3)))) == 3
-
-
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:x", ""])
-def test_nobody_there_is_a_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
-    with (
-        pytest.raises(ClusterError, match="no scheduler of Dask answers") as error,
-        connected(address, None),
-    ):
-        pass
-    assert "\n" not in str(error.value)
 
 
 class Killer:

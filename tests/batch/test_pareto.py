@@ -8,31 +8,25 @@ from hypothesis import strategies as st
 from gvo.batch.pareto import is_non_dominated, variant_means
 from gvo.batch.results import to_frame
 from gvo.batch.rows import BatchRow
+from tests.batch.rows import complete, failed
 
 LEVELS = (0.01, 1.0, 100.0)
 
 
 def runs_of(
-    variants: dict[str, tuple[float, float]], failed: set[tuple[str, int]]
+    variants: dict[str, tuple[float, float]], failures: set[tuple[str, int]]
 ) -> list[BatchRow]:
     """Return runs of configurations with an error and a time each; pairs with a number failed."""
     rows = []
     for number, level in enumerate(LEVELS):
         for name, (error, time) in variants.items():
-            is_failed = (name, number) in failed
-            rows.append(
-                BatchRow(
-                    recording=f"recording {number}",
-                    variant=name,
-                    status="failed" if is_failed else "complete",
-                    source="",
-                    folder="",
-                    frames=None if is_failed else 100,
-                    coverage_percent=None if is_failed else 100.0,
-                    ate_smoothed_m=None if is_failed else level * error,
-                    frame_ms=None if is_failed else time,
-                )
+            row = complete(
+                recording=f"recording {number}",
+                variant=name,
+                ate_smoothed_m=level * error,
+                frame_ms=time,
             )
+            rows.append(failed(row) if (name, number) in failures else row)
     return rows
 
 
@@ -57,8 +51,8 @@ def test_the_front_holds_the_fast_and_the_accurate_but_none_that_failed() -> Non
 
 def test_where_none_completed_all_those_with_most_are_compared_on_what_they_share() -> None:
     variants = {"x": (1.0, 1.0), "y": (3.0, 1.0), "z": (0.5, 1.0)}
-    failed = {("x", 0), ("y", 1), ("z", 0), ("z", 1)}
-    means = variant_means(to_frame(runs_of(variants, failed)))
+    failures = {("x", 0), ("y", 1), ("z", 0), ("z", 1)}
+    means = variant_means(to_frame(runs_of(variants, failures)))
     assert means.index.tolist() == ["x", "y", "z"]
     assert means["is_candidate"].tolist() == [True, True, False]
     assert means["is_on_front"].tolist() == [True, False, False]

@@ -3,7 +3,6 @@
 import math
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -13,40 +12,20 @@ from hypothesis import strategies as st
 from gvo.batch.results import CSV, PARQUET, to_frame, write_results
 from gvo.batch.rows import BatchRow, Value
 from gvo.errors import OutputError
+from tests.batch.rows import complete, failed
 
 HOSTILE = ['a,b"c\nd\re', "=1+1", " blank ", "NULL", "ü\u2028🤖", "\x00", "<script>", "\\N", "'"]
 
 
-def failed(**values: Any) -> BatchRow:
-    given: dict[str, Any] = {
-        "recording": "b",
-        "variant": "default",
-        "source": "/b.bag",
-        "folder": "b",
-    } | values
-    return BatchRow(status="failed", **{"reason": "does not exist"} | given)
-
-
-def complete(**values: Any) -> BatchRow:
-    figures: dict[str, Any] = {
-        "sensor": "stereo",
-        "frames": 10,
-        "tracked": 9,
-        "coverage_percent": 100 / 3,
-        "segments": 1,
-        "ate_smoothed_m": 0.1 + 0.2,
-        "rpe_smoothed_deg": 1e-300,
-        "run_s": 12.5,
-        "gvo_version": "1",
-        "configuration_hash": "00ff",
-    }
-    given: dict[str, Any] = {
-        "recording": "a",
-        "variant": "default",
-        "source": "/a.bag",
-        "folder": "a",
-    } | values
-    return BatchRow(status="complete", **figures | given)
+MEASURED = {
+    "tracked": 99,
+    "coverage_percent": 100 / 3,
+    "ate_smoothed_m": 0.1 + 0.2,
+    "rpe_smoothed_deg": 1e-300,
+    "run_s": 12.5,
+    "gvo_version": "1",
+    "configuration_hash": "00ff",
+}
 
 
 def read_csv(path: Path, frame: pd.DataFrame) -> pd.DataFrame:
@@ -66,13 +45,19 @@ def assert_both_give_it_back(frame: pd.DataFrame, folder: Path) -> None:
 
 
 def test_both_files_give_the_table_back(tmp_path: Path) -> None:
-    frame = to_frame([complete(), failed(), complete(recording="c", is_found=True, run_s=None)])
+    frame = to_frame(
+        [
+            complete(**MEASURED),
+            failed(),
+            complete(**MEASURED | {"is_found": True, "run_s": None}),
+        ]
+    )
     assert_both_give_it_back(frame, tmp_path)
     assert pd.read_csv(tmp_path / CSV)["ate_smoothed_m"].tolist()[0] == 0.1 + 0.2
 
 
 def test_every_field_of_a_row_has_its_column() -> None:
-    row = complete(parameters={"window.size": 4})
+    row = complete(**MEASURED, parameters={"window.size": 4})
     frame = to_frame([row])
     values = asdict(row)
     del values["parameters"]

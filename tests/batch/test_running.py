@@ -16,8 +16,7 @@ from gvo.batch import BatchOptions, BatchProgress, Variant, run, run_batch
 from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.running import make_tasks
 from gvo.batch.variants import make_variants
-from gvo.errors import OutputError, RecordingError
-from gvo.io.excerpt import Excerpt
+from gvo.errors import OutputError
 from tests.batch.conftest import NO_REPORT, assert_same_run, copy_of, state_of
 
 FORCED = BatchOptions(report=False, force=True)
@@ -68,24 +67,6 @@ def test_what_is_finished_is_found_and_the_rest_is_run(
     pd.testing.assert_frame_equal(forced[columns], table[columns])
 
 
-def test_another_recording_of_the_same_name_is_run(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    bag = copy_of(bags / "walk0.mcap", tmp_path / "in", "walk.mcap")
-    first = run(bag, out=out, client=near, options=NO_REPORT)
-    copy_of(bags / "walk1.mcap", tmp_path / "in", "walk.mcap")
-    second = run(bag, out=out, client=near, options=NO_REPORT)
-    assert not second["is_found"].any()
-    assert first["run_hash"][0] != second["run_hash"][0]
-    other = run(bag, with_size(3), out=out, client=near, options=NO_REPORT)
-    assert not other["is_found"].any()
-    assert (
-        json.loads((out / "walk" / "summary.json").read_text())["configuration"]["window"]["size"]
-        == 3
-    )
-
-
 def test_configurations_have_folders_and_columns_of_their_own(
     near: Client, bags: Path, tmp_path: Path
 ) -> None:
@@ -103,11 +84,6 @@ def test_configurations_have_folders_and_columns_of_their_own(
     single = run(asked, [with_size(2)], out=tmp_path / "b", client=near, options=NO_REPORT)
     assert "window.size" not in single.columns
     assert_same_run(out / "walk0" / "small", tmp_path / "b" / "walk0")
-
-
-def test_options_reach_every_run(near: Client, bags: Path, tmp_path: Path) -> None:
-    options = BatchOptions(report=False, excerpt=Excerpt(every=2))
-    assert run(bags, out=tmp_path, client=near, options=options)["frames"].tolist() == [4, 4, 4]
 
 
 class StoppedError(Exception):
@@ -183,20 +159,6 @@ def test_everything_may_lie_behind_urls(
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "copy" / "results.parquet"), first)
     again = run(f"{memory}/in/*.mcap", out=f"{memory}/out", client=near, options=NO_REPORT)
     assert again["is_found"].all()
-
-
-def test_a_folder_that_cannot_be_written_is_said_at_once(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="file: cannot be written"):
-        run(bags, out=tmp_path / "file", client=near, options=NO_REPORT)
-
-
-def test_without_recordings_nothing_is_begun(near: Client, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no recording there"):
-        run(tmp_path, out=tmp_path / "out", client=near)
-    assert not (tmp_path / "out").exists()
 
 
 def test_names_of_files_that_are_no_text_are_no_obstacle(

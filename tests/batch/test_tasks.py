@@ -86,16 +86,6 @@ def test_a_finished_run_is_found_and_not_touched(bag: Path, options: TaskOptions
     assert replace(second, is_found=False, run_s=first.run_s) == first
 
 
-def test_a_finished_run_is_made_again_where_that_is_wanted(bag: Path, options: TaskOptions) -> None:
-    run_task(task_of(bag), options)
-    out = Path(options.out) / "a"
-    (out / "raw.txt").write_text("")
-    assert not run_task(
-        task_of(bag), replace(options, batch=BatchOptions(report=False, force=True))
-    ).is_found
-    assert (out / "raw.txt").read_text().count("\n") == N_FRAMES
-
-
 @pytest.mark.parametrize("change", ["configuration", "recording", "excerpt", "damaged"])
 def test_another_run_in_the_folder_is_replaced(
     bag: Path, bags: Path, options: TaskOptions, tmp_path: Path, change: str

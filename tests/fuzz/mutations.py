@@ -74,6 +74,11 @@ def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
     return data
 
 
+def mutate_behind_first(data: bytes, rng: random.Random) -> bytes:
+    """Change a text, not the byte before it that chooses what it stands for."""
+    return data[:1] + mutate_text(data[1:], rng)
+
+
 def mutate_picture(data: bytes, rng: random.Random) -> bytes:
     """Change bytes behind the two that choose; mend the checksums of a PNG, half of the time."""
     data = data[:2] + mutate_bytes(data[2:], rng)

@@ -1,12 +1,11 @@
 """Run folders: what a run left, or is still writing."""
 
 import json
-import random
 from functools import cache
 
 from gvo.io.run_folder.reader import read_run
 from gvo.trajectory.formats import COVARIANCE_HEADER
-from tests.fuzz.mutations import mutate_text
+from tests.fuzz.mutations import mutate_behind_first
 from tests.fuzz.target import Folder, Target
 
 _COVARIANCE = (
@@ -53,15 +52,11 @@ def _run_folder(data: bytes) -> None:
         folder.write(name, _FILES[name].encode())
 
 
-def _mutate_behind_first(data: bytes, rng: random.Random) -> bytes:
-    return data[:1] + mutate_text(data[1:], rng)
-
-
 TARGETS = (
     Target(
         name="run_folders",
         run=_run_folder,
         seeds=lambda: [bytes([n]) + _FILES[name].encode() for n, name in enumerate(_NAMES)],
-        mutate=_mutate_behind_first,
+        mutate=mutate_behind_first,
     ),
 )

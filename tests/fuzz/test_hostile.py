@@ -5,6 +5,8 @@ import struct
 import subprocess
 import sys
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,6 +56,15 @@ def as_file(folder: Path, text: str | bytes, name: str = "file.yaml") -> Path:
     return path
 
 
+@contextmanager
+def refused(kind: type[Exception]) -> Iterator[None]:
+    """Expect a refusal in a short line, whatever is wrong."""
+    with pytest.raises(kind) as caught:
+        yield
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
+
+
 def pixels_of(data: bytes) -> NDArray[np.uint8]:
     return np.frombuffer(data, dtype=np.uint8)
 
@@ -88,10 +99,8 @@ def compressed(data: bytes, format_: str = "png") -> SimpleNamespace:
 def test_a_configuration_that_means_harm_is_refused_in_a_line(
     text: str | bytes, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with refused(ConfigurationError):
         load_configuration(as_file(tmp_path, text))
-    assert len(str(caught.value)) < 1000
-    assert str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize(
@@ -100,10 +109,8 @@ def test_a_configuration_that_means_harm_is_refused_in_a_line(
     ids=lambda value: value[:8],
 )
 def test_a_setting_that_means_harm_is_refused_in_a_line(value: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with refused(ConfigurationError):
         load_configuration(None, [f"images.black={value}"])
-    assert len(str(caught.value)) < 1000
-    assert str(caught.value).isprintable()
 
 
 def test_aliases_that_stand_for_little_are_followed(tmp_path: Path) -> None:
@@ -130,9 +137,8 @@ def test_aliases_that_stand_for_little_are_followed(tmp_path: Path) -> None:
     ids=range(8),
 )
 def test_a_calibration_that_means_harm_is_refused_in_a_line(text: str, tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError) as caught:
+    with refused(CalibrationError):
         read_cameras(as_file(tmp_path, text), sensor="rgbd", is_rectified=False)
-    assert len(str(caught.value)) < 1000
 
 
 def test_no_more_of_a_text_is_read_than_it_may_hold() -> None:
@@ -334,9 +340,8 @@ def test_a_damaged_name_in_a_database_is_no_traceback(tmp_path: Path) -> None:
     ids=lambda line: line[:12],
 )
 def test_a_line_that_means_harm_is_refused_shortly(line: str) -> None:
-    with pytest.raises(ValueError, match=r".") as caught:
+    with refused(ValueError):
         parse_line(line, "json" if line.startswith("{") else "csv")
-    assert len(str(caught.value)) < 1000
 
 
 def test_a_line_without_an_end_takes_no_memory(tmp_path: Path) -> None:
@@ -359,9 +364,8 @@ def test_a_line_without_an_end_takes_no_memory(tmp_path: Path) -> None:
     ids=range(5),
 )
 def test_poses_beyond_the_planets_are_refused_shortly(text: str, tmp_path: Path) -> None:
-    with pytest.raises(GvoError) as caught:
+    with refused(GvoError):
         read_trajectory(as_file(tmp_path, text, "poses.txt"))
-    assert len(str(caught.value)) < 1000
 
 
 def test_a_long_comment_takes_no_time(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Text files and lines: poses, pose graphs, edges, the tables of recordings."""
 
-import random
 from functools import cache, partial
 from itertools import islice
 
@@ -24,7 +23,7 @@ from gvo.trajectory.formats import COVARIANCE_HEADER, read_covariances, read_tra
 from gvo.trajectory.g2o import convert_line
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.trajectory.trajectory import Trajectory
-from tests.fuzz.mutations import mutate_text
+from tests.fuzz.mutations import mutate_behind_first, mutate_text
 from tests.fuzz.target import Folder, Target
 
 _TUM = b"# stamp tx ty tz qx qy qz qw\n1.5 0 0 0 0 0 0 1\n1.6 1 0 0 0 0 0.7071 0.7071\n"
@@ -214,10 +213,6 @@ def _recording_seeds() -> list[bytes]:
     return [bytes([number]) + _FILES[kind][name] for number, (kind, name) in enumerate(_PLACES)]
 
 
-def _mutate_behind_first(data: bytes, rng: random.Random) -> bytes:
-    return data[:1] + mutate_text(data[1:], rng)
-
-
 _text = partial(Target, mutate=mutate_text)
 
 TARGETS = (
@@ -247,5 +242,5 @@ TARGETS = (
         run=_words,
         seeds=lambda: [b"tf:odom:base", b"/odom", b"topic:odom", b"0.1,0.02", b"1,2,3,0,0,0,1"],
     ),
-    Target(name="recordings", run=_recording, seeds=_recording_seeds, mutate=_mutate_behind_first),
+    Target(name="recordings", run=_recording, seeds=_recording_seeds, mutate=mutate_behind_first),
 )

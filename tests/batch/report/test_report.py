@@ -21,6 +21,7 @@ from gvo.batch.report.values import log_limits, log_ticks
 from gvo.batch.rows import BatchRow, Value
 from gvo.config import Config
 from gvo.errors import ConfigurationError
+from tests.batch.rows import complete, failed
 
 SWEEP: Mapping[str, Sequence[Value]] = {
     "window.n_links": [1, 3, 5],
@@ -43,18 +44,13 @@ def made_up(
         place = [*next(iter(sweep.values()))].index(combination[0]) if sweep else 0
         error_m = 10.0 ** (number - 1) * 2.0**place * np.exp(noise * rng.normal())
         rows.append(
-            BatchRow(
+            complete(
                 recording=f"drive {number}",
                 variant=variant,
-                status="complete",
                 source=f"drive_{number}.mcap",
                 folder=f"drive_{number}/{variant}",
                 parameters=parameters,
-                sensor="stereo",
                 frames=1000,
-                tracked=999,
-                coverage_percent=100.0,
-                segments=1,
                 ate_raw_m=3.0 * error_m,
                 ate_smoothed_m=error_m,
                 frame_ms=20.0 / 2.0**place,
@@ -63,18 +59,6 @@ def made_up(
             )
         )
     return rows
-
-
-def failed(row: BatchRow, reason: str = "no frame is usable") -> BatchRow:
-    return BatchRow(
-        recording=row.recording,
-        variant=row.variant,
-        status="failed",
-        reason=reason,
-        source=row.source,
-        folder=row.folder,
-        parameters=row.parameters,
-    )
 
 
 class _Page(HTMLParser):
@@ -128,7 +112,7 @@ def page_of(
 
 def test_a_sweep_has_all_sections_and_its_totals(tmp_path: Path) -> None:
     rows = made_up(SWEEP, 3)
-    rows[4] = failed(rows[4])
+    rows[4] = failed(rows[4], "no frame is usable")
     rows[8] = replace(rows[8], status="partly", reason="2 frames are faulty", is_found=True)
     page = page_of(tmp_path, rows, note="Made up.")
     assert [name for name in page.ids if name in SECTIONS] == SECTIONS
@@ -256,7 +240,7 @@ def test_the_worst_run_of_a_sweep_stands_first(tmp_path: Path) -> None:
     rows = made_up({"window.n_links": [1, 3, 5]}, 3, noise=0.0)
     # errors 0.1, 0.2, 0.4; 1, 2, 4; 10, 20, 40
     rows[1] = replace(rows[1], ate_smoothed_m=1.5)  # fifteen times the best, though small
-    rows[8] = failed(rows[8])
+    rows[8] = failed(rows[8], "no frame is usable")
     rows[3] = replace(rows[3], status="partly", coverage_percent=97.0)
     rows[4] = replace(rows[4], status="partly", coverage_percent=99.0)
     table = page_of(tmp_path, rows).rows["runs"]

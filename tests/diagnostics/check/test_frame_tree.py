@@ -11,6 +11,7 @@ from gvo.config import CheckConfig
 from gvo.diagnostics.check.findings import Finding
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.io.poses.tf import TfBuffer
+from tests.diagnostics.check.planted import check, complaints, render
 
 S = 1_000_000_000
 STAMPS_NS = np.arange(0, 10 * S, S // 10, dtype=np.int64)
@@ -35,10 +36,6 @@ def look(
 ) -> dict[str, Finding]:
     found = check_frame_tree(buffer, camera, STAMPS_NS, base_frame=base, check=CheckConfig())
     return {finding.name: finding for finding in found}
-
-
-def complaints(findings: dict[str, Finding]) -> set[str]:
-    return {name for name, finding in findings.items() if finding.verdict in ("warning", "fault")}
 
 
 @pytest.mark.parametrize("slash", ["", "/"])
@@ -97,8 +94,8 @@ def test_the_ground_truth_of_a_data_set_is_no_second_tree() -> None:
     assert complaints(look(cameras, "left")) == set()
 
 
-def test_the_tree_is_part_of_a_check(bench: Any) -> None:
-    recording = bench.render("handheld", "rgbd")
-    names = {finding.name for finding in bench.check(recording, transforms=tree()).findings}
+def test_the_tree_is_part_of_a_check() -> None:
+    recording = render("handheld", "rgbd")
+    names = {finding.name for finding in check(recording, transforms=tree()).findings}
     assert {"tf: frames", "tf: camera"} <= names
-    assert not any(f.name.startswith("tf") for f in bench.check(recording).findings)
+    assert not any(f.name.startswith("tf") for f in check(recording).findings)

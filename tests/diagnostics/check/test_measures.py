@@ -16,6 +16,7 @@ from gvo.diagnostics.check.depth import Misregistration, depth_steps, estimate_m
 from gvo.diagnostics.check.images import blur_sigma_px, n_torn_rows
 from gvo.diagnostics.check.stereo import FreeMatcher, FreeMatches, row_error
 from gvo.types import Failure, RgbdFrame
+from tests.diagnostics.check.planted import render
 
 
 def squares(seed: int, *, size: int = 240) -> tuple[Any, Any]:
@@ -156,8 +157,8 @@ def test_wrong_matches_do_not_reach_the_row_error(offset: float, sigma: float, s
 
 
 @pytest.mark.parametrize(("du", "dv"), [(12.25, 0.0), (-20.5, 3.75), (5.0, -9.5)])
-def test_free_matches_find_any_offset(bench: Any, du: float, dv: float) -> None:
-    left = bench.render("handheld", "rgbd").stream(0)[0].load()
+def test_free_matches_find_any_offset(du: float, dv: float) -> None:
+    left = render("handheld", "rgbd").stream(0)[0].load()
     M = np.array([[1.0, 0.0, -du], [0.0, 1.0, dv]])
     size = left.shape[::-1]
     right = np.asarray(cv2.warpAffine(left, M, size, borderMode=cv2.BORDER_REFLECT), np.uint8)

@@ -17,6 +17,7 @@ from gvo.diagnostics.check.sampling import StreamStamps, Survey
 from gvo.diagnostics.check.timing import check_timing
 from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.io.recording import RecordingInfo
+from tests.diagnostics.check.planted import check, complaints, find, render
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333
@@ -56,10 +57,6 @@ def timing(
         damage="",
     )
     return {finding.name: finding for finding in check_timing(survey, INFO, Config())}
-
-
-def complaints(findings: dict[str, Finding]) -> set[str]:
-    return {name for name, finding in findings.items() if finding.verdict in ("warning", "fault")}
 
 
 @given(
@@ -142,22 +139,22 @@ def test_missing_partners_are_counted_and_blamed_on_the_stream() -> None:
     assert "dropped frames" in finding.fix
 
 
-def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not(bench: Any) -> None:
+def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
     def late(stamp_ns: int, _: int) -> int:
         return stamp_ns + 5 * MS - 1000
 
-    result = bench.check(bench.render("handheld", "stereo").with_stamps(late, stream=1))
-    finding = bench.find(result, "left/right: frames without partner")
+    result = check(render("handheld", "stereo").with_stamps(late, stream=1))
+    finding = find(result, "left/right: frames without partner")
     assert (finding.verdict, finding.value) == ("fault", 100.0)
     assert "--set sync.stereo_tolerance_ms=5" in finding.fix
     # The images are looked at all the same.
-    assert bench.find(result, "left/right: row offset").verdict == "ok"
+    assert find(result, "left/right: row offset").verdict == "ok"
 
 
-def test_dropped_images_of_a_rendered_recording_are_found(bench: Any) -> None:
-    recording = bench.render("handheld", "rgbd")
+def test_dropped_images_of_a_rendered_recording_are_found() -> None:
+    recording = render("handheld", "rgbd")
     thinned = recording.mapped(lambda image, number: None if number % 7 == 3 else image)
-    found = bench.complaints(bench.check(thinned))
+    found = complaints(check(thinned))
     assert found == {"colour: dropped frames", "depth: dropped frames"}
 
 
@@ -182,11 +179,11 @@ def test_a_clock_that_is_set_while_recording_is_found() -> None:
     assert findings["colour: clock jump"].value == pytest.approx(400.0)
 
 
-def test_the_recording_clock_reaches_the_check_from_the_images(bench: Any) -> None:
-    recording = bench.render("handheld", "rgbd").mapped(
+def test_the_recording_clock_reaches_the_check_from_the_images() -> None:
+    recording = render("handheld", "rgbd").mapped(
         lambda image, number: replace(image, log_time_ns=image.stamp_ns + 7 * MS)
     )
-    result = bench.check(recording)
-    assert bench.find(result, "colour: recording clock").value == "7 ms after the header"
-    assert bench.find(result, "depth: clock drift").value == 0.0
-    assert bench.complaints(result) == set()
+    result = check(recording)
+    assert find(result, "colour: recording clock").value == "7 ms after the header"
+    assert find(result, "depth: clock drift").value == 0.0
+    assert complaints(result) == set()

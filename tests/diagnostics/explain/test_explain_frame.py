@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from gvo.types import FaultyFrame, FrameResult, Progress
 
 KINDS = ("klt", "descriptor")
 SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
+EACH = pytest.mark.parametrize(("kind", "sensor"), [*product(KINDS, SENSORS)])
 LAST = 4
 BLACK = 2
 
@@ -77,8 +79,7 @@ def explained(kind: str, sensor: Sensor, index: int = LAST) -> FrameExplanation:
     return explain_frame(recording(sensor), index, config=configuration(kind))
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("kind", KINDS)
+@EACH
 def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sensor: Sensor) -> None:
     explanation = explained(kind, sensor)
     expected = run(recording(sensor), configuration(kind))[LAST]
@@ -109,8 +110,7 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
     assert np.array_equal(explanation.result.raw.covariance, expected.raw.covariance)
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("kind", KINDS)
+@EACH
 def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
     kind: str, sensor: Sensor
 ) -> None:
@@ -120,8 +120,7 @@ def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
     assert counts["kept"] == explanation.result.n_points
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("kind", KINDS)
+@EACH
 def test_the_keypoints_within_the_budget_are_those_that_were_measured(
     kind: str, sensor: Sensor
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -76,6 +77,11 @@ def frame_view_of(index: int, *, fault: str = "", is_faulty: bool = False) -> Fr
     )
 
 
+def cells(numbers: str) -> dict[str, str]:
+    """The numbers as a browser would find them."""
+    return dict(re.findall(r'data-gvo="([^"]+)">([^<]*)<', numbers))
+
+
 class FakeHistory:
     """The paths of a camera that drives ahead."""
 
@@ -83,23 +89,23 @@ class FakeHistory:
         self.n = 0
 
     def raw_path(self) -> tuple[IntArray, FloatArray]:
-        """A path aside of the others."""
         return stamps_of(self.n), self._positions() + np.array([0.1, 0.0, 0.0])
 
     def causal_path(self) -> tuple[IntArray, FloatArray]:
-        """The path of the views."""
         return stamps_of(self.n), self._positions()
 
     def smoothed_path(self) -> tuple[IntArray, FloatArray]:
-        """A frame behind."""
         return stamps_of(self.n)[:-1], self._positions()[:-1]
 
     def accumulated_cloud(self) -> tuple[Any, Any]:
-        """A point per frame."""
         return self._positions().astype(np.float32), np.zeros((self.n, 3), dtype=np.uint8)
 
     def _positions(self) -> FloatArray:
         return np.array([pose_of(index)[:3, 3] for index in range(self.n)]).reshape(-1, 3)
+
+
+def _noted(name: str) -> Callable[..., None]:
+    return lambda player, *arguments: player.calls.append((name, *arguments))
 
 
 class FakePlayer:
@@ -120,7 +126,6 @@ class FakePlayer:
         self.callbacks: list[Callable[[FrameView], None]] = []
 
     def show(self, view: FrameView) -> None:
-        """Be at a frame, and tell."""
         self.frame_view = view
         self.fault = view.fault
         self.history.n = view.index + 1
@@ -129,44 +134,19 @@ class FakePlayer:
 
     @property
     def index(self) -> int:
-        """Frame that is shown."""
         return self.history.n - 1
 
     @property
     def n_done(self) -> int:
-        """Frames that are done."""
         return self.history.n
 
     def subscribe(self, callback: Callable[[FrameView], None]) -> Callable[[], None]:
-        """Tell of every frame, until it is called back."""
         self.callbacks.append(callback)
         return lambda: self.callbacks.remove(callback)
 
     def reconfigure(self, config: Config) -> None:
-        """Keep it."""
         self.calls.append(("reconfigure",))
         self.config = config
 
-    def seek(self, index: int) -> None:
-        """Write it down."""
-        self.calls.append(("seek", index))
-
-    def set_speed(self, factor: float | None) -> None:
-        """Write it down."""
-        self.calls.append(("speed", factor))
-
-    def play(self) -> None:
-        """Write it down."""
-        self.calls.append(("play",))
-
-    def pause(self) -> None:
-        """Write it down."""
-        self.calls.append(("pause",))
-
-    def step(self) -> None:
-        """Write it down."""
-        self.calls.append(("step",))
-
-    def restart(self) -> None:
-        """Write it down."""
-        self.calls.append(("restart",))
+    set_speed, seek = _noted("speed"), _noted("seek")
+    play, pause, step, restart = map(_noted, ("play", "pause", "step", "restart"))

@@ -1,6 +1,5 @@
 """The page of a finished run, and what plays it."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from gvo.types import FaultyFrame
 from gvo.viz.view import serve
 from gvo.viz.view.finished import FinishedPage, RunPlayer, aligned_truth, start_sigmas, world_up
 from gvo.viz.view.server import ViewServer
-from tests.viz.view.fakes import pose_of, result_of, stamps_of
+from tests.viz.view.fakes import cells, pose_of, result_of, stamps_of
 
 N_FRAMES = 12
 SKIPPED = 7
@@ -60,12 +59,6 @@ def page(view: ViewServer, record: RunRecord) -> Iterator[FinishedPage]:
     opened.close()
 
 
-def cells(page: FinishedPage) -> dict[str, str]:
-    """The numbers as a browser would find them."""
-    page.settle()
-    return dict(re.findall(r'data-gvo="([^"]+)">([^<]*)<', page.numbers_text))
-
-
 def drawn(view: ViewServer, path: str) -> float:
     """Metres of a path as it is drawn."""
     nodes: list[Any] = [
@@ -80,7 +73,8 @@ def test_every_frame_shows_its_row_of_the_table(page: FinishedPage, folder: Path
     for index in (0, SKIPPED, N_FRAMES - 1):
         row = dict(zip(header.split(","), lines[index].split(","), strict=True))
         page.player.seek(index)
-        numbers = cells(page)
+        page.settle()
+        numbers = cells(page.numbers_text)
         assert numbers["frame"] == f"{index} of {N_FRAMES}"
         assert numbers["status"] == row["status"]
         assert numbers["matches"] == row["n_matches"]

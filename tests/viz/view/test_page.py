@@ -1,6 +1,5 @@
 """The page of a recording shows what the player does, and controls it."""
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +18,7 @@ from gvo.types import FloatArray, IntArray
 from gvo.viz.view.clouds import empty_cloud
 from gvo.viz.view.page import Page, TruthPath
 from gvo.viz.view.server import ViewServer
-from tests.viz.view.fakes import FakePlayer, frame_view_of, pose_of, stamps_of
+from tests.viz.view.fakes import FakePlayer, cells, frame_view_of, pose_of, stamps_of
 
 
 @pytest.fixture
@@ -42,11 +41,6 @@ def show(page: Page, player: FakePlayer, index: int, **options: Any) -> None:
     page.settle()
 
 
-def cells(page: Page) -> dict[str, str]:
-    """The numbers as a browser would find them."""
-    return dict(re.findall(r'data-gvo="([^"]+)">([^<]*)<', page.numbers_text))
-
-
 def nodes(view: ViewServer, prefix: str) -> list[Any]:
     """Scene nodes whose name begins so."""
     names = [*view.viser.scene._handle_from_node_name]
@@ -62,7 +56,7 @@ def length(view: ViewServer, path: str) -> float:
 
 def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> None:
     show(page, player, 7)
-    numbers = cells(page)
+    numbers = cells(page.numbers_text)
     assert numbers["frame"] == "7 of 40"
     assert numbers["stamp"] == "0.700000000"
     assert (numbers["status"], numbers["matches"], numbers["inliers"]) == ("ok", "107", "97")
@@ -73,7 +67,7 @@ def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> N
 
 def test_a_faulty_frame_tells_its_reason_and_no_counts(page: Page, player: FakePlayer) -> None:
     show(page, player, 3, is_faulty=True)
-    numbers = cells(page)
+    numbers = cells(page.numbers_text)
     assert (numbers["status"], numbers["reason"]) == ("skipped", "truncated image")
     assert "matches" not in numbers
 
@@ -191,7 +185,7 @@ def test_the_painter_draws_the_last_frame(page: Page, player: FakePlayer, view: 
     for index in range(25):
         player.show(frame_view_of(index))
     page.settle()
-    assert cells(page)["frame"] == "24 of 40"
+    assert cells(page.numbers_text)["frame"] == "24 of 40"
 
 
 STEP_NS = 100_000_000

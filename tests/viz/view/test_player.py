@@ -84,6 +84,17 @@ def change(**sections: dict[str, object]) -> Config:
     return Config.model_validate(sections)
 
 
+@pytest.fixture
+def player() -> Iterator[Player]:
+    with Player(Recording().open, Config()) as opened:
+        yield opened
+
+
+def go(player: Player, index: int) -> None:
+    player.seek(index)
+    assert player.wait(LIMIT_S)
+
+
 def follow(player: Player) -> list[FrameView]:
     """Return a list that each view shown is added to."""
     views: list[FrameView] = []
@@ -91,104 +102,90 @@ def follow(player: Player) -> list[FrameView]:
     return views
 
 
-def test_playing_shows_each_frame_once_with_the_poses_of_a_run() -> None:
-    with Player(Recording().open, Config()) as player:
-        views = follow(player)
-        assert player.index == -1
-        assert player.frame_view is None
-        player.set_speed(None)
-        player.play()
-        assert player.wait(LIMIT_S)
-        assert not player.is_playing
-        assert player.is_finished
-        assert player.fault == ""
-        # Once more at the end, with the smoothed poses of all.
-        assert [view.index for view in views] == [*range(N_FRAMES), N_FRAMES - 1]
-        assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
-        results, smoothed = computed()
-        for view, result in zip(views, results, strict=False):
-            np.testing.assert_array_equal(view.T_world_cam, result.causal.T_world_cam)
-            assert view.keyframes == result.keyframes_ns
-            assert set(view.keyframes) <= set(view.window_poses)
-            assert set(view.window_poses) == set(view.window_covariances)
-        paths = player.history.raw_path(), player.history.causal_path()
-        for (stamps, path), kind in zip(paths, ("raw", "causal"), strict=True):
-            assert stamps.tolist() == stamps_ns()
-            assert path.tolist() == positions([getattr(result, kind) for result in results])
-        stamps, path = player.history.smoothed_path()
+def test_playing_shows_each_frame_once_with_the_poses_of_a_run(player: Player) -> None:
+    views = follow(player)
+    assert player.index == -1
+    assert player.frame_view is None
+    player.set_speed(None)
+    player.play()
+    assert player.wait(LIMIT_S)
+    assert not player.is_playing
+    assert player.is_finished
+    assert player.fault == ""
+    # Once more at the end, with the smoothed poses of all.
+    assert [view.index for view in views] == [*range(N_FRAMES), N_FRAMES - 1]
+    assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
+    results, smoothed = computed()
+    for view, result in zip(views, results, strict=False):
+        np.testing.assert_array_equal(view.T_world_cam, result.causal.T_world_cam)
+        assert view.keyframes == result.keyframes_ns
+        assert set(view.keyframes) <= set(view.window_poses)
+        assert set(view.window_poses) == set(view.window_covariances)
+    paths = player.history.raw_path(), player.history.causal_path()
+    for (stamps, path), kind in zip(paths, ("raw", "causal"), strict=True):
         assert stamps.tolist() == stamps_ns()
-        assert path.tolist() == positions(list(smoothed))
+        assert path.tolist() == positions([getattr(result, kind) for result in results])
+    stamps, path = player.history.smoothed_path()
+    assert stamps.tolist() == stamps_ns()
+    assert path.tolist() == positions(list(smoothed))
 
 
-def test_a_frame_that_is_done_is_shown_as_it_was() -> None:
-    with Player(Recording().open, Config()) as player:
-        views = follow(player)
-        player.seek(7)
-        assert player.wait(LIMIT_S)
-        player.seek(3)
-        assert player.wait(LIMIT_S)
-        then, now = views[3], views[-1]
-        assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
-        assert now.status == then.status
-        np.testing.assert_array_equal(now.T_world_cam, then.T_world_cam)
-        np.testing.assert_array_equal(now.cloud[0], then.cloud[0])
-        assert now.image.shape == then.image.shape
-        assert np.abs(now.overlay.astype(int) - then.overlay).mean() < 6  # JPEG
-        assert len(player.history.raw_path()[0]) == 4
-        assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4]
+def test_a_frame_that_is_done_is_shown_as_it_was(player: Player) -> None:
+    views = follow(player)
+    go(player, 7)
+    go(player, 3)
+    then, now = views[3], views[-1]
+    assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
+    assert now.status == then.status
+    np.testing.assert_array_equal(now.T_world_cam, then.T_world_cam)
+    np.testing.assert_array_equal(now.cloud[0], then.cloud[0])
+    assert now.image.shape == then.image.shape
+    assert np.abs(now.overlay.astype(int) - then.overlay).mean() < 6  # JPEG
+    assert len(player.history.raw_path()[0]) == 4
+    assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4]
 
 
-def test_steps_go_through_what_is_done_and_on() -> None:
-    with Player(Recording().open, Config()) as player:
-        player.seek(2)
-        player.wait(LIMIT_S)
-        player.seek(0)
-        player.wait(LIMIT_S)
-        views = follow(player)
-        for _ in range(4):
-            player.step()
-        assert player.wait(LIMIT_S)
-        assert [(view.index, view.n_done) for view in views][-2:] == [(3, 4), (4, 5)]
-        assert not player.is_playing
+def test_steps_go_through_what_is_done_and_on(player: Player) -> None:
+    go(player, 2)
+    go(player, 0)
+    views = follow(player)
+    for _ in range(4):
+        player.step()
+    assert player.wait(LIMIT_S)
+    assert [(view.index, view.n_done) for view in views][-2:] == [(3, 4), (4, 5)]
+    assert not player.is_playing
 
 
 @pytest.mark.parametrize("tell", ["pause", "seek"])
-def test_the_way_to_a_frame_can_be_interrupted(tell: str) -> None:
-    with Player(Recording().open, Config()) as player:
+def test_the_way_to_a_frame_can_be_interrupted(player: Player, tell: str) -> None:
+    def interrupt(view: FrameView) -> None:
+        if (view.index, view.n_done) == (4, 5):
+            player.pause() if tell == "pause" else player.seek(1)
 
-        def interrupt(view: FrameView) -> None:
-            if (view.index, view.n_done) == (4, 5):
-                player.pause() if tell == "pause" else player.seek(1)
-
-        player.subscribe(interrupt)
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
-        assert (player.index, player.n_done) == (4 if tell == "pause" else 1, 5)
+    player.subscribe(interrupt)
+    go(player, N_FRAMES - 1)
+    assert (player.index, player.n_done) == (4 if tell == "pause" else 1, 5)
 
 
-def test_a_seek_beyond_the_end_shows_the_last_frame_and_before_the_start_the_first() -> None:
-    with Player(Recording().open, Config()) as player:
-        player.seek(10_000)
-        assert player.wait(LIMIT_S)
-        assert (player.index, player.n_frames, player.is_finished) == (N_FRAMES - 1, N_FRAMES, True)
-        player.seek(-5)
-        player.wait(LIMIT_S)
-        assert player.index == 0
-        player.seek(10_000)
-        assert player.wait(LIMIT_S)
-        assert player.index == N_FRAMES - 1
+def test_a_seek_beyond_an_end_shows_the_frame_there(
+    player: Player,
+) -> None:
+    go(player, 10_000)
+    assert (player.index, player.n_frames, player.is_finished) == (N_FRAMES - 1, N_FRAMES, True)
+    go(player, -5)
+    assert player.index == 0
+    go(player, 10_000)
+    assert player.index == N_FRAMES - 1
 
 
-def test_pause_ends_a_wait_for_the_next_frame() -> None:
-    with Player(Recording().open, Config()) as player:
-        player.set_speed(1e-6)  # hours from frame to frame
-        player.seek(0)
-        player.wait(LIMIT_S)
-        player.play()
-        assert not player.wait(0.05)
-        player.pause()
-        assert player.wait(LIMIT_S)
-        assert player.index < 2
+def test_pause_ends_a_wait_for_the_next_frame(player: Player) -> None:
+    player.set_speed(1e-6)  # hours from frame to frame
+    go(player, 0)
+    player.play()
+    assert not player.wait(0.05)
+    player.pause()
+    assert player.wait(LIMIT_S)
+    assert player.index < 2
 
 
 def test_a_jump_of_the_stamps_is_not_waited_for() -> None:
@@ -213,39 +210,33 @@ def test_a_speed_that_is_none_is_refused(factor: float) -> None:
         player.set_speed(factor)
 
 
-def test_after_a_restart_the_world_begins_at_the_frame_shown() -> None:
-    with Player(Recording().open, Config()) as player:
-        player.seek(8)
-        player.wait(LIMIT_S)
-        player.seek(5)
-        player.wait(LIMIT_S)
-        player.restart()
-        assert player.wait(LIMIT_S)
-        assert (player.index, player.first_index, player.n_done) == (5, 5, 6)
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
-        results, smoothed = computed(5)
-        stamps, path = player.history.smoothed_path()
-        assert stamps.tolist() == stamps_ns()[5:]
-        assert path.tolist() == positions(list(smoothed))
-        player.seek(0)
-        player.wait(LIMIT_S)
-        assert player.index == 5
-        assert player.frame_view is not None
-        np.testing.assert_array_equal(player.frame_view.T_world_cam, results[0].causal.T_world_cam)
-        player.restart(0)
-        assert player.wait(LIMIT_S)
-        assert (player.index, player.first_index, player.n_done) == (0, 0, 1)
-        with pytest.raises(ValueError, match="frame 4 is not known"):
-            player.restart(4)
+def test_after_a_restart_the_world_begins_at_the_frame_shown(player: Player) -> None:
+    go(player, 8)
+    go(player, 5)
+    player.restart()
+    assert player.wait(LIMIT_S)
+    assert (player.index, player.first_index, player.n_done) == (5, 5, 6)
+    go(player, N_FRAMES - 1)
+    results, smoothed = computed(5)
+    stamps, path = player.history.smoothed_path()
+    assert stamps.tolist() == stamps_ns()[5:]
+    assert path.tolist() == positions(list(smoothed))
+    go(player, 0)
+    assert player.index == 5
+    assert player.frame_view is not None
+    np.testing.assert_array_equal(player.frame_view.T_world_cam, results[0].causal.T_world_cam)
+    player.restart(0)
+    assert player.wait(LIMIT_S)
+    assert (player.index, player.first_index, player.n_done) == (0, 0, 1)
+    with pytest.raises(ValueError, match="frame 4 is not known"):
+        player.restart(4)
 
 
 def test_another_configuration_counts_from_the_next_frame_on() -> None:
     recording = Recording()
     with Player(recording.open, Config()) as player:
         views = follow(player)
-        player.seek(3)
-        player.wait(LIMIT_S)
+        go(player, 3)
         player.reconfigure(change(klt={"n_corners": 50}))
         player.step()
         assert player.wait(LIMIT_S)
@@ -266,11 +257,9 @@ def test_what_matters_when_reading_opens_the_recording_again_without_a_gap(other
     recording = Recording()
     with Player(recording.open, Config()) as player:
         views = follow(player)
-        player.seek(3)
-        player.wait(LIMIT_S)
+        go(player, 3)
         player.reconfigure(other)
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES - 1)
         assert recording.n_opened == 2
         assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
         expected = positions([result.raw for result in computed()[0]])
@@ -287,15 +276,13 @@ def test_a_configuration_that_cannot_be_read_with_leaves_the_former_one() -> Non
 
     with Player(open_source, Config()) as player:
         views = follow(player)
-        player.seek(3)
-        player.wait(LIMIT_S)
+        go(player, 3)
         player.reconfigure(change(images={"black": 7}, klt={"n_corners": 50}))
         player.step()
         assert player.wait(LIMIT_S)
         assert views[-1].fault == player.fault == "black is not black; take 0"
         assert player.config == Config()
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES - 1)
         assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
 
 
@@ -310,8 +297,7 @@ def test_a_faulty_frame_is_shown_without_result() -> None:
 
     with Player(Recording(spoil).open, Config()) as player:
         views = follow(player)
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES - 1)
         view = views[4]
         assert view.result is None
         assert view.status is None
@@ -319,8 +305,7 @@ def test_a_faulty_frame_is_shown_without_result() -> None:
         np.testing.assert_array_equal(view.T_world_cam, views[3].T_world_cam)
         assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
         player.restart(4)
-        player.seek(6)
-        assert player.wait(LIMIT_S)
+        go(player, 6)
         assert player.history.raw_path()[0].tolist() == stamps_ns()[5:7]
 
 
@@ -329,8 +314,7 @@ def test_images_without_partner_are_no_frames() -> None:
         return (i for i in images if (i.stamp_ns, i.stream) != (stamps_ns()[4], 1))
 
     with Player(Recording(drop).open, Config()) as player:
-        player.seek(N_FRAMES)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES)
         assert player.n_frames == N_FRAMES - 1
         assert player.history.raw_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
 
@@ -353,8 +337,7 @@ def test_a_recording_that_breaks_off_is_told_and_its_poses_are_there() -> None:
         assert player.is_finished
         assert not player.is_playing
         assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:6]
-        player.seek(1)
-        assert player.wait(LIMIT_S)
+        go(player, 1)
         assert player.index == 1
 
 
@@ -370,57 +353,49 @@ def test_a_recording_without_a_frame_is_told() -> None:
 def test_a_fault_of_the_program_is_told_and_a_restart_goes_on() -> None:
     broken = [Recording(break_off(ZeroDivisionError("an odd image"))), Recording()]
     with Player(lambda config: broken.pop(0), Config()) as player:
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES - 1)
         assert player.fault == "ZeroDivisionError: an odd image"
         player.restart(0)
-        player.seek(N_FRAMES - 1)
-        assert player.wait(LIMIT_S)
+        go(player, N_FRAMES - 1)
         assert player.fault == ""
         assert player.index == N_FRAMES - 1
 
 
-def test_a_subscriber_that_fails_stops_nobody() -> None:
-    with Player(Recording().open, Config()) as player:
-        page: dict[str, FrameView] = {}
-        player.subscribe(lambda view: page["page"])  # type: ignore[arg-type]
-        views = follow(player)
-        player.seek(2)
-        assert player.wait(LIMIT_S)
-        assert player.fault == "KeyError: 'page'"
-        assert [view.index for view in views] == [0, 1, 2]
+def test_a_subscriber_that_fails_stops_nobody(player: Player) -> None:
+    page: dict[str, FrameView] = {}
+    player.subscribe(lambda view: page["page"])  # type: ignore[arg-type]
+    views = follow(player)
+    go(player, 2)
+    assert player.fault == "KeyError: 'page'"
+    assert [view.index for view in views] == [0, 1, 2]
 
 
-def test_who_unsubscribes_is_not_called() -> None:
-    with Player(Recording().open, Config()) as player:
-        views: list[FrameView] = []
-        end = player.subscribe(views.append)
-        player.step()
-        player.wait(LIMIT_S)
-        end()
-        end()
-        player.step()
-        player.wait(LIMIT_S)
-        assert [view.index for view in views] == [0]
+def test_who_unsubscribes_is_not_called(player: Player) -> None:
+    views: list[FrameView] = []
+    end = player.subscribe(views.append)
+    player.step()
+    player.wait(LIMIT_S)
+    end()
+    end()
+    player.step()
+    player.wait(LIMIT_S)
+    assert [view.index for view in views] == [0]
 
 
 def test_an_excerpt_is_played_and_restarted_within() -> None:
     excerpt = Excerpt(start_s=0.1, duration_s=0.25, every=2)
     expected = [ns for ns in stamps_ns() if 0.1 <= 1e-9 * (ns - stamps_ns()[0]) < 0.35][::2]
     with Player(Recording().open, Config(), excerpt=excerpt) as player:
-        player.seek(100)
-        assert player.wait(LIMIT_S)
+        go(player, 100)
         assert player.history.raw_path()[0].tolist() == expected
         player.restart(2)
-        player.seek(100)
-        assert player.wait(LIMIT_S)
+        go(player, 100)
         assert player.history.raw_path()[0].tolist() == expected[2:]
 
 
 def test_what_was_done_can_be_read_after_the_end() -> None:
     player = Player(Recording().open, Config())
-    player.seek(4)
-    player.wait(LIMIT_S)
+    go(player, 4)
     player.close()
     player.close()
     assert player.history.frame_view(1).index == 1

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
-import pytest
 from numpy.typing import NDArray
 
 from gvo.config import Config
@@ -85,29 +84,13 @@ def check(recording: Held, *, n_samples: int = 4, **options: Any) -> CheckResult
     return check_recording(recording, Config(), n_samples=n_samples, **options)
 
 
-def complaints(result: CheckResult) -> set[str]:
+def complaints(found: CheckResult | Mapping[str, Finding]) -> set[str]:
     """Return the names of all warnings and faults."""
-    return {finding.name for finding in result.with_verdict("warning", "fault")}
+    findings = found.findings if isinstance(found, CheckResult) else found.values()
+    return {finding.name for finding in findings if finding.verdict in ("warning", "fault")}
 
 
 def find(result: CheckResult, name: str) -> Finding:
     """Return the finding of this name."""
     (found,) = [finding for finding in result.findings if finding.name == name]
     return found
-
-
-@dataclass(frozen=True)
-class Bench:
-    """What the tests of the checks share."""
-
-    render: Callable[..., Held] = render
-    check: Callable[..., CheckResult] = check
-    complaints: Callable[[CheckResult], set[str]] = complaints
-    find: Callable[[CheckResult, str], Finding] = find
-    n_frames: int = N_FRAMES
-
-
-@pytest.fixture(scope="session")
-def bench() -> Bench:
-    """Return rendered recordings and the way to check them."""
-    return Bench()
