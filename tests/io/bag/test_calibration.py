@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from rosbags.rosbag1 import Writer
 from scipy.spatial.transform import Rotation
 
 from gvo.errors import CalibrationError
@@ -20,9 +19,8 @@ from gvo.io.bag.calibration import (
     calibrations_of_messages,
 )
 from gvo.io.bag.cameras import camera_info_changes
-from gvo.io.bag.reader import TF_TYPE, BagReader, typestore
+from gvo.io.bag.reader import TF_TYPE, BagReader
 from gvo.io.bag.topics import (
-    CAMERA_INFO_TYPE,
     COMPRESSED_TYPE,
     IMAGE_TYPE,
     TopicChoice,
@@ -30,90 +28,37 @@ from gvo.io.bag.topics import (
 )
 from gvo.io.calibration.stereo_pair import stereo_baseline
 from gvo.types import FloatArray
+from tests.io.camera_bags import K, Message, camera_info, header, image, make, write
 
-_K = [50.0, 0, 23.5, 0, 50.0, 15.5, 0, 0, 1]
 _P = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _D = [-0.2, 0.05, 0.001, -0.002, 0.0]
 
-Message = tuple[str, str, int, object]
-
-
-def _make(type_: str, **fields: Any) -> Any:
-    make_message: Any = typestore(is_ros1=True).types[type_]
-    return make_message(**fields)
-
-
-def _header(frame_id: str, stamp_ns: int = 0) -> Any:
-    sec, nanosec = divmod(stamp_ns, 10**9)
-    stamp = _make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return _make("std_msgs/msg/Header", seq=0, stamp=stamp, frame_id=frame_id)
-
-
-def _info(topic: str, frame_id: str = "camera", stamp_ns: int = 0, **changes: Any) -> Message:
-    region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
-    fields: dict[str, Any] = {
-        "height": 32,
-        "width": 48,
-        "distortion_model": "plumb_bob",
-        "D": [0.0] * 5,
-        "K": _K,
-        "R": np.zeros(9),
-        "P": np.zeros(12),
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": {},
-    } | changes
-    for name in "DKRP":
-        fields[name] = np.array(fields[name], dtype=np.float64)
-    roi = region | {"do_rectify": False} | fields["roi"]
-    fields["roi"] = _make("sensor_msgs/msg/RegionOfInterest", **roi)
-    header = _header(frame_id, stamp_ns)
-    return topic, CAMERA_INFO_TYPE, stamp_ns, _make(CAMERA_INFO_TYPE, header=header, **fields)
-
 
 def _image(topic: str, size: tuple[int, int] = (48, 32), frame_id: str = "camera") -> Message:
-    message = _make(
-        IMAGE_TYPE,
-        header=_header(frame_id),
-        height=size[1],
-        width=size[0],
-        encoding="mono8",
-        is_bigendian=0,
-        step=size[0],
-        data=np.zeros(size[0] * size[1], np.uint8),
-    )
-    return topic, IMAGE_TYPE, 0, message
+    return image(topic, np.zeros(size[::-1], np.uint8), header=header(frame_id))
 
 
 def _transform(T: FloatArray) -> Any:
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return _make(
+    return make(
         "geometry_msgs/msg/Transform",
-        translation=_make("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))),
-        rotation=_make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        translation=make("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))),
+        rotation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
     )
 
 
 def _tf(topic: str, parent: str, child: str, T: FloatArray, stamp_ns: int = 0) -> Message:
-    transform = _make(
+    transform = make(
         "geometry_msgs/msg/TransformStamped",
-        header=_header(parent, stamp_ns),
+        header=header(parent, stamp_ns),
         child_frame_id=child,
         transform=_transform(T),
     )
-    return topic, TF_TYPE, stamp_ns, _make(TF_TYPE, transforms=[transform])
+    return topic, TF_TYPE, stamp_ns, make(TF_TYPE, transforms=[transform])
 
 
 def _bag(path: Path, messages: Sequence[Message]) -> BagReader:
-    store = typestore(is_ros1=True)
-    with Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for topic, type_, log_time_ns, message in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_, typestore=store)
-            data = store.serialize_ros1(message, type_)
-            writer.write(connections[topic], log_time_ns, data)
-    return BagReader(path)
+    return BagReader(write(path, messages))
 
 
 def _found(path: Path, messages: Sequence[Message], **choice: str) -> BagCalibration:
@@ -137,7 +82,7 @@ def _pair(name: str = "image_raw", **changes: Any) -> list[Message]:
     return [
         *(_image(f"/s/{side}/{name}") for side in ("left", "right")),
         *(
-            _info(f"/s/{side}/camera_info", f"{side}_optical", **changes)
+            camera_info(f"/s/{side}/camera_info", f"{side}_optical", **changes)
             for side in ("left", "right")
         ),
     ]
@@ -200,7 +145,7 @@ def test_rectified_images_without_baseline_take_it_from_tf(tmp_path: Path) -> No
 
 def test_a_baseline_of_p_wins_over_tf(tmp_path: Path) -> None:
     messages = [*_pair(P=_P), *_mounts()]
-    info = _info("/s/right/camera_info", "right_optical", P=[*_P[:3], -25.0, *_P[4:]])
+    info = camera_info("/s/right/camera_info", "right_optical", P=[*_P[:3], -25.0, *_P[4:]])
     messages[3] = info
     found = _found(tmp_path / "a.bag", messages)
     assert "baseline: 0.5000 m from P of /s/right/camera_info" in found.decisions
@@ -210,10 +155,10 @@ def test_a_baseline_of_p_wins_over_tf(tmp_path: Path) -> None:
 def test_without_any_baseline_the_message_says_what_was_looked_for(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"nor from tf: .*right_optical.*--calibration FILE"):
         _found(tmp_path / "a.bag", [*_pair(), _mounts()[0]])
-    messages = [m if m[1] == IMAGE_TYPE else _info(m[0], "same") for m in _pair()]
+    messages = [m if m[1] == IMAGE_TYPE else camera_info(m[0], "same") for m in _pair()]
     with pytest.raises(CalibrationError, match="both CameraInfo name the frame same"):
         _found(tmp_path / "b.bag", messages)
-    messages = [m if m[1] == IMAGE_TYPE else _info(m[0], "") for m in _pair()]
+    messages = [m if m[1] == IMAGE_TYPE else camera_info(m[0], "") for m in _pair()]
     with pytest.raises(CalibrationError, match="name no frame") as caught:
         _found(tmp_path / "c.bag", messages)
     assert str(caught.value).startswith("the bag: the baseline must be positive")
@@ -231,7 +176,7 @@ def test_binning_and_region_of_the_message_describe_the_recorded_image(tmp_path:
     }
     messages = _pair(**changes)
     changes["P"][3] = -36.0
-    messages[3] = _info("/s/right/camera_info", **changes)
+    messages[3] = camera_info("/s/right/camera_info", **changes)
     left, right = _found(tmp_path / "a.bag", messages).calibrations
     assert (left.width, left.height) == (48, 32)
     np.testing.assert_allclose(left.K.ravel(), [90, 0, 39.5, 0, 90, 19.5, 0, 0, 1])
@@ -244,9 +189,9 @@ def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool
     messages[:2] = [_image(f"/s/{side}/image_raw", (64, 40)) for side in ("left", "right")]
     if is_compressed:
         data = np.asarray(cv2.imencode(".png", np.zeros((40, 64), np.uint8))[1]).ravel()
-        fields = {"header": _header("camera"), "format": "png", "data": data}
+        fields = {"header": header("camera"), "format": "png", "data": data}
         messages[:2] = [
-            (f"{m[0]}/compressed", COMPRESSED_TYPE, 0, _make(COMPRESSED_TYPE, **fields))
+            (f"{m[0]}/compressed", COMPRESSED_TYPE, 0, make(COMPRESSED_TYPE, **fields))
             for m in messages[:2]
         ]
     found = _found(tmp_path / "a.bag", [*messages, *_mounts()])
@@ -260,8 +205,8 @@ def test_camera_info_that_changes_is_counted_and_the_first_one_used(tmp_path: Pa
     messages = [
         _image("/c/rgb/image_raw"),
         _image("/c/depth/image_raw"),
-        *(_info(name, stamp_ns=n, K=_K if n < 3 else zoomed) for n in range(5)),
-        *(_info("/c/depth/camera_info", stamp_ns=n) for n in range(5)),
+        *(camera_info(name, stamp_ns=n, K=K if n < 3 else zoomed) for n in range(5)),
+        *(camera_info("/c/depth/camera_info", stamp_ns=n) for n in range(5)),
     ]
     assert _found(tmp_path / "a.bag", messages).calibrations[0].K[0, 0] == 50.0
     reader = BagReader(tmp_path / "a.bag")
@@ -273,8 +218,8 @@ def _rgbd(depth_name: str = "/c/depth/image_raw", **depth: Any) -> list[Message]
     return [
         _image("/c/rgb/image_raw"),
         _image(depth_name),
-        _info("/c/rgb/camera_info", "color_optical"),
-        _info(f"{depth_name.rpartition('/')[0]}/camera_info", frame_id, **depth),
+        camera_info("/c/rgb/camera_info", "color_optical"),
+        camera_info(f"{depth_name.rpartition('/')[0]}/camera_info", frame_id, **depth),
     ]
 
 

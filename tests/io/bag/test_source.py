@@ -6,83 +6,24 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from rosbags.rosbag1 import Writer
 
 from gvo.config import Config
 from gvo.errors import CalibrationError, GvoError, RecordingError
-from gvo.io.bag.reader import TF_TYPE, typestore
+from gvo.io.bag.reader import TF_TYPE
 from gvo.io.bag.source import BagSource
-from gvo.io.bag.topics import CAMERA_INFO_TYPE, IMAGE_TYPE, TopicChoice
+from gvo.io.bag.topics import IMAGE_TYPE, TopicChoice
 from gvo.io.frames import frames
 from gvo.io.opening import open_recording
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
+from tests.io.camera_bags import K, Message, camera_info, header, image, make, write
 
-_K = [50.0, 0, 23.5, 0, 50.0, 15.5, 0, 0, 1]
 _P_LEFT = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _P_RIGHT = [50.0, 0, 23.5, -25.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 
-Message = tuple[str, str, int, object]
-
-
-def _make(type_: str, **fields: Any) -> Any:
-    make_message: Any = typestore(is_ros1=True).types[type_]
-    return make_message(**fields)
-
-
-def _header(stamp_ns: int, frame_id: str = "camera") -> Any:
-    sec, nanosec = divmod(stamp_ns, 10**9)
-    stamp = _make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return _make("std_msgs/msg/Header", seq=0, stamp=stamp, frame_id=frame_id)
-
-
-def _image(topic: str, stamp_ns: int, pixels: Any, encoding: str, **changes: Any) -> Message:
-    fields = {
-        "header": _header(stamp_ns),
-        "height": pixels.shape[0],
-        "width": pixels.shape[1],
-        "encoding": encoding,
-        "is_bigendian": 0,
-        "step": pixels[0].nbytes,
-        "data": np.frombuffer(pixels.tobytes(), np.uint8),
-    }
-    return topic, IMAGE_TYPE, stamp_ns, _make(IMAGE_TYPE, **(fields | changes))
-
 
 def _info(topic: str, projection: list[float], **changes: Any) -> Message:
-    region = _make(
-        "sensor_msgs/msg/RegionOfInterest",
-        x_offset=0,
-        y_offset=0,
-        height=0,
-        width=0,
-        do_rectify=False,
-    )
-    fields: dict[str, Any] = {
-        "header": _header(0),
-        "height": 32,
-        "width": 48,
-        "distortion_model": "plumb_bob",
-        "D": np.zeros(5),
-        "K": np.array(_K),
-        "R": np.eye(3).ravel(),
-        "P": np.array(projection),
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": region,
-    }
-    return topic, CAMERA_INFO_TYPE, 0, _make(CAMERA_INFO_TYPE, **(fields | changes))
-
-
-def _write(path: Path, messages: list[Message]) -> Path:
-    store = typestore(is_ros1=True)
-    with Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for topic, type_, log_time_ns, message in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_, typestore=store)
-            data = message if isinstance(message, bytes) else store.serialize_ros1(message, type_)
-            writer.write(connections[topic], log_time_ns, data)
-    return path
+    fields: dict[str, Any] = {"R": np.eye(3), "P": projection} | changes
+    return camera_info(topic, **fields)
 
 
 def _stereo(tiny: Any, name: str = "image_rect", **info: Any) -> list[Message]:
@@ -92,20 +33,20 @@ def _stereo(tiny: Any, name: str = "image_rect", **info: Any) -> list[Message]:
     ]
     for n in range(3):
         for k, side in enumerate(("left", "right")):
-            messages.append(_image(f"/s/{side}/{name}", n, tiny.texture(2 * n + k), "mono8"))
+            messages.append(image(f"/s/{side}/{name}", tiny.texture(2 * n + k), "mono8", n))
     return messages
 
 
 def _rgbd(tiny: Any, depth: Any, encoding: str) -> list[Message]:
     return [
         _info("/c/rgb/camera_info", _P_LEFT),
-        _image("/c/rgb/image_color", 0, tiny.texture(1, is_color=True)[:, :, ::-1], "rgb8"),
-        _image("/c/depth/image", 0, depth, encoding),
+        image("/c/rgb/image_color", tiny.texture(1, is_color=True)[:, :, ::-1], "rgb8", 0),
+        image("/c/depth/image", depth, encoding),
     ]
 
 
 def test_a_stereo_pair_is_read_with_its_calibration(tmp_path: Path, tiny: Any) -> None:
-    source = BagSource(_write(tmp_path / "drive.bag", _stereo(tiny)))
+    source = BagSource(write(tmp_path / "drive.bag", _stereo(tiny)))
     assert source.info.name == "drive"
     assert source.info.n_images == 3
     assert source.info.decisions == [
@@ -121,10 +62,10 @@ def test_a_stereo_pair_is_read_with_its_calibration(tmp_path: Path, tiny: Any) -
 
 def test_raw_images_are_undistorted_rectified_ones_are_not(tmp_path: Path, tiny: Any) -> None:
     D = np.array([-0.2, 0.1, 0.0, 0.0, 0.0])
-    raw = BagSource(_write(tmp_path / "raw.bag", _stereo(tiny, "image_raw", D=D)))
+    raw = BagSource(write(tmp_path / "raw.bag", _stereo(tiny, "image_raw", D=D)))
     assert not raw.info.calibrations[0].is_rectified
     np.testing.assert_array_equal(raw.info.calibrations[1].D, D)
-    rectified = BagSource(_write(tmp_path / "rect.bag", _stereo(tiny, D=D)))
+    rectified = BagSource(write(tmp_path / "rect.bag", _stereo(tiny, D=D)))
     assert rectified.info.calibrations[0].is_rectified
     (frame, *_) = frames(rectified, Config())
     assert isinstance(frame, StereoFrame)
@@ -143,7 +84,7 @@ def test_depth_is_in_metres(
     tmp_path: Path, tiny: Any, encoding: str, scale: float | None, factor: float
 ) -> None:
     depth = tiny.depth(1) if encoding == "32FC1" else tiny.counts(1)
-    path = _write(tmp_path / "a.bag", _rgbd(tiny, depth, encoding))
+    path = write(tmp_path / "a.bag", _rgbd(tiny, depth, encoding))
     (frame,) = frames(BagSource(path, config=_scaled(scale)), Config())
     assert isinstance(frame, RgbdFrame)
     np.testing.assert_allclose(frame.depth, factor * tiny.depth(1), rtol=1e-6)
@@ -151,27 +92,27 @@ def test_depth_is_in_metres(
 
 def test_depth_of_another_camera_is_registered(tmp_path: Path, tiny: Any) -> None:
     messages = _rgbd(tiny, tiny.counts(1), "16UC1")
-    other = _info("/c/depth/camera_info", _P_LEFT, K=np.array([40.0, *_K[1:]]))
-    view = BagSource(_write(tmp_path / "a.bag", [*messages, other])).info.depth_view
+    other = _info("/c/depth/camera_info", _P_LEFT, K=np.array([40.0, *K[1:]]))
+    view = BagSource(write(tmp_path / "a.bag", [*messages, other])).info.depth_view
     assert view is not None
     np.testing.assert_array_equal(view.T_color_depth, np.eye(4))
     assert view.calibration.K[0, 0] == 40.0
     same = _info("/c/depth/camera_info", _P_LEFT)
-    assert BagSource(_write(tmp_path / "b.bag", [*messages, same])).info.depth_view is None
+    assert BagSource(write(tmp_path / "b.bag", [*messages, same])).info.depth_view is None
 
 
 def test_each_faulty_image_is_one_faulty_frame(tmp_path: Path, tiny: Any) -> None:
     messages = _stereo(tiny)
     left = "/s/left/image_rect"
     messages += [
-        _image(left, 10, tiny.texture(1), "mono8", data=np.zeros(3, np.uint8)),
-        _image(left, 11, tiny.texture(1), "mono8", height=2**31, step=2**30),
-        _image(left, 12, tiny.texture(1), "unknown"),
-        _image(left, 13, tiny.texture(1)[:9], "mono8"),
+        image(left, tiny.texture(1), "mono8", 10, data=np.zeros(3, np.uint8)),
+        image(left, tiny.texture(1), "mono8", 11, height=2**31, step=2**30),
+        image(left, tiny.texture(1), "unknown", 12),
+        image(left, tiny.texture(1)[:9], "mono8", 13),
         (left, IMAGE_TYPE, 14, b"short"),
     ]
-    messages += [_image("/s/right/image_rect", n, tiny.texture(1), "mono8") for n in range(10, 15)]
-    read = list(frames(BagSource(_write(tmp_path / "a.bag", messages)), Config()))
+    messages += [image("/s/right/image_rect", tiny.texture(1), "mono8", n) for n in range(10, 15)]
+    read = list(frames(BagSource(write(tmp_path / "a.bag", messages)), Config()))
     assert [type(item) for item in read] == [StereoFrame] * 3 + [FaultyFrame] * 5
     reasons = [item.reason for item in read if isinstance(item, FaultyFrame)]
     for reason, word in zip(
@@ -183,7 +124,7 @@ def test_each_faulty_image_is_one_faulty_frame(tmp_path: Path, tiny: Any) -> Non
 
 def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> None:
     messages = [m for m in _rgbd(tiny, tiny.counts(1), "16UC1") if m[1] == IMAGE_TYPE]
-    bag = _write(tmp_path / "a.bag", messages)
+    bag = write(tmp_path / "a.bag", messages)
     with pytest.raises(CalibrationError, match=r"no CameraInfo for /c/rgb/image_color: .*--calib"):
         BagSource(bag)
     path = tmp_path / "mine.yaml"
@@ -197,7 +138,7 @@ def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> N
 
 
 def test_a_stereo_calibration_file_holds_both_cameras(tmp_path: Path, tiny: Any) -> None:
-    bag = _write(tmp_path / "a.bag", _stereo(tiny))
+    bag = write(tmp_path / "a.bag", _stereo(tiny))
     right = tiny.ros_camera(projection_matrix={"data": [50.0, 0, 23.5, -50.0, *_P_RIGHT[4:]]})
     path = tmp_path / "pair.yaml"
     path.write_text(yaml.safe_dump({"left": tiny.ros_camera(), "right": right}))
@@ -218,7 +159,7 @@ def test_a_stereo_calibration_file_holds_both_cameras(tmp_path: Path, tiny: Any)
 def test_an_unusable_camera_info_is_refused(
     tmp_path: Path, tiny: Any, info: dict[str, Any], text: str
 ) -> None:
-    bag = _write(tmp_path / "a.bag", _stereo(tiny, "image_raw", **info))
+    bag = write(tmp_path / "a.bag", _stereo(tiny, "image_raw", **info))
     with pytest.raises(CalibrationError, match=text) as caught:
         BagSource(bag)
     assert str(caught.value).startswith(str(bag))
@@ -229,31 +170,31 @@ def test_depth_of_a_camera_that_rectification_turns_is_refused(tmp_path: Path, t
     messages = _rgbd(tiny, tiny.depth(0), "32FC1")
     messages[0] = _info("/c/rgb/camera_info", _P_LEFT, R=R)
     with pytest.raises(CalibrationError, match=r"/c/rgb/camera_info: R turns the camera"):
-        BagSource(_write(tmp_path / "a.bag", messages))
+        BagSource(write(tmp_path / "a.bag", messages))
     content = tiny.ros_camera(rectification_matrix={"data": R.tolist()})
     file = tmp_path / "turned.yaml"
     file.write_text(yaml.safe_dump(content))
-    bag = _write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
+    bag = write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
     with pytest.raises(CalibrationError, match=r"turned\.yaml: R turns the camera"):
         BagSource(bag, calibration=file)
 
 
 def test_topics_can_be_chosen(tmp_path: Path, tiny: Any) -> None:
-    bag = _write(tmp_path / "a.bag", _stereo(tiny))
+    bag = write(tmp_path / "a.bag", _stereo(tiny))
     choice = TopicChoice(left="/s/right/image_rect", right="/s/left/image_rect")
     with pytest.raises(CalibrationError, match="exchanged"):
         BagSource(bag, topics=choice)
 
 
 def _transform(parent: str, child: str, stamp_ns: int, t: float, w: float = 1.0) -> Any:
-    return _make(
+    return make(
         "geometry_msgs/msg/TransformStamped",
-        header=_header(stamp_ns, parent),
+        header=header(parent, stamp_ns),
         child_frame_id=child,
-        transform=_make(
+        transform=make(
             "geometry_msgs/msg/Transform",
-            translation=_make("geometry_msgs/msg/Vector3", x=t, y=0.0, z=0.0),
-            rotation=_make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=w),
+            translation=make("geometry_msgs/msg/Vector3", x=t, y=0.0, z=0.0),
+            rotation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=w),
         ),
     )
 
@@ -265,30 +206,30 @@ def test_the_truth_is_world_to_ground_truth_and_nothing_else(tmp_path: Path, tin
         _transform("/world", "/ground_truth", 5, 1.0),
         _transform("map", "ground_truth", 8, 4.0),
     ]
-    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms))
-    truth = BagSource(_write(tmp_path / "a.bag", [*_stereo(tiny), message])).ground_truth()
+    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms))
+    truth = BagSource(write(tmp_path / "a.bag", [*_stereo(tiny), message])).ground_truth()
     assert truth is not None
     assert truth.stamps_ns.tolist() == [5, 7]
     np.testing.assert_array_equal(truth.positions[:, 0], [1.0, 2.0])
-    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms[1:2]))
-    assert BagSource(_write(tmp_path / "b.bag", [*_stereo(tiny), message])).ground_truth() is None
-    assert BagSource(_write(tmp_path / "c.bag", _stereo(tiny))).ground_truth() is None
+    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms[1:2]))
+    assert BagSource(write(tmp_path / "b.bag", [*_stereo(tiny), message])).ground_truth() is None
+    assert BagSource(write(tmp_path / "c.bag", _stereo(tiny))).ground_truth() is None
 
 
 def test_a_truth_that_is_no_transform_is_none(tmp_path: Path, tiny: Any) -> None:
     transforms = [_transform("world", "ground_truth", 7, 2.0, w=0.0)]
-    message = ("/tf", TF_TYPE, 9, _make(TF_TYPE, transforms=transforms))
-    source = BagSource(_write(tmp_path / "a.bag", [*_stereo(tiny), message]))
+    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms))
+    source = BagSource(write(tmp_path / "a.bag", [*_stereo(tiny), message]))
     assert source.ground_truth() is None
     assert source.transforms().notes
 
 
 def test_several_bags_are_one_recording(tmp_path: Path, tiny: Any) -> None:
     messages = _stereo(tiny)
-    whole = BagSource(_write(tmp_path / "whole.bag", messages))
+    whole = BagSource(write(tmp_path / "whole.bag", messages))
     names = sorted({topic for topic, *_ in messages})
     parts = [
-        _write(tmp_path / f"{number}.bag", [m for m in messages if m[0] == name])
+        write(tmp_path / f"{number}.bag", [m for m in messages if m[0] == name])
         for number, name in enumerate(names)
     ]
     found = [tiny.fingerprint(frame) for frame in frames(BagSource(parts), Config())]
@@ -300,7 +241,7 @@ def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny:
     plain: list[tuple[str, str, int, Any]] = list(_stereo(tiny))
     for _, _, _, message in plain:
         message.header.stamp.sec = message.header.stamp.nanosec = 0
-    path = _write(tmp_path / "a.bag", plain)
+    path = write(tmp_path / "a.bag", plain)
     read = list(frames(BagSource(path), Config()))
     faulty = [item for item in read if isinstance(item, FaultyFrame)]
     assert all("--set sync.stamps=recording" in item.reason for item in faulty)
@@ -314,7 +255,7 @@ def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny:
 
 
 def test_of_a_cut_bag_the_start_is_read_and_the_loss_told(tmp_path: Path, tiny: Any) -> None:
-    path = _write(tmp_path / "a.bag", _stereo(tiny))
+    path = write(tmp_path / "a.bag", _stereo(tiny))
     data = path.read_bytes()
     path.write_bytes(data[: int(0.7 * len(data))])
     read = frames(BagSource(path), Config())
