@@ -50,16 +50,10 @@ def test_settings_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) 
     assert (config.window.size, config.window.n_links) == (9, 4)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [
-        ("depth.scale=null", None),
-        ("depth.scale=1e3", 1000.0),
-        ("depth.scale=5000", 5000.0),
-    ],
-)
-def test_values_of_settings_are_yaml(setting: str, value: float | None) -> None:
-    assert load_configuration(settings=["depth.scale=7", setting]).depth.scale == value
+@pytest.mark.parametrize(("text", "value"), [("null", None), ("1e3", 1000.0), ("5000", 5000.0)])
+def test_values_of_settings_are_yaml(text: str, value: float | None) -> None:
+    settings = ["depth.scale=7", f"depth.scale={text}"]
+    assert load_configuration(settings=settings).depth.scale == value
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ INLIER_COLOUR: Final = bgr(INLIERS)
 OUTLIER_COLOUR: Final = bgr(OUTLIERS)
 HEADER_PX: Final = 44
 MIN_WIDTH_PX: Final = 640
-"""Of a picture: its text needs so much."""
+"""Of a picture, for its text."""
 MAX_WIDTH_PX: Final = 1280
 """Of a picture, by default."""
 

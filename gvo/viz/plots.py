@@ -318,7 +318,7 @@ def _mark_start(view: Axes, start: Trajectory, plane: tuple[int, int]) -> None:
 
 
 def _set_view(view: Axes, plane: tuple[int, int]) -> None:
-    """Label the axes of a view along one axis of the world; one scale on both."""
+    """Label the axes of a view, with one scale on both."""
     horizontal, vertical = ("xyz"[axis] for axis in plane)
     view.set(xlabel=f"{horizontal} [m]", ylabel=f"{vertical} [m]")
     view.set_aspect("equal", adjustable="datalim")

@@ -90,14 +90,9 @@ def test_the_image_is_left_as_it_was_and_shown_where_nothing_matches() -> None:
 
 
 def test_text_stands_in_the_upper_left_corner() -> None:
-    nothing = np.zeros((0, 2))
-    picture = draw_matches(
-        _GREY,
-        nothing,
-        nothing,
-        np.zeros(0, dtype=np.bool_),
-        lines=["ok: 1", "\N{GREEK SMALL LETTER TAU}"],
-    )
+    nothing, inliers = np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
+    lines = ["ok: 1", "\N{GREEK SMALL LETTER TAU}"]
+    picture = draw_matches(_GREY, nothing, nothing, inliers, lines=lines)
     assert picture[:40, :50].max() > 200
     np.testing.assert_array_equal(picture[45:], _plain()[45:])
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory.trajectory import StampsFrom, Trajectory
+from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.plots import plot_trajectories
 
 BLACK, RAW, CAUSAL, SMOOTHED, FREE = (
@@ -31,14 +32,6 @@ def curve(
     twists[1:, 3:] += np.random.default_rng(seed).normal(size=(59, 3)) * 0.05
     twists[:, 3:] += start
     return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_cam=se3.exp(twists))
-
-
-def with_origin(trajectory: Trajectory, stamps_from: StampsFrom) -> Trajectory:
-    return Trajectory(
-        stamps_ns=trajectory.stamps_ns,
-        T_world_cam=trajectory.T_world_cam,
-        stamps_from=stamps_from,
-    )
 
 
 def n_pixels(path: Path, rgb: tuple[int, int, int]) -> int:
@@ -99,7 +92,7 @@ def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:
 
 
 def test_rows_without_stamps_are_counted(tmp_path: Path) -> None:
-    rows = [with_origin(curve(seed), "rows") for seed in range(2)]
+    rows = [replace(curve(seed), stamps_from="rows") for seed in range(2)]
     text = svg_text(tmp_path, rows[0], {"raw": rows[1]})
     assert "<!-- row -->" in text
     assert "elapsed" not in text

@@ -1,4 +1,4 @@
-"""The report: one page that shows a run, or estimates beside a reference."""
+"""The report of a run, or of estimates compared with a reference, as one page."""
 
 from gvo.viz.report.comparison import write_comparison_report
 from gvo.viz.report.run import write_run_report

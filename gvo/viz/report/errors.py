@@ -1,4 +1,4 @@
-"""Errors over time and path; covariances beside them."""
+"""Errors over time and distance, drift, and consistency with the covariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counts, times and links of frames."""
+"""Statuses, counts, times and edges of frames."""
 
 from __future__ import annotations
 

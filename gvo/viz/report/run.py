@@ -31,16 +31,13 @@ from gvo.viz.report.sheets import Plot, settings, write_plots
 
 _ERROR_PLOTS = ("errors_over_time", "errors_over_distance", "drift")
 _COVARIANCE_PLOTS = ("covariance", "nees")
-_ERROR_HEADER = (
-    "estimate",
-    "poses",
-    "ATE RMSE [m]",
-    "RPE [m]",
-    "RPE [deg]",
-    "t_err [%]",
-    "r_err [deg/100 m]",
-)
-_ERROR_KEYS = ("ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
+_ERROR_COLUMNS = {
+    "ate_m": "ATE RMSE [m]",
+    "rpe_m": "RPE [m]",
+    "rpe_deg": "RPE [deg]",
+    "t_pct": "t_err [%]",
+    "r_deg_per_100m": "r_err [deg/100 m]",
+}
 
 
 def write_run_report(
@@ -170,13 +167,21 @@ def _head(record: RunRecord) -> list[str]:
     parts.append(list_html("Warnings", map(str, summary.get("warnings", ())), kind="warnings"))
     parts.append(facts_html(_facts(record)))
     if summary.get("errors"):
-        rows = [_error_row(row) for row in summary["errors"]]
-        parts.append(table_html(_ERROR_HEADER, rows))
+        header = ("estimate", "poses", *_ERROR_COLUMNS.values())
+        parts.append(table_html(header, map(_error_row, summary["errors"])))
     return [part for part in parts if part]
 
 
+def _tail(record: RunRecord) -> list[str]:
+    summary = record.summary
+    return [
+        list_html("Decisions", map(str, summary.get("decisions", ()))),
+        configuration_html(summary.get("configuration", {}), Config().model_dump()),
+    ]
+
+
 def _error_row(row: Mapping[str, Any]) -> list[str]:
-    texts = [number_text(row.get(key)) for key in _ERROR_KEYS]
+    texts = [number_text(row.get(key)) for key in _ERROR_COLUMNS]
     return [str(row.get("name", "")), str(row.get("n", "")), *texts]
 
 
@@ -234,15 +239,6 @@ def _rig_words(offsets: Mapping[str, Any] | None) -> str:
 def _median_words(medians: Mapping[str, Any] | None) -> str:
     known = {stage: ms for stage, ms in (medians or {}).items() if ms is not None}
     return ", ".join(f"{stage} {float(ms):.1f} ms" for stage, ms in known.items())
-
-
-def _tail(record: RunRecord) -> list[str]:
-    summary = record.summary
-    defaults = Config().model_dump()
-    return [
-        list_html("Decisions", map(str, summary.get("decisions", ()))),
-        configuration_html(summary.get("configuration", {}), defaults),
-    ]
 
 
 def _version(summary: Mapping[str, Any]) -> str:

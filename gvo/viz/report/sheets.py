@@ -48,7 +48,7 @@ N_COLUMNS = 1000
 _MAX_PATH_POINTS = 3000
 # of the diagonal of a view of the path: less than half a pixel
 _PATH_TOLERANCE = 1.0 / 3000.0
-# smallest view of a path, relative to its diagonal in space: that along a straight line is none
+# least diagonal of a view, relative to that in space: the view along a straight line has none
 _MIN_VIEW = 0.02
 _MARGINS_INCHES = {"left": 0.78, "right": 0.2, "bottom": 0.52, "top": 0.12}
 _LEGEND_ROW_INCHES = 0.24

@@ -1,6 +1,5 @@
 """The page of a run and of a comparison, seen as text."""
 
-import csv
 import json
 import re
 import shutil
@@ -19,6 +18,7 @@ from gvo.runs.run import run_recording
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import write_covariances, write_tum
 from gvo.trajectory.trajectory import Trajectory
+from gvo.viz.palette import Style
 from gvo.viz.report import write_comparison_report, write_run_report
 from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure
 
@@ -49,6 +49,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def copy(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def rewrite_summary(folder: Path, **fields: object) -> None:
+    """Replace fields of the summary of a run."""
+    path = folder / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
 class _Page(HTMLParser):
@@ -113,12 +119,9 @@ def test_equal_input_gives_equal_files(folder: Path, tmp_path: Path) -> None:
 
 def test_texts_of_the_recording_are_escaped(copy: Path) -> None:
     evil = "</title></script><script>alert(1)</script>&"
-    summary = json.loads((copy / "summary.json").read_text())
     n_scripts = _Page(page_of(copy)).scripts
-    summary |= {"recording": evil, "warnings": [evil], "decisions": [evil], "sensor": evil}
-    summary["ground_truth"] = f"none: {evil}"
-    summary["configuration"]["frontend"]["kind"] = evil
-    (copy / "summary.json").write_text(json.dumps(summary))
+    rewrite_summary(copy, recording=evil, warnings=[evil], decisions=[evil], sensor=evil)
+    rewrite_summary(copy, ground_truth=f"none: {evil}", configuration={"frontend": {"kind": evil}})
     (copy / "ground_truth.txt").unlink()
     rows = (copy / "frames.csv").read_text().splitlines()
     (copy / "frames.csv").write_text("\n".join([*rows[:-1], f"{rows[-1]}{evil}", ""]))
@@ -149,10 +152,7 @@ def straight(n: int, *, bend: float = 0.0) -> Trajectory:
 
 def test_without_truth_a_sentence_says_why(copy: Path) -> None:
     (copy / "ground_truth.txt").unlink()
-    summary = json.loads((copy / "summary.json").read_text())
-    (copy / "summary.json").write_text(
-        json.dumps(summary | {"ground_truth": "none: nobody measured it", "errors": []})
-    )
+    rewrite_summary(copy, ground_truth="none: nobody measured it", errors=[])
     text = page_of(copy)
     assert text.count("nobody measured it") == 1 + len(SECTIONS[3:8])
     assert _Page(text).drawn == SECTIONS[:3] + SECTIONS[8:]
@@ -162,13 +162,10 @@ def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) 
     truth = read_run(copy).truth
     assert truth is not None
     (copy / "ground_truth.txt").unlink()
-    stamps_ns = truth.stamps_ns
-    rows = [
-        (int(n), float(x), float(y), float(z))
-        for n, (x, y, z) in zip(stamps_ns, truth.positions, strict=True)
-    ]
-    with (copy / "ground_truth_positions.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["stamp_ns", "x_m", "y_m", "z_m"], *map(list, rows)])
+    points = zip(truth.stamps_ns.tolist(), truth.positions.tolist(), strict=True)
+    rows = [f"{stamp_ns},{x},{y},{z}" for stamp_ns, (x, y, z) in points]
+    table = "\n".join(["stamp_ns,x_m,y_m,z_m", *rows, ""])
+    (copy / "ground_truth_positions.csv").write_text(table)
     page = page_of(copy)
     assert {*SECTIONS} - {*_Page(page).drawn} == {"drift", "covariance", "nees"}
     assert "rotation error [deg]" not in page
@@ -198,9 +195,7 @@ def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
 
 def test_what_differs_from_the_default_is_marked_with_the_default(copy: Path) -> None:
     assert 'class="changed"' not in page_of(copy)
-    summary = json.loads((copy / "summary.json").read_text())
-    summary["configuration"]["window"]["n_links"] = 7
-    (copy / "summary.json").write_text(json.dumps(summary))
+    rewrite_summary(copy, configuration={"window": {"n_links": 7, "n_keyframes": 12}})
     marked = re.findall(r'<tr class="changed">(.*?)</tr>', page_of(copy))
     assert [re.sub("<[^>]*>", " ", row).split() for row in marked] == [
         ["n_links", "7", "default", "3"]
@@ -222,8 +217,6 @@ def test_two_frames_are_enough(tmp_path: Path) -> None:
 
 
 def test_a_lone_point_between_gaps_is_drawn() -> None:
-    from gvo.viz.palette import Style
-
     axes = new_figure(4.0, 3.0).subplots()
     y = np.array([1.0, np.nan, 2.0, np.nan, 3.0, 3.0])
     draw_curve(axes, np.arange(6.0), y, Style(color="black"))
@@ -277,13 +270,7 @@ def test_the_page_is_there_though_its_plots_cannot_be_written(folder: Path, tmp_
     assert "</html>" in (tmp_path / "run.html").read_text()
     truth, names = straight(9), {"one": straight(9, bend=0.01)}
     measured = [evaluate(truth, names["one"], name="one")]
+    page, plots = tmp_path / "compared.html", tmp_path / "file"
     with pytest.raises(ConfigurationError, match="--plots"):
-        write_comparison_report(
-            tmp_path / "compared.html",
-            truth,
-            names,
-            measured,
-            align="se3",
-            plots=tmp_path / "file",
-        )
-    assert "</html>" in (tmp_path / "compared.html").read_text()
+        write_comparison_report(page, truth, names, measured, align="se3", plots=plots)
+    assert "</html>" in page.read_text()
