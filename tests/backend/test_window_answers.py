@@ -171,14 +171,6 @@ def test_the_covariance_of_coasting_grows_by_the_sigmas_per_second() -> None:
         np.testing.assert_allclose(estimate.covariance / scale, expected / scale, atol=1e-3)
 
 
-def test_the_second_pose_without_edges_stays_where_the_first_is() -> None:
-    window = SlidingWindow(CONFIG)
-    window.add_pose("a", 0, [], POSE_PRIOR)
-    estimate = window.add_pose("b", STEP_NS, [])
-    assert estimate.status == Status.COASTING
-    np.testing.assert_allclose(estimate.T_world_cam, POSE_PRIOR.T_world_frame, atol=1e-6)
-
-
 def test_a_gap_of_many_poses_loses_none_and_an_edge_across_it_brings_all_back() -> None:
     window, step = straight_window(config=WindowConfig(size=60, kernel="none"))
     last = 3
@@ -271,15 +263,6 @@ def test_a_keyframe_keeps_edges_to_keyframes_only() -> None:
             assert isinstance(window.add_edge(1, loop), Estimate)
     ends = [(each.reference_id, each.frame_id) for each in window.graph()]
     assert sorted(ends, key=str) == sorted([(0, 1), (28, 1), (29, 1), (28, 29)], key=str)
-
-
-def test_an_edge_to_a_name_that_left_is_not_told_of_its_next_bearer() -> None:
-    window = SlidingWindow(WindowConfig(size=3, kernel="none"))
-    for frame in range(4):
-        window.add_pose(frame, frame * STEP_NS, two_edges(frame))
-    window.add_pose(0, 4 * STEP_NS, [edge(3, STEP, 0.01)])
-    ends = [(each.reference_id, each.frame_id) for each in window.graph()]
-    assert ends == [(2, 3), (3, 0)]
 
 
 # Keyframes by distance, as a ruler on the known path tells.

@@ -33,7 +33,6 @@ from tests.backend.twins import (
     plain_twin,
     run,
     stamp_of,
-    true_poses,
     twin_without_edges,
 )
 from tests.backend.walks import (
@@ -74,24 +73,7 @@ def test_one_failing_update_is_undone_and_its_pose_coasts(
     assert "\n" not in line
 
 
-def test_an_update_and_its_coasting_failing_restart_the_graph(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with caplog.at_level(logging.WARNING, logger="gvo"):
-        found, failed = run_failing("update", [0, 1])
-    assert failed == [0, 1]
-    assert_complete(found)
-    assert found.window.counts.n_rebuilt == 1
-    assert found.window.counts.n_restored >= 1
-    assert messages(caplog)
-    # What follows hangs on the pose the graph began again from: the motion is kept.
-    for frame in range(FAULTY + 4, N):
-        ours = np.linalg.inv(found.causal[frame - 1].T_world_cam) @ found.causal[frame].T_world_cam
-        theirs = np.linalg.inv(true_poses()[frame - 1]) @ true_poses()[frame]
-        np.testing.assert_allclose(ours, theirs, atol=0.02)
-
-
-@pytest.mark.parametrize("n_failures", [3, 4, 5, 10, 40, 10_000])
+@pytest.mark.parametrize("n_failures", [3, 4, 10, 10_000])
 def test_nothing_is_lost_when_updates_fail_many_times_in_a_row(n_failures: int) -> None:
     found, failed = run_failing("update", range(n_failures))
     assert len(failed) >= min(n_failures, N - FAULTY)
@@ -302,11 +284,14 @@ def test_an_update_that_fails_takes_all_measurements_of_its_pose_along() -> None
     assert [each.frame_id for each in window.graph()] == [1, 2, 3, 4]
 
 
-def test_a_graph_that_is_made_anew_knows_its_poses_and_no_measurements() -> None:
+def test_a_graph_that_is_made_anew_knows_its_poses_and_no_measurements(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     window = walk(WindowConfig(size=9), 5)
     before = {frame: window.estimate(frame) for frame in range(5)}
-    with failing("update", [0, 1]):
+    with caplog.at_level(logging.WARNING, logger="gvo"), failing("update", [0, 1]):
         window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
+    assert messages(caplog)
     assert (window.counts.n_restored, window.counts.n_rebuilt) == (2, 1)
     assert window.graph() == []
     assert all(window.edges(frame) == () for frame in range(6))
@@ -316,7 +301,9 @@ def test_a_graph_that_is_made_anew_knows_its_poses_and_no_measurements() -> None
         # As told before but for what the poses have in common, which can only be less.
         assert np.all(np.diag(found.covariance) <= np.diag(each.covariance) * (1 + 1e-6))
         np.testing.assert_allclose(np.diag(found.covariance), np.diag(each.covariance), rtol=0.3)
-    assert [each.frame_id for each in window.finish()] == list(range(6))
+    for each in go_on(window, 6, 9):  # the motion is kept
+        np.testing.assert_allclose(each.T_world_cam, power(number(each.frame_id)), atol=1e-6)
+    assert [each.frame_id for each in window.finish()] == list(range(9))
 
 
 def test_the_first_pose_that_fails_is_the_origin_no_more_but_stays_where_it_is() -> None:

@@ -320,39 +320,6 @@ class WindowMachine(RuleBasedStateMachine):
         assert set(self.live()) == set(self.stamps) - names
         assert self.window.pop_finished() == []
 
-    # Misuse.
-
-    @rule(
-        number=picks, back=st.integers(0, 10**9), stranger=st.sampled_from(["x", -1, None, (0, 1)])
-    )
-    def misuse_changes_nothing(self, number: int, back: int, stranger: Any) -> None:
-        known, new, newest = self.pick(number), len(self.stamps), max(self.stamps.values())
-        edge = self.measure(known, self.pick(0), "good", 1e-2, "")
-        for stamp in (newest - back, float(newest + STEP_NS), None):
-            self.check_misuse("add_pose", new, stamp, [edge])
-        self.check_misuse("add_pose", known, newest + 1, [])
-        self.check_misuse("add_pose", new, newest + 1, ["edge"])
-        self.check_misuse("add_pose", new, newest + 1, [], "prior")
-        self.check_misuse("add_edge", known, np.eye(4))
-        self.check_misuse("add_prior", known, np.zeros(3))
-        for method in ("keep", "release", "covariance", "pose", "stamp_ns"):
-            self.check_misuse(method, stranger)
-        self.check_misuse("relative_pose", stranger, known)
-        self.check_misuse("relative_pose", known, stranger)
-
-    @rule(number=picks)
-    def edges_and_priors_of_nowhere_are_refused(self, number: int) -> None:
-        edge = self.measure(self.pick(number), self.pick(0), "good", 1e-2, "")
-        prior = PosePrior(T_world_frame=np.eye(4), covariance=np.eye(6))
-        self.check_refusal(self.window.add_edge("x", edge), "x")
-        self.check_refusal(self.window.add_prior("x", prior), "x")
-
-    def check_misuse(self, method: str, *arguments: Any) -> None:
-        before = self.window.poses()
-        with pytest.raises(ValueError, match=r"\S"):
-            getattr(self.window, method)(*arguments)
-        self.check_unchanged(before)
-
     # The end.
 
     def teardown(self) -> None:

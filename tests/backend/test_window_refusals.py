@@ -138,15 +138,6 @@ def test_a_bad_edge_between_known_poses_is_refused_and_leaves_no_trace(fault: st
     assert found.window.counts.n_rejected == 1
 
 
-def test_all_kinds_of_bad_edges_at_once_are_refused_one_by_one() -> None:
-    good = good_edges()[FAULTY]
-    bad = [bad_edge(fault, good[-1], FAULTY) for fault in BAD_EDGES]
-    found = run(edges=(*bad, *good, *bad))
-    rejected = found.causal[FAULTY].rejected
-    assert len(rejected) == 2 * len(bad) == found.window.counts.n_rejected
-    assert_as_twin(found, plain_twin())
-
-
 BAD_PRIORS: dict[str, Prior] = {
     **{
         f"pose: {name}": replace(POSE_PRIOR, T_world_frame=fault(POSE_PRIOR.T_world_frame))
@@ -249,9 +240,12 @@ MISUSES: dict[str, Act] = {
     "a negative stamp": adding("x", -1, GOOD),
     "a float as stamp": adding("x", float(SOON), GOOD),
     "a NaN as stamp": adding("x", float("nan"), GOOD),
+    "a truth value as stamp": adding("x", True, GOOD),
+    "a truth value of numpy as stamp": adding("x", np.True_, GOOD),
     "a text as stamp": adding("x", str(SOON), GOOD),
     "no stamp": adding("x", None, GOOD),
     "a list as name": adding([1], SOON, GOOD),
+    "no name": adding(None, SOON, GOOD),
     "an array as name": adding(np.zeros(2), SOON, GOOD),
     "a text as edges": adding("x", SOON, WRONG),
     "one edge that is none": adding("x", SOON, [*GOOD, WRONG]),
@@ -262,6 +256,10 @@ MISUSES: dict[str, Act] = {
     "an edge as prior": adding("x", SOON, GOOD, GOOD[0]),
     "an array as prior": adding("x", SOON, GOOD, np.eye(4)),
     "an edge to a list": lambda window: window.add_pose("x", SOON, [unhashable_edge()]),
+    "an edge of a list": lambda window: window.add_edge([1], GOOD[0]),
+    "a prior of a list": lambda window: window.add_prior([1], POSE_PRIOR),
+    "the pose of a dictionary": lambda window: window.pose({}),
+    "keep a list": lambda window: window.keep([1]),
     "an edge that is none": lambda window: window.add_edge(NEWEST, WRONG),
     "a prior in place of an edge": lambda window: window.add_edge(NEWEST, POSE_PRIOR),  # type: ignore[arg-type]
     "a prior that is none": lambda window: window.add_prior(NEWEST, WRONG),
@@ -324,34 +322,11 @@ def test_an_empty_window_refuses_finishes_and_begins_again() -> None:
     assert [e.stamp_ns for e in window.finish()] == [5]
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda window: window.add_edge([1], edge(0, STEP)),
-        lambda window: window.add_prior([1], PositionPrior(
-            position_world=np.zeros(3), covariance=np.eye(3)
-        )),
-        lambda window: window.pose({}),
-        lambda window: window.keep([1]),
-    ],
-)  # fmt: skip
-def test_a_name_that_cannot_be_one_is_told_as_such(ask: Any) -> None:
-    with pytest.raises(ValueError, match="a frame_id must be hashable"):
-        ask(walk(WindowConfig(), 2))
-
-
-def test_a_stamp_may_be_a_number_of_numpy_but_no_truth_value() -> None:
+def test_a_stamp_may_be_a_number_of_numpy() -> None:
     window = SlidingWindow()
     found = window.add_pose("a", np.int64(7), [])  # type: ignore[arg-type]
     assert type(found.stamp_ns) is int
     assert (found.stamp_ns, window.stamp_ns("a")) == (7, 7)
-    for wrong in (True, np.True_, 8.0):
-        with pytest.raises(ValueError, match="stamp_ns of 'b' must be an int"):
-            window.add_pose("b", wrong, [])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="must not be None"):
-        window.add_pose(None, 8, [])
-    with pytest.raises(ValueError, match="'a' is in the window already"):
-        window.add_pose("a", 8, [])
 
 
 def test_another_type_is_refused() -> None:
