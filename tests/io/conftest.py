@@ -121,6 +121,33 @@ class Tiny:
                 self.write_image(folder / f"image_{camera}" / f"{n:06d}.png", pixels)
         return folder
 
+    def euroc_camera(self, T_body_cam: NDArray[Any], **changes: object) -> str:
+        """Return the text of a `sensor.yaml`; keys of value None are left out."""
+        camera = self.camera
+        content: dict[str, object] = {
+            "sensor_type": "camera",
+            "T_BS": {"cols": 4, "rows": 4, "data": np.ravel(T_body_cam).tolist()},
+            "resolution": list(self.size),
+            "camera_model": "pinhole",
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": [0.0, 0.0, 0.0, 0.0],
+        }
+        kept = {key: value for key, value in (content | changes).items() if value is not None}
+        return yaml.safe_dump(kept)
+
+    def write_euroc(self, folder: Path, stamps_ns: Sequence[int], sensors: Sequence[str]) -> Path:
+        """Write an EuRoC folder with images of these stamps; a text of `sensor.yaml` a camera."""
+        for n, sensor in enumerate(sensors):
+            camera = folder / "mav0" / f"cam{n}"
+            rows = ["#timestamp [ns],filename"]
+            for k, stamp_ns in enumerate(stamps_ns):
+                self.write_image(camera / "data" / f"{stamp_ns}.png", self.texture(10 * k + n))
+                rows.append(f"{stamp_ns},{stamp_ns}.png")
+            (camera / "data.csv").write_text("\r\n".join(rows) + "\r\n")
+            (camera / "sensor.yaml").write_text(sensor)
+        return folder
+
     def write_tum(self, folder: Path, color: Sequence[str], depth: Sequence[str]) -> Path:
         """Write a TUM folder with images of these stamps and a `calibration.yaml`."""
         for stream, stamps in (("rgb", color), ("depth", depth)):

@@ -85,23 +85,16 @@ def _write_euroc(tiny: Tiny, folder: Path, model: str) -> Path:
     turn = np.asarray(Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix())
     T_left_right = make_transform(turn, np.array([0.11, 0.001, -0.002]))
     D, _ = _LENSES[model]
-    for camera, T_body_sensor in enumerate((T_body_left, T_body_left @ T_left_right)):
-        place = folder / "mav0" / f"cam{camera}"
-        rows = ["#timestamp [ns],filename"]
-        for k in range(3):
-            name = f"{_START_NS + k * _STEP_NS}.png"
-            tiny.write_image(place / "data" / name, tiny.texture(10 * k + camera))
-            rows.append(f"{name.removesuffix('.png')},{name}")
-        (place / "data.csv").write_text("\n".join(rows) + "\n")
-        content = {
-            "T_BS": {"cols": 4, "rows": 4, "data": T_body_sensor.ravel().tolist()},
-            "resolution": list(tiny.size),
-            "camera_model": "pinhole",
-            "intrinsics": [30.1 + camera, 30.3, 23.7, 15.9 - camera],
-            "distortion_model": model,
-            "distortion_coefficients": (np.array(D) * rng.uniform(0.9, 1.1, len(D))).tolist(),
-        }
-        (place / "sensor.yaml").write_text(yaml.safe_dump(content))
+    sensors = [
+        tiny.euroc_camera(
+            T_body_cam,
+            intrinsics=[30.1 + camera, 30.3, 23.7, 15.9 - camera],
+            distortion_model=model,
+            distortion_coefficients=(np.array(D) * rng.uniform(0.9, 1.1, len(D))).tolist(),
+        )
+        for camera, T_body_cam in enumerate((T_body_left, T_body_left @ T_left_right))
+    ]
+    tiny.write_euroc(folder, [_START_NS + k * _STEP_NS for k in range(3)], sensors)
     truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
     truth.parent.mkdir()
     write_euroc(truth, _truth(20, step_ns=10**7))

@@ -17,20 +17,6 @@ from gvo.types import StereoFrame
 _STAMPS = (1403636584763555584, 1403636584813555456)
 
 
-def _sensor(tiny: Any, T_body_cam: Any, **changes: Any) -> str:
-    camera = tiny.camera
-    content = {
-        "sensor_type": "camera",
-        "T_BS": {"cols": 4, "rows": 4, "data": np.ravel(T_body_cam).tolist()},
-        "resolution": list(tiny.size),
-        "camera_model": "pinhole",
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "distortion_model": "radial-tangential",
-        "distortion_coefficients": [0.0, 0.0, 0.0, 0.0],
-    }
-    return yaml.safe_dump({k: v for k, v in (content | changes).items() if v is not None})
-
-
 def _poses() -> tuple[Any, Any]:
     """Return T_body_left and T_body_right: turned, the right one 0.5 m along the left x axis."""
     T_body_left = np.eye(4)
@@ -43,15 +29,8 @@ def _poses() -> tuple[Any, Any]:
 
 
 def _write(folder: Path, tiny: Any, **changes: Any) -> Path:
-    for n, T_body_cam in enumerate(_poses()):
-        camera = folder / "mav0" / f"cam{n}"
-        rows = ["#timestamp [ns],filename"]
-        for k, stamp_ns in enumerate(_STAMPS):
-            tiny.write_image(camera / "data" / f"{stamp_ns}.png", tiny.texture(10 * k + n))
-            rows.append(f"{stamp_ns},{stamp_ns}.png")
-        (camera / "data.csv").write_text("\r\n".join(rows) + "\r\n")
-        (camera / "sensor.yaml").write_text(_sensor(tiny, T_body_cam, **changes))
-    return folder
+    sensors = [tiny.euroc_camera(T_body_cam, **changes) for T_body_cam in _poses()]
+    return Path(tiny.write_euroc(folder, _STAMPS, sensors))
 
 
 def test_the_folder_and_its_mav0_are_the_same_recording(tmp_path: Path, tiny: Any) -> None:
