@@ -230,7 +230,7 @@ def _find_finished(
     return RunResult(
         summary=summary,
         evaluations=(),
-        is_complete=bool(summary.get("is_complete", True)),
+        is_complete=summary.get("is_complete") is True,
         warnings=tuple(summary.get("warnings", ())),
     )
 
