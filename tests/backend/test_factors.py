@@ -12,7 +12,7 @@ from scipy import integrate, stats
 from gvo.backend.factors import Factors, Measurement
 from gvo.config import Kernel, WindowConfig
 from gvo.types import Edge, FloatArray, PosePrior, PositionPrior
-from tests.backend.walks import seeds
+from tests.backend.walks import edge, seeds, shifted
 
 KERNELS: tuple[Kernel, ...] = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 CONSTANTS: dict[Kernel, float] = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
@@ -86,10 +86,8 @@ def test_the_constants_lose_as_little_of_good_data(kernel: Kernel) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_residual_names_the_weight_of_its_kernel(kernel: Kernel) -> None:
-    T = np.eye(4)
-    T[0, 3] = 6.0
-    edge = Edge(reference_id="a", T_reference_frame=T, covariance=np.eye(6), kernel=kernel)
-    found = Factors(WindowConfig()).residual_of_edge(edge, "b", np.eye(4), np.eye(4))
+    far = replace(edge("a", shifted(6.0), 1.0), kernel=kernel)
+    found = Factors(WindowConfig()).residual_of_edge(far, "b", np.eye(4), np.eye(4))
     np.testing.assert_allclose(found.residual, [0, 0, 0, -6, 0, 0], atol=1e-12)
     expected = 1.0 if kernel == "none" else float(weight(kernel, np.array(6.0), CONSTANTS[kernel]))
     assert found.weight == pytest.approx(expected)
@@ -98,12 +96,11 @@ def test_a_residual_names_the_weight_of_its_kernel(kernel: Kernel) -> None:
 
 def test_a_configured_constant_replaces_that_of_the_configured_kernel_alone() -> None:
     factors = Factors(WindowConfig(kernel="huber", kernel_threshold=2.0))
-    T = np.eye(4)
-    T[0, 3] = 8.0
     weights = {}
-    for kernel in ("huber", "cauchy"):
-        edge = Edge(reference_id="a", T_reference_frame=T, covariance=np.eye(6), kernel=kernel)
-        weights[kernel] = factors.residual_of_edge(edge, "b", np.eye(4), np.eye(4)).weight
+    kernels: tuple[Kernel, ...] = ("huber", "cauchy")
+    for kernel in kernels:
+        far = replace(edge("a", shifted(8.0), 1.0), kernel=kernel)
+        weights[kernel] = factors.residual_of_edge(far, "b", np.eye(4), np.eye(4)).weight
     assert weights["huber"] == pytest.approx(0.25)
     assert weights["cauchy"] == pytest.approx(1.0 / (1.0 + (8.0 / 9.4) ** 2))
 

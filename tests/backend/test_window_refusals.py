@@ -215,10 +215,6 @@ def test_a_prior_that_contradicts_a_sure_window_is_believed_and_the_window_goes_
         assert_complete(found)
 
 
-def unhashable_edge() -> Edge:
-    return replace(good_edges()[FAULTY][0], reference_id=["a list"])  # type: ignore[arg-type]
-
-
 def adding(*arguments: Any, **options: Any) -> Act:
     return lambda window: window.add_pose(*arguments, **options)
 
@@ -230,6 +226,7 @@ GOOD = good_edges()[FAULTY]
 
 
 WRONG: Any = "wrong"
+A_LIST: Any = ["a list"]
 
 
 MISUSES: dict[str, Act] = {
@@ -244,7 +241,7 @@ MISUSES: dict[str, Act] = {
     "a truth value of numpy as stamp": adding("x", np.True_, GOOD),
     "a text as stamp": adding("x", str(SOON), GOOD),
     "no stamp": adding("x", None, GOOD),
-    "a list as name": adding([1], SOON, GOOD),
+    "a list as name": adding(A_LIST, SOON, GOOD),
     "no name": adding(None, SOON, GOOD),
     "an array as name": adding(np.zeros(2), SOON, GOOD),
     "a text as edges": adding("x", SOON, WRONG),
@@ -255,11 +252,13 @@ MISUSES: dict[str, Act] = {
     "a prior among the edges": adding("x", SOON, [POSE_PRIOR]),
     "an edge as prior": adding("x", SOON, GOOD, GOOD[0]),
     "an array as prior": adding("x", SOON, GOOD, np.eye(4)),
-    "an edge to a list": lambda window: window.add_pose("x", SOON, [unhashable_edge()]),
-    "an edge of a list": lambda window: window.add_edge([1], GOOD[0]),
-    "a prior of a list": lambda window: window.add_prior([1], POSE_PRIOR),
-    "the pose of a dictionary": lambda window: window.pose({}),
-    "keep a list": lambda window: window.keep([1]),
+    "an edge to a list": lambda window: window.add_pose(
+        "x", SOON, [replace(GOOD[0], reference_id=A_LIST)]
+    ),
+    "an edge of a list": lambda window: window.add_edge(A_LIST, GOOD[0]),
+    "a prior of a list": lambda window: window.add_prior(A_LIST, POSE_PRIOR),
+    "the pose of a list": lambda window: window.pose(A_LIST),
+    "keep a list": lambda window: window.keep(A_LIST),
     "an edge that is none": lambda window: window.add_edge(NEWEST, WRONG),
     "a prior in place of an edge": lambda window: window.add_edge(NEWEST, POSE_PRIOR),  # type: ignore[arg-type]
     "a prior that is none": lambda window: window.add_prior(NEWEST, WRONG),

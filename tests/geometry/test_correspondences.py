@@ -22,10 +22,16 @@ def random_correspondences(rng: np.random.Generator, n: int) -> Correspondences:
 
 @given(seed=seeds)
 def test_pixels_of_both_frames_become_points_of_their_own_frames(seed: int) -> None:
-    matches = random_correspondences(np.random.default_rng(seed), 7)
+    rng = np.random.default_rng(seed)
+    pixels = random_pixels(rng, 7), random_pixels(rng, 7)
+    sigmas = rng.uniform(0.1, 1.0, (7, 3)), rng.uniform(0.1, 1.0, (7, 3))
+    matches = Correspondences.of_pixels(pixels, sigmas, CAMERA)
     assert len(matches) == 7
-    np.testing.assert_allclose(matches.source_points, unproject(matches.source_uvd), rtol=1e-12)
-    np.testing.assert_allclose(matches.target_points, unproject(matches.target_uvd), rtol=1e-12)
+    for index, side in enumerate(("source", "target")):
+        points = getattr(matches, f"{side}_points")
+        np.testing.assert_allclose(points, unproject(pixels[index]), rtol=1e-12)
+        np.testing.assert_array_equal(getattr(matches, f"{side}_uvd"), pixels[index])
+        np.testing.assert_array_equal(getattr(matches, f"{side}_sigmas"), sigmas[index])
 
 
 @given(seed=seeds)
@@ -73,14 +79,3 @@ def test_matches_pair_what_each_frame_saw() -> None:
                 assert uvd[row, 2] == frame.disparities[index]
                 sigmas = getattr(found, f"{side}_sigmas")
                 np.testing.assert_array_equal(sigmas[row], frame.sigmas[index])
-
-
-def test_what_was_measured_is_kept_by_the_frame_that_measured_it() -> None:
-    rng = np.random.default_rng(1)
-    pixels = random_pixels(rng, 4), random_pixels(rng, 4)
-    sigmas = rng.uniform(0.1, 1.0, (4, 3)), rng.uniform(0.1, 1.0, (4, 3))
-    matches = Correspondences.of_pixels(pixels, sigmas, CAMERA)
-    np.testing.assert_array_equal(matches.source_uvd, pixels[0])
-    np.testing.assert_array_equal(matches.target_uvd, pixels[1])
-    np.testing.assert_array_equal(matches.source_sigmas, sigmas[0])
-    np.testing.assert_array_equal(matches.target_sigmas, sigmas[1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -200,30 +200,30 @@ def test_delivery() -> None:
     assert sorted(shuffled) == list(range(_N))
 
 
-def test_a_frozen_camera_shows_the_last_image_with_new_stamps() -> None:
+@pytest.mark.parametrize(
+    ("fault", "left", "right"),
+    [
+        (made.Frozen(first=3, end=6, streams=(0,)), [0, 1, 2, 2, 2, 2, 6, 7], range(_N)),
+        (made.Lagging(by=2, streams=(1,)), range(_N), [0, 0, 0, 1, 2, 3, 4, 5]),
+    ],
+)
+def test_an_earlier_frame_is_shown_with_the_stamp_of_its_own(
+    fault: Fault, left: Sequence[int], right: Sequence[int]
+) -> None:
     sound = Small()
-    source = FaultySource(sound, made.Frozen(first=3, end=6, streams=(0,)))
-    assert stamps(source) == list(range(_N))
-    shown = [0, 1, 2, 2, 2, 2, 6, 7]
-    for frame, origin in enumerate(shown):
-        np.testing.assert_array_equal(load(source, frame), sound.pixels(origin, 0))
-        np.testing.assert_array_equal(load(source, frame, 1), sound.pixels(frame, 1))
-
-
-def test_a_lagging_stream_shows_an_earlier_frame() -> None:
-    sound = Small()
-    source = FaultySource(sound, made.Lagging(by=2, streams=(1,)))
-    for frame, origin in enumerate([0, 0, 0, 1, 2, 3, 4, 5]):
-        np.testing.assert_array_equal(load(source, frame, 1), sound.pixels(origin, 1))
-        np.testing.assert_array_equal(load(source, frame), sound.pixels(frame, 0))
+    source = FaultySource(sound, fault)
+    assert stamps(source) == stamps(source, 1) == list(range(_N))
+    for frame, shown in enumerate(zip(left, right, strict=True)):
+        for stream, origin in enumerate(shown):
+            pixels = sound.pixels(origin, stream)
+            np.testing.assert_array_equal(load(source, frame, stream), pixels)
 
 
 def test_left_and_right_are_exchanged_and_their_stamps_stay() -> None:
     sound = Small()
     source = FaultySource(sound, made.Exchanged(first=2, end=3))
-    np.testing.assert_array_equal(load(source, 2, 0), sound.pixels(2, 1))
-    np.testing.assert_array_equal(load(source, 2, 1), sound.pixels(2, 0))
-    np.testing.assert_array_equal(load(source, 3, 0), sound.pixels(3, 0))
+    for frame, stream, origin in ((2, 0, 1), (2, 1, 0), (3, 0, 0)):
+        np.testing.assert_array_equal(load(source, frame, stream), sound.pixels(frame, origin))
     assert stamps(source) == stamps(source, 1) == list(range(_N))
 
 
