@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import cv2
@@ -29,6 +28,7 @@ _N_AHEAD = 2
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Item: TypeAlias = Pair | FaultyFrame
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
+_Started: TypeAlias = tuple[_Item, list[Future[NDArray[Any] | str]]]
 
 
 def frames(
@@ -178,12 +178,6 @@ def _ahead(
             raise fault
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Started:
-    item: _Item
-    results: tuple[Future[NDArray[Any] | str], ...]
-
-
 def _start(
     submit: Callable[..., Future[NDArray[Any] | str]],
     item: _Item,
@@ -191,15 +185,15 @@ def _start(
     info: RecordingInfo,
 ) -> _Started:
     if isinstance(item, FaultyFrame):
-        return _Started(item=item, results=())
-    jobs = zip(item, preparers, strict=True)
-    return _Started(item=item, results=tuple(submit(_prepare, *job, info) for job in jobs))
+        return item, []
+    return item, [submit(_prepare, *job, info) for job in zip(item, preparers, strict=True)]
 
 
 def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
-    if isinstance(started.item, FaultyFrame):
-        return started.item
-    return _make_frame(started.item, [result.result() for result in started.results], sensor)
+    item, results = started
+    if isinstance(item, FaultyFrame):
+        return item
+    return _make_frame(item, [result.result() for result in results], sensor)
 
 
 def _prepare(

@@ -148,8 +148,14 @@ def _image_size(paths: Sequence[Path], grey_range: GreyRange) -> tuple[int, int]
 
 def _read_cameras(path: Path, names: tuple[str, str], size: tuple[int, int]) -> CameraSet:
     projections = _read_projections(path)
-    cameras = (_rectified(projections, f"P{name[-1]}", size=size, path=path) for name in names)
-    return CameraSet(calibrations=tuple(cameras), origin=str(path))
+    calibrations = []
+    for key in (f"P{name[-1]}" for name in names):
+        if key not in projections:
+            raise CalibrationError(f"{path}: lacks {key}")
+        calibration = rectified_calibration(projections[key], width=size[0], height=size[1])
+        check_camera(calibration, f"{path}: {key}")
+        calibrations.append(calibration)
+    return CameraSet(calibrations=tuple(calibrations), origin=str(path))
 
 
 def _read_projections(path: Path) -> dict[str, FloatArray]:
@@ -167,16 +173,6 @@ def _read_projections(path: Path) -> dict[str, FloatArray]:
             )
         projections[fields[0].rstrip(":")] = projection.reshape(3, 4)
     return projections
-
-
-def _rectified(
-    projections: dict[str, FloatArray], key: str, *, size: tuple[int, int], path: Path
-) -> Calibration:
-    if key not in projections:
-        raise CalibrationError(f"{path}: lacks {key}")
-    calibration = rectified_calibration(projections[key], width=size[0], height=size[1])
-    check_camera(calibration, f"{path}: {key}")
-    return calibration
 
 
 def _camera_offset(calibration: Calibration) -> FloatArray:

@@ -15,7 +15,7 @@ from gvo.geometry.camera import Calibration, PinholeCamera
 from gvo.geometry.se3 import invert, make_transform
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.moving_scene import MovingScene
-from gvo.io.synthetic.rendering import to_uint8
+from gvo.io.synthetic.rendering import scale_camera, to_uint8
 from gvo.io.synthetic.scene import Scene
 from gvo.io.synthetic.worlds.deceptive import (
     blank_room,
@@ -92,7 +92,7 @@ class SyntheticRecording:
         _check(world, sensor, n_frames, seed, scale)
         setting = _WORLDS[world]
         self._world, self._sensor, self._seed = world, sensor, seed
-        self._camera = _scale(setting.camera, scale)
+        self._camera = scale_camera(setting.camera, scale)
         self._baseline = setting.baseline
         self._noise = noise or SensorNoise(max_depth_m=setting.max_depth_m)
         frames = np.arange(n_frames, dtype=np.int64)
@@ -185,18 +185,6 @@ def _check(world: str, sensor: str, n_frames: int, seed: int, scale: float) -> N
         raise ValueError(f"n_frames must be positive, seed not negative: {n_frames}, {seed}")
     if not 0.05 <= scale <= 4.0:
         raise ValueError(f"scale must be in [0.05, 4], got {scale}")
-
-
-def _scale(camera: PinholeCamera, scale: float) -> PinholeCamera:
-    """Return the camera with images of another size; pixel (0, 0) stays the first's centre."""
-    return PinholeCamera(
-        fx=scale * camera.fx,
-        fy=scale * camera.fy,
-        cx=scale * (camera.cx + 0.5) - 0.5,
-        cy=scale * (camera.cy + 0.5) - 0.5,
-        width=round(scale * camera.width),
-        height=round(scale * camera.height),
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -230,21 +230,25 @@ def refine(view: View) -> View:
         Its linear forms take pixels of the larger image.
     """
     M = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
-    camera = PinholeCamera(
-        fx=2 * view.camera.fx,
-        fy=2 * view.camera.fy,
-        cx=2 * view.camera.cx + 0.5,
-        cy=2 * view.camera.cy + 0.5,
-        width=2 * view.camera.width,
-        height=2 * view.camera.height,
-    )
     return replace(
         view,
-        camera=camera,
+        camera=scale_camera(view.camera, 2.0),
         inverse_depth=view.inverse_depth @ M,
         texels_s=view.texels_s @ M,
         texels_t=view.texels_t @ M,
         inside=view.inside @ M,
+    )
+
+
+def scale_camera(camera: PinholeCamera, scale: float) -> PinholeCamera:
+    """Return the camera with images of another size; pixel (0, 0) stays the first's centre."""
+    return PinholeCamera(
+        fx=scale * camera.fx,
+        fy=scale * camera.fy,
+        cx=scale * (camera.cx + 0.5) - 0.5,
+        cy=scale * (camera.cy + 0.5) - 0.5,
+        width=round(scale * camera.width),
+        height=round(scale * camera.height),
     )
 
 
