@@ -174,7 +174,13 @@ def test_a_folder_that_cannot_be_written_is_a_line(
     assert is_one_line(answer.err)
 
 
-@pytest.mark.parametrize("name", ["fsspec", "pyarrow", "cryptography"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "fsspec",
+        *(pytest.param(n, marks=pytest.mark.acceptance) for n in ("pyarrow", "cryptography")),
+    ],
+)
 def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, name: str) -> None:
     program = f"import sys; sys.modules[{name!r}] = None\n{GVO[-1]}"
     out = tmp_path / "out"

@@ -1,6 +1,7 @@
 """Matches that continue the recent mean motion, where the prediction was drawn away from it."""
 
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -10,12 +11,12 @@ import pytest
 import gvo
 from gvo.config import Config, WindowConfig
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.odometry.chain import RawChain
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
+from tests.frontend import two_motions
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
 STATED_PX = 0.7
@@ -24,35 +25,17 @@ STILL = np.zeros(6)
 BUS = np.array([0.0, 0.0, 0.0, 0.015, 0.0, 0.0])
 
 
-def matches_of(*groups: tuple[FloatArray, int], noise_px: float) -> Correspondences:
-    rng = np.random.default_rng(7)
-    sources, targets = [], []
-    for twist, n in groups:
-        uvd = np.column_stack(
-            [rng.uniform(20, 620, n), rng.uniform(20, 460, n), rng.uniform(18, 24, n)]
-        )
-        points = CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2])
-        moved = se3.transform_points(se3.invert(se3.exp(twist)), points)
-        sources.append(uvd)
-        targets.append(CAMERA.project_stereo(moved))
-    source, target = np.concatenate(sources), np.concatenate(targets)
-    noise = rng.normal(0.0, noise_px, (2, *source.shape))
-    sigmas = np.full(source.shape, STATED_PX)
-    return Correspondences.of_pixels(
-        (source + noise[0], target + noise[1]), (sigmas, sigmas), CAMERA
-    )
+matches_of = partial(
+    two_motions.matches_of, camera=CAMERA, disparities=(18, 24), stated_px=STATED_PX, seed=7
+)
 
 
 def register(
     matches: Correspondences, T_predicted: FloatArray, T_recent: FloatArray | None = None
 ) -> FloatArray:
     """Return the translation that is found, metres."""
-    indices = np.tile(np.arange(len(matches))[:, np.newaxis], 2)
-    result = register_correspondences(
-        *(matches, indices, CAMERA, Config()),
-        stamps_ns=(1, 2),
-        prior=MotionPrior(T_predicted=T_predicted, T_recent=T_recent),
-    )
+    prior = MotionPrior(T_predicted=T_predicted, T_recent=T_recent)
+    result = two_motions.register(matches, CAMERA, prior)
     assert isinstance(result, RelativePose), result
     return np.asarray(result.T_reference_current[:3, 3])
 

@@ -1,14 +1,15 @@
 """Two motions in one pair of frames: which one is the camera's."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from gvo.config import Config
-from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import Contradiction, Failure, FloatArray, MotionPrior, RelativePose
+from tests.frontend import two_motions
 
 CAMERA = StereoCamera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.3)
 SIGMA_PX = 0.2
@@ -17,34 +18,19 @@ DRIVING = np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.8])
 BUS = np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])
 
 
-def matches_of(*groups: tuple[FloatArray, int], n_wrong: int = 0) -> Correspondences:
-    """Return matches, so many of each twist T_reference_current, and wrong ones."""
-    rng = np.random.default_rng(4)
-    sources, targets = [], []
-    for twist, n in groups:
-        uvd = np.column_stack(
-            [rng.uniform(20, 620, n), rng.uniform(20, 460, n), rng.uniform(8, 40, n)]
-        )
-        points = CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2])
-        moved = CAMERA.project_stereo(se3.transform_points(se3.invert(se3.exp(twist)), points))
-        sources.append(uvd)
-        targets.append(moved)
-    for each in (sources, targets):
-        each.append(rng.uniform([20, 20, 8], [620, 460, 40], (n_wrong, 3)))
-    source, target = np.concatenate(sources), np.concatenate(targets)
-    noise = rng.normal(0.0, SIGMA_PX, (2, *source.shape))
-    sigmas = np.full(source.shape, SIGMA_PX)
-    return Correspondences.of_pixels(
-        (source + noise[0], target + noise[1]), (sigmas, sigmas), CAMERA
-    )
+matches_of = partial(
+    two_motions.matches_of,
+    camera=CAMERA,
+    disparities=(8, 40),
+    noise_px=SIGMA_PX,
+    stated_px=SIGMA_PX,
+    seed=4,
+)
 
 
 def register(matches: Correspondences, prior: FloatArray | None) -> RelativePose | Failure:
-    indices = np.tile(np.arange(len(matches))[:, np.newaxis], 2)
     expected = None if prior is None else MotionPrior(T_predicted=se3.exp(prior))
-    return register_correspondences(
-        matches, indices, CAMERA, Config(), stamps_ns=(1, 2), prior=expected
-    )
+    return two_motions.register(matches, CAMERA, expected)
 
 
 def assert_is(result: RelativePose | Failure, twist: FloatArray) -> None:
