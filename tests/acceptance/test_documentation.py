@@ -41,7 +41,7 @@ def blocks(language: str) -> list[tuple[str, str]]:
 
 def commands() -> list[tuple[str, list[str]]]:
     """Return the commands of each block; none of a block whose commands another one has, too."""
-    found = []
+    found: list[tuple[str, list[str]]] = []
     for page, text in blocks("sh"):
         lines = [line for line in text.splitlines() if line.startswith("gvo ")]
         # A word in capitals stands for a file of the reader's own.

@@ -147,7 +147,7 @@ def test_a_lens_that_was_not_rectified_is_found_though_rows_hardly_differ(
     finding = find(check(distorted, n_samples=8), "left/right: lens distortion")
     assert finding.verdict == "fault"
     # The series of a strong distortion ends later than with its first term.
-    assert 0.6 < finding.value / k1 < 1.7
+    assert 0.6 < float(finding.value) / k1 < 1.7
 
 
 def through_lens(image: NDArray[Any], K: NDArray[Any], k1: float) -> NDArray[Any]:
