@@ -170,6 +170,12 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_programs_that_a_page_names_are_there(page: Path) -> None:
+    named = set(re.findall(r"\b(?:gvo|scripts|tests)/[\w/]+\.py\b", page.read_text()))
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
 def test_the_public_names_can_be_imported() -> None:
     for name in gvo.__all__:
         assert getattr(gvo, name) is not None
