@@ -30,7 +30,7 @@ def trajectory_html(
     stamps_ns : ndarray of int64, shape (n,)
         Nanoseconds.
     poses : ndarray of float64, shape (n, 4, 4)
-        T_world_cam, metres.
+        T_world_frame, metres.
     has_rotations, has_covariances : bool
         What is known beside the positions.
     stamps_from : str
@@ -64,7 +64,7 @@ def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, 
     stamp_ns : int
         Nanoseconds.
     pose : ndarray of float64, shape (4, 4)
-        T_world_cam, metres.
+        T_world_frame, metres.
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
     status : str

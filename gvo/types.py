@@ -458,7 +458,7 @@ class Estimate:
     ----------
     stamp_ns : int
         Stamp of the frame, nanoseconds.
-    T_world_cam : ndarray of float64, shape (4, 4)
+    T_world_frame : ndarray of float64, shape (4, 4)
         Maps camera coordinates to the world, metres.
     covariance : ndarray of float64, shape (6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
@@ -471,7 +471,7 @@ class Estimate:
     """
 
     stamp_ns: int
-    T_world_cam: FloatArray
+    T_world_frame: FloatArray
     covariance: FloatArray
     status: Status = Status.OK
     frame_id: FrameId = field(default=None)
@@ -479,12 +479,12 @@ class Estimate:
 
     def __post_init__(self) -> None:
         """Copy the arrays."""
-        _freeze(self, "T_world_cam", "covariance")
+        _freeze(self, "T_world_frame", "covariance")
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""
         return estimate_html(
-            self.stamp_ns, self.T_world_cam, self.covariance, status=self.status.value
+            self.stamp_ns, self.T_world_frame, self.covariance, status=self.status.value
         )
 
 

@@ -327,7 +327,7 @@ class Life:
     def take(self, causal: gvo.Estimate | None, finished: list[gvo.Estimate]) -> None:
         """Look at the estimates of an update."""
         for estimate in finished if causal is None else [causal, *finished]:
-            total = estimate.T_world_cam.sum() + estimate.covariance.sum()
+            total = estimate.T_world_frame.sum() + estimate.covariance.sum()
             self._n_not_finite += not math.isfinite(total)
         for estimate in finished:
             if isinstance(estimate.frame_id, int):
@@ -472,7 +472,7 @@ def smooth_whole(tracked: Sequence[TrackedPose], config: WindowConfig) -> list[S
 
 def poses_of(estimates: Sequence[gvo.Estimate]) -> dict[int, FloatArray]:
     """Return T_world_frame by stamp."""
-    return {estimate.stamp_ns: estimate.T_world_cam for estimate in estimates}
+    return {estimate.stamp_ns: estimate.T_world_frame for estimate in estimates}
 
 
 def edge_graph(tracked: Sequence[TrackedPose], config: WindowConfig) -> gtsam.NonlinearFactorGraph:
@@ -516,7 +516,7 @@ def trajectory_of(smoothing: Smoothing) -> gvo.Trajectory:
     """Return the poses as a trajectory, by stamp."""
     stamps_ns = np.array(sorted(smoothing.poses), dtype=np.int64)
     T = se3.normalize(np.array([smoothing.poses[stamp_ns] for stamp_ns in stamps_ns.tolist()]))
-    return gvo.Trajectory(stamps_ns=stamps_ns, T_world_cam=T)
+    return gvo.Trajectory(stamps_ns=stamps_ns, T_world_frame=T)
 
 
 def main() -> None:

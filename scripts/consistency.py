@@ -132,7 +132,7 @@ def chained(estimates: list[gvo.Estimate]) -> list[Relative]:
         if start is None or start >= b.stamp_ns:
             continue
         a = by_stamp[start]
-        T_a_b = se3.invert(a.T_world_cam) @ b.T_world_cam
+        T_a_b = se3.invert(a.T_world_frame) @ b.T_world_frame
         Ad = se3.adjoint(se3.invert(T_a_b))
         pairs.append((start, b.stamp_ns, T_a_b, b.covariance - Ad @ a.covariance @ Ad.T))
     return pairs
@@ -144,7 +144,7 @@ def compare(pairs: list[Relative], truth: gvo.Trajectory) -> list[tuple[FloatArr
     compared = []
     for start, end, T_a_b, covariance in pairs:
         if first <= start and end <= last:
-            T_world_a, T_world_b = truth.interpolate(np.array([start, end])).T_world_cam
+            T_world_a, T_world_b = truth.interpolate(np.array([start, end])).T_world_frame
             error = se3.log(se3.invert(T_a_b) @ se3.invert(T_world_a) @ T_world_b)
             compared.append((error, covariance))
     return compared

@@ -150,7 +150,7 @@ def view(task: Task) -> Picture | None:
             view = player.frame_view
             if view is None:
                 raise RecordingError(f"{task.bag}: {player.fault}")
-            R, t = view.T_world_cam[:3, :3], view.T_world_cam[:3, 3]
+            R, t = view.T_world_frame[:3, :3], view.T_world_frame[:3, 3]
             for client in server.viser.get_clients().values():
                 client.camera.position, client.camera.look_at = R @ FROM_CAM + t, R @ TO_CAM + t
             time.sleep(3.0)  # the page draws on its own time

@@ -43,11 +43,11 @@ def main() -> None:
                 window.add_pose(edges[0].reference_id, int(stamp) - 1, [])
             estimate = window.add_pose(name, int(stamp), edges)
             sigma = np.sqrt(estimate.covariance[3:, 3:].trace())
-            print(f"causal {name} {estimate.T_world_cam[:3, 3].round(4)} +- {sigma:.4f} m")
+            print(f"causal {name} {estimate.T_world_frame[:3, 3].round(4)} +- {sigma:.4f} m")
             for refusal in estimate.rejected:
                 print(f"refused {refusal}")
     for smoothed in window.finish():
-        print(f"smoothed {smoothed.frame_id} {smoothed.T_world_cam[:3, 3].round(4)}")
+        print(f"smoothed {smoothed.frame_id} {smoothed.T_world_frame[:3, 3].round(4)}")
 
 
 if __name__ == "__main__":

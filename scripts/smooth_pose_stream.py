@@ -24,7 +24,7 @@ def relative_edge(
     poses: gvo.Trajectory, reference: int, frame: int, covariance: np.ndarray
 ) -> gvo.Edge:
     """Return the edge from one pose of a trajectory to another, named by their rows."""
-    T_world_reference, T_world_frame = poses.T_world_cam[[reference, frame]]
+    T_world_reference, T_world_frame = poses.T_world_frame[[reference, frame]]
     T_reference_frame = np.linalg.inv(T_world_reference) @ T_world_frame
     return gvo.Edge(
         reference_id=reference, T_reference_frame=T_reference_frame, covariance=covariance
@@ -57,9 +57,9 @@ def main() -> None:
                 window.release(keyframes.pop(0))
             sigma = float(np.sqrt(estimate.covariance[3:, 3:].trace()))
             window.pop_finished()  # smoothed poses that left: yours to store
-            print(f"{row:6d} {estimate.T_world_cam[:3, 3].round(2)} +- {sigma:.2f} m")
+            print(f"{row:6d} {estimate.T_world_frame[:3, 3].round(2)} +- {sigma:.2f} m")
     last = window.finish()[-1]
-    drift = np.linalg.norm((np.linalg.inv(last.T_world_cam) @ poses.T_world_cam[-1])[:3, 3])
+    drift = np.linalg.norm((np.linalg.inv(last.T_world_frame) @ poses.T_world_frame[-1])[:3, 3])
     print(f"{len(poses)} poses; the last one is {drift:.2f} m from the odometry's")
 
 

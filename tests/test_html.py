@@ -42,7 +42,7 @@ def moving(positions: FloatArray, *, rate_hz: float = 10.0) -> Trajectory:
     poses = np.tile(np.eye(4), (len(positions), 1, 1))
     poses[:, :3, 3] = positions
     stamps_ns = np.round(1e9 / rate_hz * np.arange(len(positions))).astype(np.int64)
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=poses)
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=poses)
 
 
 @given(
@@ -67,7 +67,7 @@ def test_any_estimate_is_well_formed(
     pose: FloatArray, covariance: FloatArray, is_rigid: bool
 ) -> None:
     estimate = Estimate(
-        stamp_ns=5, T_world_cam=np.eye(4) if is_rigid else pose, covariance=covariance
+        stamp_ns=5, T_world_frame=np.eye(4) if is_rigid else pose, covariance=covariance
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -77,7 +77,7 @@ def test_any_estimate_is_well_formed(
 @pytest.mark.parametrize("shape", [(), (3, 3)])
 def test_an_estimate_of_the_wrong_shape_shows_its_status(shape: tuple[int, ...]) -> None:
     estimate = Estimate(
-        stamp_ns=0, T_world_cam=np.zeros(shape), covariance=np.zeros(shape), status=Status.LOST
+        stamp_ns=0, T_world_frame=np.zeros(shape), covariance=np.zeros(shape), status=Status.LOST
     )
     assert cells(estimate._repr_html_())["status"] == "lost"
 
@@ -98,7 +98,7 @@ def test_an_estimate_shows_its_position_along_the_axes_of_the_world() -> None:
     pose[:3, 3] = [1.0, 2.0, 3.0]
     # uncertain ahead of the camera, which looks along x of the world
     covariance = np.diag(np.square([0.01, 0.02, 0.03, 0.1, 0.1, 0.5]))
-    shown = cells(Estimate(stamp_ns=0, T_world_cam=pose, covariance=covariance)._repr_html_())
+    shown = cells(Estimate(stamp_ns=0, T_world_frame=pose, covariance=covariance)._repr_html_())
     assert shown["position x, y, z [m]"] == "1.00 ± 0.50, 2.00 ± 0.10, 3.00 ± 0.10"
     assert shown["rotation vector [deg]"].startswith("0.00 ± 0.57, 90.0 ± 1.1, 0.0 ± 1.7")
 

@@ -66,9 +66,9 @@ def test_images_of_another_type_are_refused() -> None:
 def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
     T, covariance = np.eye(4), np.eye(6)
     edge = Edge(reference_id="a", T_reference_frame=T, covariance=covariance)
-    estimate = Estimate(stamp_ns=0, T_world_cam=T, covariance=covariance)
+    estimate = Estimate(stamp_ns=0, T_world_frame=T, covariance=covariance)
     T[0, 3], covariance[0, 0] = 7.0, 7.0
-    for array in (edge.T_reference_frame, estimate.T_world_cam):
+    for array in (edge.T_reference_frame, estimate.T_world_frame):
         assert array[0, 3] == 0.0
     for array in (edge.covariance, estimate.covariance):
         assert array[0, 0] == 1.0

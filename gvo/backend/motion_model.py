@@ -133,7 +133,7 @@ class ConstantVelocity:
         self._step = None
         if self._measured is not None and T_world_measured is not None:
             elapsed_s = 1e-9 * (estimate.stamp_ns - self._measured.stamp_ns)
-            self._step = T_world_measured, estimate.T_world_cam, elapsed_s
+            self._step = T_world_measured, estimate.T_world_frame, elapsed_s
         self._measured = estimate
 
     def predict_step(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
@@ -154,7 +154,7 @@ class ConstantVelocity:
             return None
         T_last_frame, covariance = self.predict_step(stamp_ns)
         return (
-            se3.normalize(self.last.T_world_cam @ T_last_frame),
+            se3.normalize(self.last.T_world_frame @ T_last_frame),
             se3.compose_covariance(self.last.covariance, T_last_frame, covariance),
         )
 

@@ -65,7 +65,7 @@ class SlidingWindow:
     >>> step[2, 3] = 1.0
     >>> edge = Edge(reference_id="a", T_reference_frame=step, covariance=1e-4 * np.eye(6))
     >>> estimate = window.add_pose("b", 100_000_000, [edge])
-    >>> estimate.T_world_cam[:3, 3].round(6).tolist()
+    >>> estimate.T_world_frame[:3, 3].round(6).tolist()
     [0.0, 0.0, 1.0]
     """
 
@@ -186,7 +186,7 @@ class SlidingWindow:
         estimate = Estimate(
             frame_id=frame_id,
             stamp_ns=pose.stamp_ns,
-            T_world_cam=T_world_frame,
+            T_world_frame=T_world_frame,
             covariance=covariance,
             status=status if status and pose.is_measured else found,
             rejected=pose.rejected,

@@ -313,7 +313,7 @@ class WindowGraph:
             self._isam.update(factors, gtsam.Values())
             self._isam.iterate(before)
             estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam)
+            _check_result(estimate.T_world_frame)
             self._check_others()
         return estimate
 
@@ -340,11 +340,11 @@ class WindowGraph:
         for frame_id, pose in self.poses.items():
             estimate = self.estimate(frame_id)
             prior = PosePrior(
-                T_world_frame=se3.normalize(estimate.T_world_cam),
+                T_world_frame=se3.normalize(estimate.T_world_frame),
                 covariance=sane_covariance(estimate.covariance),
             )
             factors.add(self._factors.prior(pose.key, prior))
-            values.insert(pose.key, gtsam.Pose3(estimate.T_world_cam))
+            values.insert(pose.key, gtsam.Pose3(estimate.T_world_frame))
         with graph.restored_on_error():
             graph.update(factors, values)
         self._isam = graph
@@ -362,14 +362,14 @@ class WindowGraph:
         pose = self.poses[frame_id]
         T_world_frame = self._isam.pose(pose.key)
         if pose.causal is not None and pose_fault(T_world_frame):
-            return pose.causal.T_world_cam
+            return pose.causal.T_world_frame
         return T_world_frame
 
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return the estimate of a pose; the causal one if GTSAM has none any more."""
         try:
             estimate = self._estimate(frame_id)
-            _check_result(estimate.T_world_cam)
+            _check_result(estimate.T_world_frame)
         except (RuntimeError, SmoothingError) as error:
             pose = self.poses[frame_id]
             place = f"{frame_id!r} at {pose.stamp_ns} ns"
@@ -383,7 +383,7 @@ class WindowGraph:
         pose = self.poses[frame_id]
         return Estimate(
             stamp_ns=pose.stamp_ns,
-            T_world_cam=self._isam.pose(pose.key),
+            T_world_frame=self._isam.pose(pose.key),
             covariance=self._isam.covariance(pose.key) if covariance is None else covariance,
             status=pose.status,
             frame_id=frame_id,

@@ -100,7 +100,7 @@ def _compose(
     return Estimate(
         stamp_ns=stamp_ns,
         # Over a million products the rotation would lose its orthogonality.
-        T_world_cam=se3.normalize(reference.T_world_cam @ T_reference_frame),
+        T_world_frame=se3.normalize(reference.T_world_frame @ T_reference_frame),
         covariance=se3.compose_covariance(reference.covariance, T_reference_frame, covariance),
         status=status,
     )
@@ -260,9 +260,9 @@ class RawChain(Generic[ObservationsT]):
         return poses.velocity is not None and 1e-9 * (stamp_ns - anchor_ns) <= MAX_EXTRAPOLATION_S
 
     def _predict(self, poses: PoseChain, node: _Node[ObservationsT], stamp_ns: int) -> MotionPrior:
-        T_world_newest = poses.newest.T_world_cam
+        T_world_newest = poses.newest.T_world_frame
         T_world_predicted = T_world_newest @ poses.predict(stamp_ns)[0]
-        T_node_world = se3.invert(node.estimate.T_world_cam)
+        T_node_world = se3.invert(node.estimate.T_world_frame)
         elapsed_s = 1e-9 * (stamp_ns - poses.newest.stamp_ns)
         T_newest_recent = se3.exp(self._recent.mean() * elapsed_s)
         return MotionPrior(
@@ -272,7 +272,7 @@ class RawChain(Generic[ObservationsT]):
 
     def _begin(self, current: ObservationsT) -> RawStep:
         estimate = Estimate(
-            stamp_ns=current.stamp_ns, T_world_cam=np.eye(4), covariance=np.zeros((6, 6))
+            stamp_ns=current.stamp_ns, T_world_frame=np.eye(4), covariance=np.zeros((6, 6))
         )
         self._poses = PoseChain(self._config, estimate)
         self._nodes = [_Node(observations=current, estimate=estimate, n_steps=0)]
@@ -425,11 +425,11 @@ class EdgeChain:
             reference = self._poses[edge.reference_id]
             estimate = chain.append(reference, stamp_ns, edge.T_reference_frame, edge.covariance)
             elapsed_s = 1e-9 * (stamp_ns - newest.stamp_ns)
-            T_newest_frame = se3.invert(newest.T_world_cam) @ estimate.T_world_cam
+            T_newest_frame = se3.invert(newest.T_world_frame) @ estimate.T_world_frame
             chain.velocity = se3.log(T_newest_frame) / elapsed_s if elapsed_s > 0 else None
         elif isinstance(prior, PosePrior):
             T, covariance = prior.T_world_frame, prior.covariance
-            chain.start(Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=covariance))
+            chain.start(Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=covariance))
         else:
             chain.coast(stamp_ns)
             return False

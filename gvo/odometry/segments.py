@@ -190,7 +190,7 @@ def _do_agree(before: RelocalizationCandidate, edge: Edge, raw: Estimate, known:
 
 def _step(first: Estimate, second: Estimate) -> tuple[FloatArray, FloatArray]:
     """Return T_first_second of two poses of a chain, and its covariance (6, 6)."""
-    T_first_second = se3.invert(first.T_world_cam) @ second.T_world_cam
+    T_first_second = se3.invert(first.T_world_frame) @ second.T_world_frame
     Ad = se3.adjoint(se3.invert(T_first_second))
     # The covariances of a chain add up step by step: their difference is that of what is between.
     return T_first_second, second.covariance - Ad @ first.covariance @ Ad.T

@@ -245,7 +245,7 @@ def _with_stamps(
         stamps_ns = folder.frame_stamps_ns()
         if len(stamps_ns) != len(truth):
             return truth
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=truth.T_world_cam)
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=truth.T_world_frame)
 
 
 def conclude(

@@ -125,7 +125,7 @@ def run_identity(
             "frame": base_frame.name,
             "mount": _digest_of(base_frame.fixed_mount),
             "initial pose": _digest_of(base_frame.T_initial),
-            "true start": "" if start is None else _digest_of(start.T_world_cam),
+            "true start": "" if start is None else _digest_of(start.T_world_frame),
         },
     }
 

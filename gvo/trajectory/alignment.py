@@ -203,13 +203,13 @@ class Similarity:
 
     def apply(self, trajectory: Trajectory) -> Trajectory:
         """Transform a trajectory, with its covariances if any, from world b to world a."""
-        scaled = np.array(trajectory.T_world_cam)
+        scaled = np.array(trajectory.T_world_frame)
         scaled[:, :3, 3] *= self.scale
         covariances = trajectory.covariances
         if covariances is not None:
             factors = np.array([1.0] * 3 + [self.scale] * 3)
             covariances = covariances * np.outer(factors, factors)
-        return replace(trajectory, T_world_cam=scaled, covariances=covariances).moved(self.T_a_b)
+        return replace(trajectory, T_world_frame=scaled, covariances=covariances).moved(self.T_a_b)
 
 
 def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> Similarity:
@@ -246,7 +246,7 @@ def alignment(reference: Trajectory, estimate: Trajectory, mode: AlignMode) -> S
         return Similarity(T_a_b=np.eye(4))
     if mode == "origin":
         _refuse_without_rotations(reference, estimate)
-        return Similarity(T_a_b=reference.T_world_cam[0] @ se3.invert(estimate.T_world_cam[0]))
+        return Similarity(T_a_b=reference.T_world_frame[0] @ se3.invert(estimate.T_world_frame[0]))
     if mode not in ("se3", "sim3"):
         raise ValueError(f"mode must be one of {get_args(AlignMode)}, got {mode!r}")
     return _fit(reference.positions, estimate.positions, is_scaled=mode == "sim3")

@@ -254,7 +254,7 @@ def _have_rotations(reference: Trajectory, estimate: Trajectory) -> bool:
 def _pair_errors(
     reference: Trajectory, estimate: Trajectory, first: IntArray, last: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    T_ref, T_est = reference.T_world_cam, estimate.T_world_cam
+    T_ref, T_est = reference.T_world_frame, estimate.T_world_frame
     motion_ref = se3.invert(T_ref[first]) @ T_ref[last]
     motion_est = se3.invert(T_est[first]) @ T_est[last]
     errors = se3.invert(motion_est) @ motion_ref

@@ -62,7 +62,7 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     Returns
     -------
     Trajectory
-        T_world_cam of TUM and KITTI files, T_world_body of EuRoC's ground truth.
+        T_world_frame of TUM and KITTI files, T_world_body of EuRoC's ground truth.
 
     Raises
     ------
@@ -138,14 +138,14 @@ def _upper(n: int) -> tuple[IntArray, IntArray]:
     return rows, columns
 
 
-def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
+def format_tum_line(stamp_ns: int, T_world_frame: FloatArray) -> str:
     """Return one line of a TUM file, without its line end.
 
     Parameters
     ----------
     stamp_ns : int
         Nanoseconds; written as seconds with nine decimals.
-    T_world_cam : ndarray of float64, shape (4, 4)
+    T_world_frame : ndarray of float64, shape (4, 4)
         Metres.
 
     Returns
@@ -155,8 +155,10 @@ def format_tum_line(stamp_ns: int, T_world_cam: FloatArray) -> str:
         quaternion.
     """
     # adding zero turns -0.0 into 0.0
-    t = " ".join(f"{round(value, 9) + 0.0:.9f}" for value in T_world_cam[:3, 3].tolist())
-    q = " ".join(f"{round(value, 12) + 0.0:.12f}" for value in se3.quaternion(T_world_cam[:3, :3]))
+    t = " ".join(f"{round(value, 9) + 0.0:.9f}" for value in T_world_frame[:3, 3].tolist())
+    q = " ".join(
+        f"{round(value, 12) + 0.0:.12f}" for value in se3.quaternion(T_world_frame[:3, :3])
+    )
     return f"{format_stamp(stamp_ns)} {t} {q}"
 
 
@@ -191,7 +193,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         If the file cannot be written.
     """
     _check_rotations(trajectory)
-    poses = zip(trajectory.stamps_ns, trajectory.T_world_cam, strict=True)
+    poses = zip(trajectory.stamps_ns, trajectory.T_world_frame, strict=True)
     _write_lines(path, (format_tum_line(int(stamp_ns), T) for stamp_ns, T in poses))
 
 
@@ -213,7 +215,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
         If the file cannot be written.
     """
     _check_rotations(trajectory)
-    rows = trajectory.T_world_cam[:, :3].reshape(-1, 12)
+    rows = trajectory.T_world_frame[:, :3].reshape(-1, 12)
     _write_lines(path, (" ".join(f"{value:.12e}" for value in row) for row in rows))
 
 
@@ -235,7 +237,7 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
         If the file cannot be written.
     """
     _check_rotations(trajectory)
-    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_cam[:, :3, :3]).as_quat()
+    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_frame[:, :3, :3]).as_quat()
     rows = zip(trajectory.stamps_ns, trajectory.positions, quaternions_xyzw, strict=True)
     lines = (
         ",".join([str(int(stamp_ns)), *(repr(float(x)) for x in (*t, w, *xyz))])
@@ -283,7 +285,7 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
 
 def _read_growing(rows: list[Row]) -> Trajectory:
     if not rows:
-        return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_cam=np.empty((0, 4, 4)))
+        return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
     order = np.argsort(read_stamps(rows, unit_ns=1_000_000_000), kind="stable")
     return _read_tum([rows[index] for index in order])
 
@@ -298,7 +300,7 @@ def _read_tum(rows: list[Row]) -> Trajectory:
     R = _rotations_of_quaternions(rows, values[:, 3:])
     return Trajectory(
         stamps_ns=check_increasing(rows, stamps_ns[is_last]),
-        T_world_cam=se3.make_transform(R, values[:, :3]),
+        T_world_frame=se3.make_transform(R, values[:, :3]),
     )
 
 
@@ -306,7 +308,7 @@ def _read_euroc(rows: list[Row]) -> Trajectory:
     values = read_numbers(rows, slice(1, 8), n_columns=len(rows[0].fields))
     stamps_ns = check_increasing(rows, read_stamps(rows, unit_ns=1))
     R = _rotations_of_quaternions(rows, values[:, [4, 5, 6, 3]])
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=se3.make_transform(R, values[:, :3]))
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=se3.make_transform(R, values[:, :3]))
 
 
 def _read_kitti(path: Path, rows: list[Row]) -> Trajectory:
@@ -317,7 +319,7 @@ def _read_kitti(path: Path, rows: list[Row]) -> Trajectory:
     stamps_ns, stamps_from = _kitti_stamps(path, len(rows))
     return Trajectory(
         stamps_ns=stamps_ns,
-        T_world_cam=se3.make_transform(se3.nearest_rotation(M), P[:, :, 3]),
+        T_world_frame=se3.make_transform(se3.nearest_rotation(M), P[:, :, 3]),
         stamps_from=stamps_from,
     )
 

@@ -126,12 +126,12 @@ def round_trip_error(
         return Failure(reason=f"frames with a pose both ways: {len(first)}, expected 2 or more")
     if first[0] != 0 or second[0] != len(trajectory) - 1:
         return Failure(reason="the way back does not end at the first frame")
-    poses = trajectory.T_world_cam
+    poses = trajectory.T_world_frame
     errors = se3.invert(poses[first]) @ poses[second]
     forward = trajectory.select(first)
     return RoundTripError(
         forward=forward,
-        backward=Trajectory(stamps_ns=forward.stamps_ns, T_world_cam=poses[second]),
+        backward=Trajectory(stamps_ns=forward.stamps_ns, T_world_frame=poses[second]),
         errors=errors,
         path_m=float(trajectory.distances()[-1]) if path_m is None else path_m,
         chi2=_chi2(errors[0], trajectory.covariances),

@@ -30,7 +30,7 @@ class Trajectory:
     ----------
     stamps_ns : ndarray of int64, shape (n,)
         Strictly increasing, nanoseconds.
-    T_world_cam : ndarray of float64, shape (n, 4, 4)
+    T_world_frame : ndarray of float64, shape (n, 4, 4)
         Map camera coordinates to the world, metres.
     covariances : ndarray of float64, shape (n, 6, 6), optional
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
@@ -49,7 +49,7 @@ class Trajectory:
     """
 
     stamps_ns: IntArray
-    T_world_cam: FloatArray
+    T_world_frame: FloatArray
     covariances: FloatArray | None = None
     stamps_from: StampsFrom = "file"
     has_rotations: bool = True
@@ -61,9 +61,9 @@ class Trajectory:
         stamps_ns = _checked_stamps(self.stamps_ns)
         n = len(stamps_ns)
         object.__setattr__(self, "stamps_ns", stamps_ns)
-        poses = _checked_array("T_world_cam", self.T_world_cam, (n, 4, 4))
+        poses = _checked_array("T_world_frame", self.T_world_frame, (n, 4, 4))
         _check_rigid(poses)
-        object.__setattr__(self, "T_world_cam", poses)
+        object.__setattr__(self, "T_world_frame", poses)
         if self.covariances is not None:
             covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
             object.__setattr__(self, "covariances", covariances)
@@ -76,7 +76,7 @@ class Trajectory:
         ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
         return cls(
             stamps_ns=np.array([estimate.stamp_ns for estimate in ordered], dtype=np.int64),
-            T_world_cam=np.array([e.T_world_cam for e in ordered]).reshape(-1, 4, 4),
+            T_world_frame=np.array([e.T_world_frame for e in ordered]).reshape(-1, 4, 4),
             covariances=np.array([e.covariance for e in ordered]).reshape(-1, 6, 6),
         )
 
@@ -100,7 +100,7 @@ class Trajectory:
             raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
         return cls(
             stamps_ns=stamps_ns,
-            T_world_cam=_unrotated(positions),
+            T_world_frame=_unrotated(positions),
             stamps_from=stamps_from,
             has_rotations=False,
         )
@@ -126,7 +126,7 @@ class Trajectory:
         """Return a table for notebooks."""
         return trajectory_html(
             self.stamps_ns,
-            self.T_world_cam,
+            self.T_world_frame,
             has_rotations=self.has_rotations,
             has_covariances=self.covariances is not None,
             stamps_from=self.stamps_from,
@@ -135,7 +135,7 @@ class Trajectory:
     @property
     def positions(self) -> FloatArray:
         """Camera centres in the world, shape (n, 3), metres."""
-        return self.T_world_cam[:, :3, 3]
+        return self.T_world_frame[:, :3, 3]
 
     def distances(self) -> FloatArray:
         """Return the path travelled up to each pose, shape (n,), metres, from zero."""
@@ -162,7 +162,7 @@ class Trajectory:
         return replace(
             self,
             stamps_ns=self.stamps_ns[chosen],
-            T_world_cam=self.T_world_cam[chosen],
+            T_world_frame=self.T_world_frame[chosen],
             covariances=None if covariances is None else covariances[chosen],
         )
 
@@ -177,7 +177,7 @@ class Trajectory:
         Returns
         -------
         Trajectory
-            T_world_cam @ T_cam_body, the covariances in the new frame.
+            T_world_frame @ T_cam_body, the covariances in the new frame.
 
         Raises
         ------
@@ -194,7 +194,7 @@ class Trajectory:
             # T exp(xi) B = T B exp(Ad(B^-1) xi)
             Ad = se3.adjoint(se3.invert(T_cam_body))
             covariances = Ad @ covariances @ Ad.T
-        return replace(self, T_world_cam=self.T_world_cam @ T_cam_body, covariances=covariances)
+        return replace(self, T_world_frame=self.T_world_frame @ T_cam_body, covariances=covariances)
 
     def moved(self, T_map_world: FloatArray) -> Trajectory:
         """Return the trajectory in another world frame.
@@ -207,12 +207,12 @@ class Trajectory:
         Returns
         -------
         Trajectory
-            T_map_world @ T_world_cam; the covariances, in the pose's own frame, stay the same.
+            T_map_world @ T_world_frame; the covariances, in the pose's own frame, stay the same.
         """
-        T_map_cam = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_cam
+        T_map_cam = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_frame
         if not self.has_rotations:
             T_map_cam = _unrotated(T_map_cam[:, :3, 3])
-        return replace(self, T_world_cam=T_map_cam)
+        return replace(self, T_world_frame=T_map_cam)
 
     def interpolate(self, stamps_ns: IntArray) -> Trajectory:
         """Interpolate poses at given stamps: positions linearly, rotations by SLERP.
@@ -237,8 +237,8 @@ class Trajectory:
         # at the first pose both neighbours are that pose, their span zero
         spans = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
-        poses = _between(self.T_world_cam[before], self.T_world_cam[after], shares)
-        return replace(self, stamps_ns=wanted, T_world_cam=poses, covariances=None)
+        poses = _between(self.T_world_frame[before], self.T_world_frame[after], shares)
+        return replace(self, stamps_ns=wanted, T_world_frame=poses, covariances=None)
 
 
 def _checked_stamps(stamps_ns: IntArray) -> IntArray:
@@ -271,7 +271,7 @@ def _check_rigid(poses: FloatArray) -> None:
     if not np.all(is_rigid):
         index = int(np.argmin(is_rigid))
         fault = se3.transform_fault(poses[index], tolerance=_ROTATION_TOLERANCE)
-        raise ValueError(f"T_world_cam[{index}] {fault}")
+        raise ValueError(f"T_world_frame[{index}] {fault}")
 
 
 def _unrotated(positions: FloatArray) -> FloatArray:

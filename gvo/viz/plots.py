@@ -381,7 +381,7 @@ def is_of_camera(reference: Trajectory) -> bool:
     if len(reference) == 0 or not reference.has_rotations:
         return False
     extents = np.ptp(reference.positions, axis=0)
-    begins = np.allclose(reference.T_world_cam[0], np.eye(4), atol=1e-3)
+    begins = np.allclose(reference.T_world_frame[0], np.eye(4), atol=1e-3)
     return bool(begins and extents[2] >= _FLAT * extents[1])
 
 

@@ -167,7 +167,7 @@ def _bytes(trajectories: tuple[Trajectory, Trajectory]) -> list[bytes]:
     return [
         array.tobytes()
         for trajectory in trajectories
-        for array in (trajectory.stamps_ns, trajectory.T_world_cam, trajectory.covariances)
+        for array in (trajectory.stamps_ns, trajectory.T_world_frame, trajectory.covariances)
         if array is not None
     ]
 
@@ -176,7 +176,7 @@ def _error(source: Source) -> float:
     """Return how far the last smoothed pose is from the true one, metres."""
     truth = source.ground_truth()
     assert truth is not None
-    T_first_last = np.linalg.inv(truth.T_world_cam[0]) @ truth.T_world_cam[-1]
+    T_first_last = np.linalg.inv(truth.T_world_frame[0]) @ truth.T_world_frame[-1]
     _, smoothed = _estimates(source)
     return float(np.linalg.norm(smoothed.positions[-1] - T_first_last[:3, 3]))
 

@@ -73,7 +73,7 @@ def robot(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     bag = PoseBag(tmp_path_factory.mktemp("robot") / "robot.mcap")
     stamps_ns = truth.stamps_ns.tolist()
     bag.tf(stamps_ns[0], "base_link", "camera_left_optical", T_base_cam, is_static=True)
-    for stamp_ns, T_world_cam in zip(stamps_ns, truth.T_world_cam, strict=True):
+    for stamp_ns, T_world_cam in zip(stamps_ns, truth.T_world_frame, strict=True):
         T_map_base = T_base_cam @ T_world_cam @ np.linalg.inv(T_base_cam)
         bag.tf(stamp_ns, "map", "base_link", T_map_base)
     return bag.write()

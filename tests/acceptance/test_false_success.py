@@ -22,11 +22,11 @@ class Tracked:
     """What the odometry said of each frame, and the truth."""
 
     results: list[FrameResult]
-    T_world_cam: FloatArray
+    T_world_frame: FloatArray
 
     def errors_m(self) -> FloatArray:
-        estimates = np.array([result.causal.T_world_cam[:3, 3] for result in self.results])
-        return np.asarray(np.linalg.norm(estimates - self.T_world_cam[:, :3, 3], axis=1))
+        estimates = np.array([result.causal.T_world_frame[:3, 3] for result in self.results])
+        return np.asarray(np.linalg.norm(estimates - self.T_world_frame[:, :3, 3], axis=1))
 
     def wrong_steps(self) -> Iterator[int]:
         """Yield frames registered far off: by 0.1 m or 0.5 deg, and 5 sigma of what was stated."""
@@ -34,8 +34,8 @@ class Tracked:
             result, before = self.results[n], self.results[n - 1]
             if result.registration is None:
                 continue
-            T_true = se3.invert(self.T_world_cam[n - 1]) @ self.T_world_cam[n]
-            T_raw = se3.invert(before.raw.T_world_cam) @ result.raw.T_world_cam
+            T_true = se3.invert(self.T_world_frame[n - 1]) @ self.T_world_frame[n]
+            T_raw = se3.invert(before.raw.T_world_frame) @ result.raw.T_world_frame
             x = se3.log(se3.invert(T_true) @ T_raw)
             is_far = np.linalg.norm(x[3:]) > 0.1 or np.linalg.norm(x[:3]) > np.radians(0.5)
             sigmas = np.sqrt(x @ np.linalg.solve(result.registration.covariance, x))
@@ -57,7 +57,7 @@ def follow(recording: SyntheticRecording, **sections: Any) -> Tracked:
     for frame in frames(recording, config):
         assert isinstance(frame, StereoFrame | RgbdFrame)
         results.append(odometry.track(frame))
-    return Tracked(results, recording.ground_truth().T_world_cam)
+    return Tracked(results, recording.ground_truth().T_world_frame)
 
 
 def test_a_bus_that_fills_two_thirds_of_the_view_does_not_carry_the_camera_along() -> None:
@@ -105,7 +105,7 @@ def test_a_bus_that_drives_by_does_not_move_a_camera_at_rest() -> None:
 def test_a_front_that_repeats_exactly_is_not_followed_by_a_window_off() -> None:
     tracked = track("facade", n_frames=45, scale=0.4)
     assert not list(tracked.wrong_steps())
-    travelled = np.linalg.norm(tracked.T_world_cam[-1, :3, 3])
+    travelled = np.linalg.norm(tracked.T_world_frame[-1, :3, 3])
     assert tracked.errors_m()[-1] < 0.03 * travelled
 
 

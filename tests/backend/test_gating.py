@@ -51,7 +51,7 @@ def test_of_two_edges_that_disagree_the_one_that_fits_the_motion_stays(
     estimate = window.add_pose(5, 5 * STEP_NS, edges[::-1] if is_wrong_first else edges)
     assert [refused.reference_id for refused in estimate.rejected] == [wrong]
     assert window.counts.n_gated == 1
-    np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-3)
+    np.testing.assert_allclose(estimate.T_world_frame, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("is_swapped", [False, True])

@@ -15,7 +15,7 @@ STEP_NS = 50_000_000
 
 
 def estimate(frame: int, stamp_ns: int, T: FloatArray, covariance: FloatArray) -> Estimate:
-    return Estimate(frame_id=frame, stamp_ns=stamp_ns, T_world_cam=T, covariance=covariance)
+    return Estimate(frame_id=frame, stamp_ns=stamp_ns, T_world_frame=T, covariance=covariance)
 
 
 def generator(twist: FloatArray) -> FloatArray:
@@ -30,7 +30,7 @@ def moving(
     poses = [start @ expm(0.05 * frame * generator(velocity)) for frame in range(n)]
     given = [estimate(k, k * STEP_NS, T, 1e-4 * np.eye(6)) for k, T in enumerate(poses)]
     for before, each in zip([None, *given[:-1]], given, strict=True):
-        place = None if before is None else before.T_world_cam
+        place = None if before is None else before.T_world_frame
         motion.append(each, is_measured=True, T_world_measured=place)
     return given
 
@@ -49,7 +49,7 @@ def test_a_constant_velocity_goes_on(seed: int) -> None:
     prediction = motion.predict_pose(last.stamp_ns + 2 * STEP_NS)
     assert prediction is not None
     T, covariance = prediction
-    np.testing.assert_allclose(T, last.T_world_cam @ T_last_frame, atol=1e-9)
+    np.testing.assert_allclose(T, last.T_world_frame @ T_last_frame, atol=1e-9)
     # The uncertainty of the last pose, seen from the new one, and that of the step.
     Ad = np.linalg.inv(se3.adjoint(T_last_frame))
     expected = Ad @ last.covariance @ Ad.T + step_covariance

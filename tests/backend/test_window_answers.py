@@ -79,11 +79,11 @@ def test_the_first_pose_is_where_it_is_told_and_the_rest_follows() -> None:
     first = window.add_pose(
         "a", 0, [], PosePrior(T_world_frame=start, covariance=1e-10 * np.eye(6))
     )
-    np.testing.assert_allclose(first.T_world_cam, start, atol=1e-12)
+    np.testing.assert_allclose(first.T_world_frame, start, atol=1e-12)
     assert np.sqrt(np.diag(first.covariance)).max() < 1e-4
     step = se3.exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 1.0]))
     second = window.add_pose("b", 7, [edge("a", step)], status=Status.RESUMED)
-    np.testing.assert_allclose(second.T_world_cam, start @ step, atol=1e-9)
+    np.testing.assert_allclose(second.T_world_frame, start @ step, atol=1e-9)
     assert (second.stamp_ns, second.frame_id, second.status) == (7, "b", Status.RESUMED)
     assert [e.status for e in window.finish()] == [Status.OK, Status.RESUMED]
 
@@ -94,7 +94,7 @@ def test_a_first_position_is_believed_but_for_what_is_unknown_of_it(sigma_m: flo
     place, variances = np.array([400.0, -500.0, 600.0]), sigma_m**2 * np.array([1.0, 4.0, 9.0])
     prior = PositionPrior(position_world=place, covariance=np.diag(variances))
     first = SlidingWindow(WindowConfig(size=5)).add_pose("a", 0, [], prior)
-    np.testing.assert_allclose(first.T_world_cam, se3.make_transform(np.eye(3), place), atol=1e-9)
+    np.testing.assert_allclose(first.T_world_frame, se3.make_transform(np.eye(3), place), atol=1e-9)
     expected = np.r_[np.ones(3), 1.0 / (1.0 / variances + 1e-8)]
     np.testing.assert_allclose(np.diag(first.covariance), expected, rtol=1e-6)
 
@@ -123,7 +123,7 @@ def test_arrays_rounded_to_single_precision_are_good_enough() -> None:
     assert found.causal[FAULTY].rejected == ()
     assert_complete(found)
     for one, other in zip(found.causal, plain_twin().causal, strict=True):
-        np.testing.assert_allclose(one.T_world_cam, other.T_world_cam, atol=1e-5)
+        np.testing.assert_allclose(one.T_world_frame, other.T_world_frame, atol=1e-5)
 
 
 def test_late_measurements_are_listed_with_the_others() -> None:
@@ -152,7 +152,7 @@ def test_a_pose_without_edges_continues_the_last_velocity() -> None:
         assert estimate.status == Status.COASTING
         assert estimate.rejected == ()
         expected = newest @ se3.exp(share * se3.log(step))
-        np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-6)
+        np.testing.assert_allclose(estimate.T_world_frame, expected, atol=1e-6)
         assert window.counts.n_coasting == 1
         assert [e.status for e in window.finish()][-1] == Status.COASTING
 
@@ -186,7 +186,7 @@ def test_a_gap_of_many_poses_loses_none_and_an_edge_across_it_brings_all_back() 
     assert back.rejected == ()
     assert back.status == Status.RESUMED
     assert window.counts.n_coasting == 40
-    np.testing.assert_allclose(back.T_world_cam, window.pose(last) @ across, atol=1e-5)
+    np.testing.assert_allclose(back.T_world_frame, window.pose(last) @ across, atol=1e-5)
     assert [e.frame_id for e in window.finish()] == list(range(45))
 
 
@@ -196,7 +196,7 @@ def test_a_full_prior_alone_is_enough_for_a_pose() -> None:
     prior = PosePrior(T_world_frame=place, covariance=1e-4 * np.eye(6))
     estimate = window.add_pose("x", 4 * STEP_NS, [], prior)
     assert (estimate.status, estimate.rejected) == (Status.OK, ())
-    np.testing.assert_allclose(estimate.T_world_cam, place, atol=1e-6)
+    np.testing.assert_allclose(estimate.T_world_frame, place, atol=1e-6)
     np.testing.assert_allclose(estimate.covariance, 1e-4 * np.eye(6), atol=1e-6)
     assert [e.frame_id for e in window.finish()] == [0, 1, 2, 3, "x"]
 
@@ -207,7 +207,7 @@ def test_a_position_alone_holds_a_coasting_pose() -> None:
     prior = PositionPrior(position_world=place, covariance=1e-6 * np.eye(3))
     estimate = window.add_pose("x", 4 * STEP_NS, [], prior)
     assert estimate.rejected == ()
-    np.testing.assert_allclose(estimate.T_world_cam[:3, 3], place, atol=1e-3)
+    np.testing.assert_allclose(estimate.T_world_frame[:3, 3], place, atol=1e-3)
     assert np.diag(estimate.covariance)[3:].max() < 1.1e-6
 
 
@@ -367,10 +367,10 @@ def test_a_window_that_finished_knows_nothing_of_the_motion_before() -> None:
     window.finish()
     first = window.add_pose("a", 0, [])
     assert first.status is Status.OK
-    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(first.T_world_frame, np.eye(4), atol=1e-12)
     second = window.add_pose("b", STEP_NS, [])
     assert second.status is Status.COASTING
-    np.testing.assert_allclose(second.T_world_cam, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(second.T_world_frame, np.eye(4), atol=1e-9)
     assert window.newest == "b"
 
 
@@ -411,7 +411,7 @@ def reconfigured(
 
 def stacked(estimates: list[Estimate]) -> FloatArray:
     ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
-    return np.stack([estimate.T_world_cam for estimate in ordered])
+    return np.stack([estimate.T_world_frame for estimate in ordered])
 
 
 def test_a_smaller_window_lets_poses_leave_with_the_next_update() -> None:
@@ -532,5 +532,5 @@ def test_each_pose_is_finished_exactly_once_over_any_changes(
     finished += window.finish()
     assert sorted(estimate.stamp_ns for estimate in finished) == [n * STEP_NS for n in range(40)]
     assert all(
-        np.isfinite(e.T_world_cam).all() and np.isfinite(e.covariance).all() for e in finished
+        np.isfinite(e.T_world_frame).all() and np.isfinite(e.covariance).all() for e in finished
     )

@@ -151,7 +151,7 @@ def test_a_batch_optimization_that_fails_leaves_the_estimates_as_they_were(
     for estimate in finished:
         assert_sound(estimate)
         np.testing.assert_allclose(
-            estimate.T_world_cam, before[number(estimate.frame_id)], atol=1e-9
+            estimate.T_world_frame, before[number(estimate.frame_id)], atol=1e-9
         )
     assert messages(caplog)
 
@@ -170,7 +170,7 @@ def test_others_are_looked_at_where_a_new_pose_moved_them(is_moved: bool) -> Non
         patch.setattr(PoseGraph, "positions", lambda _: FAR)
         patch.setattr(PoseGraph, "iterate", lambda *_, **__: is_moved)
         estimate = window.add_pose(5, 5 * STEP_NS, [edge(4, STEP)])
-    np.testing.assert_allclose(estimate.T_world_cam, power(5), atol=1e-6)
+    np.testing.assert_allclose(estimate.T_world_frame, power(5), atol=1e-6)
     assert (window.counts.n_restored > 0) is is_moved
     assert window.counts.n_edges == (4 if is_moved else 5)
     for frame_id, T in before.items():
@@ -197,7 +197,7 @@ def test_an_estimate_that_is_nowhere_is_the_causal_one(value: float) -> None:
         found = window.estimate(2)
         finished = window.finish()
     for each in (found, finished[2]):
-        np.testing.assert_allclose(each.T_world_cam, expected.T_world_cam, atol=1e-6)
+        np.testing.assert_allclose(each.T_world_frame, expected.T_world_frame, atol=1e-6)
         assert np.isfinite(each.covariance).all()
         assert each.status is Status.OK
 
@@ -275,7 +275,7 @@ def test_an_update_that_fails_takes_all_measurements_of_its_pose_along() -> None
     assert [each.reference_id for each in found.rejected] == [4, 3, None]
     assert {each.reason for each in found.rejected} == {"GTSAM gave up on the update"}
     assert found.status is Status.COASTING
-    np.testing.assert_allclose(found.T_world_cam, power(5), atol=1e-6)
+    np.testing.assert_allclose(found.T_world_frame, power(5), atol=1e-6)
     counts = window.counts
     assert (counts.n_edges, counts.n_priors, counts.n_rejected) == (4, 0, 3)
     assert (counts.n_gated, counts.n_coasting, counts.n_poses) == (0, 1, 6)
@@ -297,12 +297,12 @@ def test_a_graph_that_is_made_anew_knows_its_poses_and_no_measurements(
     assert all(window.edges(frame) == () for frame in range(6))
     for frame, each in before.items():
         found = window.estimate(frame)
-        np.testing.assert_allclose(found.T_world_cam, each.T_world_cam, atol=1e-9)
+        np.testing.assert_allclose(found.T_world_frame, each.T_world_frame, atol=1e-9)
         # As told before but for what the poses have in common, which can only be less.
         assert np.all(np.diag(found.covariance) <= np.diag(each.covariance) * (1 + 1e-6))
         np.testing.assert_allclose(np.diag(found.covariance), np.diag(each.covariance), rtol=0.3)
     for each in go_on(window, 6, 9):  # the motion is kept
-        np.testing.assert_allclose(each.T_world_cam, power(number(each.frame_id)), atol=1e-6)
+        np.testing.assert_allclose(each.T_world_frame, power(number(each.frame_id)), atol=1e-6)
     assert [each.frame_id for each in window.finish()] == list(range(9))
 
 
@@ -311,11 +311,11 @@ def test_the_first_pose_that_fails_is_the_origin_no_more_but_stays_where_it_is()
     with failing("update", [0]):
         first = window.add_pose("a", 0, [], PLACE)
     assert [each.reference_id for each in first.rejected] == [None]
-    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(first.T_world_frame, np.eye(4), atol=1e-12)
     assert (window.counts.n_priors, window.counts.n_rejected) == (0, 1)
     assert first.status is Status.OK
     second = window.add_pose("b", STEP_NS, [edge("a", STEP)])
-    np.testing.assert_allclose(second.T_world_cam, STEP, atol=1e-9)
+    np.testing.assert_allclose(second.T_world_frame, STEP, atol=1e-9)
 
 
 def test_a_first_pose_that_gtsam_never_takes_is_handed_over_where_the_world_begins() -> None:
@@ -325,7 +325,7 @@ def test_a_first_pose_that_gtsam_never_takes_is_handed_over_where_the_world_begi
         second = window.add_pose("b", STEP_NS, [])
     assert len(window) == 0
     for estimate in (first, second):
-        np.testing.assert_array_equal(estimate.T_world_cam, np.eye(4))
+        np.testing.assert_array_equal(estimate.T_world_frame, np.eye(4))
     assert np.linalg.eigvalsh(first.covariance)[0] > 0.0
     assert second.covariance[5, 5] > first.covariance[5, 5]
     # The window itself is whole: the next pose that GTSAM takes begins it.
@@ -343,10 +343,10 @@ def test_where_there_is_no_covariance_any_more_the_causal_pose_stands(
     assert len(causal.rejected) == 1
     turned = edge(0, se3.normalize(STEP @ STEP @ STEP @ STEP @ STEP), 1e-3)
     assert isinstance(window.add_edge(4, turned), Estimate)
-    assert not np.allclose(window.pose(4), causal.T_world_cam, atol=1e-4)
+    assert not np.allclose(window.pose(4), causal.T_world_frame, atol=1e-4)
     with caplog.at_level(logging.WARNING, logger="gvo"), failing("marginalCovariance"):
         found = window.estimate(4)
-    np.testing.assert_array_equal(found.T_world_cam, causal.T_world_cam)
+    np.testing.assert_array_equal(found.T_world_frame, causal.T_world_frame)
     np.testing.assert_array_equal(found.covariance, causal.covariance)
     assert (found.frame_id, found.stamp_ns, found.status) == (4, 4 * STEP_NS, causal.status)
     assert found.rejected == ()  # told once, with the pose
@@ -361,7 +361,9 @@ def test_where_the_joint_covariance_is_lost_two_poses_share_nothing() -> None:
     with failing("jointMarginalCovariance"):
         found = window.relative_pose(2, 5)
     H_first, H_last = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
-    between = gtsam.Pose3(first.T_world_cam).between(gtsam.Pose3(last.T_world_cam), H_first, H_last)
+    between = gtsam.Pose3(first.T_world_frame).between(
+        gtsam.Pose3(last.T_world_frame), H_first, H_last
+    )
     expected = H_first @ first.covariance @ H_first.T + H_last @ last.covariance @ H_last.T
     np.testing.assert_allclose(found.T_reference_frame, between.matrix(), atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-6, atol=1e-12)
@@ -389,7 +391,7 @@ def test_a_whole_window_that_cannot_be_made_to_slide_goes_on_all_the_same(
     assert [each.frame_id for each in finished] == list(range(12))
     for frame, each in enumerate(finished):
         expected = np.linalg.matrix_power(STEP, frame)
-        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-6)
+        np.testing.assert_allclose(each.T_world_frame, expected, atol=1e-6)
 
 
 def test_where_cholesky_gives_up_the_batch_is_solved_by_qr() -> None:

@@ -59,7 +59,7 @@ def damage(T: FloatArray, covariance: FloatArray, breakage: str) -> tuple[FloatA
 
 
 def assert_sound(estimate: Estimate) -> None:
-    assert se3.transform_fault(estimate.T_world_cam, tolerance=1e-6) == ""
+    assert se3.transform_fault(estimate.T_world_frame, tolerance=1e-6) == ""
     assert_covariance(estimate.covariance)
 
 
@@ -179,7 +179,7 @@ class WindowMachine(RuleBasedStateMachine):
         assert_sound(estimate)
         assert (estimate.frame_id, estimate.stamp_ns) == (frame, self.stamps[frame])
         if frame in self.window:
-            np.testing.assert_allclose(self.window.pose(frame), estimate.T_world_cam, atol=1e-9)
+            np.testing.assert_allclose(self.window.pose(frame), estimate.T_world_frame, atol=1e-9)
         else:  # where GTSAM takes it not even alone it is reckoned, and handed over at once
             assert self.window.counts.n_restored > 0
 

@@ -243,7 +243,7 @@ def test_full_smoothing_of_a_loopy_graph_is_the_batch_optimum(seed: int, with_pr
     assert [e.frame_id for e in smoothed] == list(range(40))
     for frame, estimate in enumerate(smoothed):
         expected = optimum.atPose3(frame).matrix()
-        np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-6)
+        np.testing.assert_allclose(estimate.T_world_frame, expected, atol=1e-6)
         assert_equal_covariances(estimate.covariance, marginals.marginalCovariance(frame), 0.05)
     assert window.batch_result is not None
     error = build(problem).error(optimum)
@@ -265,7 +265,7 @@ def test_each_answer_is_the_batch_optimum_of_what_was_known(seed: int, with_prio
         )
         optimum, marginals = batch(known, n=n)
         expected = optimum.atPose3(n - 1).matrix()
-        np.testing.assert_allclose(causal[n - 1].T_world_cam, expected, atol=1e-7)
+        np.testing.assert_allclose(causal[n - 1].T_world_frame, expected, atol=1e-7)
         covariance = marginals.marginalCovariance(n - 1)
         assert_equal_covariances(causal[n - 1].covariance, covariance, 1e-3)
 
@@ -286,7 +286,7 @@ def test_late_measurements_are_polished_with_the_others_and_the_gain_is_told() -
     optimum, _ = batch(problem)
     for frame, each in enumerate(smoothed):
         expected = optimum.atPose3(frame).matrix()
-        np.testing.assert_allclose(each.T_world_cam, expected, atol=1e-4)
+        np.testing.assert_allclose(each.T_world_frame, expected, atol=1e-4)
     assert window.batch_result is not None
     assert window.batch_result.error_after == pytest.approx(build(problem).error(optimum), rel=1e-4)
     assert window.batch_result.error_after > 1.0
@@ -312,8 +312,8 @@ def test_a_late_loop_answers_with_the_pose_it_moved() -> None:
     optimum, marginals = batch(replace(problem, late_edges={29: [(29, loop)]}))
     expected = optimum.atPose3(29).matrix()
     assert np.abs(before - expected).max() > 1e-4  # there was something to close
-    np.testing.assert_allclose(answer.T_world_cam, expected, atol=1e-5)
-    np.testing.assert_allclose(answer.T_world_cam, window.pose(29), atol=1e-12)
+    np.testing.assert_allclose(answer.T_world_frame, expected, atol=1e-5)
+    np.testing.assert_allclose(answer.T_world_frame, window.pose(29), atol=1e-12)
     assert_equal_covariances(answer.covariance, marginals.marginalCovariance(29), 5e-3)
 
 
@@ -444,7 +444,7 @@ def test_full_smoothing_with_a_kernel_reaches_the_cost_of_the_batch(
     assert min(edge.weight for edge in window.graph()) < 0.9  # the kernel has something to do
     smoothed = window.finish()
     graph = build(problem, kernel, threshold=threshold)
-    found = values_of({number(e.frame_id): e.T_world_cam for e in smoothed})
+    found = values_of({number(e.frame_id): e.T_world_frame for e in smoothed})
     truth = values_of(dict(enumerate(problem.poses)))
     assert graph.error(found) <= graph.error(optimise(graph, found)) * (1 + 1e-6)
     if kernel in ("huber", "cauchy"):  # the others have many optima
@@ -466,7 +466,7 @@ def test_edges_that_agree_within_the_kernel_give_their_mean_in_any_order(
     edges = [edge(0, shifted(x), 1e-3) for x in (-0.0025, 0.0025, 0.0015)]
     estimate = window.add_pose(1, 1, [edges[i] for i in order])
     assert [each.weight for each in window.graph() if each.reference_id == 0] == [1.0, 1.0, 1.0]
-    assert estimate.T_world_cam[0, 3] == pytest.approx(0.0005, abs=2e-5)
+    assert estimate.T_world_frame[0, 3] == pytest.approx(0.0005, abs=2e-5)
 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:])
@@ -509,7 +509,7 @@ def assert_refused(
     assert [r.reference_id for r in found.rejected] == [wrong.reference_id]
     assert found.rejected[0].reason
     assert (window.counts.n_gated, twin.counts.n_gated) == (1, 0)
-    np.testing.assert_allclose(found.T_world_cam, expected.T_world_cam, atol=atol)
+    np.testing.assert_allclose(found.T_world_frame, expected.T_world_frame, atol=atol)
     # Of other start values: linearized a hundredth elsewhere.
     assert_equal_covariances(found.covariance, expected.covariance, 0.03)
 
@@ -579,7 +579,7 @@ def test_a_loop_closure_after_long_drift_is_not_refused_with_a_pose(seed: int) -
     # The drift is many sigmas of the loop.
     assert np.linalg.norm(drifted[:3, 3] - expected[:3, 3]) > 0.1
     assert estimate.rejected == ()
-    np.testing.assert_allclose(estimate.T_world_cam, expected, atol=0.1)
+    np.testing.assert_allclose(estimate.T_world_frame, expected, atol=0.1)
     following = replace(edges[1][0], reference_id=299)
     assert window.add_pose(300, 300, [following]).rejected == ()
     np.testing.assert_allclose(window.pose(299), expected, atol=0.01)
@@ -594,13 +594,13 @@ def test_a_loop_closure_after_long_drift_is_not_refused_later(seed: int) -> None
     assert np.linalg.norm(window.pose(149)[:3, 3] - poses[149][:3, 3]) > 0.05
     answer = window.add_edge(149, loop)
     assert not isinstance(answer, Rejected)
-    np.testing.assert_allclose(answer.T_world_cam, poses[149], atol=0.1)
-    np.testing.assert_allclose(window.finish()[149].T_world_cam, poses[149], atol=0.01)
+    np.testing.assert_allclose(answer.T_world_frame, poses[149], atol=0.1)
+    np.testing.assert_allclose(window.finish()[149].T_world_frame, poses[149], atol=0.01)
 
 
 def test_without_a_prior_the_first_pose_is_the_identity_and_nearly_sure() -> None:
     first = SlidingWindow().add_pose("a", 0, [])
-    np.testing.assert_allclose(first.T_world_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(first.T_world_frame, np.eye(4), atol=1e-12)
     np.testing.assert_allclose(first.covariance, 1e-10 * np.eye(6), atol=1e-16)
 
 
@@ -621,12 +621,12 @@ def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) ->
     window = SlidingWindow(WindowConfig(size=size, kernel="none"))
     causal = feed(window, problem)
     optimum, _ = batch(problem)
-    np.testing.assert_allclose(causal[-1].T_world_cam, poses[-1], atol=0.05)
-    np.testing.assert_allclose(causal[-1].T_world_cam, optimum.atPose3(79).matrix(), atol=0.01)
+    np.testing.assert_allclose(causal[-1].T_world_frame, poses[-1], atol=0.05)
+    np.testing.assert_allclose(causal[-1].T_world_frame, optimum.atPose3(79).matrix(), atol=0.01)
     if size is None:
         for estimate in window.finish():
             expected = optimum.atPose3(number(estimate.frame_id)).matrix()
-            np.testing.assert_allclose(estimate.T_world_cam, expected, atol=1e-5)
+            np.testing.assert_allclose(estimate.T_world_frame, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -644,8 +644,8 @@ def test_smoothing_consecutive_edges_returns_the_chain(
     for frame in range(n):
         if frame:
             chained = chained @ edges[frame][0].T_reference_frame
-        np.testing.assert_allclose(causal[frame].T_world_cam, chained, atol=1e-6)
-        np.testing.assert_allclose(smoothed[frame].T_world_cam, chained, atol=1e-6)
+        np.testing.assert_allclose(causal[frame].T_world_frame, chained, atol=1e-6)
+        np.testing.assert_allclose(smoothed[frame].T_world_frame, chained, atol=1e-6)
 
 
 # Keyframes that come and go.
@@ -668,7 +668,7 @@ def random_soak(
         references += rng.permutation(np.array(candidates, dtype=int))[:2].tolist()
         edges.append([measure(poses, i, frame, rng, 2e-3) for i in references])
         estimate = window.add_pose(frame, frame * STEP_NS, edges[-1])
-        assert np.isfinite(estimate.T_world_cam).all()
+        assert np.isfinite(estimate.T_world_frame).all()
         assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
         finished += window.pop_finished()
         if rng.random() < 0.4:
@@ -691,7 +691,9 @@ def test_keyframes_may_come_and_go_for_hundreds_of_poses(seed: int) -> None:
     assert all(e.stamp_ns == number(e.frame_id) * STEP_NS for e in finished)
     assert largest <= 5 + 6 + 1
     optimum, _ = batch(Problem(poses=poses, edges=edges))
-    windowed = np.array([e.T_world_cam[:3, 3] for e in sorted(finished, key=lambda e: e.stamp_ns)])
+    windowed = np.array(
+        [e.T_world_frame[:3, 3] for e in sorted(finished, key=lambda e: e.stamp_ns)]
+    )
     batched = np.array([optimum.atPose3(i).matrix()[:3, 3] for i in range(n)])
     length = np.linalg.norm(np.diff(batched, axis=0), axis=1).sum()
     assert np.abs(windowed - batched).max() < 0.002 * length
@@ -740,7 +742,7 @@ def test_a_loop_with_a_large_turn_is_closed_when_the_call_returns(turn_rad: floa
     optimum, _ = optimum_of(before, [*edges, (N - 1, loop)])
     moved = se3.invert(before[N - 1]) @ optimum.atPose3(N - 1).matrix()
     assert se3.rotation_angle(moved) > 0.4
-    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N - 1).matrix(), atol=1e-4)
+    np.testing.assert_allclose(answer.T_world_frame, optimum.atPose3(N - 1).matrix(), atol=1e-4)
     for frame, T in enumerate(window.poses().values()):
         np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
 
@@ -758,7 +760,7 @@ def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once_with_the
     assert answer.rejected == ()
     everything = [*edges, *((N, each) for each in arriving)]
     optimum, _ = optimum_of(before | {N: power(N)}, everything)
-    np.testing.assert_allclose(answer.T_world_cam, optimum.atPose3(N).matrix(), atol=2e-4)
+    np.testing.assert_allclose(answer.T_world_frame, optimum.atPose3(N).matrix(), atol=2e-4)
     for frame, T in enumerate(window.poses().values()):
         np.testing.assert_allclose(T, optimum.atPose3(frame).matrix(), atol=1e-3)
 
@@ -793,7 +795,7 @@ def test_a_whole_graph_takes_sigmas_at_which_cholesky_gives_up(
     expected = covariance[-6:, -6:]
     assert_equal_covariances(window.covariance(N - 1), expected, 1e-3)
     for frame, each in enumerate(window.finish()):
-        np.testing.assert_allclose(each.T_world_cam, power(frame), atol=1e-4)
+        np.testing.assert_allclose(each.T_world_frame, power(frame), atol=1e-4)
     assert window.batch_result is not None
     assert window.batch_result.error_after == pytest.approx(0.0, abs=1e-6)
 

@@ -209,7 +209,10 @@ def test_a_prior_that_contradicts_a_sure_window_is_believed_and_the_window_goes_
         if jump < 100.0:  # beyond, no step of Gauss-Newton comes back
             assert found.window.counts.n_priors == 1
             assert (
-                abs(found.causal[-1].T_world_cam[0, 3] - plain_twin().causal[-1].T_world_cam[0, 3])
+                abs(
+                    found.causal[-1].T_world_frame[0, 3]
+                    - plain_twin().causal[-1].T_world_frame[0, 3]
+                )
                 > 0.01 * jump
             )
         assert_complete(found)

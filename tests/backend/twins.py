@@ -114,7 +114,7 @@ def twin_without_edges() -> Run:
 
 
 def assert_sound(estimate: Estimate) -> None:
-    assert se3.transform_fault(estimate.T_world_cam, tolerance=1e-6) == ""
+    assert se3.transform_fault(estimate.T_world_frame, tolerance=1e-6) == ""
     assert se3.covariance_fault(estimate.covariance) == ""
 
 
@@ -133,7 +133,7 @@ def assert_as_twin(found: Run, twin: Run) -> None:
         for one, other in zip(ours, theirs, strict=True):
             assert (one.frame_id, one.stamp_ns) == (other.frame_id, other.stamp_ns)
             assert one.status == other.status
-            np.testing.assert_allclose(one.T_world_cam, other.T_world_cam, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(one.T_world_frame, other.T_world_frame, rtol=0, atol=1e-9)
             scale = np.abs(other.covariance).max()
             np.testing.assert_allclose(
                 one.covariance / scale, other.covariance / scale, rtol=0, atol=1e-9

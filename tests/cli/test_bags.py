@@ -50,7 +50,7 @@ def is_one_line(text: str) -> bool:
 
 
 def poses(folder: Path, name: str) -> FloatArray:
-    return read_trajectory(folder / f"{name}.txt").T_world_cam
+    return read_trajectory(folder / f"{name}.txt").T_world_frame
 
 
 def frame_stamps(folder: Path) -> list[int]:
@@ -324,7 +324,7 @@ def test_the_bag_of_a_run_holds_the_poses_of_its_files(
         trajectory = read_trajectory(out / f"{name}.txt")
         assert sorted(found) == trajectory.stamps_ns.tolist()
         np.testing.assert_allclose(
-            np.array([found[stamp] for stamp in sorted(found)]), trajectory.T_world_cam, atol=2e-9
+            np.array([found[stamp] for stamp in sorted(found)]), trajectory.T_world_frame, atol=2e-9
         )
     compared = command("compare", out / "raw.txt", f"{path}#/gvo/raw/odometry", "--json")
     assert json.loads(compared.out)["estimates"][0]["ate_m"] < 1e-8

@@ -90,11 +90,11 @@ def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path
     for trajectory in _TRAJECTORIES:
         folder, *bags = (read_trajectory(out / trajectory) for out in outs)
         for bag in bags:
-            np.testing.assert_allclose(bag.T_world_cam, folder.T_world_cam, rtol=0, atol=2e-9)
+            np.testing.assert_allclose(bag.T_world_frame, folder.T_world_frame, rtol=0, atol=2e-9)
     camera = tmp_path / "camera"
     assert command("run", "--no-report", tmp_path / "a.bag", "--out", camera).code == 0
-    T_first_cam = read_trajectory(camera / "raw.txt").T_world_cam
-    T_first_body = read_trajectory(outs[0] / "raw.txt").T_world_cam
+    T_first_cam = read_trajectory(camera / "raw.txt").T_world_frame
+    T_first_body = read_trajectory(outs[0] / "raw.txt").T_world_frame
     np.testing.assert_allclose(
         T_first_body, T_body_cam @ T_first_cam @ np.linalg.inv(T_body_cam), rtol=0, atol=1e-8
     )

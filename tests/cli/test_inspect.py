@@ -278,7 +278,9 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
     # Each keypoint is kept, or counted once under the test it failed.
     assert sum(stereo.values()) == 2 * stereo["n"]
     position = np.loadtxt(run / "raw.txt")[4, 1:4]
-    np.testing.assert_allclose(np.array(numbers["raw"]["T_world_cam"])[:3, 3], position, atol=1e-8)
+    np.testing.assert_allclose(
+        np.array(numbers["raw"]["T_world_frame"])[:3, 3], position, atol=1e-8
+    )
 
 
 @pytest.mark.acceptance

@@ -53,7 +53,7 @@ def observations(sensor: Sensor) -> list[KltObservations]:
 
 
 def true_motion(sensor: Sensor, reference: int, current: int) -> FloatArray:
-    poses = recording(sensor).ground_truth().T_world_cam
+    poses = recording(sensor).ground_truth().T_world_frame
     return np.asarray(se3.invert(poses[reference]) @ poses[current])
 
 
@@ -215,7 +215,7 @@ def test_a_drive_at_a_low_rate_begins_without_a_prediction() -> None:
     first, last = tracker.extract(seen[0]), tracker.extract(seen[4])
     result = tracker.register(first, last)
     assert isinstance(result, RelativePose)
-    poses = drive.ground_truth().T_world_cam
+    poses = drive.ground_truth().T_world_frame
     error = se3.log(
         se3.invert(result.T_reference_current) @ np.asarray(se3.invert(poses[0]) @ poses[4])
     )

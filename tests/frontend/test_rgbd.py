@@ -16,7 +16,7 @@ seeds = st.integers(min_value=0, max_value=2**32 - 1)
 SETTINGS = DepthConfig(min_depth_m=0.5, max_depth_m=6.0, max_edge_step=0.1, edge_radius_px=2)
 RECORDING = SyntheticRecording("handheld", "rgbd", n_frames=31, scale=1.0)
 IMAGES = list(RECORDING.images())
-T_WORLD_CAM = RECORDING.ground_truth().T_world_cam
+T_WORLD_CAM = RECORDING.ground_truth().T_world_frame
 CONFIG = DepthConfig()
 CAMERA = as_stereo(RECORDING.info.camera, Config())
 

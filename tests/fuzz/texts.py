@@ -77,7 +77,7 @@ def _poses(data: bytes) -> None:
 
 
 def _check_finite(trajectory: Trajectory) -> None:
-    if not np.all(np.isfinite(trajectory.T_world_cam)):
+    if not np.all(np.isfinite(trajectory.T_world_frame)):
         raise AssertionError("poses that are not finite were taken")
 
 

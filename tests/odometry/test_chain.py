@@ -102,7 +102,7 @@ def stamps_of(n: int, start: int = 0) -> list[int]:
 
 def test_the_first_frame_is_the_world() -> None:
     steps, _ = run([0], set())
-    np.testing.assert_array_equal(steps[0].estimate.T_world_cam, np.eye(4))
+    np.testing.assert_array_equal(steps[0].estimate.T_world_frame, np.eye(4))
     np.testing.assert_array_equal(steps[0].estimate.covariance, np.zeros((6, 6)))
     assert steps[0].reference_ns is None
     assert steps[0].is_registered
@@ -120,7 +120,7 @@ def test_the_chain_is_the_product_of_its_relative_poses(seed: int) -> None:
     for step, stamp, previous in zip(steps, stamps, [None, *stamps], strict=False):
         product = product @ step.T_reference_frame
         expected = np.linalg.inv(poses[stamps[0]]) @ poses[stamp]
-        np.testing.assert_allclose(step.estimate.T_world_cam, expected, atol=1e-9)
+        np.testing.assert_allclose(step.estimate.T_world_frame, expected, atol=1e-9)
         np.testing.assert_allclose(product, expected, atol=1e-9)
         assert step.reference_ns == previous
         assert step.is_registered
@@ -136,7 +136,7 @@ def test_the_covariance_grows_as_sampled_chains_spread() -> None:
     for step in steps[1:]:
         noise = rng.multivariate_normal(np.zeros(6), COVARIANCE, len(T))
         T = T @ step.T_reference_frame @ se3.exp(noise)
-    errors = se3.log(np.linalg.inv(steps[-1].estimate.T_world_cam) @ T)
+    errors = se3.log(np.linalg.inv(steps[-1].estimate.T_world_frame) @ T)
     covariance = steps[-1].estimate.covariance
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     np.testing.assert_allclose(np.cov(errors.T) / scale, covariance / scale, atol=0.05)
@@ -155,7 +155,7 @@ def test_a_bad_frame_in_between_coasts_and_the_next_is_tied_to_the_one_before_it
     assert steps[4].failure is None
     # At a constant rate coasting goes where the camera went.
     for step, stamp in zip(steps, stamps, strict=True):
-        np.testing.assert_allclose(step.estimate.T_world_cam, steady(stamp), atol=1e-9)
+        np.testing.assert_allclose(step.estimate.T_world_frame, steady(stamp), atol=1e-9)
     references = [a for a, b, _ in frontend.asked if b == stamps[4]]
     assert list(dict.fromkeys(references)) == [stamps[3], stamps[2]]
 
@@ -178,14 +178,14 @@ def test_a_long_gap_coasts_on_and_comes_back_to_the_last_good_frame() -> None:
     assert [step.is_registered for step in steps] == [True] * 5 + [False] * 10 + [True] * 5
     assert steps[15].reference_ns == stamps[4]
     assert [step.reference_ns for step in steps[5:15]] == stamps[4:14]
-    np.testing.assert_allclose(steps[19].estimate.T_world_cam, steady(stamps[19]), atol=1e-9)
+    np.testing.assert_allclose(steps[19].estimate.T_world_frame, steady(stamps[19]), atol=1e-9)
 
 
 def test_coasting_goes_on_by_the_time_that_passed() -> None:
     stamps = [0, STEP_NS, 4 * STEP_NS, 5 * STEP_NS]
     steps, _ = run(stamps, {stamps[2]})
     assert not steps[2].is_registered
-    np.testing.assert_allclose(steps[2].estimate.T_world_cam, steady(stamps[2]), atol=1e-9)
+    np.testing.assert_allclose(steps[2].estimate.T_world_frame, steady(stamps[2]), atol=1e-9)
 
 
 def test_a_velocity_is_not_carried_over_a_long_gap() -> None:
@@ -232,7 +232,7 @@ def test_frames_from_the_start_on_may_be_blank() -> None:
 
 def test_rotations_stay_rotations_over_a_long_chain() -> None:
     steps, _ = run(stamps_of(2000), set())
-    R = steps[-1].estimate.T_world_cam[:3, :3]
+    R = steps[-1].estimate.T_world_frame[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
@@ -273,7 +273,7 @@ def test_a_relative_pose_that_is_none_is_a_failure_and_the_chain_goes_on(
     assert [step.is_registered for step in steps] == [stamp != stamps[3] for stamp in stamps]
     assert steps[3].failure is not None
     assert "front-end is at fault" in steps[3].failure.reason
-    np.testing.assert_allclose(steps[5].estimate.T_world_cam, steady(stamps[5]), atol=1e-9)
+    np.testing.assert_allclose(steps[5].estimate.T_world_frame, steady(stamps[5]), atol=1e-9)
 
 
 def test_steps_are_counted_from_where_they_start() -> None:

@@ -22,7 +22,7 @@ def causal(n: int, T: FloatArray | None = None) -> Estimate:
     """Return what the window says of pose n; of later poses the chain takes only the name."""
     return Estimate(
         stamp_ns=n * SECOND,
-        T_world_cam=np.eye(4) if T is None else T,
+        T_world_frame=np.eye(4) if T is None else T,
         covariance=1e-10 * np.eye(6),
         frame_id=n,
     )
@@ -44,7 +44,7 @@ def test_the_chain_is_the_product_of_the_first_edges(seed: int) -> None:
         step, other = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6))
         T.append(T[reference] @ step)
         raw = chain.advance(causal(n), [edge(reference, step), edge(n - 1, other)], None)
-        np.testing.assert_allclose(raw.T_world_cam, T[n], atol=1e-9)
+        np.testing.assert_allclose(raw.T_world_frame, T[n], atol=1e-9)
         assert raw.status is Status.OK
 
 
@@ -54,7 +54,7 @@ def test_an_unusable_edge_is_passed_over() -> None:
     step = se3.exp(np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
     edges = [edge(0, np.full((4, 4), np.nan)), edge(77, np.eye(4)), edge(0, step)]
     raw = chain.advance(causal(1), edges, None)
-    np.testing.assert_allclose(raw.T_world_cam, step, atol=1e-12)
+    np.testing.assert_allclose(raw.T_world_frame, step, atol=1e-12)
 
 
 def test_without_an_edge_the_last_velocity_goes_on() -> None:
@@ -63,7 +63,7 @@ def test_without_an_edge_the_last_velocity_goes_on() -> None:
     step = se3.exp(np.array([0.0, 0.0, 0.1, 1.0, 0.0, 0.0]))
     before = chain.advance(causal(1), [edge(0, step)], None)
     raw = chain.advance(causal(2), [], None)
-    np.testing.assert_allclose(raw.T_world_cam, step @ step, atol=1e-9)
+    np.testing.assert_allclose(raw.T_world_frame, step @ step, atol=1e-9)
     assert raw.status is Status.COASTING
     assert np.all(np.linalg.eigvalsh(raw.covariance - before.covariance)[-3:] > 0.1)
     assert chain.advance(causal(3), [edge(2, step)], None).status is Status.RESUMED
@@ -78,7 +78,7 @@ def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
         for step in range(1, n_steps + 1):
             late = Estimate(
                 stamp_ns=SECOND + step * SECOND // n_steps,
-                T_world_cam=np.eye(4),
+                T_world_frame=np.eye(4),
                 covariance=1e-10 * np.eye(6),
                 frame_id=1 + step,
             )
@@ -92,7 +92,7 @@ def test_without_an_edge_a_known_pose_begins_the_chain_anew() -> None:
     chain.advance(causal(0), [], None)
     T = se3.exp(np.arange(6.0))
     raw = chain.advance(causal(1), [], PosePrior(T_world_frame=T, covariance=np.eye(6)))
-    np.testing.assert_allclose(raw.T_world_cam, T)
+    np.testing.assert_allclose(raw.T_world_frame, T)
     assert raw.status is Status.OK
 
 

@@ -34,7 +34,7 @@ def step_of(
     )
     return RawStep(
         estimate=Estimate(
-            stamp_ns=100, T_world_cam=np.eye(4), covariance=covariance, status=Status.OK
+            stamp_ns=100, T_world_frame=np.eye(4), covariance=covariance, status=Status.OK
         ),
         reference_ns=reference_ns,
         T_reference_frame=forward(1.0),

@@ -147,7 +147,7 @@ def stereo_run() -> tuple[list[FrameResult], list[Estimate]]:
 def position_errors(estimates: Iterable[Estimate]) -> FloatArray:
     return np.array(
         [
-            np.linalg.norm((e.T_world_cam - true_pose(e.stamp_ns // STEP_NS))[:3, 3])
+            np.linalg.norm((e.T_world_frame - true_pose(e.stamp_ns // STEP_NS))[:3, 3])
             for e in estimates
         ]
     )
@@ -176,8 +176,8 @@ def test_a_depth_camera_is_followed_to_centimetres() -> None:
 
 def test_the_first_frame_is_the_world() -> None:
     first = stereo_run()[0][0]
-    np.testing.assert_array_equal(first.raw.T_world_cam, np.eye(4))
-    np.testing.assert_allclose(first.causal.T_world_cam, np.eye(4), atol=1e-12)
+    np.testing.assert_array_equal(first.raw.T_world_frame, np.eye(4))
+    np.testing.assert_allclose(first.causal.T_world_frame, np.eye(4), atol=1e-12)
     assert first.status == Status.OK
     assert first.n_links == 0
 
@@ -208,7 +208,7 @@ def same_estimates(first: Iterable[Estimate], second: Iterable[Estimate]) -> boo
     return all(
         a.stamp_ns == b.stamp_ns
         and a.status == b.status
-        and a.T_world_cam.tobytes() == b.T_world_cam.tobytes()
+        and a.T_world_frame.tobytes() == b.T_world_frame.tobytes()
         and a.covariance.tobytes() == b.covariance.tobytes()
         for a, b in zip(first, second, strict=True)
     )
@@ -328,7 +328,7 @@ def test_a_camera_that_turned_in_the_dark_is_found_again() -> None:
     assert joined
     assert joined[0] <= 11
     errors = [
-        np.linalg.norm((result.causal.T_world_cam - pose(n))[:3, 3])
+        np.linalg.norm((result.causal.T_world_frame - pose(n))[:3, 3])
         for n, result in enumerate(results)
     ]
     assert errors[joined[0] - 1] > 0.1
@@ -340,7 +340,7 @@ def test_nothing_but_blank_images_gives_finite_poses() -> None:
     assert [result.status for result in results[1:]] == [Status.COASTING] * 7
     assert len(smoothed) == 8
     for estimate in [*(r.raw for r in results), *(r.causal for r in results), *smoothed]:
-        np.testing.assert_allclose(estimate.T_world_cam, np.eye(4), atol=1e-6)
+        np.testing.assert_allclose(estimate.T_world_frame, np.eye(4), atol=1e-6)
         assert np.isfinite(estimate.covariance).all()
 
 
@@ -348,7 +348,7 @@ def test_blank_images_at_the_start_delay_the_odometry_alone() -> None:
     results, _ = run(with_blanks(range(3), 8), configure())
     assert [result.status for result in results[4:]] == [Status.RESUMED] + [Status.OK] * 3
     T_3 = np.linalg.inv(true_pose(3)) @ true_pose(7)
-    moved = np.linalg.inv(results[3].raw.T_world_cam) @ results[7].raw.T_world_cam
+    moved = np.linalg.inv(results[3].raw.T_world_frame) @ results[7].raw.T_world_frame
     np.testing.assert_allclose(moved, T_3, atol=0.05)
 
 
@@ -407,7 +407,7 @@ def test_a_front_end_of_ones_own_needs_no_camera_and_counts_nothing() -> None:
     assert [result.status for result in results] == [Status.OK] * 20
     for index, result in enumerate(results):
         for estimate in (result.raw, result.causal):
-            np.testing.assert_allclose(estimate.T_world_cam, scan_pose(index), atol=0.03)
+            np.testing.assert_allclose(estimate.T_world_frame, scan_pose(index), atol=0.03)
         assert (result.n_keypoints, result.n_points) == (0, 0)
         assert (result.n_matches, result.n_inliers) == (0, 0)
 
@@ -441,16 +441,16 @@ def test_keyframes_outvote_a_wrong_step_also_where_they_are_lost_soon(step_m: fl
     for index in range(40):
         T = se3.exp(np.array([0.0, 0.0, 0.0, step_m * index, 0.0, 0.0]))
         result = odometry.track(Scan(index * STEP_NS, T))
-        error_m = np.linalg.norm(result.causal.T_world_cam[:3, 3] - T[:3, 3])
+        error_m = np.linalg.norm(result.causal.T_world_frame[:3, 3] - T[:3, 3])
         assert error_m < 0.3  # what the chain drifts by
-    assert np.linalg.norm(result.raw.T_world_cam[:3, 3] - T[:3, 3]) > 1.3
+    assert np.linalg.norm(result.raw.T_world_frame[:3, 3] - T[:3, 3]) > 1.3
 
 
 def test_an_empty_scan_is_coasted_over() -> None:
     results, _ = run_scans(12, empty=6)
     assert [r.status for r in results[5:8]] == [Status.OK, Status.COASTING, Status.RESUMED]
     assert results[6].reason == "an empty scan"
-    np.testing.assert_allclose(results[11].raw.T_world_cam, scan_pose(11), atol=0.03)
+    np.testing.assert_allclose(results[11].raw.T_world_frame, scan_pose(11), atol=0.03)
 
 
 def test_neither_camera_nor_front_end_is_misuse() -> None:
@@ -508,7 +508,7 @@ def walk(positions_m: Iterable[float], config: Config) -> tuple[list[FrameResult
 
 
 def path_length(estimates: Iterable[Estimate]) -> float:
-    positions = np.array([estimate.T_world_cam[:3, 3] for estimate in estimates])
+    positions = np.array([estimate.T_world_frame[:3, 3] for estimate in estimates])
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
@@ -532,7 +532,7 @@ def test_a_creeping_camera_is_not_frozen() -> None:
     config = configure_klt(zero_motion=True)
     results, smoothed = walk(steps, config)
     true_length = float(steps[-1] * np.hypot(1.0, 0.5))
-    went = np.linalg.norm(smoothed[-1].T_world_cam[:3, 3])
+    went = np.linalg.norm(smoothed[-1].T_world_frame[:3, 3])
     assert went == pytest.approx(true_length, rel=0.06)
     assert path_length(smoothed) > 0.98 * true_length  # noise lengthens a path
     off, _ = walk(steps, configure_klt(zero_motion=False))
@@ -556,7 +556,7 @@ def registration_with(flow_px: float | None) -> RelativePose:
 def test_standstill_is_no_flow_and_no_significant_motion(
     changes: dict[str, Any], is_still: bool
 ) -> None:
-    estimate = Estimate(stamp_ns=7, T_world_cam=np.eye(4), covariance=np.eye(6))
+    estimate = Estimate(stamp_ns=7, T_world_frame=np.eye(4), covariance=np.eye(6))
     step = RawStep(
         estimate=estimate,
         reference_ns=3,

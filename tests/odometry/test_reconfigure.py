@@ -59,7 +59,7 @@ def odometry_of(sensor: Sensor, config: Config | None = None) -> Odometry:
 def fingerprint(results: Sequence[FrameResult], last: Sequence[Estimate]) -> list[bytes]:
     finished = [estimate for result in results for estimate in result.finished] + list(last)
     poses = [pose for r in results for pose in (r.raw, r.causal)] + finished
-    return [e.T_world_cam.tobytes() + e.covariance.tobytes() for e in poses]
+    return [e.T_world_frame.tobytes() + e.covariance.tobytes() for e in poses]
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
@@ -118,8 +118,8 @@ def test_the_chain_goes_on_without_a_break_over_another_kind_of_front_end(
             odometry.reconfigure(later)
         results.append(odometry.track(frame))
     assert all(result.reason == "" and result.status == "ok" for result in results)
-    truth = recording(sensor).ground_truth().T_world_cam[::3]
-    error_m = results[-1].raw.T_world_cam[:3, 3] - truth[-1][:3, 3]
+    truth = recording(sensor).ground_truth().T_world_frame[::3]
+    error_m = results[-1].raw.T_world_frame[:3, 3] - truth[-1][:3, 3]
     assert np.linalg.norm(error_m) < 0.02
 
 
@@ -255,5 +255,5 @@ def test_no_sequence_of_configurations_breaks_it(sensor: Sensor, data: st.DataOb
     assert [result.stamp_ns for result in results] == stamps
     assert sorted(estimate.stamp_ns for estimate in finished) == stamps
     for estimate in [*finished, *(e for r in results for e in (r.raw, r.causal))]:
-        assert np.isfinite(estimate.T_world_cam).all()
+        assert np.isfinite(estimate.T_world_frame).all()
         assert np.isfinite(estimate.covariance).all()

@@ -101,7 +101,7 @@ def run(frontend: Beacon, places: list[Place], **window: object) -> list[FrameRe
 
 def errors(results: list[FrameResult], places: list[Place]) -> list[float]:
     return [
-        float(np.linalg.norm((result.causal.T_world_cam - place.T_world_frame)[:3]))
+        float(np.linalg.norm((result.causal.T_world_frame - place.T_world_frame)[:3]))
         for result, place in zip(results, places, strict=True)
     ]
 
@@ -160,7 +160,7 @@ def test_the_raw_chain_is_never_joined() -> None:
     joined = run(Beacon(), places)
     apart = run(Beacon(see=lambda _: None), places)
     for first, second in zip(joined, apart, strict=True):
-        np.testing.assert_array_equal(first.raw.T_world_cam, second.raw.T_world_cam)
+        np.testing.assert_array_equal(first.raw.T_world_frame, second.raw.T_world_frame)
 
 
 def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:

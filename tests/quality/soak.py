@@ -104,7 +104,7 @@ class EndlessDrive:
         T_lap[0] = np.eye(4)
         indices = np.arange(self.n_frames, dtype=np.int64)
         return gvo.Trajectory(
-            stamps_ns=START_NS + indices * STEP_NS, T_world_cam=T_lap[indices % len(T_lap)]
+            stamps_ns=START_NS + indices * STEP_NS, T_world_frame=T_lap[indices % len(T_lap)]
         )
 
 

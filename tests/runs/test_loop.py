@@ -46,9 +46,9 @@ class Kept:
     def poses(self) -> dict[str, FloatArray]:
         smoothed = sorted(self.smoothed, key=lambda estimate: estimate.stamp_ns)
         return {
-            "raw": np.array([result.raw.T_world_cam for result in self.frames]),
-            "causal": np.array([result.causal.T_world_cam for result in self.frames]),
-            "smoothed": np.array([estimate.T_world_cam for estimate in smoothed]),
+            "raw": np.array([result.raw.T_world_frame for result in self.frames]),
+            "causal": np.array([result.causal.T_world_frame for result in self.frames]),
+            "smoothed": np.array([estimate.T_world_frame for estimate in smoothed]),
         }
 
 
@@ -129,7 +129,7 @@ def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(
     kept, _ = run(walk, excerpt=Excerpt(start_s=0.05), first_pose=first_pose)
     assert asked == [kept.frames[0].stamp_ns]
     assert asked[0] == walk.items[4].stamp_ns
-    np.testing.assert_allclose(kept.frames[0].raw.T_world_cam, T_first, atol=1e-12)
+    np.testing.assert_allclose(kept.frames[0].raw.T_world_frame, T_first, atol=1e-12)
 
 
 def test_only_the_excerpt_is_tracked_and_announced(walk: Rendered) -> None:

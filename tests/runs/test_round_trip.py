@@ -104,7 +104,7 @@ def test_both_ways_are_in_the_run_folder(
         assert trajectory.stamps_ns[_N_FRAMES - 1 :].tolist() == mirrored_ns.tolist()
         # the way back is driven backwards: it ends near where it began, far from the turn
         back = trajectory.select(slice(_N_FRAMES - 1, None))
-        expected = Trajectory(stamps_ns=mirrored_ns, T_world_cam=truth.T_world_cam[::-1])
+        expected = Trajectory(stamps_ns=mirrored_ns, T_world_frame=truth.T_world_frame[::-1])
         for part, reference in ((there, truth), (back, expected)):
             assert evaluate(reference, part, name=name, align="none").ate_max_m < 0.1
     assert float(np.ptp(truth.positions[:, 2])) > 2.0

@@ -127,7 +127,7 @@ def test_trajectories_are_close_to_the_exact_truth(run_dir: Path) -> None:
 
 def test_the_world_is_the_first_camera_pose(run_dir: Path) -> None:
     for name in TRAJECTORIES:
-        first = gvo.read_trajectory(run_dir / f"{name}.txt").T_world_cam[0]
+        first = gvo.read_trajectory(run_dir / f"{name}.txt").T_world_frame[0]
         np.testing.assert_allclose(first, np.eye(4), atol=1e-4)
 
 
@@ -197,7 +197,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 
 def test_a_truth_of_another_time_is_a_warning(room: SyntheticRecording, tmp_path: Path) -> None:
     truth = room.ground_truth()
-    late = Trajectory(stamps_ns=truth.stamps_ns + 10**12, T_world_cam=truth.T_world_cam)
+    late = Trajectory(stamps_ns=truth.stamps_ns + 10**12, T_world_frame=truth.T_world_frame)
     result = gvo.run_recording(room, tmp_path, outputs=NO_REPORT, ground_truth=late)
     assert result.evaluations == ()
     assert "not compared" in result.warnings[0]
@@ -208,7 +208,7 @@ def test_the_errors_do_not_depend_on_the_frame_of_the_truth(
 ) -> None:
     truth = room.ground_truth()
     T_map_world = se3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
-    moved = Trajectory(stamps_ns=truth.stamps_ns, T_world_cam=T_map_world @ truth.T_world_cam)
+    moved = Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=T_map_world @ truth.T_world_frame)
     first = gvo.run_recording(room, tmp_path / "a", outputs=NO_REPORT).evaluations
     second = gvo.run_recording(
         room, tmp_path / "b", outputs=NO_REPORT, ground_truth=moved
@@ -302,7 +302,7 @@ def test_a_run_in_which_nothing_could_be_registered_says_so(tmp_path: Path) -> N
 
 
 def _poses(folder: Path, name: str) -> np.ndarray:
-    return gvo.read_trajectory(folder / f"{name}.txt").T_world_cam
+    return gvo.read_trajectory(folder / f"{name}.txt").T_world_frame
 
 
 def _covariance_by_hand(covariance: np.ndarray, T_base_cam: np.ndarray) -> np.ndarray:

@@ -100,9 +100,9 @@ def test_a_chain_without_redundant_edges_stays_as_it_is(tmp_path: Path) -> None:
     T = np.eye(4)
     for i in range(1, 30):
         T = T @ step(i)
-    np.testing.assert_allclose(raw.T_world_cam[-1], T, atol=1e-8)
-    np.testing.assert_allclose(causal.T_world_cam, raw.T_world_cam, atol=1e-6)
-    np.testing.assert_allclose(smoothed.T_world_cam, raw.T_world_cam, atol=1e-6)
+    np.testing.assert_allclose(raw.T_world_frame[-1], T, atol=1e-8)
+    np.testing.assert_allclose(causal.T_world_frame, raw.T_world_frame, atol=1e-6)
+    np.testing.assert_allclose(smoothed.T_world_frame, raw.T_world_frame, atol=1e-6)
     raw_C, smoothed_C = (
         read_covariances(tmp_path / f"{n}_covariance.csv")[1] for n in ("raw", "smoothed")
     )
@@ -242,8 +242,8 @@ def test_fusing_independent_chains_is_better_than_the_worse(tmp_path: Path) -> N
     stamps_ns = np.arange(n) * SECOND // 10
     paths = [tmp_path / "a.txt", tmp_path / "b.txt"]
     for path, poses in zip(paths, drifting, strict=True):
-        write_tum(path, Trajectory(stamps_ns=stamps_ns, T_world_cam=np.stack(poses)))
-    reference = Trajectory(stamps_ns=stamps_ns, T_world_cam=np.stack(truth))
+        write_tum(path, Trajectory(stamps_ns=stamps_ns, T_world_frame=np.stack(poses)))
+    reference = Trajectory(stamps_ns=stamps_ns, T_world_frame=np.stack(truth))
     result = smooth_edges(open_edges(paths), tmp_path / "out", ground_truth=reference)
     rpe = {e.name: e.rpe_m for e in result.evaluations}
     ends = [gvo.evaluate(reference, gvo.read_trajectory(path), name="x").rpe_m for path in paths]

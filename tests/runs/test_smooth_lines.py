@@ -35,7 +35,7 @@ def test_each_line_is_answered_by_the_causal_estimate(tmp_path: Path) -> None:
     replies = [json.loads(answer) for answer in answers]
     assert [reply["id"] for reply in replies] == list(range(9))
     causal = gvo.read_trajectory(tmp_path / "causal.txt")
-    for reply, stamp_ns, T in zip(replies, causal.stamps_ns, causal.T_world_cam, strict=True):
+    for reply, stamp_ns, T in zip(replies, causal.stamps_ns, causal.T_world_frame, strict=True):
         assert reply["stamp_ns"] == stamp_ns
         np.testing.assert_allclose(reply["pose"][:3], T[:3, 3], atol=1e-8)
         assert reply["status"] == "ok"

@@ -46,7 +46,7 @@ def test_images_without_partner_count_as_frames_only_where_they_are_a_loss() -> 
 def add(
     statistics: RunStatistics, stamp_ns: int, status: Status, segment: int, *joins: tuple[int, int]
 ) -> None:
-    pose = Estimate(stamp_ns=stamp_ns, T_world_cam=np.eye(4), covariance=np.eye(6))
+    pose = Estimate(stamp_ns=stamp_ns, T_world_frame=np.eye(4), covariance=np.eye(6))
     result = FrameResult(
         raw=pose,
         causal=pose,

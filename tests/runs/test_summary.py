@@ -80,7 +80,7 @@ def test_the_same_run_is_the_same_as_a_file_gives_it_back() -> None:
         {"base_frame": BaseFrame("base_link")},
         {"base_frame": BaseFrame("camera", MOVED)},
         {"base_frame": BaseFrame("camera", T_initial=MOVED)},
-        {"start": Trajectory(stamps_ns=np.array([1]), T_world_cam=np.eye(4)[np.newaxis])},
+        {"start": Trajectory(stamps_ns=np.array([1]), T_world_frame=np.eye(4)[np.newaxis])},
     ],
 )
 def test_another_run_is_told_apart(options: dict[str, Any]) -> None:

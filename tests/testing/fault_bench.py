@@ -106,7 +106,7 @@ def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
     of_stamp = {image.given.stamp_ns: image.frame for image in reversed(given)}
     frames = np.array([of_stamp[stamp_ns] for stamp_ns in causal.stamps_ns.tolist()])
     assert with_pose == set(causal.stamps_ns.tolist())
-    errors_m, deviations = _errors(truth, frames, causal.T_world_cam, covariances)
+    errors_m, deviations = _errors(truth, frames, causal.T_world_frame, covariances)
     return Outcome(
         exit_code=0 if result.is_complete else 3,
         warnings=result.warnings,
@@ -114,7 +114,7 @@ def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
         rows=rows,
         n_given=len(given),
         frames=frames,
-        poses={name: trajectory.T_world_cam for name, trajectory in poses.items()},
+        poses={name: trajectory.T_world_frame for name, trajectory in poses.items()},
         covariances=covariances,
         errors_m=errors_m,
         deviations=deviations,
@@ -141,7 +141,7 @@ def _until_error(source: FaultySource) -> Iterator[FaultyImage]:
 def _errors(
     truth: Trajectory, frames: IntArray, poses: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    true = se3.invert(truth.T_world_cam[frames[0]]) @ truth.T_world_cam[frames]
+    true = se3.invert(truth.T_world_frame[frames[0]]) @ truth.T_world_frame[frames]
     errors = se3.log(se3.invert(poses) @ true)
     solved = np.linalg.solve(covariances + 1e-10 * np.eye(6), errors[..., np.newaxis])
     distances = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)

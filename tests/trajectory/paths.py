@@ -16,7 +16,7 @@ def random_trajectory(seed: int, n: int = 12, *, size_m: float = 1.0) -> Traject
     factors = 1e-3 * rng.normal(size=(n, 6, 6))
     return Trajectory(
         stamps_ns=1_305_031_101_000_000_000 + np.cumsum(rng.integers(1, 10**9, n)),
-        T_world_cam=se3.exp(rng.normal(size=(n, 6)) * np.repeat([1.0, size_m], 3)),
+        T_world_frame=se3.exp(rng.normal(size=(n, 6)) * np.repeat([1.0, size_m], 3)),
         covariances=factors @ factors.transpose(0, 2, 1),
     )
 
@@ -29,11 +29,11 @@ def unturned(positions: FloatArray) -> FloatArray:
 def straight(n: int, step_m: float = 1.0) -> Trajectory:
     """Return steps along z at 10 Hz."""
     positions = step_m * np.outer(np.arange(n), [0.0, 0.0, 1.0])
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=unturned(positions))
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=unturned(positions))
 
 
 def still(stamps_ns: list[int], stamps_from: StampsFrom = "file") -> Trajectory:
     poses = unturned(np.zeros((len(stamps_ns), 3)))
     return Trajectory(
-        stamps_ns=np.array(stamps_ns, dtype=np.int64), T_world_cam=poses, stamps_from=stamps_from
+        stamps_ns=np.array(stamps_ns, dtype=np.int64), T_world_frame=poses, stamps_from=stamps_from
     )

@@ -114,7 +114,7 @@ def test_a_known_motion_is_found_again(seed: int) -> None:
 def test_the_first_pose_lies_on_the_first_after_alignment_of_the_origin(seed: int) -> None:
     reference, estimate = random_trajectory(seed), random_trajectory(seed + 1)
     aligned = alignment(reference, estimate, "origin").apply(estimate)
-    np.testing.assert_allclose(aligned.T_world_cam[0], reference.T_world_cam[0], atol=1e-12)
+    np.testing.assert_allclose(aligned.T_world_frame[0], reference.T_world_frame[0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("mode", "is_scaled"), [("se3", False), ("sim3", True)])
@@ -138,9 +138,9 @@ def test_an_optimiser_finds_no_better_alignment(
 
 def test_mirrored_points_are_aligned_by_a_rotation() -> None:
     reference = random_trajectory(3)
-    mirrored = reference.T_world_cam.copy()
+    mirrored = reference.T_world_frame.copy()
     mirrored[:, 0, 3] *= -1.0
-    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_cam=mirrored)
+    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_frame=mirrored)
     for mode in ("se3", "sim3"):
         found = alignment(reference, estimate, mode)
         assert np.linalg.det(found.T_a_b[:3, :3]) == pytest.approx(1.0)
@@ -156,7 +156,7 @@ def test_poses_on_a_line_or_nearly_so_are_aligned_exactly(
     """A drive of 100 m that leaves its line by millimetres still tells which side is up."""
     rng = np.random.default_rng(0)
     positions = rng.normal(size=(n, 3)) * [100.0, across_m, 2.0 * across_m]
-    path = Trajectory(stamps_ns=np.arange(n), T_world_cam=unturned(positions))
+    path = Trajectory(stamps_ns=np.arange(n), T_world_frame=unturned(positions))
     reference = Similarity(T_a_b=random_similarity(4).T_a_b).apply(path)
     aligned = alignment(reference, path, mode).apply(path)
     np.testing.assert_allclose(aligned.positions, reference.positions, atol=1e-6)
@@ -179,14 +179,14 @@ def test_wrong_use_of_alignment_is_refused() -> None:
 def test_no_alignment_moves_nothing() -> None:
     trajectory = random_trajectory(0)
     same = alignment(random_trajectory(1), trajectory, "none").apply(trajectory)
-    np.testing.assert_array_equal(same.T_world_cam, trajectory.T_world_cam)
+    np.testing.assert_array_equal(same.T_world_frame, trajectory.T_world_frame)
 
 
 def test_covariances_scale_with_the_positions() -> None:
     covariance = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
     covariance[0, 3] = covariance[3, 0] = 0.5
     trajectory = Trajectory(
-        stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None], covariances=covariance[None]
+        stamps_ns=np.array([0]), T_world_frame=np.eye(4)[None], covariances=covariance[None]
     )
     scaled = Similarity(T_a_b=np.eye(4), scale=3.0).apply(trajectory).covariances
     assert scaled is not None
@@ -200,7 +200,7 @@ def circle(stamps_ns: np.ndarray, stamps_from: StampsFrom = "topic") -> Trajecto
     R = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
     t = 10.0 * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
     return Trajectory(
-        stamps_ns=stamps_ns, T_world_cam=se3.make_transform(R, t), stamps_from=stamps_from
+        stamps_ns=stamps_ns, T_world_frame=se3.make_transform(R, t), stamps_from=stamps_from
     )
 
 
@@ -226,7 +226,7 @@ def test_trajectories_of_topics_meet_at_the_stamps_of_the_sparser_one(
     apart = np.linalg.norm(interpolated.positions - stamped.positions, axis=1)
     assert apart.max() <= sagitta + 1e-9
     np.testing.assert_allclose(
-        interpolated.T_world_cam[:, :3, :3], stamped.T_world_cam[:, :3, :3], atol=1e-9
+        interpolated.T_world_frame[:, :3, :3], stamped.T_world_frame[:, :3, :3], atol=1e-9
     )
 
 
@@ -241,7 +241,7 @@ def test_nothing_is_interpolated_over_a_gap_or_outside() -> None:
 def test_equal_stamps_give_the_very_poses() -> None:
     trajectory = circle(np.array([0, 7, 11, 3 * MAX_GAP_NS]))
     first, second = pair(trajectory, circle(trajectory.stamps_ns, "file"))
-    np.testing.assert_allclose(first.T_world_cam, second.T_world_cam, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(first.T_world_frame, second.T_world_frame, rtol=0.0, atol=1e-12)
     assert len(first) == 4
 
 

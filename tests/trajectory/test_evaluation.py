@@ -30,17 +30,17 @@ def drive(n: int, step_m: float = 1.0, *, seed: int = 0) -> Trajectory:
     poses = [np.eye(4)]
     for step in se3.exp(twists[1:]):
         poses.append(poses[-1] @ step)
-    return Trajectory(stamps_ns=10**18 + np.arange(n) * 100_000_000, T_world_cam=np.array(poses))
+    return Trajectory(stamps_ns=10**18 + np.arange(n) * 100_000_000, T_world_frame=np.array(poses))
 
 
 def disturbed(trajectory: Trajectory, *, seed: int = 1, sigma: float = 0.005) -> Trajectory:
     """Return the chain of the trajectory's steps, each with an error."""
-    T = trajectory.T_world_cam
+    T = trajectory.T_world_frame
     twists = np.random.default_rng(seed).normal(size=(len(T), 6)) * sigma
     poses = [T[0]]
     for step, error in zip(se3.invert(T[:-1]) @ T[1:], se3.exp(twists[1:]), strict=True):
         poses.append(poses[-1] @ step @ error)
-    return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_cam=np.array(poses))
+    return Trajectory(stamps_ns=trajectory.stamps_ns, T_world_frame=np.array(poses))
 
 
 def measures(evaluation: Evaluation) -> list[float | None]:
@@ -126,7 +126,7 @@ def test_segment_errors_are_those_of_the_devkit(
 ) -> None:
     reference = drive(n, step_m)
     estimate = disturbed(reference)
-    expected = devkit_errors(reference.T_world_cam, estimate.T_world_cam, lengths, step)
+    expected = devkit_errors(reference.T_world_frame, estimate.T_world_frame, lengths, step)
     evaluation = evaluate(reference, estimate, name="estimate", **options)
     assert (evaluation.t_pct, evaluation.r_deg_per_100m) == pytest.approx(expected, rel=1e-7)
     assert evaluation.segments_m == tuple(lengths)
@@ -162,9 +162,9 @@ def test_the_errors_do_not_depend_on_the_world_of_the_estimate(seed: int) -> Non
 
 def test_a_wrong_scale_is_measured_and_taken_out_by_sim3() -> None:
     reference = drive(300)
-    T = reference.T_world_cam.copy()
+    T = reference.T_world_frame.copy()
     T[:, :3, 3] *= 1.02
-    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_cam=T)
+    estimate = Trajectory(stamps_ns=reference.stamps_ns, T_world_frame=T)
     rigid = evaluate(reference, estimate, name="scaled")
     similar = evaluate(reference, estimate, name="scaled", align="sim3")
     assert rigid.path_ratio == similar.path_ratio == pytest.approx(1.02)
@@ -252,7 +252,9 @@ def test_wrong_use_is_refused() -> None:
 
 def test_stamps_may_differ_by_what_is_allowed_and_no_more() -> None:
     reference = drive(30)
-    late = Trajectory(stamps_ns=reference.stamps_ns + 12_000_000, T_world_cam=reference.T_world_cam)
+    late = Trajectory(
+        stamps_ns=reference.stamps_ns + 12_000_000, T_world_frame=reference.T_world_frame
+    )
     with pytest.raises(TrajectoryError, match=r"^late and the reference share no stamps"):
         evaluate(reference, late, name="late")
     found = evaluate(reference, late, name="late", max_difference_ns=12_000_000)
@@ -291,7 +293,9 @@ def test_ate_and_rpe_are_those_of_evo_on_tum_files(
 ) -> None:
     reference = drive(200)
     estimate = disturbed(reference).select(np.arange(5, 200, 3))
-    shifted = Trajectory(stamps_ns=estimate.stamps_ns + 3_000_000, T_world_cam=estimate.T_world_cam)
+    shifted = Trajectory(
+        stamps_ns=estimate.stamps_ns + 3_000_000, T_world_frame=estimate.T_world_frame
+    )
     files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
     write_tum(files[0], reference)
     write_tum(files[1], shifted)

@@ -41,7 +41,7 @@ def test_files_give_back_stamps_and_covariances_exactly_and_poses_to_nanometres(
         write(folder / "00.txt", trajectory)
         back = read_trajectory(folder / "00.txt")
         np.testing.assert_array_equal(back.stamps_ns, expected_ns)
-        np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+        np.testing.assert_allclose(back.T_world_frame, trajectory.T_world_frame, atol=1e-9)
         assert back.stamps_from == stamps_from
     write_covariances(folder / "covariances.csv", trajectory)
     stamps_ns, covariances = read_covariances(folder / "covariances.csv")
@@ -72,7 +72,7 @@ def test_an_empty_covariance_file_reads_as_none(tmp_path: Path) -> None:
 
 
 def test_writing_covariances_needs_some(tmp_path: Path) -> None:
-    bare = Trajectory(stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None])
+    bare = Trajectory(stamps_ns=np.array([0]), T_world_frame=np.eye(4)[None])
     with pytest.raises(ValueError, match="no covariances"):
         write_covariances(tmp_path / "covariances.csv", bare)
 
@@ -128,7 +128,7 @@ def test_commas_comments_blank_lines_and_a_byte_order_mark_are_no_hindrance(
     path.write_bytes("\r\n".join(lines).encode())
     trajectory = read_trajectory(path)
     assert trajectory.stamps_ns.tolist() == [10**9, 2_500_000_000]
-    np.testing.assert_array_equal(trajectory.T_world_cam[1, :3, :3], np.eye(3))
+    np.testing.assert_array_equal(trajectory.T_world_frame[1, :3, :3], np.eye(3))
 
 
 def test_of_repeated_stamps_in_a_tum_file_the_last_row_is_kept(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_euroc_file_is_told_by_its_header_or_its_17_columns(tmp_path: Path, co
     )
     trajectory = read_trajectory(path)
     assert trajectory.stamps_ns.tolist() == [1_403_636_579_763_555_584]
-    T = trajectory.T_world_cam[0]
+    T = trajectory.T_world_frame[0]
     np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-6)
 
 

@@ -28,7 +28,7 @@ def round_trip(
     stamps_ns = _TURN_NS + _STEP_NS * np.arange(1 - n, n)
     return Trajectory(
         stamps_ns=stamps_ns,
-        T_world_cam=np.concatenate([poses, back]),
+        T_world_frame=np.concatenate([poses, back]),
         covariances=covariances,
     )
 
@@ -59,11 +59,11 @@ def test_what_is_planted_on_the_way_back_is_found(poses: FloatArray, data: st.Da
 def test_the_error_is_a_share_of_the_path_both_ways() -> None:
     errors = np.tile(np.eye(4), (10, 1, 1))
     errors[0, 0, 3] = 0.2
-    error = measured(round_trip(straight(11).T_world_cam, errors), path_m=20.0)
+    error = measured(round_trip(straight(11).T_world_frame, errors), path_m=20.0)
     assert error.error_pct == pytest.approx(1.0)
     turned = np.tile(np.eye(4), (10, 1, 1))
     turned[0, :3, :3] = Rotation.from_euler("y", 3.0, degrees=True).as_matrix()
-    error = measured(round_trip(straight(11).T_world_cam, turned))
+    error = measured(round_trip(straight(11).T_world_frame, turned))
     assert error.path_m == pytest.approx(20.0)
     assert error.error_deg_per_100m == pytest.approx(15.0)
     assert error.error_pct == pytest.approx(0.0)
@@ -79,20 +79,20 @@ def test_the_error_is_measured_by_the_covariance_of_the_last_pose() -> None:
     errors[0, :3, 3] = [0.3, 0.0, 0.8]
     covariances = np.tile(np.eye(6), (5, 1, 1))
     covariances[-1] = np.diag(np.square([1.0, 1.0, 1.0, 0.1, 1.0, 0.4]))
-    trajectory = round_trip(straight(3).T_world_cam, errors, covariances=covariances)
+    trajectory = round_trip(straight(3).T_world_frame, errors, covariances=covariances)
     assert measured(trajectory).chi2 == pytest.approx(9.0 + 4.0)
-    singular = round_trip(straight(3).T_world_cam, errors, covariances=np.zeros((5, 6, 6)))
+    singular = round_trip(straight(3).T_world_frame, errors, covariances=np.zeros((5, 6, 6)))
     assert measured(singular).chi2 is None
-    assert measured(round_trip(straight(3).T_world_cam, errors)).chi2 is None
+    assert measured(round_trip(straight(3).T_world_frame, errors)).chi2 is None
 
 
 def test_a_frame_without_a_pose_one_way_is_left_out() -> None:
-    whole = round_trip(straight(4).T_world_cam, np.tile(np.eye(4), (3, 1, 1)))
+    whole = round_trip(straight(4).T_world_frame, np.tile(np.eye(4), (3, 1, 1)))
     error = measured(whole.select([0, 2, 3, 4, 5, 6]))
     assert (error.forward.stamps_ns - _TURN_NS).tolist() == [-3 * _STEP_NS, -_STEP_NS, 0]
 
 
 @pytest.mark.parametrize("kept", [[3], [0, 1, 2, 3], [0, 1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]])
 def test_a_way_back_that_is_missing_or_ends_early_has_no_error(kept: list[int]) -> None:
-    whole = round_trip(straight(4).T_world_cam, np.tile(np.eye(4), (3, 1, 1)))
+    whole = round_trip(straight(4).T_world_frame, np.tile(np.eye(4), (3, 1, 1)))
     assert isinstance(round_trip_error(whole.select(kept), _TURN_NS), Failure)

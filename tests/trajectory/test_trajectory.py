@@ -17,12 +17,12 @@ from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
 def test_arrays_are_copies_that_nobody_can_write_to() -> None:
     stamps, poses, covariances = np.arange(3), np.tile(np.eye(4), (3, 1, 1)), np.zeros((3, 6, 6))
-    trajectory = Trajectory(stamps_ns=stamps, T_world_cam=poses, covariances=covariances)
+    trajectory = Trajectory(stamps_ns=stamps, T_world_frame=poses, covariances=covariances)
     stamps[0], poses[0, 0, 3], covariances[0, 0, 0] = -1, 7.0, 7.0
     assert trajectory.stamps_ns[0] == trajectory.positions[0, 0] == 0
     assert trajectory.covariances is not None
     assert trajectory.covariances[0, 0, 0] == 0
-    for array in (trajectory.stamps_ns, trajectory.T_world_cam, trajectory.covariances):
+    for array in (trajectory.stamps_ns, trajectory.T_world_frame, trajectory.covariances):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
 
@@ -45,12 +45,15 @@ def test_a_trajectory_may_be_empty() -> None:
         ({"stamps_ns": np.array([0, 3, 2])}, "after index 1"),
         ({"stamps_ns": np.array([0.0, 1.0, 2.0])}, "integers"),
         ({"stamps_ns": np.array([[0, 1, 2]])}, "shape"),
-        ({"stamps_ns": np.array([0, 1])}, "T_world_cam must have shape"),
+        ({"stamps_ns": np.array([0, 1])}, "T_world_frame must have shape"),
         ({"covariances": np.zeros((3, 3, 3))}, "covariances must have shape"),
         ({"covariances": np.zeros((3, 6, 6)), "has_rotations": False}, "identities and no cov"),
-        ({"T_world_cam": se3.exp(np.full((3, 6), 0.1)), "has_rotations": False}, "identities and"),
+        (
+            {"T_world_frame": se3.exp(np.full((3, 6), 0.1)), "has_rotations": False},
+            "identities and",
+        ),
         *(
-            ({"T_world_cam": np.tile(np.eye(4), (3, 1, 1)) + at(place, value)}, match)
+            ({"T_world_frame": np.tile(np.eye(4), (3, 1, 1)) + at(place, value)}, match)
             for place, value, match in [
                 ((1, 0, 3), np.nan, "finite"),
                 ((1, 0, 3), np.inf, "finite"),
@@ -64,7 +67,7 @@ def test_a_trajectory_may_be_empty() -> None:
 def test_what_is_no_trajectory_is_refused(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         Trajectory(
-            **{"stamps_ns": np.arange(3), "T_world_cam": np.tile(np.eye(4), (3, 1, 1))} | changes
+            **{"stamps_ns": np.arange(3), "T_world_frame": np.tile(np.eye(4), (3, 1, 1))} | changes
         )
 
 
@@ -77,7 +80,7 @@ def test_a_stamp_is_written_without_loss(stamp_ns: int) -> None:
 
 def test_distances_add_up_the_steps() -> None:
     poses = unturned(np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 2.0]]))
-    trajectory = Trajectory(stamps_ns=np.arange(3), T_world_cam=poses)
+    trajectory = Trajectory(stamps_ns=np.arange(3), T_world_frame=poses)
     assert trajectory.distances().tolist() == [0.0, 5.0, 7.0]
 
 
@@ -88,7 +91,7 @@ def test_changing_the_frame_back_and_forth_changes_nothing(seed: int) -> None:
     back = trajectory.transformed(T_cam_body).transformed(se3.invert(T_cam_body))
     assert trajectory.covariances is not None
     assert back.covariances is not None
-    np.testing.assert_allclose(back.T_world_cam, trajectory.T_world_cam, atol=1e-12)
+    np.testing.assert_allclose(back.T_world_frame, trajectory.T_world_frame, atol=1e-12)
     np.testing.assert_allclose(back.covariances, trajectory.covariances, atol=1e-9, rtol=1e-7)
 
 
@@ -100,7 +103,7 @@ def test_the_covariance_of_another_frame_is_that_of_moved_samples() -> None:
     moved = T_world_cam @ se3.exp(samples) @ T_cam_body
     twists = se3.log(se3.invert(T_world_cam @ T_cam_body) @ moved)
     trajectory = Trajectory(
-        stamps_ns=np.array([0]), T_world_cam=T_world_cam[None], covariances=covariance[None]
+        stamps_ns=np.array([0]), T_world_frame=T_world_cam[None], covariances=covariance[None]
     ).transformed(T_cam_body)
     assert trajectory.covariances is not None
     np.testing.assert_allclose(trajectory.covariances[0], np.cov(twists.T), atol=6e-7)
@@ -111,7 +114,7 @@ def test_interpolating_at_the_stamps_returns_the_poses(seed: int) -> None:
     trajectory = random_trajectory(seed)
     same = trajectory.interpolate(trajectory.stamps_ns)
     np.testing.assert_array_equal(same.stamps_ns, trajectory.stamps_ns)
-    np.testing.assert_allclose(same.T_world_cam, trajectory.T_world_cam, atol=1e-9)
+    np.testing.assert_allclose(same.T_world_frame, trajectory.T_world_frame, atol=1e-9)
 
 
 @given(seeds, st.floats(min_value=0.0, max_value=1.0))
@@ -128,11 +131,11 @@ def test_interpolation_follows_a_screw_about_a_fixed_axis(seed: int, share: floa
         )
 
     trajectory = Trajectory(
-        stamps_ns=np.array([7, 7 + span]), T_world_cam=np.stack([pose(0.0), pose(1.0)])
+        stamps_ns=np.array([7, 7 + span]), T_world_frame=np.stack([pose(0.0), pose(1.0)])
     )
     wanted = round(share * span)
     between = trajectory.interpolate(np.array([7 + wanted]))
-    np.testing.assert_allclose(between.T_world_cam[0], pose(wanted / span), atol=1e-9)
+    np.testing.assert_allclose(between.T_world_frame[0], pose(wanted / span), atol=1e-9)
 
 
 def test_nothing_is_extrapolated() -> None:
@@ -149,7 +152,7 @@ def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
     assert trajectory.covariances is not None
     assert chosen.covariances is not None
     np.testing.assert_array_equal(chosen.stamps_ns, trajectory.stamps_ns[[2, 5]])
-    np.testing.assert_array_equal(chosen.T_world_cam, trajectory.T_world_cam[[2, 5]])
+    np.testing.assert_array_equal(chosen.T_world_frame, trajectory.T_world_frame[[2, 5]])
     np.testing.assert_array_equal(chosen.covariances, trajectory.covariances[[2, 5]])
     assert len(trajectory.select(trajectory.stamps_ns > trajectory.stamps_ns[8])) == 3
 
@@ -159,14 +162,14 @@ def test_estimates_in_any_order_become_a_trajectory_with_covariances() -> None:
     estimates = [
         Estimate(
             stamp_ns=stamp_ns,
-            T_world_cam=se3.exp(rng.normal(size=6)),
+            T_world_frame=se3.exp(rng.normal(size=6)),
             covariance=stamp_ns * np.eye(6),
         )
         for stamp_ns in (30, 10, 20)
     ]
     collected = Trajectory.of(estimates)
     assert collected.stamps_ns.tolist() == [10, 20, 30]
-    np.testing.assert_array_equal(collected.T_world_cam[2], estimates[0].T_world_cam)
+    np.testing.assert_array_equal(collected.T_world_frame[2], estimates[0].T_world_frame)
     assert collected.covariances is not None
     np.testing.assert_array_equal(collected.covariances[1], 20.0 * np.eye(6))
     assert len(Trajectory.of([])) == 0
@@ -190,7 +193,7 @@ def test_positions_without_rotations_stay_so_wherever_they_go(seed: int) -> None
         assert not other.has_rotations
         assert other.stamps_from == "topic"
         unturned = np.tile(np.eye(3), (len(other), 1, 1))
-        np.testing.assert_array_equal(other.T_world_cam[:, :3, :3], unturned)
+        np.testing.assert_array_equal(other.T_world_frame[:, :3, :3], unturned)
 
 
 def test_without_rotations_only_the_point_itself_is_known() -> None:
@@ -198,7 +201,7 @@ def test_without_rotations_only_the_point_itself_is_known() -> None:
         Trajectory.of_positions(np.arange(2), np.zeros((2, 2)))
     found = positions_only()
     turned = found.transformed(se3.exp(np.array([0.3, 0.2, 0.1, 0.0, 0.0, 0.0])))
-    np.testing.assert_array_equal(turned.T_world_cam, found.T_world_cam)
+    np.testing.assert_array_equal(turned.T_world_frame, found.T_world_frame)
     with pytest.raises(ValueError, match="positions of another point are not known"):
         found.transformed(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])))
 
@@ -207,7 +210,7 @@ def test_without_rotations_only_the_point_itself_is_known() -> None:
 def test_another_world_changes_neither_steps_nor_covariances(seed: int) -> None:
     trajectory = random_trajectory(seed)
     moved = trajectory.moved(se3.exp(np.random.default_rng(seed).normal(size=6)))
-    steps = [se3.invert(T[:-1]) @ T[1:] for T in (trajectory.T_world_cam, moved.T_world_cam)]
+    steps = [se3.invert(T[:-1]) @ T[1:] for T in (trajectory.T_world_frame, moved.T_world_frame)]
     np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)
     assert moved.covariances is not None
     assert trajectory.covariances is not None
@@ -221,7 +224,7 @@ def test_a_trajectory_prints_as_one_line() -> None:
     assert str(known) == "Trajectory(2 poses, 1.0 s from 0.500000000, 5.00 m, positions alone)"
     covariances = np.tile(np.eye(6), (2, 1, 1))
     whole = Trajectory(
-        stamps_ns=stamps_ns, T_world_cam=unturned(positions), covariances=covariances
+        stamps_ns=stamps_ns, T_world_frame=unturned(positions), covariances=covariances
     )
     assert repr(whole).endswith("5.00 m, with covariances)")
     assert str(known.select([])) == "Trajectory(no poses)"

@@ -121,7 +121,7 @@ def _result(
     pixels: list[tuple[float, float]], depths_m: list[float], *, status: Status = Status.OK
 ) -> FrameResult:
     """Return what a frame gave whose points did not move in the image; all are inliers."""
-    estimate = Estimate(stamp_ns=10**18, T_world_cam=np.eye(4), covariance=np.eye(6))
+    estimate = Estimate(stamp_ns=10**18, T_world_frame=np.eye(4), covariance=np.eye(6))
     points = np.zeros((len(depths_m), 3))
     points[:, 2] = depths_m
     registration = RelativePose(

@@ -31,7 +31,7 @@ def curve(
     twists[:, 3:] = np.column_stack([np.sin(angle), angle / 6, 1 - np.cos(angle)]) * extents
     twists[1:, 3:] += np.random.default_rng(seed).normal(size=(59, 3)) * 0.05
     twists[:, 3:] += start
-    return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_cam=se3.exp(twists))
+    return Trajectory(stamps_ns=np.arange(60) * 100_000_000, T_world_frame=se3.exp(twists))
 
 
 def n_pixels(path: Path, rgb: tuple[int, int, int]) -> int:
@@ -143,7 +143,7 @@ def test_drawing_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     program = (
         "import sys; import gvo.viz.plots as plots; assert 'matplotlib' not in sys.modules;"
         "import matplotlib, numpy as np; from gvo.trajectory.trajectory import Trajectory;"
-        "one = Trajectory(stamps_ns=np.array([0]), T_world_cam=np.eye(4)[None]);"
+        "one = Trajectory(stamps_ns=np.array([0]), T_world_frame=np.eye(4)[None]);"
         f"plots.plot_trajectories({str(tmp_path / 'p.svg')!r}, None, {{'raw': one}});"
         "assert 'matplotlib.pyplot' not in sys.modules;"
         "assert matplotlib.rcParams['svg.hashsalt'] is None"
@@ -164,7 +164,7 @@ def test_positions_without_rotations_are_drawn_with_their_errors(tmp_path: Path)
 def test_the_plane_of_positions_is_that_of_their_motion(tmp_path: Path) -> None:
     """They begin with an identity that means nothing: it makes no world of a camera."""
     path = curve(0, extents=(3.0, 5.0, 0.5))
-    path = path.moved(se3.invert(path.T_world_cam[0]))
+    path = path.moved(se3.invert(path.T_world_frame[0]))
     points = Trajectory.of_positions(path.stamps_ns, path.positions)
     axes = {
         name: [letter for letter in "xyz" if f"<!-- {letter} [m] -->" in text]

@@ -19,7 +19,7 @@ def round_trip(gap_m: float, n: int = _N) -> RoundTripError:
     poses[:, 2, 3] = [*range(n), *range(n - 2, -1, -1)]
     poses[n:, 0, 3] = gap_m
     stamps_ns = 100_000_000 * np.arange(1 - n, n)
-    found = round_trip_error(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses), 0)
+    found = round_trip_error(Trajectory(stamps_ns=stamps_ns, T_world_frame=poses), 0)
     assert isinstance(found, RoundTripError)
     return found
 

@@ -127,7 +127,7 @@ class _Writer:
         truth = true_poses(source, self.left_out)
         self._poses: deque[tuple[int, FloatArray]] = deque()
         if truth is not None:
-            self._poses.extend(zip(truth.stamps_ns.tolist(), truth.T_world_cam, strict=True))
+            self._poses.extend(zip(truth.stamps_ns.tolist(), truth.T_world_frame, strict=True))
         self.n_images = [0, 0]
         self.n_poses = len(self._poses)
 

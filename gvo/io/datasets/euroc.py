@@ -87,7 +87,7 @@ class EurocSource(FolderSource):
         truth = read_trajectory(path)
         return Trajectory(
             stamps_ns=truth.stamps_ns,
-            T_world_cam=se3.normalize(truth.T_world_cam @ self._T_body_cam),
+            T_world_frame=se3.normalize(truth.T_world_frame @ self._T_body_cam),
         )
 
 

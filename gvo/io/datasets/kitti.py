@@ -93,7 +93,7 @@ class KittiSource(FolderSource):
         return None
 
     def _read_truth(self, path: Path) -> Trajectory:
-        T_world_cam0 = read_trajectory(path).T_world_cam
+        T_world_cam0 = read_trajectory(path).T_world_frame
         if len(T_world_cam0) != len(self._stamps_ns):
             raise RecordingError(
                 f"{path}: expected {len(self._stamps_ns)} rows as in times.txt, got "
@@ -104,7 +104,7 @@ class KittiSource(FolderSource):
         is_later = np.concatenate([[True], stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1]])
         return Trajectory(
             stamps_ns=stamps_ns[is_later],
-            T_world_cam=(T_world_cam0 @ T_cam0_cam)[is_later],
+            T_world_frame=(T_world_cam0 @ T_cam0_cam)[is_later],
             stamps_from="times",
         )
 

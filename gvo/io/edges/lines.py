@@ -361,7 +361,7 @@ def format_estimate(
     rejected : iterable of Rejected
         What was refused beside what the estimate lists.
     """
-    T = estimate.T_world_cam
+    T = estimate.T_world_frame
     quaternion = se3.quaternions(T[:3, :3])
     pose = [float(value) for value in (*T[:3, 3], *quaternion)]
     covariance = upper_triangle(estimate.covariance).tolist()

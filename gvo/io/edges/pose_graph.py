@@ -368,7 +368,7 @@ class GraphFile:
     def add(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses, named by whole numbers, in any order."""
         for estimate in estimates:
-            vertex = format_vertex(str(estimate.frame_id), estimate.T_world_cam)
+            vertex = format_vertex(str(estimate.frame_id), estimate.T_world_frame)
             self._file.write(f"{estimate.stamp_ns} {vertex}\n")
 
     def close(self, measurement_lines: Iterable[str]) -> None:

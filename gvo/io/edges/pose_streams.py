@@ -157,7 +157,7 @@ class TrajectoryStream:
         for i, stamp_ns in enumerate(self._trajectory.stamps_ns):
             yield PoseSample(
                 stamp_ns=int(stamp_ns),
-                T_world_frame=self._trajectory.T_world_cam[i],
+                T_world_frame=self._trajectory.T_world_frame[i],
                 covariance=None if self._covariances is None else self._covariances[i],
             )
 

@@ -202,21 +202,20 @@ class BaseFrame:
         Returns
         -------
         Estimate
-            Its `T_world_cam` is T_world_frame, metres; its covariance is that of a right
-            perturbation in the frame. The very same object where there is nothing to do.
+            The very same object where there is nothing to do.
         """
         if self.first_stamp_ns is None:
             self.start(estimate.stamp_ns)
         if self._is_camera and self._T_initial is None:
             return estimate
         T_base_cam = self.T_base_cam(estimate.stamp_ns)
-        T_camera = self._T_world_cam_first @ estimate.T_world_cam
+        T_camera = self._T_world_cam_first @ estimate.T_world_frame
         # T exp(xi) B = T B exp(Ad(B^-1) xi), with B = T_cam_frame
         Ad = se3.adjoint(T_base_cam)
         covariance = Ad @ estimate.covariance @ Ad.T
         return replace(
             estimate,
-            T_world_cam=T_camera @ se3.invert(T_base_cam),
+            T_world_frame=T_camera @ se3.invert(T_base_cam),
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
         )
 
@@ -255,8 +254,8 @@ class BaseFrame:
         is_known = np.array([not is_guessed for _, is_guessed in found], dtype=np.bool_)
         T_base_cam = np.array([T for T, _ in found]).reshape(-1, 4, 4)[is_known]
         known = trajectory.select(is_known)
-        T_world_frame = known.T_world_cam @ se3.invert(T_base_cam)
-        return replace(known, T_world_cam=T_world_frame, covariances=None)
+        T_world_frame = known.T_world_frame @ se3.invert(T_base_cam)
+        return replace(known, T_world_frame=T_world_frame, covariances=None)
 
 
 class _MovingMount:

@@ -198,7 +198,7 @@ def _of_chain(buffer: TfBuffer, spec: TfTruth, where: str) -> BagTruth:
     left_out = f"; {n_unknown} stamps where not all of the chain is known" if n_unknown else ""
     trajectory = Trajectory(
         stamps_ns=stamps_ns[is_known],
-        T_world_cam=T_parent_child[is_known],
+        T_world_frame=T_parent_child[is_known],
         # as data sets are written: at the stamps of their files
         stamps_from="file" if spec == TRUTH_FRAMES else "topic",
     )
@@ -222,7 +222,7 @@ def _of_poses(reader: BagReader, topic: Topic) -> BagTruth:
     return BagTruth(
         trajectory=Trajectory(
             stamps_ns=stamps_ns,
-            T_world_cam=np.stack([poses[int(stamp_ns)] for stamp_ns in stamps_ns]),
+            T_world_frame=np.stack([poses[int(stamp_ns)] for stamp_ns in stamps_ns]),
             stamps_from="topic",
         ),
         parent_frame=stream.parent_frame,

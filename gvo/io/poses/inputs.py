@@ -366,7 +366,7 @@ def initial_pose(truth: Truth | Failure, stamp_ns: int) -> FloatArray:
         raise TrajectoryError("--initial-pose truth: the ground truth ends before the first frame")
     at_first = truth.trajectory.interpolate(np.array([stamp_ns], dtype=np.int64))
     poses = at_first if len(at_first) else truth.trajectory
-    first: FloatArray = poses.T_world_cam[0]
+    first: FloatArray = poses.T_world_frame[0]
     return first
 
 

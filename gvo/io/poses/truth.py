@@ -161,12 +161,12 @@ def _moved(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> T
             reason=f"it is of {child.describe()}, the estimate of {asked.describe()}: {reason}; "
             f"give --frame {child.name or 'FRAME'} and its T_body_cam by --calibration FILE"
         )
-    poses = trajectory.T_world_cam[is_known] @ T_child_asked[is_known]
+    poses = trajectory.T_world_frame[is_known] @ T_child_asked[is_known]
     n_unknown = int(np.count_nonzero(~is_known))
     left_out = f"; {n_unknown} left out where tf does not know it" if n_unknown else ""
     how = "" if child.name == asked.name else f"; brought from {child.name} to {asked.name} by tf"
     framed = _framed(truth, how + left_out)
-    return replace(framed, trajectory=replace(trajectory.select(is_known), T_world_cam=poses))
+    return replace(framed, trajectory=replace(trajectory.select(is_known), T_world_frame=poses))
 
 
 def _at_point(truth: BagTruth, buffer: TfBuffer, child: _Place, asked: _Place) -> Truth:

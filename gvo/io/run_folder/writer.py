@@ -194,7 +194,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             self._add_pose("smoothed", estimate)
 
     def _add_pose(self, name: str, estimate: Estimate) -> None:
-        pose = format_tum_line(estimate.stamp_ns, estimate.T_world_cam)
+        pose = format_tum_line(estimate.stamp_ns, estimate.T_world_frame)
         self._write(f"{name}.txt", f"{pose}\n")
         covariance = format_covariance_line(estimate.stamp_ns, estimate.covariance)
         self._write(f"{name}_covariance.csv", f"{covariance}\n")

@@ -128,7 +128,7 @@ class SyntheticRecording:
         """Return the exact T_world_cam of the left or colour camera; the first is the identity."""
         T_world_cam = invert(self._T_map_cam[0]) @ self._T_map_cam
         T_world_cam[0] = np.eye(4)
-        return Trajectory(stamps_ns=_START_NS + self._elapsed_ns, T_world_cam=T_world_cam)
+        return Trajectory(stamps_ns=_START_NS + self._elapsed_ns, T_world_frame=T_world_cam)
 
     def render_depth(self, index: int, stream: int = 0) -> DepthArray:
         """Return the exact depth of a frame.

@@ -200,7 +200,7 @@ class RunBag(AbstractContextManager["RunBag"]):
 
     def _previous(self, name: str) -> StampedPose | None:
         last = self._last.get(name)
-        return None if last is None else StampedPose(last.stamp_ns, last.T_world_cam)
+        return None if last is None else StampedPose(last.stamp_ns, last.T_world_frame)
 
     def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
         """Return the covariance (6, 6) of the last step of the raw chain, where it is known.

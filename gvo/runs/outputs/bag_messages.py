@@ -76,14 +76,14 @@ def write_odometry(
         Of the child frame, in its own axes.
     """
     parent, child = frames
-    R = estimate.T_world_cam[:3, :3]
+    R = estimate.T_world_frame[:3, :3]
     message = bag.make(
         ODOMETRY_TYPE,
         header=bag.header(Header(estimate.stamp_ns, parent)),
         child_frame_id=child,
         pose=bag.make(
             "geometry_msgs/msg/PoseWithCovariance",
-            pose=_pose(bag, pose_numbers(estimate.T_world_cam).tolist()),
+            pose=_pose(bag, pose_numbers(estimate.T_world_frame).tolist()),
             covariance=covariance_to_ros(estimate.covariance, R).ravel(),
         ),
         twist=_twist(bag, twist),

@@ -95,7 +95,7 @@ class RunFrames:
     def moving(self, name: str, estimate: Estimate) -> Iterator[FramePose]:
         """Yield the moving transforms of a pose."""
         stamp_ns = estimate.stamp_ns
-        yield FramePose(stamp_ns, self.world, self.base_by(name), estimate.T_world_cam)
+        yield FramePose(stamp_ns, self.world, self.base_by(name), estimate.T_world_frame)
         if callable(self.T_base_cam) and not self.is_camera:
             yield self._mounted(stamp_ns, name)
 
@@ -147,7 +147,7 @@ class Track:
         """Take the next pose, in any order of stamps."""
         index = bisect_right(self._stamps_ns, estimate.stamp_ns)
         self._stamps_ns.insert(index, estimate.stamp_ns)
-        numbers = pose_numbers(estimate.T_world_cam).tolist()
+        numbers = pose_numbers(estimate.T_world_frame).tolist()
         self._poses[_N_NUMBERS * index : _N_NUMBERS * index] = array("d", numbers)
 
     def before(self, stamp_ns: int) -> StampedPose | None:
@@ -193,6 +193,6 @@ def twist_between(
     if previous is None:
         return Twist(velocity=np.zeros(6), covariance=None)
     elapsed_s = 1e-9 * (estimate.stamp_ns - previous.stamp_ns)
-    step = se3.log(se3.invert(previous.T_world_frame) @ estimate.T_world_cam)
+    step = se3.log(se3.invert(previous.T_world_frame) @ estimate.T_world_frame)
     covariance = None if step_covariance is None else step_covariance / elapsed_s**2
     return Twist(velocity=step / elapsed_s, covariance=covariance)

@@ -101,7 +101,7 @@ class RerunWriter:
         """Log poses at their own stamps."""
         for estimate in estimates:
             self._set_frame(estimate.stamp_ns)
-            transform = make_transform(estimate.T_world_cam)
+            transform = make_transform(estimate.T_world_frame)
             self.stream.log("world/smoothed/frame", transform)
             self._tracks["smoothed"].add(estimate)
 
@@ -122,7 +122,7 @@ class RerunWriter:
         self._first_ns = result.stamp_ns
         is_optical = self._frames.is_world_optical or (
             # A camera in a world of its recording: one with y down, or one with z up.
-            self._frames.is_camera and result.causal.T_world_cam[1, 1] > np.cos(np.pi / 4)
+            self._frames.is_camera and result.causal.T_world_frame[1, 1] > np.cos(np.pi / 4)
         )
         self.stream.log("world", make_axes(is_optical=is_optical), is_static=True)
         if not callable(self._frames.T_base_cam):
@@ -137,10 +137,10 @@ class RerunWriter:
     def _add_poses(self, result: FrameResult) -> None:
         for name, estimate in (("raw", result.raw), ("causal", result.causal)):
             path = f"world/{name}"
-            self.stream.log(f"{path}/frame", make_transform(estimate.T_world_cam))
+            self.stream.log(f"{path}/frame", make_transform(estimate.T_world_frame))
             self.stream.log(f"{path}/covariance", make_ellipsoids(name, [estimate]))
             self._tracks[name].add(estimate)
-            self._recent[name].append(estimate.T_world_cam[:3, 3])
+            self._recent[name].append(estimate.T_world_frame[:3, 3])
         if callable(self._frames.T_base_cam):
             self.stream.log(_CAMERA, make_transform(self._frames.mount(result.stamp_ns)))
 
@@ -153,7 +153,7 @@ class RerunWriter:
         found = result.registration or _NOTHING
         self.stream.log(f"{_CAMERA}/points", make_matches(found))
         if result.stamp_ns in result.keyframes_ns and len(found.points_current) > 0:
-            T_world_cam = result.causal.T_world_cam @ self._frames.mount(result.stamp_ns)
+            T_world_cam = result.causal.T_world_frame @ self._frames.mount(result.stamp_ns)
             self.stream.log(place.CLOUD, make_cloud(found, image, T_world_cam))
 
     def _add_links(self, result: FrameResult) -> None:
@@ -164,7 +164,7 @@ class RerunWriter:
         self.stream.log("world/keyframes", make_keyframes(kept))
         ellipsoids = make_ellipsoids(KEYFRAMES, kept)
         self.stream.log("world/keyframes/covariance", ellipsoids)
-        here = result.causal.T_world_cam[:3, 3]
+        here = result.causal.T_world_frame[:3, 3]
         ends = [(link, self._position(link.reference_ns)) for link in result.links]
         placed = [(link, np.stack([end, here])) for link, end in ends if end is not None]
         segments = np.array([segment for _, segment in placed]).reshape(-1, 2, 3)
@@ -325,13 +325,13 @@ def _axes(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
     variances, directions = np.linalg.eigh(estimate.covariance[3:, 3:])
     if np.linalg.det(directions) < 0:
         directions = -directions
-    R = estimate.T_world_cam[:3, :3] @ directions
+    R = estimate.T_world_frame[:3, :3] @ directions
     half_sizes = N_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
     return half_sizes, np.asarray(Rotation.from_matrix(R).as_quat())
 
 
 def _positions(estimates: Sequence[Estimate]) -> FloatArray:
-    return np.array([e.T_world_cam[:3, 3] for e in estimates]).reshape(-1, 3)
+    return np.array([e.T_world_frame[:3, 3] for e in estimates]).reshape(-1, 3)
 
 
 def make_matches(found: RelativePose) -> rr.Points3D:

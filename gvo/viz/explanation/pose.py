@@ -37,10 +37,10 @@ def draw_pose(explanation: FrameExplanation) -> Picture:
     """Draw the covariance of the pose, with all its numbers."""
     result, relative = explanation.result, explanation.result.registration
     poses = [
-        ("raw, in the world", result.raw.T_world_cam, result.raw.covariance),
+        ("raw, in the world", result.raw.T_world_frame, result.raw.covariance),
         (
             f"causal, in the world ({result.status})",
-            result.causal.T_world_cam,
+            result.causal.T_world_frame,
             result.causal.covariance,
         ),
     ]

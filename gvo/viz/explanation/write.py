@@ -263,7 +263,7 @@ def _relative(relative: RelativePose) -> dict[str, Any]:
 
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {"status": estimate.status.value, **_pick(estimate, "T_world_cam", "covariance")}
+    return {"status": estimate.status.value, **_pick(estimate, "T_world_frame", "covariance")}
 
 
 def _link(link: KeyframeLink) -> dict[str, Any]:

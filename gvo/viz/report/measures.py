@@ -70,7 +70,7 @@ def compare(truth: Trajectory, estimate: Trajectory, *, name: str, align: AlignM
     moved = similarity.apply(est)
     errors_rad = None
     if ref.has_rotations and est.has_rotations:
-        turned = [se3.invert(t.T_world_cam[:1]) @ t.T_world_cam for t in (ref, est)]
+        turned = [se3.invert(t.T_world_frame[:1]) @ t.T_world_frame for t in (ref, est)]
         errors_rad = se3.rotation_angle(se3.invert(turned[0]) @ turned[1])
     return Comparison(
         name=name,
@@ -249,8 +249,8 @@ def consistency(truth: Trajectory, estimate: Trajectory, *, name: str) -> Consis
     true, est = _at_stamps_of(truth, estimate)
     if len(true) < 2 or est.covariances is None:
         return None
-    origin = est.T_world_cam[0] @ se3.invert(true.T_world_cam[0])
-    errors = se3.log(se3.invert(est.T_world_cam) @ origin @ true.T_world_cam)[1:]
+    origin = est.T_world_frame[0] @ se3.invert(true.T_world_frame[0])
+    errors = se3.log(se3.invert(est.T_world_frame) @ origin @ true.T_world_frame)[1:]
     covariances = est.covariances[1:]
     is_usable = _is_positive(covariances)
     errors, covariances = errors[is_usable], covariances[is_usable]

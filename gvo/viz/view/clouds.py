@@ -112,8 +112,8 @@ def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
 
     Parameters
     ----------
-    clouds : sequence of (T_world_cam, cloud)
-        T_world_cam has shape (4, 4).
+    clouds : sequence of (T_world_frame, cloud)
+        T_world_frame has shape (4, 4).
 
     Returns
     -------

@@ -56,7 +56,7 @@ def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewS
 def world_up(record: RunRecord) -> Up:
     """Return which axis points up: -y where the world is the first camera, else +z."""
     causal = record.trajectories["causal"]
-    is_first = len(causal) == 0 or np.allclose(causal.T_world_cam[0], np.eye(4), atol=1e-6)
+    is_first = len(causal) == 0 or np.allclose(causal.T_world_frame[0], np.eye(4), atol=1e-6)
     return "-y" if is_first and record.summary.get("base_frame", "camera") == "camera" else "+z"
 
 
@@ -143,10 +143,10 @@ class FinishedPage:
                 is_past = self._truth.stamps_ns <= stamp_ns
                 self.scene.show_path("truth", self._truth.positions[is_past])
             self._draw_ellipsoids(stamp_ns)
-            T_world_cam = self._pose(stamp_ns)
-            if T_world_cam is not None:
-                self.scene.show_pose(T_world_cam)
-                self._view.show_pose(T_world_cam)
+            T_world_frame = self._pose(stamp_ns)
+            if T_world_frame is not None:
+                self.scene.show_pose(T_world_frame)
+                self._view.show_pose(T_world_frame)
 
     def _add_frame_panel(self) -> None:
         with add_frame_panel(self._server):
@@ -177,7 +177,7 @@ class FinishedPage:
         row = int(np.searchsorted(causal.stamps_ns, stamp_ns))
         if row < len(causal) and causal.stamps_ns[row] == stamp_ns:
             covariance = None if causal.covariances is None else causal.covariances[row]
-            rows |= pose_rows(causal.T_world_cam[row], covariance)
+            rows |= pose_rows(causal.T_world_frame[row], covariance)
         return rows
 
     def _milliseconds(self, stamp_ns: int) -> dict[str, str]:
@@ -194,7 +194,7 @@ class FinishedPage:
         """Return the last causal pose until a stamp."""
         causal = self._record.trajectories["causal"]
         row = int(np.searchsorted(causal.stamps_ns, stamp_ns, side="right")) - 1
-        return causal.T_world_cam[row] if row >= 0 else None
+        return causal.T_world_frame[row] if row >= 0 else None
 
     def _draw_ellipsoids(self, stamp_ns: int) -> None:
         """Draw covariances along the smoothed path, of the same poses whatever frame is shown."""
@@ -204,7 +204,7 @@ class FinishedPage:
         is_past = thinned.stamps_ns <= stamp_ns
         if thinned.covariances is not None:
             self.scene.show_ellipsoids(
-                thinned.T_world_cam[is_past], thinned.covariances[is_past], self._sigmas.value
+                thinned.T_world_frame[is_past], thinned.covariances[is_past], self._sigmas.value
             )
 
 

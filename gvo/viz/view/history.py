@@ -38,7 +38,7 @@ class FrameRecord:
     cloud : tuple of ndarray
         Points that the frame measured, in the `cam` frame, and their colours.
     window_poses : dict of int to ndarray of float64, shape (4, 4)
-        T_world_cam of the newest poses in the window and of its keyframes, by stamp.
+        T_world_frame of the newest poses in the window and of its keyframes, by stamp.
     window_covariances : dict of int to ndarray of float64, shape (6, 6)
         Of the same, in the poses' own frames.
     """
@@ -63,7 +63,7 @@ class FrameView(FrameRecord):
         Of the frame in the recording, from 0; faulty ones count.
     n_done : int
         Frames that are done: the index of the last one, and 1.
-    T_world_cam : ndarray of float64, shape (4, 4)
+    T_world_frame : ndarray of float64, shape (4, 4)
         Causal pose; for a faulty frame that of the frame before, the identity before any.
     fault : str
         What the player has to tell; empty while all is well.
@@ -71,7 +71,7 @@ class FrameView(FrameRecord):
 
     index: int
     n_done: int
-    T_world_cam: FloatArray
+    T_world_frame: FloatArray
     fault: str = ""
 
     @property
@@ -143,8 +143,8 @@ class History:
             if result is None:
                 return
             self._tracked.append((index, record.stamp_ns))
-            self._raw.append(result.raw.T_world_cam.ravel())
-            self._causal.append(result.causal.T_world_cam.ravel())
+            self._raw.append(result.raw.T_world_frame.ravel())
+            self._causal.append(result.causal.T_world_frame.ravel())
             self._note_finished(index, result.finished)
             if record.stamp_ns in result.keyframes_ns:
                 self._keyframes.append(index)
@@ -158,7 +158,7 @@ class History:
     def _note_finished(self, index: int, estimates: Iterable[Estimate]) -> None:
         for estimate in estimates:
             self._finishing.append((index, estimate.stamp_ns))
-            self._finished.append(estimate.T_world_cam.ravel())
+            self._finished.append(estimate.T_world_frame.ravel())
 
     def show(self, index: int) -> None:
         """Set the frame shown, up to which the paths go.
@@ -199,7 +199,7 @@ class History:
                 **{field.name: getattr(record, field.name) for field in fields(record)},
                 index=index,
                 n_done=self.n_done,
-                T_world_cam=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
+                T_world_frame=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),
                 fault=fault,
             )
 
@@ -214,8 +214,8 @@ class History:
     def smoothed_path(self) -> Path:
         """Return stamps (n,) and positions (n, 3) as of the frame shown."""
         with self._lock:
-            stamps_ns, T_world_cam = self._smoothed()
-            return stamps_ns, T_world_cam[:, :3, 3]
+            stamps_ns, T_world_frame = self._smoothed()
+            return stamps_ns, T_world_frame[:, :3, 3]
 
     def accumulated_cloud(self) -> Cloud:
         """Return the points of all keyframes in the world, metres, and their colours, RGB.
@@ -223,10 +223,10 @@ class History:
         Placed by the smoothed poses as of the frame shown; thinned to at most 200,000.
         """
         with self._lock:
-            _, T_world_cam = self._smoothed()
+            _, T_world_frame = self._smoothed()
             keyframes = self._keyframes[: bisect_right(self._keyframes, self._shown)]
-            rows = np.searchsorted(self._tracked.rows[: len(T_world_cam), 0], keyframes)
-            clouds = self._clouds.select(dict(zip(keyframes, T_world_cam[rows], strict=True)))
+            rows = np.searchsorted(self._tracked.rows[: len(T_world_frame), 0], keyframes)
+            clouds = self._clouds.select(dict(zip(keyframes, T_world_frame[rows], strict=True)))
         return accumulate(clouds)
 
     def _check(self, index: int) -> None:

@@ -118,7 +118,7 @@ class Page:
             self._draw_images(frame)
             self._draw_paths()
             self._draw_window(frame)
-            self._view.show_pose(frame.T_world_cam)
+            self._view.show_pose(frame.T_world_frame)
 
     def _draw_newest(self) -> None:
         frame = self._player.frame_view
@@ -202,15 +202,15 @@ class Page:
         camera = self._player.camera
         depth = _depth_of(frame, camera)
         self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
-        start = frame.T_world_cam[:3, 3]
+        start = frame.T_world_frame[:3, 3]
         self.scene.show_ground(start - _GROUND_SHARE * depth * UP["-y"], grid_cell(0.1 * depth))
-        self._view.look_along(frame.T_world_cam, _VIEW_SHARE * depth)
+        self._view.look_along(frame.T_world_frame, _VIEW_SHARE * depth)
 
     def _draw_images(self, frame: FrameView) -> None:
         self._overlay.image = _rgb(frame.overlay)
         self.scene.show_image(_rgb(frame.image))
         self.scene.show_points(*frame.cloud)
-        self.scene.show_pose(frame.T_world_cam)
+        self.scene.show_pose(frame.T_world_frame)
 
     def _draw_paths(self) -> None:
         history = self._player.history
@@ -267,7 +267,7 @@ def _link_lines(frame: FrameView) -> dict[str, FloatArray]:
         if link.reference_ns in frame.window_poses:
             start = frame.window_poses[link.reference_ns][:3, 3]
             name = "keyframe link" if link.kind == "keyframe" else link.kind
-            ends = np.stack([start, frame.T_world_cam[:3, 3]])
+            ends = np.stack([start, frame.T_world_frame[:3, 3]])
             lines.setdefault(name if link.is_accepted else "refused", []).append(ends)
     return {name: np.stack(ends) for name, ends in lines.items()}
 
@@ -320,7 +320,7 @@ class TruthPath:
             return None
         if not stamps_ns[0] <= first_ns[0] <= stamps_ns[-1]:
             return None
-        T_truth_first = self._truth.interpolate(first_ns).T_world_cam[0]
+        T_truth_first = self._truth.interpolate(first_ns).T_world_frame[0]
         return self._truth.moved(se3.invert(T_truth_first))
 
     def _fitted(self, stamps_ns: IntArray, positions_world: FloatArray) -> Trajectory | None:

@@ -119,20 +119,20 @@ class ViewPoint:
         self._moved_s = -np.inf
         server.on_client_connect(self._catch_up)
 
-    def look_along(self, T_world_cam: FloatArray, distance_m: float) -> None:
+    def look_along(self, T_world_frame: FloatArray, distance_m: float) -> None:
         """Look from behind and above along the camera's axis, also in browsers that come later.
 
         Parameters
         ----------
-        T_world_cam : ndarray of float64, shape (4, 4)
+        T_world_frame : ndarray of float64, shape (4, 4)
             Pose of the camera, metres.
         distance_m : float
             From the camera.
         """
-        forward = T_world_cam[:3, 2] - self._up * (T_world_cam[:3, 2] @ self._up)
+        forward = T_world_frame[:3, 2] - self._up * (T_world_frame[:3, 2] @ self._up)
         norm = float(np.linalg.norm(forward))
-        forward = forward / norm if norm > 1e-6 else T_world_cam[:3, 0]
-        self._last = start = T_world_cam[:3, 3].copy()
+        forward = forward / norm if norm > 1e-6 else T_world_frame[:3, 0]
+        self._last = start = T_world_frame[:3, 3].copy()
         self.look(
             start - distance_m * forward + 0.6 * distance_m * self._up,
             start + distance_m * forward,
@@ -160,9 +160,9 @@ class ViewPoint:
             self._offsets[number] = self._start[1]
         self._moved_s = time.monotonic()
 
-    def show_pose(self, T_world_cam: FloatArray) -> None:
+    def show_pose(self, T_world_frame: FloatArray) -> None:
         """Move the view with the camera, if it follows."""
-        before, self._last = self._last, T_world_cam[:3, 3].copy()
+        before, self._last = self._last, T_world_frame[:3, 3].copy()
         if not self.follow.value:
             return
         is_at_rest = time.monotonic() - self._moved_s > _REST_S
@@ -252,15 +252,15 @@ def result_rows(result: FrameResult) -> dict[str, str]:
         "links": f"{result.n_links}" + (f" ({refused} refused)" if refused else ""),
         "keyframes": f"{len(result.keyframes_ns)}",
         "ms": f"{total:.1f} ({stages})",
-        **pose_rows(estimate.T_world_cam, estimate.covariance),
+        **pose_rows(estimate.T_world_frame, estimate.covariance),
     }
 
 
-def pose_rows(T_world_cam: FloatArray, covariance: FloatArray | None) -> dict[str, str]:
+def pose_rows(T_world_frame: FloatArray, covariance: FloatArray | None) -> dict[str, str]:
     """Return position and standard deviations, value by label."""
-    rows = {"position [m]": ", ".join(f"{value:.3f}" for value in T_world_cam[:3, 3])}
+    rows = {"position [m]": ", ".join(f"{value:.3f}" for value in T_world_frame[:3, 3])}
     if covariance is not None:
-        sigmas = position_sigmas(T_world_cam, covariance)
+        sigmas = position_sigmas(T_world_frame, covariance)
         turn = np.degrees(np.sqrt(np.trace(covariance[:3, :3])))
         rows["sigma [m]"] = ", ".join(f"{value:.4f}" for value in sigmas)
         rows["turn sigma [deg]"] = f"{turn:.3f}"

@@ -127,10 +127,10 @@ class Scene:
         """
         self._paths[name].show(positions_world)
 
-    def show_pose(self, T_world_cam: FloatArray) -> None:
+    def show_pose(self, T_world_frame: FloatArray) -> None:
         """Move the camera, with its image and points."""
-        self._camera.wxyz = quaternions_wxyz(T_world_cam[np.newaxis, :3, :3])[0]
-        self._camera.position = _position(T_world_cam[:3, 3])
+        self._camera.wxyz = quaternions_wxyz(T_world_frame[np.newaxis, :3, :3])[0]
+        self._camera.position = _position(T_world_frame[:3, 3])
 
     def show_image(self, image: ImageArray | None) -> None:
         """Show an RGB image (h, w, 3) in the camera."""
@@ -169,22 +169,22 @@ class Scene:
             node.show(segments.get(name, _NO_LINES))
 
     def show_ellipsoids(
-        self, T_world_cam: FloatArray, covariances: FloatArray, n_sigmas: float
+        self, T_world_frame: FloatArray, covariances: FloatArray, n_sigmas: float
     ) -> None:
         """Draw the covariances of positions; see `position_ellipsoids`."""
         if self._ellipsoids is not None:
             self._ellipsoids.remove()
             self._ellipsoids = None
-        if len(T_world_cam) == 0:
+        if len(T_world_frame) == 0:
             return
-        half_axes, quaternions = position_ellipsoids(T_world_cam, covariances, n_sigmas)
+        half_axes, quaternions = position_ellipsoids(T_world_frame, covariances, n_sigmas)
         vertices, faces = unit_sphere()
         self._ellipsoids = self._scene.add_batched_meshes_simple(
             "/ellipsoids/meshes",
             vertices,
             faces,
             quaternions,
-            T_world_cam[:, :3, 3],
+            T_world_frame[:, :3, 3],
             batched_scales=np.maximum(half_axes, 1e-6).astype(np.float32),
             batched_colors=rgb(COLOURS["ellipsoids"]),
             opacity=0.4,
@@ -219,13 +219,13 @@ def _frustum_corners(fov: float, aspect: float, depth: float) -> FloatArray:
 
 
 def position_ellipsoids(
-    T_world_cam: FloatArray, covariances: FloatArray, n_sigmas: float
+    T_world_frame: FloatArray, covariances: FloatArray, n_sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the half axes and orientations of the positions' ellipsoids.
 
     Parameters
     ----------
-    T_world_cam : ndarray of float64, shape (n, 4, 4)
+    T_world_frame : ndarray of float64, shape (n, 4, 4)
         Poses, metres.
     covariances : ndarray of float64, shape (n, 6, 6)
         Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
@@ -240,7 +240,7 @@ def position_ellipsoids(
         Of the axes in the world.
     """
     variances, axes_cam = np.linalg.eigh(covariances[:, 3:, 3:])
-    axes_world = T_world_cam[:, :3, :3] @ axes_cam
+    axes_world = T_world_frame[:, :3, :3] @ axes_cam
     axes_world[:, :, 2] *= np.sign(np.linalg.det(axes_world))[:, np.newaxis]
     half_axes = n_sigmas * np.sqrt(np.maximum(variances, 0.0))
     return half_axes, quaternions_wxyz(axes_world)
@@ -251,9 +251,9 @@ def quaternions_wxyz(rotations: FloatArray) -> FloatArray:
     return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
 
 
-def position_sigmas(T_world_cam: FloatArray, covariance: FloatArray) -> FloatArray:
+def position_sigmas(T_world_frame: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the standard deviations (3,) of a position along the axes of the world, metres."""
-    R = T_world_cam[:3, :3]
+    R = T_world_frame[:3, :3]
     return np.asarray(np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T)))
 
 

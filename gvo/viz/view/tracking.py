@@ -201,7 +201,7 @@ class Tracking:
         known = [ns for ns in sorted({*self._keyframes_ns, *self._stamps_ns}) if ns in window]
         estimates = {ns: window.estimate(ns) for ns in known}
         return (
-            {ns: estimate.T_world_cam for ns, estimate in estimates.items()},
+            {ns: estimate.T_world_frame for ns, estimate in estimates.items()},
             {ns: estimate.covariance for ns, estimate in estimates.items()},
         )
 

@@ -106,7 +106,7 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
     assert np.array_equal(refinement.inliers[1], registration.inliers)
     assert np.array_equal(matches.partners[kept], registration.pixels_current)
     assert np.array_equal(matches.pixels[kept], registration.pixels_reference)
-    assert np.array_equal(explanation.result.causal.T_world_cam, expected.causal.T_world_cam)
+    assert np.array_equal(explanation.result.causal.T_world_frame, expected.causal.T_world_frame)
     assert np.array_equal(explanation.result.raw.covariance, expected.raw.covariance)
 
 

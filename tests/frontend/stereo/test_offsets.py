@@ -135,7 +135,7 @@ def test_the_length_of_the_path_is_right_with_it_and_wrong_without() -> None:
         smoothed = gvo.Trajectory.of(
             [odometry.window.estimate(stamp) for stamp in odometry.window.poses()]
         )
-        lengths.append(float(np.linalg.norm(smoothed.T_world_cam[-1, :3, 3])))
-    T = np.linalg.inv(truth.T_world_cam[0]) @ truth.T_world_cam[N_FRAMES - 1]
+        lengths.append(float(np.linalg.norm(smoothed.T_world_frame[-1, :3, 3])))
+    T = np.linalg.inv(truth.T_world_frame[0]) @ truth.T_world_frame[N_FRAMES - 1]
     errors = np.abs(np.array(lengths) - np.linalg.norm(T[:3, 3]))
     assert errors[0] < 0.5 * errors[1]

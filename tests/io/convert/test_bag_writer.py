@@ -55,7 +55,7 @@ def _truth(n: int) -> Trajectory:
     R = Rotation.from_rotvec(rng.normal(0, 1, (n, 3))).as_matrix()
     stamps_ns = _START_NS - 50 + 33 * np.arange(n, dtype=np.int64)
     return Trajectory(
-        stamps_ns=stamps_ns, T_world_cam=make_transform(np.asarray(R), rng.normal(0, 9, (n, 3)))
+        stamps_ns=stamps_ns, T_world_frame=make_transform(np.asarray(R), rng.normal(0, 9, (n, 3)))
     )
 
 
@@ -97,7 +97,7 @@ def _assert_same(source: Source, copy: Source) -> None:
     assert (mine_truth is None) == (truth is None)
     if mine_truth is not None and truth is not None:
         np.testing.assert_array_equal(mine_truth.stamps_ns, truth.stamps_ns)
-        np.testing.assert_allclose(mine_truth.T_world_cam, truth.T_world_cam, atol=1e-14)
+        np.testing.assert_allclose(mine_truth.T_world_frame, truth.T_world_frame, atol=1e-14)
 
 
 @_KINDS

@@ -55,7 +55,9 @@ def _truth(n: int, *, start_ns: int = _START_NS, step_ns: int = _STEP_NS) -> Tra
     rng = np.random.default_rng(5)
     R = np.asarray(Rotation.from_rotvec(rng.normal(0, 1, (n, 3))).as_matrix())
     stamps_ns = start_ns + step_ns * np.arange(n, dtype=np.int64)
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=make_transform(R, rng.normal(0, 5, (n, 3))))
+    return Trajectory(
+        stamps_ns=stamps_ns, T_world_frame=make_transform(R, rng.normal(0, 5, (n, 3)))
+    )
 
 
 def _pairs(tiny: Tiny, n: int = 3, *, is_color: bool = False) -> list[Item]:
@@ -117,7 +119,7 @@ def _assert_same_truth(copy: Source, source: Source, *, atol: float) -> None:
     assert mine is not None
     assert theirs is not None
     np.testing.assert_array_equal(mine.stamps_ns, theirs.stamps_ns)
-    np.testing.assert_allclose(mine.T_world_cam, theirs.T_world_cam, rtol=0, atol=atol)
+    np.testing.assert_allclose(mine.T_world_frame, theirs.T_world_frame, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("cameras", [(0, 1), (2, 3)], ids=["grey", "colour"])
@@ -135,8 +137,8 @@ def test_kitti_comes_back_from_a_bag_as_it_was(
         np.testing.assert_array_equal(mine.P, theirs.P)
     # Of colour, too, the file holds the poses of the first grey camera.
     np.testing.assert_allclose(
-        read_trajectory(tmp_path / "copy" / "poses.txt").T_world_cam,
-        read_trajectory(origin / "poses.txt").T_world_cam,
+        read_trajectory(tmp_path / "copy" / "poses.txt").T_world_frame,
+        read_trajectory(origin / "poses.txt").T_world_frame,
         rtol=0,
         atol=1e-12,
     )

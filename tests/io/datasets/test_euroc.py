@@ -73,7 +73,7 @@ def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: An
     T_body_left, _ = _poses()
     point_body = T_body_left[:3, :3] @ point_raw + T_body_left[:3, 3]
     expected = Rotation.from_quat([0, 0.6, 0, 0.8]).apply(point_body) + np.array([1, 2, 3])
-    found = truth.T_world_cam[0] @ np.append(point_rectified, 1.0)
+    found = truth.T_world_frame[0] @ np.append(point_rectified, 1.0)
     np.testing.assert_allclose(found[:3], expected, atol=1e-12)
     assert truth.stamps_ns.tolist() == [_STAMPS[0]]
 

@@ -61,7 +61,7 @@ def test_poses_are_found_beside_and_in_the_official_layout(tmp_path: Path, tiny:
     official = KittiSource(folder).ground_truth()
     assert beside is not None
     assert official is not None
-    np.testing.assert_array_equal(official.T_world_cam, beside.T_world_cam)
+    np.testing.assert_array_equal(official.T_world_frame, beside.T_world_frame)
     np.testing.assert_array_equal(official.stamps_ns, [0, 100_000_000, 200_000_000])
     (tmp_path / "poses" / "07.txt").unlink()
     assert KittiSource(folder).ground_truth() is None

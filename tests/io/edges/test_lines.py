@@ -169,7 +169,7 @@ def test_no_line_brings_anything_but_value_error(line: str) -> None:
 def test_answers_hold_the_estimate_without_loss(seed: int) -> None:
     T, pose, covariance = random_numbers(seed)
     estimate = Estimate(
-        stamp_ns=17, T_world_cam=T, covariance=covariance, status=Status.OK, frame_id="b, c"
+        stamp_ns=17, T_world_frame=T, covariance=covariance, status=Status.OK, frame_id="b, c"
     )
     refusal = Rejected(frame_id="b, c", stamp_ns=17, reason='it is "wrong"', reference_id="a")
     by_json: dict[str, Any] = json.loads(format_estimate(estimate, "json", [refusal]))

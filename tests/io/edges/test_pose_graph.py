@@ -218,7 +218,7 @@ def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: P
 def estimate(number: int, stamp_ns: int) -> Estimate:
     T = np.eye(4)
     T[0, 3] = number
-    return Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=np.eye(6), frame_id=number)
+    return Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=np.eye(6), frame_id=number)
 
 
 def test_vertices_come_by_their_stamps_then_the_measurements(tmp_path: Path) -> None:

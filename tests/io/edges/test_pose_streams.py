@@ -122,7 +122,7 @@ def test_bare_rows_of_different_length_are_the_same_frames(tmp_path: Path) -> No
     paths = [tmp_path / "a.txt", tmp_path / "b.txt"]
     for path, n in zip(paths, (5, 3), strict=True):
         poses = np.stack([motion(0.1 * i) for i in range(n)])
-        write_kitti(path, Trajectory(stamps_ns=np.arange(n), T_world_cam=poses))
+        write_kitti(path, Trajectory(stamps_ns=np.arange(n), T_world_frame=poses))
     source = FusedChains([TrajectoryStream(path=path) for path in paths], [StepSigma()] * 2)
     assert source.has_made_up_stamps
     assert [len(event.edges) for event in source.events() if isinstance(event, PoseEvent)] == [
@@ -197,7 +197,7 @@ def test_covariances_beside_a_file_are_taken(tmp_path: Path) -> None:
         covariances.append(se3.compose_covariance(covariances[-1], T_step, C))
     trajectory = Trajectory(
         stamps_ns=np.arange(5) * SECOND,
-        T_world_cam=np.stack(poses),
+        T_world_frame=np.stack(poses),
         covariances=np.stack(covariances),
     )
     write_tum(tmp_path / "raw.txt", trajectory)

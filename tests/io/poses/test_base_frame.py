@@ -37,7 +37,7 @@ def camera_drive(rng: np.random.Generator) -> list[Estimate]:
         poses.append(poses[-1] @ random_transform(rng))
     return [
         Estimate(
-            stamp_ns=stamp_ns, T_world_cam=T, covariance=random_covariance(rng), status=Status.OK
+            stamp_ns=stamp_ns, T_world_frame=T, covariance=random_covariance(rng), status=Status.OK
         )
         for stamp_ns, T in zip(STAMPS_NS, poses, strict=True)
     ]
@@ -73,11 +73,11 @@ def test_a_static_mount_is_composed_as_by_hand(seed: int) -> None:
     drive, T_body_cam, T_initial = camera_drive(rng), random_transform(rng), random_transform(rng)
     frame = BaseFrame("body", T_body_cam, T_initial=T_initial)
     outs = apply_all(frame, drive)
-    np.testing.assert_allclose(outs[0].T_world_cam, T_initial, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(outs[0].T_world_frame, T_initial, rtol=0, atol=1e-12)
     for out, given_ in zip(outs, drive, strict=True):
         # a body's motion since the start is the camera's, seen from the body
-        T_first_now = T_body_cam @ given_.T_world_cam @ np.linalg.inv(T_body_cam)
-        np.testing.assert_allclose(out.T_world_cam, T_initial @ T_first_now, rtol=0, atol=1e-9)
+        T_first_now = T_body_cam @ given_.T_world_frame @ np.linalg.inv(T_body_cam)
+        np.testing.assert_allclose(out.T_world_frame, T_initial @ T_first_now, rtol=0, atol=1e-9)
         assert (out.stamp_ns, out.status) == (given_.stamp_ns, given_.status)
     assert frame.n_guessed == 0
 
@@ -91,11 +91,11 @@ def test_a_camera_that_looks_forward_moves_the_base_along_its_x_axis() -> None:
     frame.apply(first)
     moved = frame.apply(
         Estimate(
-            stamp_ns=second.stamp_ns, T_world_cam=forward, covariance=np.eye(6), status=Status.OK
+            stamp_ns=second.stamp_ns, T_world_frame=forward, covariance=np.eye(6), status=Status.OK
         )
     )
-    np.testing.assert_allclose(moved.T_world_cam[:3, 3], [2.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(moved.T_world_cam[:3, :3], np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(moved.T_world_frame[:3, 3], [2.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(moved.T_world_frame[:3, :3], np.eye(3), atol=1e-12)
 
 
 @settings(deadline=None)
@@ -107,8 +107,8 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
     frame = BaseFrame.from_tf(buffer, "base", "/cam")
     frame.start(STAMPS_NS[0])
     for n in rng.permutation(len(drive)):
-        expected = T_base_cam[0] @ drive[n].T_world_cam @ np.linalg.inv(T_base_cam[n])
-        out = frame.apply(drive[n]).T_world_cam
+        expected = T_base_cam[0] @ drive[n].T_world_frame @ np.linalg.inv(T_base_cam[n])
+        out = frame.apply(drive[n]).T_world_frame
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-9)
     assert frame.n_guessed == 0
 
@@ -123,7 +123,7 @@ def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: in
         frame.apply(
             Estimate(
                 stamp_ns=stamp_ns,
-                T_world_cam=np.linalg.inv(T_base_cam[0]) @ T_base_cam[n],
+                T_world_frame=np.linalg.inv(T_base_cam[0]) @ T_base_cam[n],
                 covariance=np.eye(6),
                 status=Status.OK,
             )
@@ -131,7 +131,7 @@ def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: in
         for n, stamp_ns in enumerate(STAMPS_NS)
     ]
     for out in outs[1:]:
-        np.testing.assert_allclose(out.T_world_cam, outs[0].T_world_cam, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(out.T_world_frame, outs[0].T_world_frame, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("is_moving", [False, True])
@@ -147,7 +147,7 @@ def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
         return frame.apply(
             Estimate(
                 stamp_ns=STAMPS_NS[3],
-                T_world_cam=T_world_cam,
+                T_world_frame=T_world_cam,
                 covariance=covariance,
                 status=Status.OK,
             )
@@ -155,8 +155,8 @@ def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
 
     out = of(T)
     twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)
-    poses = np.array([of(T @ se3.exp(xi)).T_world_cam for xi in twists])
-    moved = se3.log(np.linalg.inv(out.T_world_cam) @ poses)
+    poses = np.array([of(T @ se3.exp(xi)).T_world_frame for xi in twists])
+    moved = se3.log(np.linalg.inv(out.T_world_frame) @ poses)
     sampled = moved.T @ moved / len(moved)
     # whitened by the stated covariance it is the identity; its entries scatter by 0.016 to 0.022
     L_inverse = np.linalg.inv(np.linalg.cholesky(out.covariance))
@@ -173,8 +173,8 @@ def test_where_tf_starts_late_and_ends_early_the_nearest_transform_is_taken_and_
         outs = apply_all(frame, drive)
     rows = [0, 0, 0, 1, 2, 2]
     for out, given_, row in zip(outs, drive, rows, strict=True):
-        expected = T_base_cam[0] @ given_.T_world_cam @ np.linalg.inv(T_base_cam[row])
-        np.testing.assert_allclose(out.T_world_cam, expected, rtol=0, atol=1e-9)
+        expected = T_base_cam[0] @ given_.T_world_frame @ np.linalg.inv(T_base_cam[row])
+        np.testing.assert_allclose(out.T_world_frame, expected, rtol=0, atol=1e-9)
     assert frame.n_guessed == 3
 
 
@@ -196,7 +196,7 @@ def test_the_first_frame_may_be_named_and_its_pose_given_late() -> None:
     frame = BaseFrame()
     frame.start(STAMPS_NS[0], T_truth)
     np.testing.assert_allclose(
-        frame.apply(drive[3]).T_world_cam, T_truth @ drive[3].T_world_cam, atol=1e-12
+        frame.apply(drive[3]).T_world_frame, T_truth @ drive[3].T_world_frame, atol=1e-12
     )
     with pytest.raises(ValueError, match="already"):
         frame.start(STAMPS_NS[1])
@@ -254,9 +254,9 @@ def test_true_poses_of_the_camera_become_those_of_the_frame_in_their_own_world(
     truth = frame.convert(Trajectory.of(drive))
     first = 1 if is_moving else 0  # tf says nothing of the first stamp
     assert truth.stamps_ns.tolist() == STAMPS_NS[first:]
-    for n, T_world_base in enumerate(truth.T_world_cam):
+    for n, T_world_base in enumerate(truth.T_world_frame):
         T = T_base_cam[n] if is_moving else T_base_cam[0]
-        np.testing.assert_allclose(T_world_base @ T, drive[n + first].T_world_cam, atol=1e-9)
+        np.testing.assert_allclose(T_world_base @ T, drive[n + first].T_world_frame, atol=1e-9)
 
 
 def test_positions_alone_are_not_moved_to_another_frame() -> None:

@@ -53,7 +53,7 @@ def test_a_topic_gives_poses_at_the_stamps_of_its_headers(
     truth = read(bag.write(), TopicTruth(name="truth"))
     assert truth.trajectory.stamps_ns.tolist() == [n * SECOND + 5 for n in (1, 2, 3)]
     expected = np.stack([pose(n) for n in (1, 2, 3)])
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, expected, atol=1e-12)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, expected, atol=1e-12)
     assert truth.trajectory.stamps_from == "topic"
     assert (truth.parent_frame, truth.child_frame) == ("map", child)
     assert truth.decision == f"/truth ({type_}), 3 poses{' of base' if child else ''}"
@@ -65,7 +65,7 @@ def test_of_two_poses_of_one_stamp_the_later_counts_and_bad_ones_are_told(tmp_pa
     bag.pose("/truth", STAMPED, 1, pose(2))
     bag.pose("/truth", STAMPED, 2, pose(3), norm=0.0)
     truth = read(bag.write(), TopicTruth(name="/truth"))
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, [pose(2)], atol=1e-12)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, [pose(2)], atol=1e-12)
     assert "1 poses; 1 messages hold no pose and were skipped; the first: /truth" in truth.decision
 
 
@@ -104,7 +104,7 @@ def test_a_chain_gives_a_pose_at_each_stamp_of_its_moving_edges(tmp_path: Path, 
     T_map_odom = between([10 * n for n in range(5)], [pose(0.1 * n) for n in range(5)], tenths)
     T_odom_base = between([4 * n for n in range(12)], [pose(n) for n in range(12)], tenths)
     expected = T_map_odom @ T_odom_base @ pose(-2)
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, expected, atol=1e-9)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, expected, atol=1e-9)
     assert truth.decision == (
         "tf map -> camera, 13 poses; 1 stamps where not all of the chain is known"
     )
@@ -122,7 +122,7 @@ def test_a_chain_may_be_followed_from_the_child_to_the_parent(tmp_path: Path) ->
     path = chain_bag(tmp_path / "a.bag").write()
     up = read(path, TfTruth(parent="base", child="map")).trajectory
     down = read(path, TfTruth(parent="map", child="base")).trajectory
-    np.testing.assert_allclose(up.T_world_cam @ down.T_world_cam, [np.eye(4)] * 13, atol=1e-9)
+    np.testing.assert_allclose(up.T_world_frame @ down.T_world_frame, [np.eye(4)] * 13, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_the_truth_of_converted_data_sets_is_of_the_camera_at_the_stamps_of_its_
     assert truth.is_of_camera
     assert truth.trajectory.stamps_from == "file"
     assert truth.trajectory.stamps_ns.tolist() == [5, 7]
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, [pose(1), pose(2)], atol=1e-12)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, [pose(1), pose(2)], atol=1e-12)
 
 
 @pytest.mark.recorded
@@ -171,7 +171,7 @@ def test_the_recorded_chain_of_odometry_is_the_recorded_topic(gvo_data: Path) ->
     assert (topic.parent_frame, topic.child_frame) == ("odom", "base_link")
     np.testing.assert_array_equal(chain.trajectory.stamps_ns, topic.trajectory.stamps_ns)
     assert len(chain.trajectory) == 2639
-    difference = np.abs(chain.trajectory.T_world_cam - topic.trajectory.T_world_cam).max()
+    difference = np.abs(chain.trajectory.T_world_frame - topic.trajectory.T_world_frame).max()
     assert difference < 1e-9
 
 

@@ -69,7 +69,7 @@ def test_a_bag_by_itself_gives_the_truth_that_it_names(bag: Path) -> None:
     found = read_pose_input(str(bag))
     assert found.name == "a"
     assert found.decision.startswith("/gt (")
-    np.testing.assert_allclose(found.trajectory.T_world_cam, MOTION, atol=1e-12)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, MOTION, atol=1e-12)
 
 
 def test_a_bag_that_names_no_truth_lists_what_can_be_asked_for(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_a_bag_that_names_no_truth_lists_what_can_be_asked_for(tmp_path: Path) -
 
 
 def test_files_are_read_and_win_over_bags(bag: Path, tmp_path: Path) -> None:
-    trajectory = Trajectory(stamps_ns=np.arange(8), T_world_cam=MOTION)
+    trajectory = Trajectory(stamps_ns=np.arange(8), T_world_frame=MOTION)
     for name in ("poses.txt", f"{bag.name}#odd"):
         write_tum(tmp_path / name, trajectory)
         assert not is_in_bag(str(tmp_path / name))

@@ -98,7 +98,7 @@ def test_poses_of_the_base_are_brought_to_the_frame_asked_for(
     for text in ("/robot", "topic:/robot", "tf:map:base_link"):
         truth = read_truth(source, text, base_frame=frame).trajectory
         np.testing.assert_array_equal(truth.stamps_ns, stamps_ns)
-        np.testing.assert_allclose(truth.T_world_cam, expected, atol=1e-9)
+        np.testing.assert_allclose(truth.T_world_frame, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("type_", [STAMPED, WITH_COVARIANCE])
@@ -111,7 +111,7 @@ def test_poses_that_name_no_frame_are_of_the_frame_asked_for(
         bag.pose("/true/base", type_, stamp_ns, T)
     source = gvo.open_recording([walk_bag, bag.write()])
     truth = read_truth(source, "/true/base", base_frame=find_base_frame(source, "base_link"))
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, poses, atol=1e-12)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, poses, atol=1e-12)
     assert "taken for base_link" in truth.decision
 
 
@@ -130,14 +130,14 @@ def test_what_is_in_a_bag_cannot_be_asked_of_a_folder(tmp_path: Path) -> None:
         read_truth(Walk(), "/robot")
     write_tum(tmp_path / "poses.txt", Walk().true_poses())
     truth = read_truth(Walk(), str(tmp_path / "poses.txt"))
-    np.testing.assert_allclose(truth.trajectory.T_world_cam, true_poses(STAMPS_NS), atol=1e-8)
+    np.testing.assert_allclose(truth.trajectory.T_world_frame, true_poses(STAMPS_NS), atol=1e-8)
 
 
 def test_the_truth_of_a_folder_follows_the_frame_asked_for() -> None:
     found = recorded_truth(Walk(has_truth=True), base_frame=BaseFrame("body", T_BASE_CAM))
     assert isinstance(found, Truth)
     expected = true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
-    np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-12)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-12)
     assert not recorded_truth(Walk())
 
 
@@ -150,7 +150,7 @@ def test_a_name_decides_what_is_the_named_truth(walk_bag: Path, tmp_path: Path) 
         found = recorded_truth(gvo.open_recording([walk_bag, bag.write()]))
         assert isinstance(found, Truth) is is_truth
         if isinstance(found, Truth):
-            np.testing.assert_allclose(found.trajectory.T_world_cam, poses, atol=1e-12)
+            np.testing.assert_allclose(found.trajectory.T_world_frame, poses, atol=1e-12)
 
 
 def framed(trajectory: Trajectory) -> Truth:
@@ -162,11 +162,11 @@ def test_the_initial_pose_lies_between_the_true_ones_around_the_first_frame() ->
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
     poses[1, :3, 3] = 4.0, 0.0, 8.0
-    T = initial_pose(framed(Trajectory(stamps_ns=stamps_ns, T_world_cam=poses)), START_NS)
+    T = initial_pose(framed(Trajectory(stamps_ns=stamps_ns, T_world_frame=poses)), START_NS)
     np.testing.assert_allclose(T[:3, 3], [3.0, 0.0, 6.0])
     rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     np.testing.assert_allclose(rotation, [0.0, 0.0, 0.3], atol=1e-12)
-    late = framed(Trajectory(stamps_ns=stamps_ns + 100, T_world_cam=poses))
+    late = framed(Trajectory(stamps_ns=stamps_ns + 100, T_world_frame=poses))
     np.testing.assert_array_equal(initial_pose(late, START_NS), poses[0])
 
 
@@ -176,7 +176,7 @@ def test_without_a_true_pose_at_the_first_frame_it_cannot_start_there() -> None:
     positions = Trajectory.of_positions(STAMPS_NS, np.zeros((len(STAMPS_NS), 3)))
     with pytest.raises(TrajectoryError, match="has no rotations"):
         initial_pose(framed(positions), START_NS)
-    past = Trajectory(stamps_ns=STAMPS_NS - 10**12, T_world_cam=true_poses(STAMPS_NS))
+    past = Trajectory(stamps_ns=STAMPS_NS - 10**12, T_world_frame=true_poses(STAMPS_NS))
     with pytest.raises(TrajectoryError, match="ends before the first frame"):
         initial_pose(framed(past), START_NS)
 
@@ -185,7 +185,7 @@ def test_true_poses_are_read_from_files_folders_and_bags(tmp_path: Path) -> None
     truth = Walk().true_poses()
     write_tum(tmp_path / "groundtruth.txt", truth)
     bag = PoseBag(tmp_path / "truth.bag")
-    for stamp_ns, T in zip(truth.stamps_ns.tolist(), truth.T_world_cam, strict=True):
+    for stamp_ns, T in zip(truth.stamps_ns.tolist(), truth.T_world_frame, strict=True):
         bag.pose("/vicon/cam", TRANSFORM, stamp_ns, T, child="cam")
         bag.tf(stamp_ns, "map", "cam", T)
     path = bag.write()
@@ -198,7 +198,7 @@ def test_true_poses_are_read_from_files_folders_and_bags(tmp_path: Path) -> None
     ):
         found = read_ground_truth(str(text))
         np.testing.assert_array_equal(found.stamps_ns, truth.stamps_ns)
-        np.testing.assert_allclose(found.T_world_cam, truth.T_world_cam, atol=1e-8)
+        np.testing.assert_allclose(found.T_world_frame, truth.T_world_frame, atol=1e-8)
 
 
 def test_a_recording_without_truth_is_no_reference(tmp_path: Path, walk_bag: Path) -> None:
@@ -217,10 +217,10 @@ def test_estimates_are_brought_to_the_frame_of_the_reference(tmp_path: Path) -> 
         bag.pose("/other", ODOMETRY, stamp_ns, T, child="other")
     path = bag.write()
     reference, estimates, warnings = read_compared(f"{path}#/cam", [f"{path}#/base"])
-    np.testing.assert_allclose(estimates["/base"].T_world_cam, reference.T_world_cam, atol=1e-9)
+    np.testing.assert_allclose(estimates["/base"].T_world_frame, reference.T_world_frame, atol=1e-9)
     assert warnings == []
     _, estimates, (warning,) = read_compared(f"{path}#/cam", [f"{path}#/other"])
-    np.testing.assert_allclose(estimates["/other"].T_world_cam, poses, atol=1e-12)
+    np.testing.assert_allclose(estimates["/other"].T_world_frame, poses, atol=1e-12)
     assert warning.startswith(f"/other is of other, the reference of {CAMERA}")
 
 

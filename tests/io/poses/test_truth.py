@@ -34,7 +34,7 @@ def motion(n: int = 30, seed: int = 0) -> FloatArray:
 
 def trajectory(poses: FloatArray) -> Trajectory:
     stamps_ns = np.arange(len(poses)) * SECOND // 10
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=poses, stamps_from="topic")
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=poses, stamps_from="topic")
 
 
 def truth_of(found: Trajectory, child: str, *, is_of_camera: bool = False) -> BagTruth:
@@ -64,7 +64,7 @@ def test_the_truth_of_the_base_becomes_that_of_the_camera(seed: int) -> None:
     T_map_base = motion(seed=seed)
     truth = truth_of(trajectory(T_map_base), "/base")
     found = framed(truth, mounted(), camera_frame="/cam")
-    np.testing.assert_allclose(found.trajectory.T_world_cam, T_map_base @ T_BASE_CAM, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, T_map_base @ T_BASE_CAM, atol=1e-9)
     assert found.decision == "it was read; brought from base to cam by tf"
     estimate = trajectory(se3.exp(np.ones(6)) @ T_map_base @ T_BASE_CAM)  # in a world of its own
     assert found.comparable(estimate) is estimate
@@ -77,9 +77,9 @@ def test_a_frame_asked_for_counts_not_the_camera() -> None:
     found = framed(
         truth_of(trajectory(T_map_cam), "cam"), mounted(), base_frame="base", camera_frame="cam"
     )
-    np.testing.assert_allclose(found.trajectory.T_world_cam, motion(), atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, motion(), atol=1e-9)
     same = framed(truth_of(trajectory(T_map_cam), "cam"), TfBuffer(), camera_frame="cam")
-    np.testing.assert_array_equal(same.trajectory.T_world_cam, T_map_cam)
+    np.testing.assert_array_equal(same.trajectory.T_world_frame, T_map_cam)
     assert same.decision == "it was read"
 
 
@@ -90,7 +90,7 @@ def test_the_truth_of_the_camera_follows_its_mount_from_tf_or_from_a_file() -> N
     by_tf = framed(truth, mounted(), base_frame="base", camera_frame="cam")
     by_file = framed(truth, TfBuffer(), base_frame="body", T_base_cam=T_BASE_CAM)
     for found in (by_tf, by_file):
-        np.testing.assert_allclose(found.trajectory.T_world_cam, motion(), atol=1e-9)
+        np.testing.assert_allclose(found.trajectory.T_world_frame, motion(), atol=1e-9)
 
 
 def test_a_mount_from_a_file_goes_with_tf_up_to_the_camera() -> None:
@@ -99,7 +99,7 @@ def test_a_mount_from_a_file_goes_with_tf_up_to_the_camera() -> None:
     truth = truth_of(trajectory(motion()), "base")
     found = framed(truth, mounted(), base_frame="body", camera_frame="cam", T_base_cam=T_body_cam)
     expected = motion() @ T_BASE_CAM @ np.linalg.inv(T_body_cam)
-    np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-9)
 
 
 def test_poses_that_name_no_frame_are_taken_for_the_one_asked_for() -> None:
@@ -129,7 +129,7 @@ def test_where_the_mount_is_not_known_the_poses_are_left_out() -> None:
         buffer.add("base", "cam", n * SECOND // 10, se3.exp(n * np.full(6, 0.1)))
     found = framed(truth_of(trajectory(motion()), "base"), buffer, camera_frame="cam")
     expected = np.stack([motion()[n] @ se3.exp(n * np.full(6, 0.1)) for n in range(11)])
-    np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-9)
     assert found.decision.endswith("by tf; 19 left out where tf does not know it")
 
 
@@ -200,10 +200,10 @@ def test_what_is_asked_for_or_named_comes_in_the_frame_of_the_camera(
         found = find_truth(reader, spec, where=name, camera_frame="cam", buffer=buffer)
         assert isinstance(found, Truth)
         expected = motion() @ T_BASE_CAM
-        np.testing.assert_allclose(found.trajectory.T_world_cam, expected, atol=1e-9)
+        np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-9)
     as_it_is = find_truth(reader, spec, where=name, base_frame="base", camera_frame="cam")
     assert isinstance(as_it_is, Truth)
-    np.testing.assert_allclose(as_it_is.trajectory.T_world_cam, motion(), atol=1e-9)
+    np.testing.assert_allclose(as_it_is.trajectory.T_world_frame, motion(), atol=1e-9)
 
 
 def test_odometry_has_to_be_asked_for(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ LEVER = np.array([0.4, -1.1, 0.7])
 
 
 def estimate(T_world_frame: FloatArray) -> Trajectory:
-    return Trajectory(stamps_ns=STAMPS_NS, T_world_cam=T_world_frame)
+    return Trajectory(stamps_ns=STAMPS_NS, T_world_frame=T_world_frame)
 
 
 def spoilt(poses: FloatArray, seed: int = 0) -> FloatArray:
@@ -45,7 +45,7 @@ def spoilt(poses: FloatArray, seed: int = 0) -> FloatArray:
 
 @given(seeds)
 def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed: int) -> None:
-    poses = Walk().true_poses().T_world_cam
+    poses = Walk().true_poses().T_world_frame
     truth = Truth(trajectory=estimate(poses), T_base_point=np.eye(4), decision="")
     elsewhere = se3.exp(np.random.default_rng(seed).normal(size=6))
     wrong = spoilt(poses, seed)
@@ -61,7 +61,7 @@ def test_the_truth_in_another_world_has_no_error_and_a_mistake_has_its_own(seed:
 
 @given(seeds)
 def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> None:
-    poses = Walk().true_poses().T_world_cam
+    poses = Walk().true_poses().T_world_frame
     points = poses[:, :3, :3] @ LEVER + poses[:, :3, 3]
     truth = Truth(
         trajectory=Trajectory.of_positions(STAMPS_NS, points),
@@ -74,14 +74,14 @@ def test_positions_are_compared_at_the_point_that_was_measured(seed: int) -> Non
     assert right.ate_m == pytest.approx(0.0, abs=1e-9)
     wrong_points = wrong[:, :3, :3] @ LEVER + wrong[:, :3, 3]
     assert mistaken.ate_m == pytest.approx(ate_by_hand(wrong_points, points), abs=1e-9)
-    np.testing.assert_allclose(found.estimates["wrong"].T_world_cam[:, :3, 3], wrong_points)
+    np.testing.assert_allclose(found.estimates["wrong"].T_world_frame[:, :3, 3], wrong_points)
     # without its place on the camera, the same positions hold an error that is none
     unknown = replace(truth, T_base_point=np.eye(4))
     assert TruthComparison.of(unknown, {"right": estimate(poses)}).evaluations[0].ate_m > 0.01
 
 
 def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
-    poses = Walk().true_poses().T_world_cam
+    poses = Walk().true_poses().T_world_frame
     standing = Truth(
         trajectory=estimate(np.tile(np.eye(4), (len(poses), 1, 1))),
         T_base_point=np.eye(4),
@@ -97,7 +97,7 @@ def test_a_truth_that_stands_while_the_estimate_moves_is_doubted() -> None:
 
 def test_nothing_of_another_time_is_compared() -> None:
     poses = Walk().true_poses()
-    late = Trajectory(stamps_ns=poses.stamps_ns + 10**12, T_world_cam=poses.T_world_cam)
+    late = Trajectory(stamps_ns=poses.stamps_ns + 10**12, T_world_frame=poses.T_world_frame)
     truth = Truth(trajectory=late, T_base_point=np.eye(4), decision="")
     with pytest.raises(TrajectoryError, match="share no stamps"):
         TruthComparison.of(truth, {"raw": poses})

@@ -37,7 +37,7 @@ def test_a_folder_is_read_as_its_files_say(folder: Path) -> None:
         other = read_trajectory(folder / f"{name}.txt")
         stamps_ns, covariances = read_covariances(folder / f"{name}_covariance.csv")
         assert np.array_equal(trajectory.stamps_ns, stamps_ns)
-        np.testing.assert_allclose(trajectory.T_world_cam, other.T_world_cam, atol=1e-12)
+        np.testing.assert_allclose(trajectory.T_world_frame, other.T_world_frame, atol=1e-12)
         assert trajectory.covariances is not None
         np.testing.assert_array_equal(trajectory.covariances, covariances)
     assert record.frames.statuses == ("ok",) * N
@@ -77,7 +77,7 @@ def test_smoothed_poses_may_come_in_any_order(copy: Path) -> None:
     expected = read_run(copy).trajectories["smoothed"]
     path.write_text("".join(reversed(path.read_text().splitlines(keepends=True))))
     found = read_run(copy).trajectories["smoothed"]
-    np.testing.assert_array_equal(found.T_world_cam, expected.T_world_cam)
+    np.testing.assert_array_equal(found.T_world_frame, expected.T_world_frame)
 
 
 def test_a_folder_of_smoothed_edges_has_no_tables_of_edges_and_times(copy: Path) -> None:
@@ -105,7 +105,7 @@ def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Pat
     assert record.truth is not None
     assert not record.truth.has_rotations
     moved, raw = record.comparable()["raw"], record.trajectories["raw"]
-    np.testing.assert_allclose(moved.T_world_cam, raw.T_world_cam @ T)
+    np.testing.assert_allclose(moved.T_world_frame, raw.T_world_frame @ T)
 
 
 @pytest.mark.parametrize(

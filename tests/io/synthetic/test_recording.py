@@ -124,7 +124,7 @@ def test_a_planted_offset_makes_every_disparity_larger(offset: float) -> None:
 @pytest.mark.parametrize("world", WORLDS)
 def test_points_of_one_frame_lie_where_the_true_motion_puts_them_in_another(world: str) -> None:
     recording = perfect(world, "rgbd", n_frames=12)
-    truth = recording.ground_truth().T_world_cam
+    truth = recording.ground_truth().T_world_frame
     camera = recording.info.camera
     depth = recording.render_depth(3).astype(np.float64)
     u, v = pixel_grid(depth)
@@ -148,7 +148,7 @@ def test_points_of_one_frame_lie_where_the_true_motion_puts_them_in_another(worl
 )
 def test_poses_are_rigid_and_move_smoothly(world: str, speed: float, turn: float) -> None:
     truth = perfect(world, n_frames=900).ground_truth()
-    T = truth.T_world_cam
+    T = truth.T_world_frame
     np.testing.assert_array_equal(T[0], np.eye(4))
     R = T[:, :3, :3]
     np.testing.assert_allclose(
@@ -166,7 +166,7 @@ def test_poses_are_rigid_and_move_smoothly(world: str, speed: float, turn: float
 
 
 def test_the_drive_turns_forward_and_comes_back_to_its_start() -> None:
-    T = perfect("driving", n_frames=520).ground_truth().T_world_cam
+    T = perfect("driving", n_frames=520).ground_truth().T_world_frame
     assert np.all((invert(T[:-1]) @ T[1:])[:, 2, 3] > 0.4)
     assert 45 < np.rad2deg(rotation_angle(T[100])) < 95
     distances = np.linalg.norm(T[:, :3, 3], axis=1)

@@ -26,7 +26,7 @@ def _trajectory(
     growing = _SIGMAS**2 * np.linspace(1.0, 20.0, n)[:, np.newaxis]
     return Trajectory(
         stamps_ns=stamps_ns,
-        T_world_cam=make_transform(R, positions),
+        T_world_frame=make_transform(R, positions),
         covariances=growing[:, :, np.newaxis] * np.eye(6) if has_covariances else None,
     )
 

@@ -92,7 +92,7 @@ def _mounted(estimate: Estimate, T_base_cam: FloatArray) -> Estimate:
         J[:, k] = np.concatenate([_rotation_vector(step), step[:3, 3]]) / 1e-6
     return replace(
         estimate,
-        T_world_cam=T_base_cam @ estimate.T_world_cam @ T_cam_frame,
+        T_world_frame=T_base_cam @ estimate.T_world_frame @ T_cam_frame,
         covariance=J @ estimate.covariance @ J.T,
     )
 
@@ -275,7 +275,7 @@ def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: 
     for parent, child, stamp_ns, T in _transforms(_read(tmp_path / name)):
         gvo, kind, tracked = child.split("/")
         assert (parent, gvo, tracked) == ("world", "gvo", names.base)
-        np.testing.assert_allclose(T, expected[kind][stamp_ns].T_world_cam, atol=1e-12)
+        np.testing.assert_allclose(T, expected[kind][stamp_ns].T_world_frame, atol=1e-12)
         assert stamp_ns not in found[kind]
         found[kind].add(stamp_ns)
     assert found == {kind: set(expected[kind]) for kind in _ESTIMATES}
@@ -290,7 +290,7 @@ def test_the_camera_hangs_on_the_robot_under_every_estimate(
     for kind, poses in stereo_run.estimates(_T_BASE_CAM).items():
         for stamp_ns, pose in poses.items():
             T_world_cam = _lookup(buffer, "world", f"gvo/{kind}/left_optical", stamp_ns)
-            np.testing.assert_allclose(T_world_cam, pose.T_world_cam @ _T_BASE_CAM, atol=1e-12)
+            np.testing.assert_allclose(T_world_cam, pose.T_world_frame @ _T_BASE_CAM, atol=1e-12)
     # The robot's own tf has a base_link of its own.
     assert not {"base_link", "left_optical"} & set(buffer.frames)
 
@@ -313,7 +313,7 @@ def test_a_camera_that_moves_on_the_robot_is_placed_at_each_stamp(
     buffer = _buffer(_read(tmp_path / "run.mcap"))
     for stamp_ns in stamps:
         T_world_cam = _lookup(buffer, "world", "gvo/causal/camera_optical", stamp_ns)
-        expected = poses[stamp_ns].T_world_cam @ mount(stamp_ns)
+        expected = poses[stamp_ns].T_world_frame @ mount(stamp_ns)
         np.testing.assert_allclose(T_world_cam, expected, atol=1e-12)
 
 
@@ -341,7 +341,7 @@ def test_odometry_holds_pose_and_covariance_in_the_order_of_ros(
             assert content.child_frame_id == f"gvo/{kind}/{names.base}"
             pose = content.pose.pose
             T = _pose_matrix(pose.position, pose.orientation)
-            np.testing.assert_allclose(T, estimate.T_world_cam, atol=1e-12)
+            np.testing.assert_allclose(T, estimate.T_world_frame, atol=1e-12)
             np.testing.assert_allclose(
                 content.pose.covariance.reshape(6, 6),
                 _ros_covariance(estimate),
@@ -352,7 +352,7 @@ def test_odometry_holds_pose_and_covariance_in_the_order_of_ros(
 
 def _ros_covariance(estimate: Estimate) -> FloatArray:
     """Move the pose a little along each axis and see what changes in the world's axes."""
-    T = estimate.T_world_cam
+    T = estimate.T_world_frame
     J = np.zeros((6, 6))
     for k, xi in enumerate(1e-6 * np.eye(6)):
         moved = T @ expm(_hat(xi))
@@ -376,8 +376,8 @@ def test_the_velocity_leads_from_the_pose_before_to_this_one(
                 assert not _velocity(message).any()
                 continue
             elapsed_s = 1e-9 * (message.stamp_ns - max(earlier))
-            T = poses[max(earlier)].T_world_cam @ expm(_hat(elapsed_s * _velocity(message)))
-            np.testing.assert_allclose(T, poses[message.stamp_ns].T_world_cam, atol=1e-9)
+            T = poses[max(earlier)].T_world_frame @ expm(_hat(elapsed_s * _velocity(message)))
+            np.testing.assert_allclose(T, poses[message.stamp_ns].T_world_frame, atol=1e-9)
         assert len(known) == _N_FRAMES
 
 
@@ -474,14 +474,14 @@ def test_paths_end_with_all_poses(tmp_path: Path, stereo_run: _Run, name: str) -
         assert [_stamp_ns(p.header) for p in path.poses] == sorted(poses)
         for pose, stamp_ns in zip(path.poses, sorted(poses), strict=True):
             T = _pose_matrix(pose.pose.position, pose.pose.orientation)
-            np.testing.assert_allclose(T, poses[stamp_ns].T_world_cam, atol=1e-12)
+            np.testing.assert_allclose(T, poses[stamp_ns].T_world_frame, atol=1e-12)
 
 
 def _made_up(stamp_ns: int, status: Status = Status.OK) -> tuple[Frame, FrameResult]:
     """Return a small frame and a pose ten metres a second ahead."""
     T = np.eye(4)
     T[2, 3] = 10e-9 * (stamp_ns - _START_NS)
-    pose = Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=1e-4 * np.eye(6), status=status)
+    pose = Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=1e-4 * np.eye(6), status=status)
     registration = RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6))
     is_tied = status in (Status.OK, Status.RESUMED)
     result = FrameResult(

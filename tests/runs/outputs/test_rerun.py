@@ -143,7 +143,7 @@ class _Run:
 
     def causal(self) -> dict[int, FloatArray]:
         trajectory = self.trajectory("causal")
-        return dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_cam, strict=True))
+        return dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_frame, strict=True))
 
 
 class _Kept:
@@ -202,7 +202,7 @@ def test_all_poses_are_those_of_the_run_folder_at_their_stamps(any_run: _Run, na
     assert sorted(poses) == trajectory.stamps_ns.tolist()
     assert len(poses) == _N_FRAMES
     placed = np.stack([poses[stamp_ns] for stamp_ns in trajectory.stamps_ns.tolist()])
-    np.testing.assert_allclose(placed, trajectory.T_world_cam, atol=2e-6)
+    np.testing.assert_allclose(placed, trajectory.T_world_frame, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", _ESTIMATES)
@@ -215,7 +215,7 @@ def test_both_timelines_name_the_same_frames(any_run: _Run, name: str) -> None:
 @pytest.mark.parametrize("name", _ESTIMATES)
 def test_the_last_paths_are_whole(any_run: _Run, name: str) -> None:
     drawn = _strip(any_run.read.latest(f"/world/{name}/path", _N_FRAMES))
-    positions = any_run.trajectory(name).T_world_cam[:, :3, 3]
+    positions = any_run.trajectory(name).T_world_frame[:, :3, 3]
     np.testing.assert_allclose(drawn, positions, atol=2e-6)
 
 
@@ -230,7 +230,7 @@ def test_ellipsoids_are_three_sigma_of_the_position_in_the_world(any_run: _Run, 
 
 def _check_ellipsoid(values: dict[str, Any], k: int, estimate: Estimate) -> None:
     """Put the matrix of the ellipsoid together again and compare it with the covariance."""
-    R = estimate.T_world_cam[:3, :3]
+    R = estimate.T_world_frame[:3, :3]
     covariance = R @ estimate.covariance[3:, 3:] @ R.T
     directions = Rotation.from_quat(values["Ellipsoids3D:quaternions"][k]).as_matrix()
     sigmas = np.array(values["Ellipsoids3D:half_sizes"][k]) / 3.0
@@ -238,14 +238,14 @@ def _check_ellipsoid(values: dict[str, Any], k: int, estimate: Estimate) -> None
     drawn = directions @ np.diag(sigmas**2) @ directions.T
     np.testing.assert_allclose(drawn, covariance, atol=1e-5 * scale)
     centre = values["Ellipsoids3D:centers"][k]
-    np.testing.assert_allclose(centre, estimate.T_world_cam[:3, 3], atol=2e-6)
+    np.testing.assert_allclose(centre, estimate.T_world_frame[:3, 3], atol=2e-6)
 
 
 def test_keyframes_stand_where_their_causal_poses_put_them(any_run: _Run) -> None:
     causal = {result.stamp_ns: result.causal for result in any_run.results}
     pairs = zip(any_run.read.rows["/world/keyframes"], any_run.results, strict=True)
     for row, result in pairs:
-        expected = [causal[ns].T_world_cam[:3, 3] for ns in result.keyframes_ns]
+        expected = [causal[ns].T_world_frame[:3, 3] for ns in result.keyframes_ns]
         np.testing.assert_allclose(row.values["Points3D:positions"], expected, atol=2e-6)
         ellipsoids = any_run.read.latest("/world/keyframes/covariance", row.frame)
         for k, stamp_ns in enumerate(result.keyframes_ns):
@@ -390,7 +390,7 @@ def test_any_covariance_gives_its_ellipsoid(numbers: list[float], twist: list[fl
     from gvo.runs.outputs.rerun_writer import make_ellipsoids
 
     A = np.array(numbers).reshape(6, 6)
-    estimate = Estimate(stamp_ns=0, T_world_cam=exp(np.array(twist)), covariance=A @ A.T)
+    estimate = Estimate(stamp_ns=0, T_world_frame=exp(np.array(twist)), covariance=A @ A.T)
     batches = make_ellipsoids("raw", [estimate]).as_component_batches()
     values = {b.component_descriptor().component: b.as_arrow_array().to_pylist() for b in batches}
     _check_ellipsoid(values, 0, estimate)
@@ -412,7 +412,7 @@ def _made(
 ) -> FrameResult:
     """Make the result of a frame that was not tracked."""
     T = np.eye(4) if T_world_cam is None else T_world_cam
-    estimate = Estimate(stamp_ns=stamp_ns, T_world_cam=T, covariance=np.eye(6))
+    estimate = Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=np.eye(6))
     return FrameResult(
         raw=estimate,
         causal=estimate,

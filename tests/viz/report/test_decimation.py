@@ -66,7 +66,7 @@ def test_a_straight_line_needs_its_ends_only() -> None:
 
 def path_of(positions: FloatArray, stamps_ns: FloatArray) -> Trajectory:
     T = se3.make_transform(np.tile(np.eye(3), (len(positions), 1, 1)), positions)
-    return Trajectory(stamps_ns=stamps_ns.astype(np.int64), T_world_cam=T)
+    return Trajectory(stamps_ns=stamps_ns.astype(np.int64), T_world_frame=T)
 
 
 def test_long_noisy_paths_become_short_ones_that_keep_outliers_and_gaps() -> None:

@@ -26,7 +26,7 @@ def circle(n: int, seed: int = 0) -> Trajectory:
     twist = np.array([0.0, 0.02, 0.0, 0.1, 0.0, 1.0])
     T = np.array([se3.exp(k * twist) for k in range(n)])
     start = se3.exp(np.random.default_rng(seed).normal(size=6))
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=start @ T)
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=start @ T)
 
 
 def disturbed(truth: Trajectory, covariance: FloatArray, *, stated: float = 1.0) -> Trajectory:
@@ -36,8 +36,8 @@ def disturbed(truth: Trajectory, covariance: FloatArray, *, stated: float = 1.0)
     covariances = np.tile(stated * covariance, (n, 1, 1))
     covariances[0] = 1e-10 * np.eye(6)
     # the truth is the estimate, perturbed from the right
-    T = truth.T_world_cam @ se3.invert(se3.exp(noise))
-    return Trajectory(stamps_ns=truth.stamps_ns, T_world_cam=T, covariances=covariances)
+    T = truth.T_world_frame @ se3.invert(se3.exp(noise))
+    return Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=T, covariances=covariances)
 
 
 def test_stated_covariances_that_are_right_give_six_and_all_within_three_sigmas() -> None:
@@ -72,7 +72,7 @@ def test_the_truth_is_interpolated_at_the_stamps_of_the_estimate() -> None:
     between = truth.interpolate(truth.stamps_ns[:-1] + 50_000_000)
     estimate = Trajectory(
         stamps_ns=between.stamps_ns,
-        T_world_cam=between.T_world_cam,
+        T_world_frame=between.T_world_frame,
         covariances=np.tile(1e-6 * np.eye(6), (len(between), 1, 1)),
     )
     found = consistency(truth, estimate, name="smoothed")
@@ -104,10 +104,12 @@ def test_errors_agree_with_the_evaluation() -> None:
 
 def test_rotation_errors_are_of_the_rotation_since_the_first_pose() -> None:
     truth = circle(50)
-    turned = truth.T_world_cam.copy()
+    turned = truth.T_world_frame.copy()
     turned[25:] = turned[25:] @ se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
-    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_cam=turned)
-    errors = compare(truth, estimate.moved(truth.T_world_cam[7]), name="a", align="se3").errors_rad
+    estimate = Trajectory(stamps_ns=truth.stamps_ns, T_world_frame=turned)
+    errors = compare(
+        truth, estimate.moved(truth.T_world_frame[7]), name="a", align="se3"
+    ).errors_rad
     assert errors is not None
     np.testing.assert_allclose(errors, [0.0] * 25 + [0.1] * 25, atol=1e-6)
 

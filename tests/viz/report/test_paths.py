@@ -24,7 +24,7 @@ def test_numbers_and_labels_stay_in_the_picture_and_apart(
     angles = np.linspace(0.0, 3.0, 30)
     T[:, :3, 3] = np.stack([np.sin(angles), np.cos(angles), 0.1 * angles], axis=1) * 10 * step_m
     T[:, :3, 3] += origin
-    path = Trajectory(stamps_ns=np.arange(30) * 100_000_000, T_world_cam=T)
+    path = Trajectory(stamps_ns=np.arange(30) * 100_000_000, T_world_frame=T)
     with settings():
         for plot in path_plots(lines_of(path, {"one": path}), World.of(path))[:2]:
             assert plot.figure is not None

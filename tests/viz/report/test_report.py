@@ -147,7 +147,7 @@ def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
 def straight(n: int, *, bend: float = 0.0) -> Trajectory:
     twist = np.array([0.0, bend, 0.0, 0.0, 0.0, 1.0])
     T = np.array([se3.exp(k * twist) for k in range(n)])
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_cam=T)
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=T)
 
 
 def test_without_truth_a_sentence_says_why(copy: Path) -> None:
@@ -230,11 +230,11 @@ def test_a_long_run_gives_a_small_page_that_shows_an_outlier_of_one_frame(copy: 
     stamps_ns = np.arange(n, dtype=np.int64) * 33_333_333
     T = se3.exp(np.cumsum(rng.normal(size=(n, 6)) * 0.02, axis=0))
     covariances = np.tile(1e-4 * np.eye(6), (n, 1, 1))
-    write_tum(copy / "ground_truth.txt", Trajectory(stamps_ns=stamps_ns, T_world_cam=T))
+    write_tum(copy / "ground_truth.txt", Trajectory(stamps_ns=stamps_ns, T_world_frame=T))
     for name in ("raw", "causal", "smoothed"):
         noisy = T @ se3.exp(rng.normal(size=(n, 6)) * 1e-2)
         noisy[7777, 1, 3] += 50.0
-        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_cam=noisy, covariances=covariances)
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_frame=noisy, covariances=covariances)
         write_tum(copy / f"{name}.txt", trajectory)
         write_covariances(copy / f"{name}_covariance.csv", trajectory)
     lines = [f"{s},ok,{200 + k % 7},190,{180 + k % 11},170,3," for k, s in enumerate(stamps_ns)]

@@ -34,7 +34,7 @@ def result_of(index: int) -> FrameResult:
     """What a frame gives: a link to the frame before and a refused one to the first."""
     stamp_ns = PERIOD_NS * index
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 4e-4, 9e-4]) * (index + 1)
-    estimate = Estimate(stamp_ns=stamp_ns, T_world_cam=pose_of(index), covariance=covariance)
+    estimate = Estimate(stamp_ns=stamp_ns, T_world_frame=pose_of(index), covariance=covariance)
     links = (
         FrameLink(reference_ns=stamp_ns - PERIOD_NS, kind="step", chi2=6.0, is_accepted=True),
         FrameLink(reference_ns=0, kind="keyframe", chi2=None, is_accepted=False),
@@ -70,7 +70,7 @@ def frame_view_of(index: int, *, fault: str = "", is_faulty: bool = False) -> Fr
         image=picture,
         overlay=picture,
         cloud=(points, np.zeros((50, 3), dtype=np.uint8)),
-        T_world_cam=pose_of(index),
+        T_world_frame=pose_of(index),
         window_poses=known,
         window_covariances={stamp: np.eye(6) * 1e-4 for stamp in known},
         fault=fault,

@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         poses = np.array([pose_of(index) for index in range(N_FRAMES)])
         T_map_world = se3.exp(np.array([0.3, 0.1, -2.0, 5.0, 6.0, 7.0]))
         written.write_truth(
-            Trajectory(stamps_ns=stamps_of(N_FRAMES), T_world_cam=T_map_world @ poses)
+            Trajectory(stamps_ns=stamps_of(N_FRAMES), T_world_frame=T_map_world @ poses)
         )
         written.write_summary({"recording": "drive", "base_frame": "camera"})
     return out

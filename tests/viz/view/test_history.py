@@ -40,7 +40,7 @@ def at(x_m: float) -> FloatArray:
 
 
 def estimate(frame: int, x_m: float) -> Estimate:
-    return Estimate(stamp_ns=frame * 10, T_world_cam=at(x_m), covariance=np.eye(6))
+    return Estimate(stamp_ns=frame * 10, T_world_frame=at(x_m), covariance=np.eye(6))
 
 
 def record(
@@ -127,9 +127,9 @@ def test_frames_come_back_from_disk_as_they_were(history: History) -> None:
         assert view.image.shape == (6, 8, 3)
         assert view.overlay.shape == (12, 16, 3)
         assert np.abs(view.image.astype(int) - 20 * frame).max() <= 2
-        assert view.T_world_cam[0, 3] == frame + 0.2
+        assert view.T_world_frame[0, 3] == frame + 0.2
         assert view.result is not None
-        assert view.result.raw.T_world_cam[0, 3] == frame + 0.1
+        assert view.result.raw.T_world_frame[0, 3] == frame + 0.1
         np.testing.assert_array_equal(view.cloud[0], POINT[0])
         assert set(view.window_poses) == set(view.window_covariances)
         assert all(view.window_poses[ns][0, 3] == ns / 10 + 0.3 for ns in view.window_poses)
@@ -138,7 +138,7 @@ def test_frames_come_back_from_disk_as_they_were(history: History) -> None:
     assert (fault.result, fault.status, fault.reason, fault.fault) == (None, None, "dark", "told")
     assert fault.keyframes == ()
     assert fault.links == ()
-    assert fault.T_world_cam[0, 3] == 3.2
+    assert fault.T_world_frame[0, 3] == 3.2
 
 
 @pytest.mark.parametrize("index", [1, 7])

@@ -165,7 +165,7 @@ def test_the_truth_is_laid_onto_the_first_pose(view: ViewServer, player: FakePla
     page = Page(
         view.viser,
         cast(Any, player),
-        truth=Trajectory(stamps_ns=stamps_of(40), T_world_cam=T_map_cam),
+        truth=Trajectory(stamps_ns=stamps_of(40), T_world_frame=T_map_cam),
     )
     show(page, player, 20)
     ends = np.concatenate([node.points.reshape(-1, 3) for node in nodes(view, "/paths/truth/")])
@@ -200,7 +200,7 @@ def spiral() -> FloatArray:
 
 
 def truth_at(T: FloatArray, stamps_ns: IntArray = STAMPS_NS) -> Trajectory:
-    return Trajectory(stamps_ns=stamps_ns, T_world_cam=T @ spiral())
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=T @ spiral())
 
 
 def drawn(path: TruthPath, rows: Sequence[int] | slice = slice(None)) -> FloatArray:

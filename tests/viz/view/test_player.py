@@ -77,7 +77,7 @@ def computed(first: int = 0) -> tuple[tuple[FrameResult, ...], tuple[Estimate, .
 
 
 def positions(estimates: list[Estimate]) -> list[list[float]]:
-    return [estimate.T_world_cam[:3, 3].tolist() for estimate in estimates]
+    return [estimate.T_world_frame[:3, 3].tolist() for estimate in estimates]
 
 
 def change(**sections: dict[str, object]) -> Config:
@@ -117,7 +117,7 @@ def test_playing_shows_each_frame_once_with_the_poses_of_a_run(player: Player) -
     assert [view.stamp_ns for view in views[:-1]] == stamps_ns()
     results, smoothed = computed()
     for view, result in zip(views, results, strict=False):
-        np.testing.assert_array_equal(view.T_world_cam, result.causal.T_world_cam)
+        np.testing.assert_array_equal(view.T_world_frame, result.causal.T_world_frame)
         assert view.keyframes == result.keyframes_ns
         assert set(view.keyframes) <= set(view.window_poses)
         assert set(view.window_poses) == set(view.window_covariances)
@@ -137,7 +137,7 @@ def test_a_frame_that_is_done_is_shown_as_it_was(player: Player) -> None:
     then, now = views[3], views[-1]
     assert (now.index, now.n_done, player.n_done) == (3, 8, 8)
     assert now.status == then.status
-    np.testing.assert_array_equal(now.T_world_cam, then.T_world_cam)
+    np.testing.assert_array_equal(now.T_world_frame, then.T_world_frame)
     np.testing.assert_array_equal(now.cloud[0], then.cloud[0])
     assert now.image.shape == then.image.shape
     assert np.abs(now.overlay.astype(int) - then.overlay).mean() < 6  # JPEG
@@ -224,7 +224,7 @@ def test_after_a_restart_the_world_begins_at_the_frame_shown(player: Player) -> 
     go(player, 0)
     assert player.index == 5
     assert player.frame_view is not None
-    np.testing.assert_array_equal(player.frame_view.T_world_cam, results[0].causal.T_world_cam)
+    np.testing.assert_array_equal(player.frame_view.T_world_frame, results[0].causal.T_world_frame)
     player.restart(0)
     assert player.wait(LIMIT_S)
     assert (player.index, player.first_index, player.n_done) == (0, 0, 1)
@@ -302,7 +302,7 @@ def test_a_faulty_frame_is_shown_without_result() -> None:
         assert view.result is None
         assert view.status is None
         assert "cut off" in view.reason
-        np.testing.assert_array_equal(view.T_world_cam, views[3].T_world_cam)
+        np.testing.assert_array_equal(view.T_world_frame, views[3].T_world_frame)
         assert player.history.smoothed_path()[0].tolist() == stamps_ns()[:4] + stamps_ns()[5:]
         player.restart(4)
         go(player, 6)
