@@ -89,10 +89,10 @@ class SlidingWindow:
     def __repr__(self) -> str:
         """Return the number of poses, the newest, and the counts in one line."""
         counts = self.counts
-        newest = "" if not self else f" (newest {self.newest!r}, {len(self.kept())} kept)"
+        newest = f", newest {self.newest!r}, {len(self.kept())} kept" if self else ""
         return (
-            f"SlidingWindow: {len(self)} of {counts.n_poses} poses{newest}, {counts.n_edges} edges "
-            f"accepted, {counts.n_rejected} rejected"
+            f"SlidingWindow({len(self)} poses{newest}; so far {counts.n_poses} poses, "
+            f"{counts.n_edges} edges accepted, {counts.n_rejected} rejected)"
         )
 
     def __contains__(self, frame_id: object) -> bool:

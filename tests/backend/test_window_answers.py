@@ -60,13 +60,13 @@ def test_keyframes_are_told_oldest_first_until_they_are_released() -> None:
 
 def test_a_window_is_printed_in_one_line() -> None:
     window = SlidingWindow(WindowConfig(size=3))
-    assert str(window) == "SlidingWindow: 0 of 0 poses, 0 edges accepted, 0 rejected"
+    assert str(window) == "SlidingWindow(0 poses; so far 0 poses, 0 edges accepted, 0 rejected)"
     for frame in range(5):
         window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, STEP)] if frame else [])
     window.keep(3)
     assert isinstance(window.add_edge(4, edge("nobody", STEP)), Rejected)
     assert str(window) == (
-        "SlidingWindow: 3 of 5 poses (newest 4, 1 kept), 4 edges accepted, 1 rejected"
+        "SlidingWindow(3 poses, newest 4, 1 kept; so far 5 poses, 4 edges accepted, 1 rejected)"
     )
 
 
