@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import pandas as pd
 
-from gvo.batch.effects import ERROR, comparable
-from gvo.batch.pareto import variant_means
+from gvo.batch.effects import ERROR, comparable, variant_means
 from gvo.batch.results import to_frame
 from gvo.batch.rows import BatchRow
 from gvo.batch.variants import DEFAULT, flatten

@@ -7,7 +7,6 @@ from typing import Any
 
 from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.attempts import Registration, describe, registrations_of
 from gvo.diagnostics.explain.extraction import (
     explain_depth,
     explain_depth_pixels,
@@ -15,7 +14,14 @@ from gvo.diagnostics.explain.extraction import (
     explain_stereo,
     explain_subpixel,
 )
-from gvo.diagnostics.explain.motion import explain_consensus, explain_matches, explain_refinement
+from gvo.diagnostics.explain.motion import (
+    Registration,
+    describe,
+    explain_consensus,
+    explain_matches,
+    explain_refinement,
+    registrations_of,
+)
 from gvo.diagnostics.explain.values import FrameExplanation, KeyframeLink
 from gvo.errors import RecordingError
 from gvo.frontend.descriptor import as_stereo

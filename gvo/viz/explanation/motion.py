@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.diagnostics.explain.attempts import has_prior
+from gvo.diagnostics.explain.motion import has_prior
 from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gvo._trace import Trace
-from gvo.diagnostics.explain.attempts import has_prior
+from gvo.diagnostics.explain.motion import has_prior
 from gvo.diagnostics.explain.values import (
     ConsensusStep,
     FrameExplanation,

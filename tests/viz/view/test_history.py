@@ -23,8 +23,7 @@ from gvo.types import (
 )
 from gvo.viz.view import clouds
 from gvo.viz.view.clouds import Cloud, KeyframeClouds, accumulate, frame_cloud, thin
-from gvo.viz.view.disk_list import DiskList
-from gvo.viz.view.history import FrameRecord, History
+from gvo.viz.view.history import DiskList, FrameRecord, History
 
 CAMERA = PinholeCamera(fx=100.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 POINT: Cloud = (
