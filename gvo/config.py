@@ -51,7 +51,7 @@ class SyncConfig(Section):
         0.0, "maximum difference between the stamps of left and right; 0: equal stamps", "ms", ge=0
     )
     stamps: Literal["header", "recording"] = _parameter(
-        "header", "clock that stamps the images of a bag; recording: if the driver stamps none"
+        "header", "clock of the stamps of a bag's images; recording: for drivers that set none"
     )
     queue_size: int = _parameter(
         100, "maximum images of a stream kept while they wait for a partner", ge=2, le=10000
@@ -60,7 +60,7 @@ class SyncConfig(Section):
         0.1, "share by which a later partner must be closer in time than an earlier one", ge=0
     )
     repeated_images: Literal["skip", "keep"] = _parameter(
-        "skip", "images equal to the one before; keep: simulation without noise"
+        "skip", "frames with the image of the one before; keep: for simulation without noise"
     )
 
 
@@ -240,7 +240,7 @@ class WindowConfig(Section):
         2.5, "minimum number of steps since a keyframe, times its share in view, to link it", ge=0
     )
     keyframe_overlap: float = _parameter(
-        0.9, "a frame whose overlap with every keyframe is below becomes a keyframe", ge=0, le=1
+        0.9, "maximum overlap with every keyframe at which a frame becomes one", ge=0, le=1
     )
     link_sigma_factor: float = _parameter(
         2.5, "inflation of the sigmas of links to keyframes: links of a frame share its noise", gt=0
@@ -306,7 +306,7 @@ class CheckConfig(Section):
     )
     fault_lost_share: float = _parameter(0.2, "share of frames lost that is a fault", ge=0, le=1)
     max_jitter: float = _parameter(
-        0.3, "95th percentile of the deviation of periods from their median, relative to it", ge=0
+        0.3, "maximum deviation of periods from their median, 95th percentile, relative to it", ge=0
     )
     max_gap_s: float = _parameter(
         0.5, "maximum time without a frame; above window.lost_after_s it is a fault", "s", gt=0

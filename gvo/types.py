@@ -459,9 +459,10 @@ class Estimate:
     stamp_ns : int
         Stamp of the frame, nanoseconds.
     T_world_frame : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the world, metres.
+        Maps coordinates of the frame (of the camera, a robot's, a front-end's own) to the world,
+        metres.
     covariance : ndarray of float64, shape (6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in that frame.
     status : Status
         What ties the pose to the frames before it.
     frame_id : hashable

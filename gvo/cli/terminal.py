@@ -174,5 +174,5 @@ def told_where_it_stands(out: Path | str, *, and_then: str = "") -> Iterator[Non
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"gvo: interrupted; what was done stands in {out}{and_then}", err=True)
+        typer.echo(f"gvo: interrupted; the poses so far are in {out}{and_then}", err=True)
         raise

@@ -131,20 +131,25 @@ class CheckedFrontend(Generic[ObservationsT]):
     Parameters
     ----------
     frontend : Frontend
-
-    Attributes
-    ----------
-    camera : StereoCamera, PinholeCamera or None
-        The front-end's own, where it has one.
     """
 
     def __init__(self, frontend: Frontend[ObservationsT]) -> None:
         self._frontend = frontend
-        self._relocalizer = frontend if isinstance(frontend, Relocalizer) else None
-        self._reconfigurable = frontend if isinstance(frontend, Reconfigurable) else None
-        self._learner = frontend if isinstance(frontend, LearnsRig) else None
-        camera = frontend.camera if isinstance(frontend, HasCamera) else None
-        self.camera = camera if isinstance(camera, StereoCamera | PinholeCamera) else None
+        self._relocalizer: Relocalizer | None = _capability(frontend, "relocalize")
+        self._reconfigurable: Reconfigurable | None = _capability(frontend, "reconfigure")
+        self._learner: LearnsRig | None = _capability(frontend, "rig_offsets")
+        self._seer: HasCamera | None = _capability(frontend, "camera")
+
+    @property
+    def camera(self) -> StereoCamera | PinholeCamera | None:
+        """The front-end's own camera, where it has one; `reconfigure` may change it."""
+        camera = None if self._seer is None else self._seer.camera
+        return camera if isinstance(camera, StereoCamera | PinholeCamera) else None
+
+    @property
+    def offers_relocalization(self) -> bool:
+        """Tell whether the front-end is a `Relocalizer`."""
+        return self._relocalizer is not None
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
@@ -193,6 +198,11 @@ class CheckedFrontend(Generic[ObservationsT]):
         checked = Failure(reason=f"the front-end is at fault: {fault}") if fault else result
         note("frontend.end", result=checked)
         return checked
+
+
+def _capability(frontend: object, name: str) -> Any:  # noqa: ANN401 - one of the protocols
+    """Return the front-end if it has an attribute; isinstance would not see what it delegates."""
+    return frontend if getattr(frontend, name, None) is not None else None
 
 
 def count_points(observations: object) -> tuple[int, int]:

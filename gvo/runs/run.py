@@ -125,10 +125,19 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
-            files.close()
+            faults = _close(files)
         is_asked = ground_truth is not None
-        result = _conclude(loop, folder, identity, truth, notes, is_asked=is_asked)
+        result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
     return _drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
+
+
+def _close(files: ExitStack) -> list[str]:
+    """Complete the files; a film that is not whole takes nothing from the run."""
+    try:
+        files.close()
+    except RecordingError as error:
+        return [str(error)]
+    return []
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,6 +165,7 @@ def _conclude(
     identity: dict[str, Any],
     truth: Truth | Failure,
     notes: list[str],
+    faults: list[str],
     *,
     is_asked: bool,
 ) -> RunResult:
@@ -166,12 +176,12 @@ def _conclude(
             f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
         )
     compared = _compare(truth, folder, loop)
-    warnings = [*loop.statistics.warnings(), *notes, *_warnings_of_truth(compared)]
+    warnings = [*loop.statistics.warnings(), *notes, *faults, *_warnings_of_truth(compared)]
     evaluations: tuple[Evaluation, ...] = ()
     if isinstance(compared, TruthComparison):
         folder.write_truth(compared.truth.trajectory)
         evaluations = compared.evaluations
-    is_complete = loop.statistics.is_complete and bool(compared or not is_asked)
+    is_complete = loop.statistics.is_complete and not faults and bool(compared or not is_asked)
     summary = summarize(loop, compared, warnings)
     summary |= {"is_complete": is_complete, "run": identity}
     folder.write_summary(summary)

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from gvo.frontend.protocol import CheckedFrontend, Frontend, Relocalizer, Stamped, find_fault
+from gvo.frontend.protocol import CheckedFrontend, Frontend, Stamped, find_fault
+from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
+from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, RgbdFrame, StereoFrame
 
 # Of six honest errors, 3 in 10,000 are farther off; it leaves room for covariances a little small.
@@ -84,7 +86,8 @@ def check_frontend(
         _check_inverse(frontend, result, *pair)
         _check_prior(frontend, result, *pair)
     _check_direction(frontend, frames[0])
-    if isinstance(frontend, Relocalizer):
+    _check_capabilities(frontend)
+    if CheckedFrontend(frontend).offers_relocalization:
         for pair, result in zip(pairwise(observations), results, strict=True):
             _check_relocalization(CheckedFrontend(frontend), result, *pair)
     for nothing in _without_anything(frames[0], frames[-1], blank):
@@ -112,6 +115,19 @@ def _check_extract(frontend: Frontend[Any], frame: Stamped) -> Stamped:
     )
     observations: Stamped = first
     return observations
+
+
+def _check_capabilities(frontend: Frontend[Any]) -> None:
+    """Check the values of what a front-end offers besides; else they are ignored without a word."""
+    for name, kinds in (("camera", StereoCamera | PinholeCamera), ("rig_offsets", RigOffsets)):
+        value = getattr(frontend, name, None)
+        _require(
+            value is None or isinstance(value, kinds),
+            f"{name} is a {type(value).__name__}, which is none of {kinds}",
+        )
+    for name in ("relocalize", "reconfigure"):
+        method = getattr(frontend, name, None)
+        _require(method is None or callable(method), f"{name} must be a method")
 
 
 def _register(

@@ -100,7 +100,7 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
     -------
     stamps_ns : ndarray of int64, shape (n,)
     covariances : ndarray of float64, shape (n, 6, 6)
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame of the pose.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
         return np.empty(0, dtype=np.int64), np.empty((0, 6, 6))
     if not rows or rows[0].fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
-    values = read_numbers(rows[1:], slice(1, None), n_columns=22)
+    values = read_numbers(rows[1:], slice(1, None), n_columns=22, limit=math.inf)
     return read_stamps(rows[1:], unit_ns=1), from_upper_triangle(values)
 
 
@@ -412,7 +412,9 @@ def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, li
     return " ".join(header), rows
 
 
-def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArray:
+def read_numbers(
+    rows: list[Row], columns: slice, *, n_columns: int, limit: float = MAX_POSITION_M
+) -> FloatArray:
     """Return some columns of rows as numbers.
 
     Parameters
@@ -423,6 +425,8 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
         Which to return.
     n_columns : int
         Required in each row.
+    limit : float
+        Of the absolute values.
 
     Returns
     -------
@@ -446,8 +450,8 @@ def read_numbers(rows: list[Row], columns: slice, *, n_columns: int) -> FloatArr
             raise row.error(f"{error}; expected {n_columns} numbers") from None
     array = np.array(values).reshape(len(rows), len(range(n_columns)[columns]))
     refuse(rows, ~np.isfinite(array).all(axis=1), "a number is not finite; remove the row")
-    is_absurd = (np.abs(array) > MAX_POSITION_M).any(axis=1)
-    refuse(rows, is_absurd, f"a number is beyond {MAX_POSITION_M:g}; remove the row")
+    is_absurd = (np.abs(array) > limit).any(axis=1)
+    refuse(rows, is_absurd, f"a number is beyond {limit:g}; remove the row")
     return array
 
 

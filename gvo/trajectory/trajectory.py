@@ -31,9 +31,9 @@ class Trajectory:
     stamps_ns : ndarray of int64, shape (n,)
         Strictly increasing, nanoseconds.
     T_world_frame : ndarray of float64, shape (n, 4, 4)
-        Map camera coordinates to the world, metres.
+        Map coordinates of the frame (of the camera, a robot's) to the world, metres.
     covariances : ndarray of float64, shape (n, 6, 6), optional
-        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the camera frame.
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in that frame.
     stamps_from : {"file", "times", "rows", "topic"}
         Origin of the stamps: a column of the file; a separate list of stamps; row numbers, one
         second each; message headers, with the rate and phase of another device.
@@ -166,35 +166,37 @@ class Trajectory:
             covariances=None if covariances is None else covariances[chosen],
         )
 
-    def transformed(self, T_cam_body: FloatArray) -> Trajectory:
+    def transformed(self, T_frame_other: FloatArray) -> Trajectory:
         """Return the trajectory of another frame, rigidly attached to the present one.
 
         Parameters
         ----------
-        T_cam_body : ndarray of float64, shape (4, 4)
+        T_frame_other : ndarray of float64, shape (4, 4)
             Maps coordinates of the new frame to the present one, metres.
 
         Returns
         -------
         Trajectory
-            T_world_frame @ T_cam_body, the covariances in the new frame.
+            T_world_frame @ T_frame_other, the covariances in the new frame.
 
         Raises
         ------
         ValueError
             If rotations are unknown and the new frame has another origin.
         """
-        T_cam_body = np.asarray(T_cam_body, dtype=np.float64)
+        T_frame_other = np.asarray(T_frame_other, dtype=np.float64)
         if not self.has_rotations:
-            if np.any(T_cam_body[:3, 3] != 0.0):
+            if np.any(T_frame_other[:3, 3] != 0.0):
                 raise ValueError("without rotations the positions of another point are not known")
             return self
         covariances = self.covariances
         if covariances is not None:
             # T exp(xi) B = T B exp(Ad(B^-1) xi)
-            Ad = se3.adjoint(se3.invert(T_cam_body))
+            Ad = se3.adjoint(se3.invert(T_frame_other))
             covariances = Ad @ covariances @ Ad.T
-        return replace(self, T_world_frame=self.T_world_frame @ T_cam_body, covariances=covariances)
+        return replace(
+            self, T_world_frame=self.T_world_frame @ T_frame_other, covariances=covariances
+        )
 
     def moved(self, T_map_world: FloatArray) -> Trajectory:
         """Return the trajectory in another world frame.
@@ -209,10 +211,10 @@ class Trajectory:
         Trajectory
             T_map_world @ T_world_frame; the covariances, in the pose's own frame, stay the same.
         """
-        T_map_cam = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_frame
+        T_map_frame = np.asarray(T_map_world, dtype=np.float64) @ self.T_world_frame
         if not self.has_rotations:
-            T_map_cam = _unrotated(T_map_cam[:, :3, 3])
-        return replace(self, T_world_frame=T_map_cam)
+            T_map_frame = _unrotated(T_map_frame[:, :3, 3])
+        return replace(self, T_world_frame=T_map_frame)
 
     def interpolate(self, stamps_ns: IntArray) -> Trajectory:
         """Interpolate poses at given stamps: positions linearly, rotations by SLERP.

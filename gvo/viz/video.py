@@ -182,12 +182,25 @@ class Film:
             writer.write(answer[1])
             n += 1
         writer.release()
-        if n != self._n:
-            raise RecordingError(f"{self.path}: was not written whole: {n} of {self._n} frames")
+        n_written = min(n, _count_packets(self._part))
+        if n_written != self._n:
+            raise RecordingError(
+                f"{self.path}: was not written whole: {n_written} of {self._n} frames; its disk "
+                "needs twice the size of the film"
+            )
         with self._part.open("r+b") as stream:
             header = stream.read(64)
             stream.seek(0)
             stream.write(header.replace(_MATROSKA, _WEBM))
+
+
+def _count_packets(path: Path) -> int:
+    """Return the number of encoded pictures in a film."""
+    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    n = 0
+    while packets.read()[0]:
+        n += 1
+    return n
 
 
 class PngFolder:

@@ -243,7 +243,7 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
         *rows, last = said.splitlines()
         # The first may have ended before its row was written.
         assert all(row.startswith("[1/2] walk0: complete") for row in rows), said
-        assert last == f"gvo: interrupted; what was done stands in {out}: the same command goes on"
+        assert last == f"gvo: interrupted; the poses so far are in {out}: the same command goes on"
     before = state_of(out / "walk0")
     answer = batch(bags / "walk0.mcap", long_bag, "--out", out)
     assert answer.code == 0, answer.err

@@ -110,7 +110,7 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
             process.kill()
     if number == signal.SIGINT:
         assert process.returncode == 130
-        assert said.splitlines()[-1].startswith("gvo: interrupted; what was done stands in")
+        assert said.splitlines()[-1].startswith("gvo: interrupted; the poses so far are in")
     before = state_of(tmp_path / "walk0")
     answer = command("batch", *arguments, "--no-report")
     assert answer.code == 0, answer.err

@@ -203,7 +203,7 @@ def test_a_signal_ends_the_run_with_its_code_and_complete_files(
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == code
-    assert errors == f"gvo: interrupted; what was done stands in {tmp_path}\n".encode()
+    assert errors == f"gvo: interrupted; the poses so far are in {tmp_path}\n".encode()
     assert json.loads((tmp_path / "summary.json").read_text())["state"] == "interrupted"
     n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
     assert len(n_poses) == 1

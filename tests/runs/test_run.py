@@ -19,6 +19,7 @@ from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
+from tests.conftest import Command
 from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
@@ -471,3 +472,17 @@ def test_a_bag_that_cannot_be_written_leaves_no_folder(
     with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
         gvo.run_recording(room, tmp_path / "out", outputs=outputs)
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_film_that_is_not_whole_takes_nothing_from_the_run(
+    drive_bag: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.viz.video._count_packets", lambda _: 0)
+    out = tmp_path / "out"
+    options = ["--out", out, "--no-report", "--overlay", tmp_path / "film.webm"]
+    answer = command("run", drive_bag, *options)
+    assert answer.code == 3
+    assert "film.webm: was not written whole: 0 of 20 frames" in answer.err
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["state"], summary["is_complete"]) == ("complete", False)
+    assert summary["errors"]

@@ -327,3 +327,18 @@ def test_contradictions_are_let_pass_up_to_five_sigma(respect: str, reason: str)
     check_frontend(OffByAFewSigmas(respect, 4.9), scans)
     with pytest.raises(ContractError, match=reason):
         check_frontend(OffByAFewSigmas(respect, 5.1), scans)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("camera", "none"), ("rig_offsets", 3), ("relocalize", True), ("reconfigure", "later")],
+)
+def test_what_a_front_end_offers_besides_has_to_be_usable(name: str, value: object) -> None:
+    frontend = make_frontend(recording("stereo").info.camera, configure("klt"))
+
+    class Offering:
+        extract, register = frontend.extract, frontend.register
+
+    setattr(Offering, name, value)
+    with pytest.raises(ContractError, match=name):
+        check_frontend(Offering(), frames("stereo"))

@@ -279,3 +279,13 @@ def test_growing_files_are_read_as_far_as_they_go_and_sorted(tmp_path: Path) -> 
     stamps_ns, found = read_covariances(covariances, is_growing=True)
     assert stamps_ns.tolist() == expected
     assert len(found) == len(expected)
+
+
+def test_covariances_of_poses_hardly_known_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "covariance.csv"
+    covariances = np.diag([1.0, 1.0, 1.0, 5e12, 1.0, 1.0])[None]
+    trajectory = Trajectory(
+        stamps_ns=np.array([7]), T_world_frame=np.eye(4)[None], covariances=covariances
+    )
+    write_covariances(path, trajectory)
+    np.testing.assert_array_equal(read_covariances(path)[1], covariances)

@@ -203,3 +203,11 @@ def test_the_log_level_of_opencv_is_left_as_it_was(tmp_path: Path) -> None:
     before = cv2.utils.logging.getLogLevel()
     _write(tmp_path / "film.webm")
     assert cv2.utils.logging.getLogLevel() == before
+
+
+def test_a_film_of_which_a_part_is_missing_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "_count_packets", lambda _: len(_LEVELS) - 1)
+    with pytest.raises(RecordingError, match=r"film\.webm: was not written whole: 13 of 14 frames"):
+        _write(tmp_path / "film.webm")

@@ -58,7 +58,6 @@ class PoseGraphSource:
         self._fixed: dict[int, FloatArray] = {}
         self._start_id: int | None = None
         self._n_vertices = 0
-        self._n_waiting = 0
         self._scan()
         self.n_poses = self._n_vertices
         self.decisions = [
