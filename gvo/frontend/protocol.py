@@ -70,7 +70,6 @@ class Frontend(Protocol[ObservationsT]):
         """
 
 
-@runtime_checkable
 class Relocalizer(Protocol):
     """A front-end that finds a place again, however far apart two frames are."""
 
@@ -81,7 +80,6 @@ class Relocalizer(Protocol):
         """
 
 
-@runtime_checkable
 class Reconfigurable(Protocol):
     """A front-end whose parameters can change while it runs."""
 
@@ -89,7 +87,6 @@ class Reconfigurable(Protocol):
         """Take over a configuration; observations extracted before must stay usable."""
 
 
-@runtime_checkable
 class HasCamera(Protocol):
     """A front-end of a camera; with `HasPoints`, keyframes are chosen by view overlap."""
 
@@ -98,7 +95,6 @@ class HasCamera(Protocol):
         """The camera that the points are seen by."""
 
 
-@runtime_checkable
 class LearnsRig(Protocol):
     """A front-end that calibrates constant offsets of a stereo rig online."""
 
@@ -138,12 +134,12 @@ class CheckedFrontend(Generic[ObservationsT]):
         self._relocalizer: Relocalizer | None = _capability(frontend, "relocalize")
         self._reconfigurable: Reconfigurable | None = _capability(frontend, "reconfigure")
         self._learner: LearnsRig | None = _capability(frontend, "rig_offsets")
-        self._seer: HasCamera | None = _capability(frontend, "camera")
+        self._camera_holder: HasCamera | None = _capability(frontend, "camera")
 
     @property
     def camera(self) -> StereoCamera | PinholeCamera | None:
         """The front-end's own camera, where it has one; `reconfigure` may change it."""
-        camera = None if self._seer is None else self._seer.camera
+        camera = None if self._camera_holder is None else self._camera_holder.camera
         return camera if isinstance(camera, StereoCamera | PinholeCamera) else None
 
     @property

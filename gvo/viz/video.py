@@ -174,15 +174,13 @@ class Film:
     def _retime(self) -> None:
         """Copy the encoded pictures to WebM at the rate of the film."""
         encoded, self._part = self._part, self._part.with_stem("timed")
-        packets = cv2.VideoCapture(str(encoded), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        packets = _open_packets(encoded)
         writer = self._open(self._part, self._rate_hz, is_encoded=True)
-        n = 0
         while (answer := packets.read())[0]:
             writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, packets.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
             writer.write(answer[1])
-            n += 1
         writer.release()
-        n_written = min(n, _count_packets(self._part))
+        n_written = _count_packets(self._part)
         if n_written != self._n:
             raise RecordingError(
                 f"{self.path}: was not written whole: {n_written} of {self._n} frames; its disk "
@@ -194,9 +192,14 @@ class Film:
             stream.write(header.replace(_MATROSKA, _WEBM))
 
 
+def _open_packets(path: Path) -> cv2.VideoCapture:
+    """Open a film to read its pictures as they are encoded."""
+    return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+
+
 def _count_packets(path: Path) -> int:
     """Return the number of encoded pictures in a film."""
-    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    packets = _open_packets(path)
     n = 0
     while packets.read()[0]:
         n += 1
