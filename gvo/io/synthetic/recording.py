@@ -66,11 +66,18 @@ class SyntheticRecording:
         Size of the images relative to the full one; the intrinsics follow.
     noise : SensorNoise, optional
         Default: `SensorNoise()`, for driving with depth up to 80 m.
+    readout_ms : float
+        A rolling shutter: milliseconds from the first row to the one after the last. Row v of a
+        frame is seen from the pose at its stamp + readout_ms * (v / height - 1/2), in both images
+        of a stereo camera; stamps and ground truth are those of the middle row. Depth is that of
+        what the pixel of the colour image shows, as of a driver that registers it perfectly, along
+        the axis of the row's pose. What moves in a world stands still during the readout. 0: all
+        rows at once.
 
     Raises
     ------
     ValueError
-        Unknown world or sensor, no frames, a seed or a scale out of range.
+        Unknown world or sensor, no frames; a seed, a scale or a readout out of range.
 
     Examples
     --------
@@ -88,9 +95,14 @@ class SyntheticRecording:
         seed: int = 0,
         scale: float = 1.0,
         noise: SensorNoise | None = None,
+        readout_ms: float = 0.0,
     ) -> None:
         _check(world, sensor, n_frames, seed, scale)
         setting = _WORLDS[world]
+        frame_ms = 1e3 / setting.rate_hz
+        if not 0.0 <= readout_ms <= frame_ms:
+            raise ValueError(f"readout_ms must be in [0, {frame_ms:.1f}], got {readout_ms}")
+        self._readout_s, self._move = 1e-3 * readout_ms, setting.move
         self._world, self._sensor, self._seed = world, sensor, seed
         self._camera = scale_camera(setting.camera, scale)
         self._baseline = setting.baseline
@@ -143,8 +155,8 @@ class SyntheticRecording:
         Returns
         -------
         ndarray of float32, shape (height, width)
-            Metres along the optical axis at the centre of each pixel; of a mirror what is seen in
-            it for stereo, its glass for RGB-D.
+            Metres along the optical axis at the centre of each pixel, of a rolling shutter from
+            the pose of its row; of a mirror what is seen in it for stereo, its glass for RGB-D.
         """
         T_map_cam, camera = self._view(index, stream)
         is_reflected = self._sensor == "stereo"
@@ -156,12 +168,21 @@ class SyntheticRecording:
         return 1e-9 * float(self._elapsed_ns[index])
 
     def _view(self, index: int, stream: int) -> tuple[FloatArray, PinholeCamera]:
-        """Return pose and camera of a stream; the depth camera is the colour camera."""
+        """Return pose or poses and camera of a stream; the depth camera is the colour camera."""
+        T_map_cam = self._poses(index)
         if stream == 0 or self._sensor == "rgbd":
-            return self._T_map_cam[index], self._camera
+            return T_map_cam, self._camera
         T_left_right = make_transform(np.eye(3), np.array([self._baseline, 0.0, 0.0]))
         shifted = replace(self._camera, cx=self._camera.cx - self._noise.disparity_offset_px)
-        return self._T_map_cam[index] @ T_left_right, shifted
+        return T_map_cam @ T_left_right, shifted
+
+    def _poses(self, index: int) -> FloatArray:
+        """Return the pose of a frame, shape (4, 4), or those of its rows, (height, 4, 4)."""
+        if self._readout_s == 0.0:
+            return np.asarray(self._T_map_cam[index])
+        height = self._camera.height
+        rows_s = self._readout_s * (np.arange(height) / height - 0.5)
+        return self._move(self._elapsed_s(index) + rows_s)
 
     def _load(self, index: int, stream: int) -> NDArray[Any]:
         rng = np.random.default_rng([self._seed, index, stream])

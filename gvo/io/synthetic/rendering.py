@@ -1,4 +1,8 @@
-"""Rectangles rendered: visibility, depth, images."""
+"""Rectangles rendered: visibility, depth, images.
+
+A camera has one pose, or one for each row of its image: that of a rolling shutter. All of a
+row's pixels, and the samples in them, are seen from the row's pose.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ NOTHING = -1
 _NEAR_M = 0.05
 _SMALL_BOX = 20_000  # pixels: not worth a closer look
 _BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the cache
+_CULLED_ROWS = 8  # rectangles in view are looked for from every so manieth row's pose
 
 
 def render_image(
@@ -38,8 +43,8 @@ def render_image(
     ----------
     scene : Scene
         Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the map, metres.
+    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
+        Maps camera coordinates to the map, metres; of the image or of each of its rows.
     camera : PinholeCamera
     is_antialiased : bool
         Four samples for the pixels where surfaces meet; otherwise one for each pixel.
@@ -61,9 +66,8 @@ def render_image(
     v, u = np.nonzero(is_mixed)
     total = np.zeros(len(u), dtype=np.float32)
     for k, corner in enumerate(corners):
-        rows = (v + (0.5 * (k // 2) - 0.25)).astype(np.float32)
         columns = (u + (0.5 * (k % 2) - 0.25)).astype(np.float32)
-        total += _shade(view, corner[v, u], columns, rows)
+        total += _shade(view, corner[v, u], columns, v, below=0.5 * (k // 2) - 0.25)
     image[v, u] = 0.25 * total
     return image
 
@@ -77,8 +81,8 @@ def render_depth(
     ----------
     scene : Scene
         Rectangles in the `map` frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the map, metres.
+    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
+        Maps camera coordinates to the map, metres; of the image or of each of its rows.
     camera : PinholeCamera
     beyond : (ndarray of float64, ndarray of float64), optional
         Point and normal of a plane that cuts away what is before it, see `look`.
@@ -86,12 +90,14 @@ def render_depth(
     Returns
     -------
     ndarray of float32, shape (height, width)
-        Metres along the optical axis, NaN where there is nothing.
+        Metres along the optical axis (of the row's pose), NaN where there is nothing.
     """
     view = look(scene, T_map_cam, camera, beyond=beyond)
-    forms = np.vstack([view.inverse_depth, np.full(3, np.nan)])  # the last row: nothing
-    a, b, c = forms[find_visible(view)].transpose(2, 0, 1)
     u, v = np.arange(camera.width), np.arange(camera.height)[:, np.newaxis]
+    nothing = np.full((*view.inverse_depth.shape[:-2], 1, 3), np.nan)
+    forms = np.concatenate([view.inverse_depth, nothing], axis=-2)  # where visible is -1
+    visible = find_visible(view)
+    a, b, c = np.moveaxis(forms[v, visible] if view.is_rolling else forms[visible], -1, 0)
     return np.asarray(1.0 / (a * u + b * v + c), dtype=np.float32)
 
 
@@ -115,20 +121,22 @@ def to_uint8(grey: SampleArray) -> ImageArray:
 class View:
     """The rectangles one camera may see, as linear forms of the pixel (u, v, 1).
 
+    The forms of a rolling shutter have one more axis, the first: they differ from row to row.
+
     Parameters
     ----------
     scene : Scene
     camera : PinholeCamera
     indices : ndarray of int64, shape (n,)
         Of the rectangles in the scene.
-    inverse_depth : ndarray of float64, shape (n, 3)
+    inverse_depth : ndarray of float64, shape (n, 3) or (height, n, 3)
         1/z in 1/m.
-    texels_s, texels_t : ndarray of float64, shape (n, 3)
+    texels_s, texels_t : ndarray of float64, shape (n, 3) or (height, n, 3)
         Texture coordinates over z, texels per metre.
-    inside : ndarray of float64, shape (n, 4 or 5, 3)
+    inside : ndarray of float64, shape (n, 4 or 5, 3) or (height, n, 4 or 5, 3)
         All not negative inside of the rectangle, and beyond the plane that cuts the view.
     corners : ndarray of float64, shape (n, 4, 3)
-        In the camera frame, metres.
+        In the camera frame, of the middle row, metres.
     """
 
     scene: Scene
@@ -140,6 +148,30 @@ class View:
     inside: FloatArray
     corners: FloatArray
 
+    @property
+    def is_rolling(self) -> bool:
+        """Whether each row has forms of its own."""
+        return self.inverse_depth.ndim == 3
+
+    def of_middle_row(self, forms: FloatArray) -> FloatArray:
+        """Return forms (n, ..., 3) of the image, or of its middle row."""
+        return forms[self.camera.height // 2] if self.is_rolling else forms
+
+    def along_rows(self, forms: FloatArray, k: int, rows: IntArray) -> tuple[FloatArray, ...]:
+        """Return slopes along u, (..., 1 or n_rows), and values at u = 0, (..., n_rows).
+
+        Parameters
+        ----------
+        forms : ndarray of float64
+            One of those of the view.
+        k : int
+            The rectangle.
+        rows : ndarray of int64, shape (n_rows,)
+        """
+        chosen = forms[rows, k] if self.is_rolling else forms[np.newaxis, k]
+        a, b, c = np.moveaxis(chosen, (-1, 0), (0, -1))
+        return a, b * rows + c
+
 
 def look(
     scene: Scene, T_map_cam: FloatArray, camera: PinholeCamera, *, beyond: Plane | None = None
@@ -150,8 +182,8 @@ def look(
     ----------
     scene : Scene
         In the map frame, metres.
-    T_map_cam : ndarray of float64, shape (4, 4)
-        Maps camera coordinates to the map, metres.
+    T_map_cam : ndarray of float64, shape (4, 4) or (height, 4, 4)
+        Maps camera coordinates to the map, metres; of the image or of each of its rows.
     camera : PinholeCamera
         Of the image.
     beyond : (ndarray of float64, ndarray of float64), optional
@@ -163,23 +195,24 @@ def look(
     View
         What the camera may see.
     """
-    T_cam_map = invert(T_map_cam)
-    R, K_inverse = T_cam_map[:3, :3], np.linalg.inv(camera.K)
-    origins = transform_points(T_cam_map, scene.origins)
-    axes_s, axes_t = scene.axes_s @ R.T, scene.axes_t @ R.T
+    T_cam_map, K_inverse = invert(T_map_cam), np.linalg.inv(camera.K)
+    keep = _in_view(scene, T_cam_map, camera)
+    R = T_cam_map[..., :3, :3]
+    origins = transform_points(T_cam_map, scene.origins[keep])
+    axes_s, axes_t = (axes[keep] @ np.swapaxes(R, -1, -2) for axes in (scene.axes_s, scene.axes_t))
     distances = _dots(normals := np.cross(axes_s, axes_t), origins)
-    corners = _corners(origins, axes_s * scene.sizes[:, :1], axes_t * scene.sizes[:, 1:])
-    keep = np.flatnonzero(_faces(scene, distances) & _is_in_frustum(corners, camera))
-    inverse_depth = (normals[keep] / distances[keep, np.newaxis]) @ K_inverse
+    faces = _faces(scene.is_two_sided[keep], distances)
+    inverse_depth = (normals / np.where(faces, distances, np.inf)[..., np.newaxis]) @ K_inverse
     s, t = (
-        axes @ K_inverse - _dots(axes, origins[keep])[:, np.newaxis] * inverse_depth
-        for axes in (axes_s[keep], axes_t[keep])
+        axes @ K_inverse - _dots(axes, origins)[..., np.newaxis] * inverse_depth
+        for axes in (axes_s, axes_t)
     )
     width, height = scene.sizes[keep].T[..., np.newaxis]
     inside = [s, width * inverse_depth - s, t, height * inverse_depth - t]
     if beyond is not None:
-        point, normal = R @ beyond[0] + T_cam_map[:3, 3], R @ beyond[1]
-        inside.append(normal @ K_inverse - (normal @ point) * inverse_depth)
+        point, normal = R @ beyond[0] + T_cam_map[..., :3, 3], R @ beyond[1]
+        offset = _dots(normal, point)[..., np.newaxis, np.newaxis]
+        inside.append((normal @ K_inverse)[..., np.newaxis, :] - offset * inverse_depth)
     return View(
         scene=scene,
         camera=camera,
@@ -187,17 +220,40 @@ def look(
         inverse_depth=inverse_depth,
         texels_s=scene.texels_per_m[keep, :1] * s + scene.texel_offsets[keep, :1] * inverse_depth,
         texels_t=scene.texels_per_m[keep, 1:] * t + scene.texel_offsets[keep, 1:] * inverse_depth,
-        inside=np.stack(inside, axis=1),
-        corners=corners[keep],
+        inside=np.stack(inside, axis=-2),
+        corners=_corners(scene, keep, _of_middle_row(T_cam_map)),
     )
 
 
-def _faces(scene: Scene, distances: FloatArray) -> BoolArray:
+def _of_middle_row(T: FloatArray) -> FloatArray:
+    """Return the transform (4, 4) of the image, or of its middle row."""
+    return T if T.ndim == 2 else np.asarray(T[len(T) // 2])
+
+
+def _in_view(scene: Scene, T_cam_map: FloatArray, camera: PinholeCamera) -> IntArray:
+    """Return the indices of the rectangles that may be seen."""
+    everything = np.arange(len(scene.origins))
+    is_seen = np.zeros(len(everything), dtype=np.bool_)
+    poses = T_cam_map.reshape(-1, 4, 4)
+    for pose in [*poses[::_CULLED_ROWS], poses[-1]] if len(poses) > 1 else poses:
+        normals = np.cross(scene.axes_s, scene.axes_t) @ pose[:3, :3].T
+        distances = _dots(normals, transform_points(pose, scene.origins))
+        corners = _corners(scene, everything, pose)
+        is_seen |= _faces(scene.is_two_sided, distances) & _is_in_frustum(corners, camera)
+    return np.flatnonzero(is_seen)
+
+
+def _faces(is_two_sided: BoolArray, distances: FloatArray) -> BoolArray:
     """Tell which rectangles turn a visible side to the camera, by their distances along normals."""
-    return np.asarray((distances > 1e-9) | (scene.is_two_sided & (distances < -1e-9)))
+    return np.asarray((distances > 1e-9) | (is_two_sided & (distances < -1e-9)))
 
 
-def _corners(origins: FloatArray, edges_s: FloatArray, edges_t: FloatArray) -> FloatArray:
+def _corners(scene: Scene, indices: IntArray, T_cam_map: FloatArray) -> FloatArray:
+    """Return the corners of rectangles in the camera frame, shape (n, 4, 3)."""
+    R = T_cam_map[:3, :3]
+    origins = transform_points(T_cam_map, scene.origins[indices])
+    edges_s = scene.axes_s[indices] @ R.T * scene.sizes[indices, :1]
+    edges_t = scene.axes_t[indices] @ R.T * scene.sizes[indices, 1:]
     return np.stack(
         [origins, origins + edges_s, origins + edges_s + edges_t, origins + edges_t], axis=1
     )
@@ -213,7 +269,7 @@ def _is_in_frustum(corners: FloatArray, camera: PinholeCamera) -> BoolArray:
 
 def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the inner products of rows."""
-    return np.asarray(np.einsum("ij,ij->i", first, second))
+    return np.asarray(np.einsum("...j,...j->...", first, second))
 
 
 def refine(view: View) -> View:
@@ -227,16 +283,20 @@ def refine(view: View) -> View:
     Returns
     -------
     View
-        Its linear forms take pixels of the larger image.
+        Its linear forms take pixels of the larger image, of which two rows share a pose.
     """
     M = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
+
+    def refined(forms: FloatArray) -> FloatArray:
+        return np.repeat(forms @ M, 2, axis=0) if view.is_rolling else forms @ M
+
     return replace(
         view,
         camera=scale_camera(view.camera, 2.0),
-        inverse_depth=view.inverse_depth @ M,
-        texels_s=view.texels_s @ M,
-        texels_t=view.texels_t @ M,
-        inside=view.inside @ M,
+        inverse_depth=refined(view.inverse_depth),
+        texels_s=refined(view.texels_s),
+        texels_t=refined(view.texels_t),
+        inside=refined(view.inside),
     )
 
 
@@ -267,7 +327,7 @@ def find_visible(view: View) -> IndexArray:
     """
     nearest = np.zeros((view.camera.height, view.camera.width), dtype=np.float32)
     visible = np.full(nearest.shape, NOTHING, dtype=np.int16)
-    first, last, upper_bounds = _bounds(view)
+    first, last, upper_bounds = _bounds_by_rows(view) if view.is_rolling else _bounds(view)
     # Front to back, cut-outs last: what is hidden is found out early.
     for k in np.lexsort((-upper_bounds, view.scene.has_mask[view.indices])):
         box = slice(first[k, 1], last[k, 1]), slice(first[k, 0], last[k, 0])
@@ -282,10 +342,9 @@ def _draw(
 ) -> None:
     """Enter rectangle k into the buffers where it is the nearest one."""
     v, u = (np.arange(part.start, part.stop) for part in box)
-    a, b, c = view.inverse_depth[k]
-    inverse_depths = np.add.outer((b * v + c).astype(np.float32), (a * u).astype(np.float32))
+    inverse_depths = _evaluate(view, view.inverse_depth, k, (u, v))
     mask = inverse_depths > nearest[box]
-    left, right = _row_spans(view.inside[k], v, view.camera.width)
+    left, right = _row_spans(view, k, v)
     columns = u.astype(np.int16)
     mask &= columns >= left[:, np.newaxis]
     mask &= columns <= right[:, np.newaxis]
@@ -295,6 +354,16 @@ def _draw(
     np.copyto(visible[box], np.int16(k), where=mask)
 
 
+def _evaluate(
+    view: View, forms: FloatArray, k: int, pixels: tuple[IntArray, IntArray]
+) -> SampleArray:
+    """Return a form of rectangle k at all columns and rows, shape (n_rows, n_columns)."""
+    u, v = pixels
+    slopes, offsets = view.along_rows(forms, k, v)
+    along = (slopes[:, np.newaxis] * u).astype(np.float32)
+    return np.asarray(offsets.astype(np.float32)[:, np.newaxis] + along)
+
+
 def _shrink(
     view: View, k: int, box: tuple[slice, slice], nearest: SampleArray
 ) -> tuple[slice, slice]:
@@ -302,9 +371,8 @@ def _shrink(
     rows, columns = box
     if (rows.stop - rows.start) * (columns.stop - columns.start) < _SMALL_BOX:
         return box
-    a, b, c = view.inverse_depth[k]
-    reach = b * np.arange(rows.start, rows.stop) + c
-    reach += max(a * columns.start, a * (columns.stop - 1))
+    slopes, reach = view.along_rows(view.inverse_depth, k, np.arange(rows.start, rows.stop))
+    reach += np.maximum(slopes * columns.start, slopes * (columns.stop - 1))
     used = np.flatnonzero(nearest[box].min(axis=1) < reach)
     if len(used) == 0:
         return slice(0, 0), columns
@@ -330,16 +398,32 @@ def _bounds(view: View) -> tuple[IntArray, IntArray, FloatArray]:
     return first.astype(np.int64), last.astype(np.int64), np.minimum(over_box, over_points)
 
 
-def _row_spans(inside: FloatArray, rows: IntArray, width: int) -> tuple[IndexArray, IndexArray]:
-    """Return the first and the last column inside of a rectangle for each row."""
-    a, b, c = inside.T[..., np.newaxis]
-    offsets = b * rows + c
+def _bounds_by_rows(view: View) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the same for a rolling shutter, of which no corner has one place in the image."""
+    n = len(view.indices)
+    first, last = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
+    upper_bounds = np.zeros(n)
+    for k in range(n):
+        left, right = _row_spans(view, k, np.arange(view.camera.height))
+        rows = np.flatnonzero(left <= right)
+        if len(rows) == 0:
+            continue
+        left, right = left[rows], right[rows]
+        slopes, reach = view.along_rows(view.inverse_depth, k, rows)
+        first[k], last[k] = (left.min(), rows[0]), (right.max() + 1, rows[-1] + 1)
+        upper_bounds[k] = (reach + np.maximum(slopes * left, slopes * right)).max()
+    return first, last, upper_bounds
+
+
+def _row_spans(view: View, k: int, rows: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Return the first and the last column inside of rectangle k for each row."""
+    width = view.camera.width
+    a, offsets = view.along_rows(view.inside, k, rows)
     slopes = np.where(a == 0, 1e-300, a)  # all of the row, or nothing
     with np.errstate(over="ignore"):
         bounds = -offsets / slopes
-    is_lower = slopes[:, 0] > 0
-    lower = bounds[is_lower].max(axis=0, initial=0.0)
-    upper = bounds[~is_lower].min(axis=0, initial=width - 1.0)
+    lower = np.where(slopes > 0, bounds, 0.0).max(axis=0, initial=0.0)
+    upper = np.where(slopes > 0, np.inf, bounds).min(axis=0, initial=width - 1.0)
     left, right = np.minimum(np.ceil(lower), width), np.maximum(np.floor(upper), -1)
     return left.astype(np.int16), right.astype(np.int16)
 
@@ -352,15 +436,14 @@ def _cut_out(
     mask: BoolArray,
 ) -> None:
     """Clear the mask over columns and rows where the texture of rectangle k is transparent."""
-    u, v = pixels
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # beyond the rectangle
         depths = np.reciprocal(inverse_depths)
         s, t = (
-            np.add.outer((b * v + c).astype(np.float32), (a * u).astype(np.float32)) * depths
-            for a, b, c in (view.texels_s[k], view.texels_t[k])
+            _evaluate(view, forms, k, pixels) * depths for forms in (view.texels_s, view.texels_t)
         )
         # One level for the whole rectangle: left and right then see the same outline.
-        per_pixel = np.linalg.norm([view.texels_s[k, :2], view.texels_t[k, :2]], axis=1).max()
+        slopes = [view.of_middle_row(each)[k, :2] for each in (view.texels_s, view.texels_t)]
+        per_pixel = np.linalg.norm(slopes, axis=1).max()
         level = round(np.log2(max(view.corners[k, :, 2].mean() * per_pixel, 1.0)))
         mask &= view.scene.atlas.is_opaque(int(view.scene.textures[view.indices[k]]), level, s, t)
 
@@ -372,20 +455,28 @@ def _shade_rows(view: View, visible: IndexArray) -> SampleArray:
     u = np.arange(width, dtype=np.float32)
     n_rows = max(1, _BAND_SAMPLES // width)
     for start in range(0, height, n_rows):
-        v = np.arange(start, min(start + n_rows, height), dtype=np.float32)[:, np.newaxis]
-        image[start : start + n_rows] = _shade(view, visible[start : start + n_rows], u, v)
+        rows = np.arange(start, min(start + n_rows, height))[:, np.newaxis]
+        image[start : start + n_rows] = _shade(view, visible[start : start + n_rows], u, rows)
     return image
 
 
-def _shade(view: View, visible: IndexArray, u: SampleArray, v: SampleArray) -> SampleArray:
-    """Look the texture of the visible rectangles up at samples (u, v)."""
-    scene = view.scene
-    if len(view.indices) == 0:
+def _shade(
+    view: View, visible: IndexArray, u: SampleArray, rows: IntArray, *, below: float = 0.0
+) -> SampleArray:
+    """Look the texture of the visible rectangles up at columns u, so far below rows' middles."""
+    scene, n = view.scene, len(view.indices)
+    if n == 0:
         return np.full(visible.shape, scene.light.haze_grey, dtype=np.float32)
+    v = (rows + below).astype(np.float32)
+    first, last = (int(rows.min()), int(rows.max())) if rows.size else (0, 0)
+    by_row = (rows - first) * n + visible if view.is_rolling else visible
 
     def gather(values: FloatArray) -> list[SampleArray]:
-        # Where nothing is visible the last rectangle fills in, and is painted over.
-        return [column.take(visible, mode="wrap") for column in values.astype(np.float32).T]
+        # Where nothing is visible another rectangle fills in, and is painted over.
+        is_by_row = values.ndim == 3
+        table = values[first : last + 1].reshape(-1, 3) if is_by_row else values
+        indices = by_row if is_by_row else visible
+        return [column.take(indices, mode="wrap") for column in table.astype(np.float32).T]
 
     a, b, c = gather(view.inverse_depth)
     inverse_depths = np.maximum(a * u + b * v + c, np.float32(1e-9))

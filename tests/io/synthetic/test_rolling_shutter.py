@@ -1,0 +1,162 @@
+"""A rolling shutter: each row is what a camera at the row's own pose sees in it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.geometry.se3 import make_transform
+from gvo.io.synthetic.recording import SensorNoise, SyntheticRecording
+from gvo.io.synthetic.rendering import render_depth, render_image, to_uint8
+from gvo.io.synthetic.scene import Light, Rectangle, make_scene
+from gvo.io.synthetic.textures import Texture
+from gvo.io.synthetic.worlds.deceptive import mirror_room
+from gvo.io.synthetic.worlds.motion import drive, look_around
+from gvo.io.synthetic.worlds.room import room
+from gvo.io.synthetic.worlds.street import street
+from gvo.types import FloatArray
+
+CAMERA = PinholeCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
+READOUT_S = 0.03
+MOTIONS: dict[Any, Any] = {"driving": (street, drive), "handheld": (room, look_around)}
+
+
+def hand(stamp_s: float) -> FloatArray:
+    """Return T_map_cam of a hand that turns by some 90 deg/s about three axes, at 0.8 m/s."""
+    R = Rotation.from_rotvec(np.array([0.7, 1.2, -0.6]) * stamp_s).as_matrix()
+    return make_transform(np.asarray(R), np.array([0.6, -0.3, 0.4]) * stamp_s)
+
+
+def pixel_at(point: FloatArray, stamp_s: float) -> FloatArray:
+    """Project a point of the map into the camera of one moment, by hand."""
+    x, y, z = np.linalg.solve(hand(stamp_s), np.append(point, 1.0))[:3]
+    return np.array([CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy])
+
+
+def rolling_pixel(point: FloatArray) -> FloatArray:
+    """Find the row that is exposed just when the point is seen in it."""
+
+    def stamp_of(row: float) -> float:
+        return READOUT_S * (row / CAMERA.height - 0.5)
+
+    row = brentq(lambda v: pixel_at(point, stamp_of(v))[1] - v, -200.0, 680.0)
+    return pixel_at(point, stamp_of(row))
+
+
+def blob() -> Texture:
+    """Return a bright spot in the middle of a dark square."""
+    x = np.linspace(-4.0, 4.0, 65)[:-1] + 0.0625
+    spot = 255.0 * np.exp(-0.5 * x**2)
+    return Texture(pixels=np.rint(np.outer(spot, spot) / 255.0).astype(np.uint8), size_m=(1.0, 1.0))
+
+
+def centroid_near(image: NDArray[np.float32], pixel: FloatArray, radius: int = 30) -> FloatArray:
+    u, v = (round(float(each)) for each in pixel)
+    box = slice(v - radius, v + radius + 1), slice(u - radius, u + radius + 1)
+    rows, columns = np.mgrid[box]
+    weights = image[box] / image[box].sum()
+    return np.array([np.sum(weights * columns), np.sum(weights * rows)])
+
+
+def test_points_are_seen_where_the_pose_of_their_row_puts_them() -> None:
+    xyz = [(-0.6, -0.5, 2.0), (0.8, -0.5, 2.5), (-1.0, 0.6, 2.6), (0.2, 0.6, 1.9), (0.1, -0.1, 4)]
+    centers = np.array(xyz)
+    size = 0.06
+    spots = [
+        Rectangle(
+            corner=center - [size, size, 0],
+            edge_s=(2 * size, 0, 0),
+            edge_t=(0, 2 * size, 0),
+            texture="spot",
+            is_stretched=True,
+        )
+        for center in centers
+    ]
+    scene = make_scene(spots, {"spot": blob()}, Light(ambient=1.0, direct=0.0, haze_grey=0.0))
+    stamps_s = READOUT_S * (np.arange(CAMERA.height) / CAMERA.height - 0.5)
+    image = render_image(scene, np.stack([hand(stamp) for stamp in stamps_s]), CAMERA)
+    seen = np.array([centroid_near(image, rolling_pixel(center)) for center in centers])
+    np.testing.assert_allclose(seen, [rolling_pixel(center) for center in centers], atol=0.05)
+    # A shutter that opens all rows at once sees those far from the middle elsewhere.
+    shifts = np.linalg.norm(seen - [pixel_at(center, 0.0) for center in centers], axis=1)
+    assert shifts[:4].min() > 2.0
+    assert shifts[4] < 1.0
+
+
+@pytest.mark.parametrize("world", MOTIONS)
+def test_one_pose_for_all_rows_gives_the_image_of_one_pose(world: str) -> None:
+    build, move = MOTIONS[world]
+    scene, T_map_cam = build(0), move(np.array([2.3]))[0]
+    poses = np.broadcast_to(T_map_cam, (CAMERA.height, 4, 4))
+    for render in (render_image, render_depth):
+        np.testing.assert_array_equal(
+            render(scene, poses, CAMERA), render(scene, T_map_cam, CAMERA)
+        )
+    first, second = (
+        render_image(scene, T, CAMERA, is_antialiased=False) for T in (poses, T_map_cam)
+    )
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize("world", MOTIONS)
+def test_each_row_is_that_of_an_image_taken_at_its_stamp(world: Any, sensor: Any) -> None:
+    build, move = MOTIONS[world]
+    recording = SyntheticRecording(
+        world, sensor, n_frames=12, noise=SensorNoise.none(), scale=0.5, seed=1, readout_ms=30.0
+    )
+    camera, scene = recording.info.camera, build(1)
+    loaded = [image.load() for image in list(recording.images())[-2:]]
+    stamps_ns = recording.ground_truth().stamps_ns
+    for row in (0, camera.height // 3, camera.height - 1):
+        elapsed_s = 1e-9 * (stamps_ns[-1] - stamps_ns[0]) + 0.03 * (row / camera.height - 0.5)
+        views = [move(np.array([elapsed_s]))[0]]
+        if isinstance(camera, StereoCamera) and sensor == "stereo":
+            shift = np.array([camera.baseline, 0.0, 0.0])
+            views.append(views[0] @ make_transform(np.eye(3), shift))
+        for stream, view in enumerate(views):
+            grey = to_uint8(render_image(scene, view, camera))
+            np.testing.assert_allclose(loaded[stream][row].astype(int), grey[row], atol=1)
+            depth = render_depth(scene, view, camera)[row]
+            np.testing.assert_allclose(recording.render_depth(11, stream)[row], depth, rtol=1e-6)
+        if sensor == "rgbd":
+            np.testing.assert_allclose(loaded[1][row], depth, rtol=1e-5)
+
+
+def test_the_truth_is_that_of_the_middle_row() -> None:
+    rolling, still = (
+        SyntheticRecording("handheld", n_frames=5, scale=0.25, readout_ms=each) for each in (20, 0)
+    )
+    np.testing.assert_array_equal(
+        rolling.ground_truth().T_world_frame, still.ground_truth().T_world_frame
+    )
+    depth, expected = (recording.render_depth(4) for recording in (rolling, still))
+    np.testing.assert_allclose(depth[60], expected[60], rtol=1e-6)
+    assert np.abs(depth[0] - expected[0]).max() > 1e-3
+
+
+def test_a_mirror_is_seen_row_by_row() -> None:
+    moving = mirror_room(0)
+    stamps_s = 3.0 + READOUT_S * (np.arange(CAMERA.height) / CAMERA.height - 0.5)
+    poses = look_around(stamps_s)
+    image = moving.render_image(3.0, poses, CAMERA)
+    depth = moving.render_depth(3.0, poses, CAMERA, is_reflected=True)
+    for row in (100, 400):
+        np.testing.assert_allclose(
+            image[row], moving.render_image(3.0, poses[row], CAMERA)[row], atol=0.05
+        )
+        np.testing.assert_allclose(
+            depth[row],
+            moving.render_depth(3.0, poses[row], CAMERA, is_reflected=True)[row],
+            rtol=1e-6,
+        )
+
+
+@pytest.mark.parametrize("readout_ms", [-1.0, 34.0, float("nan")])
+def test_a_readout_that_no_frame_has_is_refused(readout_ms: float) -> None:
+    with pytest.raises(ValueError, match=r"readout_ms must be in \[0, 33.3\]"):
+        SyntheticRecording("handheld", readout_ms=readout_ms)
