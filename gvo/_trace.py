@@ -39,9 +39,9 @@ class Trace(list[Event]):
         """Return the values of all events of a name."""
         return [event.values for event in self if event.name == name]
 
-    def find(self, name: str) -> Mapping[str, Any] | None:
-        """Return the values of the first event of a name; None if there is none."""
-        return next((event.values for event in self if event.name == name), None)
+    def find(self, name: str) -> Mapping[str, Any]:
+        """Return the values of the first event of a name; empty if there is none."""
+        return next((event.values for event in self if event.name == name), {})
 
     def before(self, name: str) -> Trace:
         """Return the events before the first one of a name; all if there is none."""

@@ -27,7 +27,7 @@ def test_events_are_found_by_name() -> None:
     trace = recorded()
     assert [values["n"] for values in trace.all("a")] == [0, 2, 4]
     assert trace.find("b") == {"n": 1}
-    assert trace.find("d") is None
+    assert trace.find("d") == {}
 
 
 def test_a_trace_is_cut_before_an_event_and_split_at_events() -> None:

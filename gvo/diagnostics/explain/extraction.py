@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import cv2
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo._trace import Trace
-from gvo.config import DepthConfig, StereoConfig
-from gvo.diagnostics.explain.values import Sorting, SubpixelStep
+from gvo.config import Config, DepthConfig, StereoConfig
+from gvo.diagnostics.explain.values import Sorting, Step
 from gvo.frontend.features import Features
 from gvo.frontend.matching import best_ratios
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.corners import N_SEARCH_STEPS
 from gvo.frontend.stereo.disparity import follow_disparities
-from gvo.types import BoolArray, FloatArray, ImageArray, IntArray, RgbdFrame, StereoFrame
+from gvo.types import BoolArray, FloatArray, Frame, ImageArray, IntArray, StereoFrame
 
 # Of the curve of squared differences around the result, pixels.
 _REACH_PX = 4
@@ -26,22 +26,21 @@ _STEP_PX = 0.125
 
 def explain_keypoints(trace: Trace) -> Sorting:
     """Sort the keypoints detected into those within the budget and the others."""
-    spread = trace.find("keypoints.spread")
-    if spread is None:
-        return Sorting.by({}, np.zeros((0, 2)))
+    spread = trace.find("keypoints.spread") or {"pixels": np.zeros((0, 2)), "chosen": ()}
     pixels = np.asarray(spread["pixels"], dtype=np.float64)
     return Sorting.by({"over the budget": as_mask(spread["chosen"], len(pixels))}, pixels)
 
 
-def explain_stereo(trace: Trace, config: StereoConfig, row_offset_px: float) -> Sorting:
-    """Sort the keypoints by the tests of their matches in the right image."""
-    matched = trace.find("descriptor.stereo")
-    corners, searched = trace.find("klt.corners"), trace.find("corners.searched")
-    if corners is not None and searched is not None:
-        return _sort_corners(corners, searched, row_offset_px)
-    if matched is None:
-        raise ValueError("the trace holds no stereo matches")
-    return _sort_matches(matched, trace.find("stereo.candidates"), config)
+def explain_measured(trace: Trace, config: Config, row_offset_px: float) -> Sorting:
+    """Sort the keypoints by the tests of their matches in the right image, or of their depth."""
+    searched, matched = trace.find("corners.searched"), trace.find("descriptor.stereo")
+    if searched:
+        return _sort_corners(trace.find("klt.corners"), searched, row_offset_px)
+    if matched:
+        return _sort_matches(matched, trace.find("stereo.candidates"), config.stereo)
+    sampled = trace.find("depth.sampled")
+    tests = depth_tests(sampled["depths"], sampled["is_valid"], config.depth)
+    return Sorting.by(tests, sampled["pixels"], values=sampled["depths"])
 
 
 def _sort_corners(
@@ -62,7 +61,7 @@ def _sort_corners(
 
 
 def _sort_matches(
-    matched: Mapping[str, Any], candidates: Mapping[str, Any] | None, config: StereoConfig
+    matched: Mapping[str, Any], candidates: Mapping[str, Any], config: StereoConfig
 ) -> Sorting:
     left, right = matched["features"]
     pairs, n = matched["pairs"], len(left)
@@ -123,17 +122,10 @@ def as_mask(indices: IntArray, n: int) -> BoolArray:
     return mask
 
 
-def explain_depth(trace: Trace, config: DepthConfig) -> Sorting:
-    """Sort the keypoints by the tests of their depth."""
-    sampled = trace.find("depth.sampled")
-    if sampled is None:
-        raise ValueError("the trace holds no depths")
-    pixels, depths, is_valid = (sampled[name] for name in ("pixels", "depths", "is_valid"))
-    return Sorting.by(depth_tests(depths, is_valid, config), pixels, values=depths)
-
-
-def explain_depth_pixels(frame: RgbdFrame, config: DepthConfig) -> Sorting:
-    """Sort all pixels of a depth image by the same tests, row by row."""
+def explain_depth_pixels(frame: Frame, config: DepthConfig) -> Sorting | None:
+    """Sort all pixels of a depth image by the same tests, row by row; None for stereo."""
+    if isinstance(frame, StereoFrame):
+        return None
     rows, columns = np.indices(frame.depth.shape, dtype=np.float64)
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
     return Sorting.by(depth_tests(*sample_depth(frame.depth, pixels, config), config), pixels)
@@ -153,37 +145,33 @@ def depth_tests(
 
 
 def explain_subpixel(
-    trace: Trace, frame: StereoFrame, stereo: Sorting, config: StereoConfig, row_offset_px: float
-) -> SubpixelStep | None:
-    """Follow the match of the median horizontal gradient; None if no match was kept."""
-    if not stereo.are_kept.any():
+    trace: Trace, frame: Frame, stereo: Sorting, config: StereoConfig, row_offset_px: float
+) -> Step | None:
+    """Follow the match of the median horizontal gradient; None if none was kept, and for RGB-D."""
+    if not isinstance(frame, StereoFrame) or not stereo.are_kept.any():
         return None
-    images, radius = (frame.left, frame.right), config.patch_radius_px
-    chosen = _choose(frame.left, stereo, radius)
+    chosen = _choose(frame.left, stereo, config.patch_radius_px)
     pixel, disparity = stereo.pixels[chosen], float(stereo.values[chosen])
     searched, matched = trace.find("corners.searched"), trace.find("descriptor.stereo")
-    if searched is not None:
+    if searched:
         method, rough = "gauss-newton", searched["rough"][chosen : chosen + 1]
-        iterates = _follow(images, pixel, rough, config, row_offset_px)
+        iterates = _follow((frame.left, frame.right), pixel, rough, config, row_offset_px)
         columns = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX) + round(disparity)
-    elif matched is not None:
+    else:
         # Patches are those of whole pixels, and so are the columns.
-        method, pixel, row_offset_px = "parabola", np.rint(pixel), 0.0
+        method, pixel = "parabola", np.rint(pixel)
         start = float(pixel[0] - np.rint(_partner(matched, chosen)[0]))
         iterates, reach = np.array([start, disparity]), config.search_radius_px
         columns = start + np.arange(-reach, reach + 1, dtype=np.float64)
-    u, v = pixel
-    left = _patch(frame.left, u, v, radius)
-    patches = [_patch(frame.right, u - d, v + row_offset_px, radius) for d in columns]
-    return SubpixelStep(
+    left, *rights, right = _cut_patches(frame, pixel, [*columns, disparity], config, row_offset_px)
+    return Step(
         pixel=pixel,
-        left=left,
-        right=_patch(frame.right, u - disparity, v + row_offset_px, radius),
-        columns_px=columns,
-        ssd=np.array([_ssd(left, patch) for patch in patches]),
+        method="none" if config.subpixel == "none" else method,
         iterates_px=iterates,
         disparity_px=disparity,
-        method="none" if config.subpixel == "none" else method,
+        columns_px=columns,
+        ssd=np.array([_ssd(left, each) for each in rights]),
+        drawn=Step(left=left, right=right),
     )
 
 
@@ -216,6 +204,19 @@ def _follow(
         for n in range(1, N_SEARCH_STEPS + 1)
     ]
     return np.concatenate([rough, *ends])
+
+
+def _cut_patches(
+    frame: StereoFrame,
+    pixel: FloatArray,
+    disparities: Iterable[float],
+    config: StereoConfig,
+    row_offset_px: float,
+) -> list[NDArray[np.float32]]:
+    """Return the patch at a pixel of the left image, then those at disparities in the right one."""
+    (u, v), radius = pixel, config.patch_radius_px
+    rights = [_patch(frame.right, u - d, v + row_offset_px, radius) for d in disparities]
+    return [_patch(frame.left, u, v, radius), *rights]
 
 
 def _patch(image: ImageArray, u: float, v: float, radius: int) -> NDArray[np.float32]:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 from gvo._trace import Trace, watched
 from gvo.config import Config
 from gvo.diagnostics.explain.extraction import (
-    explain_depth,
     explain_depth_pixels,
     explain_keypoints,
-    explain_stereo,
+    explain_measured,
     explain_subpixel,
 )
 from gvo.diagnostics.explain.motion import (
@@ -22,7 +20,7 @@ from gvo.diagnostics.explain.motion import (
     explain_refinement,
     registrations_of,
 )
-from gvo.diagnostics.explain.values import FrameExplanation, KeyframeLink
+from gvo.diagnostics.explain.values import FrameExplanation, Step
 from gvo.errors import RecordingError
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.klt import image_of
@@ -39,7 +37,6 @@ from gvo.types import (
     Progress,
     RelativePose,
     Status,
-    StereoFrame,
 )
 
 
@@ -130,60 +127,40 @@ class _Drive:
         """Track a frame and tell what happened with it."""
         with watched() as trace:
             result = self._odometry.track(frame)
-        registrations = registrations_of(trace)
-        chain = registrations_of(trace.before("odometry.step"))
+        config, offsets = self._config, trace.find("rig.offsets")
+        row_px = offsets.get("row_px", 0.0)
+        measured = explain_measured(trace, config, row_px)
+        n_chain = len(chain := registrations_of(trace.before("odometry.step")))
         reference_ns = chain[-1].reference_ns if chain else None
-        scores = (trace.find("odometry.scores") or {"scores": {}})["scores"]
+        tried = chain[-1].attempts if chain else []
+        last = tried[-1] if tried else Trace()
+        scores = trace.find("odometry.scores").get("scores", {})
         return FrameExplanation(
             recording=self._name,
             index=index,
-            config=self._config,
+            config=config,
             camera=self._camera,
             frame=frame,
             reference=None if reference_ns is None else self._frames[reference_ns],
             reference_index=None if reference_ns is None else self._indices[reference_ns],
             result=result,
+            offset_px=offsets.get("disparity_px", 0.0),
+            row_offset_px=row_px,
+            keypoints=explain_keypoints(trace),
+            measured=measured,
+            depth_pixels=explain_depth_pixels(frame, config.depth),
+            subpixel=explain_subpixel(trace, frame, measured, config.stereo, row_px),
+            matches=explain_matches(last, config),
+            consensus=explain_consensus(last, self._camera, config),
+            refinement=explain_refinement(last, self._camera, config),
+            attempt=last,
             attempts=tuple(line for each in chain for line in describe(each, self._indices)),
-            links=tuple(self._links(registrations[len(chain) :], scores, result)),
-            **self._extraction(trace, frame),
-            **self._motion(chain[-1].attempts if chain else []),
+            links=tuple(self._links(registrations_of(trace)[n_chain:], scores, result)),
         )
-
-    def _extraction(self, trace: Trace, frame: Frame) -> dict[str, Any]:
-        offsets = trace.find("rig.offsets") or {"disparity_px": 0.0, "row_px": 0.0}
-        subpixel = depth_pixels = None
-        if isinstance(frame, StereoFrame):
-            config, row_px = self._config.stereo, offsets["row_px"]
-            measured = explain_stereo(trace, config, row_px)
-            subpixel = explain_subpixel(trace, frame, measured, config, row_px)
-        else:
-            measured = explain_depth(trace, self._config.depth)
-            depth_pixels = explain_depth_pixels(frame, self._config.depth)
-        return {
-            "offset_px": offsets["disparity_px"],
-            "row_offset_px": offsets["row_px"],
-            "keypoints": explain_keypoints(trace),
-            "measured": measured,
-            "subpixel": subpixel,
-            "depth_pixels": depth_pixels,
-        }
-
-    def _motion(self, attempts: Sequence[Trace]) -> dict[str, Any]:
-        """Explain the last attempt."""
-        if not attempts:
-            nothing = dict.fromkeys(("matches", "consensus", "refinement"))
-            return {"attempt": Trace(), **nothing}
-        last, camera, config = attempts[-1], self._camera, self._config
-        return {
-            "attempt": last,
-            "matches": explain_matches(last, config),
-            "consensus": explain_consensus(last, camera, config),
-            "refinement": explain_refinement(last, camera, config),
-        }
 
     def _links(
         self, tried: Sequence[Registration], scores: Mapping[int, float], result: FrameResult
-    ) -> Iterator[KeyframeLink]:
+    ) -> Iterator[Step]:
         """Tell what each earlier frame contributed."""
         registrations = {each.reference_ns: each.result for each in tried}
         keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
@@ -195,16 +172,17 @@ class _Drive:
         ]:
             is_accepted = link is not None and link.is_accepted
             unused = "keyframe" if registration is not None else "not linked"
-            yield KeyframeLink(
-                reference_ns=ns,
-                index=self._indices[ns],
+            yield Step(
+                frame=self._indices[ns],
+                stamp_ns=ns,
                 kind=unused if link is None else link.kind,
-                image=image_of(self._frames[ns]),
                 overlap=scores.get(ns),
-                registration=registration,
                 chi2=None if link is None else link.chi2,
                 is_accepted=is_accepted,
                 reason="" if is_accepted else self._reason(ns, link, registration, scores, result),
+                n_matches=0 if registration is None else registration.n_matches,
+                n_inliers=0 if registration is None else registration.n_inliers,
+                drawn=Step(image=image_of(self._frames[ns]), registration=registration),
             )
 
     def _reason(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from gvo.diagnostics.explain.extraction import (
     distance_tests,
     no_candidates,
 )
-from gvo.diagnostics.explain.values import ConsensusStep, RefinementStep, Sorting
+from gvo.diagnostics.explain.values import Sorting, Step
 from gvo.frontend.registration import search_consensus
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -24,19 +24,21 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus
 from gvo.geometry.refinement import Refinement
 from gvo.geometry.residuals import StereoResiduals, whiten_in_place
-from gvo.types import BoolArray, Failure, FloatArray, IntArray, RelativePose
+from gvo.types import BoolArray, Failure, FloatArray, RelativePose
 
 _MIN_DEPTH_M = 1e-3
 
 
-def explain_matches(attempt: Trace, config: Config) -> Sorting:
-    """Sort the points of the reference by the tests of their matches."""
-    is_of_tracks = attempt[0].values["method"] == "tracks"
-    return _tracks(attempt, config) if is_of_tracks else _descriptors(attempt, config)
+def explain_matches(attempt: Trace, config: Config) -> Sorting | None:
+    """Sort the points of the reference by the tests of their matches; None if none was tried."""
+    begin = attempt.find("attempt")
+    if not begin:
+        return None
+    sort = _sort_tracks if begin["method"] == "tracks" else _sort_descriptors
+    return sort(begin, attempt, config)
 
 
-def _tracks(attempt: Trace, config: Config) -> Sorting:
-    begin = attempt[0].values
+def _sort_tracks(begin: Mapping[str, Any], attempt: Trace, config: Config) -> Sorting:
     pixels, indices = begin["source_uvd"][:, :2], begin["indices"]
     n, tracked = len(pixels), indices[begin["is_tracked"]]
     predicted, found = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
@@ -52,25 +54,24 @@ def _track_tests(attempt: Trace, config: Config) -> dict[str, BoolArray]:
     """Tell which tracks pass each test of their disparity or depth."""
     measured, sampled = attempt.find("klt.measured"), attempt.find("depth.sampled")
     followed = attempt.find("klt.followed")
-    if measured is None:
+    if not measured:
         return {}
-    if followed is not None:
+    if followed:
         return {
             "patch leaves an image": np.isfinite(followed["disparities"]),
             "did not converge": followed["is_at_rest"],
             "depth out of range": measured["is_valid"],
         }
-    if sampled is None:
+    if not sampled:
         return {"depth out of range": measured["is_valid"]}
     return depth_tests(sampled["depths"], sampled["is_valid"], config.depth)
 
 
-def _descriptors(attempt: Trace, config: Config) -> Sorting:
-    begin, temporal = attempt[0].values, config.temporal
+def _sort_descriptors(begin: Mapping[str, Any], attempt: Trace, config: Config) -> Sorting:
+    temporal = config.temporal
     (reference, current), (expected, indices) = begin["pixels"], begin["predicted"]
     n, candidates = len(reference), attempt.find("temporal.candidates") or no_candidates()
-    registered = attempt.find("registration.begin") or {"matches": no_candidates()["pairs"]}
-    matches = registered["matches"]
+    matches = attempt.find("registration.begin").get("matches", no_candidates()["pairs"])
     predicted = np.full((n, 2), np.nan)
     predicted[indices] = expected
     found = best_partners(candidates, current, n)
@@ -85,79 +86,87 @@ def _descriptors(attempt: Trace, config: Config) -> Sorting:
     return Sorting.by(tests, reference, partners=found, predicted=predicted)
 
 
-def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> ConsensusStep | None:
-    """Return which matches agree; None if nothing was registered."""
+def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> Step | None:
+    """Count the matches that agree, and those of each sample; None if nothing was registered.
+
+    Where the prediction made samples needless, they are those that would have been drawn.
+    """
     begin, end = attempt.find("registration.begin"), attempt.find("registration.consensus")
-    if begin is None or end is None:
+    if not end:
         return None
-    matches: Correspondences = begin["correspondences"]
-    consensus: Consensus | Failure = end["consensus"]
-    search, sampled = attempt.before("registration.consensus"), consensus
+    matches, answer = begin["correspondences"], end["consensus"]
+    search, sampled = attempt.before("registration.consensus"), answer
     if end["is_known"]:
         with watched() as search:
             sampled = search_consensus(matches, camera, config, begin["stamps_ns"])
     known = attempt.find("registration.known")
-    samples = search.find("ransac.samples") or {"samples": (), "near": ()}
-    blocks = search.all("ransac.block")
-    return ConsensusStep(
-        pixels_reference=matches.source_uvd[:, :2],
-        pixels_current=matches.target_uvd[:, :2],
-        inliers=consensus.inliers if isinstance(consensus, Consensus) else None,
-        n_agreeing_with_prediction=None
-        if known is None
-        else int(np.count_nonzero(known["inliers"])),
-        n_needed=0.0 if known is None else float(known["n_needed"]),
+    return Step(
+        n_matches=len(matches),
         is_known=end["is_known"],
-        n_planned=len(samples["samples"]),
-        n_near=len(samples["near"]),
-        counts=_counts(search),
-        share_of_near=float(blocks[-1]["share"]) if blocks else 0.0,
-        sampled=sampled.inliers if isinstance(sampled, Consensus) else None,
-        reason=sampled.reason if isinstance(sampled, Failure) else "",
+        n_agreeing_with_prediction=int(known["inliers"].sum()) if known else None,
+        n_inliers=int(answer.inliers.sum()) if answer else None,
+        samples=_samples(search, sampled),
+        drawn=Step(
+            n_needed=known.get("n_needed"),
+            pixels=(matches.source_uvd[:, :2], matches.target_uvd[:, :2]),
+            inliers=answer.inliers if answer else np.zeros(len(matches), np.bool_),
+        ),
     )
 
 
-def _counts(search: Trace) -> IntArray:
-    """Return the inliers of each sample; -1 for three points on a line."""
-    blocks = search.all("ransac.block")
+def _samples(search: Trace, sampled: Consensus | Failure) -> Step:
+    """Count the inliers of each sample, -1 for three points on a line, and of the best refitted."""
+    drawn, blocks = search.find("ransac.samples"), search.all("ransac.block")
     n_drawn = max((block["n_before"] + len(block["is_valid"]) for block in blocks), default=0)
     counts = np.full(n_drawn, -1, dtype=np.int64)
     for block in blocks:
         counts[block["n_before"] + np.flatnonzero(block["is_valid"])] = block["counts"]
-    return counts
+    return Step(
+        n_drawn=n_drawn,
+        n_planned=len(drawn.get("samples", ())),
+        n_near=len(drawn.get("near", ())),
+        share_of_near=float(blocks[-1]["share"]) if blocks else 0.0,
+        reason=sampled.reason if isinstance(sampled, Failure) else "",
+        inliers=counts,
+        n_inliers=None if isinstance(sampled, Failure) else int(sampled.inliers.sum()),
+    )
 
 
-def explain_refinement(
-    attempt: Trace, camera: StereoCamera, config: Config
-) -> RefinementStep | None:
-    """Return the residuals before and after; None if the refinement was not reached."""
-    names = "registration.begin", "registration.consensus", "refinement.begin"
-    begin, consensus, start = (attempt.find(name) for name in names)
-    end = attempt.find("registration.refined")
-    if begin is None or consensus is None or start is None or end is None or not end["refined"]:
+def explain_refinement(attempt: Trace, camera: StereoCamera, config: Config) -> Step | None:
+    """Compare the residuals before and after; None if the refinement was not reached.
+
+    Residuals are (u, v, disparity) measured less predicted, NaN behind the camera.
+    """
+    begin, before, after = (
+        attempt.find(f"registration.{name}") for name in ("begin", "consensus", "refined")
+    )
+    if not after.get("refined"):
         return None
-    residuals: StereoResiduals = start["residuals"]
-    ends: tuple[Consensus, Refinement] = consensus["consensus"], end["refined"]
-    residuals_px = [
-        _residuals(each.T_target_source, begin["correspondences"], camera) for each in ends
-    ]
-    gated, gate = attempt.find("refinement.gated"), config.registration.gate
-    within = None if gated is None else residuals.within(gated["T_target_source"], gate)
-    return RefinementStep(
-        T_target_source=np.stack([each.T_target_source for each in ends]),
-        residuals_px=np.stack(residuals_px),
-        whitened=np.stack([_whiten(each, residuals) for each in residuals_px]),
-        inliers=np.stack([each.inliers for each in ends]),
-        depths=begin["correspondences"].target_points[:, 2],
-        n_within_gate=None if within is None else int(np.count_nonzero(within)),
+    matches, gate = begin["correspondences"], config.registration.gate
+    ends: tuple[Consensus, Refinement] = before["consensus"], after["refined"]
+    start, gated = attempt.find("refinement.begin"), attempt.find("refinement.gated")
+    residuals_px = [_residuals(each.T_target_source, matches, camera) for each in ends]
+    whitened = [_whiten(each, start["residuals"]) for each in residuals_px]
+    within = start["residuals"].within(gated["T_target_source"], gate) if gated else None
+    return Step(
         n_steps=len(attempt.before("registration.refined").all("refinement.step")),
+        n_within_gate=None if within is None else np.count_nonzero(within),
         gate_sigma=gate,
         scale=ends[1].scale,
+        n_inliers=[np.count_nonzero(each.inliers) for each in ends],
+        median_abs_residual_px=[_medians(each) for each in residuals_px],
+        median_abs_whitened=[_medians(each) for each in whitened],
+        drawn=Step(
+            T_target_source=[each.T_target_source for each in ends],
+            inliers=ends[1].inliers,
+            depths=matches.target_points[:, 2],
+            residuals_px=np.stack(residuals_px),
+            whitened=np.stack(whitened),
+        ),
     )
 
 
 def _residuals(T: FloatArray, matches: Correspondences, camera: StereoCamera) -> FloatArray:
-    """Return (u, v, disparity) measured less predicted, shape (n, 3); NaN behind the camera."""
     points = se3.transform_points(T, matches.source_points)
     points[points[:, 2] < _MIN_DEPTH_M] = np.nan
     return np.asarray(matches.target_uvd - camera.project_stereo(points))
@@ -169,18 +178,14 @@ def _whiten(residuals_px: FloatArray, residuals: StereoResiduals) -> FloatArray:
     return np.ascontiguousarray(rows.T)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Registration:
-    """One registration of the current frame.
+def _medians(residuals: FloatArray) -> dict[str, float | None]:
+    finite = residuals[np.isfinite(residuals).all(axis=1)]
+    medians = np.median(np.abs(finite), axis=0).tolist() if len(finite) else [None] * 3
+    return dict(zip(("u", "v", "disparity"), medians, strict=True))
 
-    Parameters
-    ----------
-    reference_ns : int
-        Stamp of the reference.
-    result : RelativePose or Failure
-    attempts : list of Trace
-        Each begins with how it matched.
-    """
+
+class Registration(NamedTuple):
+    """One registration of the current frame; each attempt begins with how it matched."""
 
     reference_ns: int
     result: RelativePose | Failure
@@ -196,25 +201,18 @@ def registrations_of(trace: Trace) -> list[Registration]:
             attempts=part.before("frontend.end").split("attempt"),
         )
         for part in trace.split("frontend.begin")
-        if (end := part.find("frontend.end")) is not None
+        if (end := part.find("frontend.end"))
     ]
 
 
 def has_prior(attempt: Trace) -> bool:
     """Tell whether an attempt started from a predicted motion."""
-    prior = attempt[0].values["prior"]
+    prior = attempt.find("attempt")["prior"]
     return prior is not None and not np.array_equal(prior, np.eye(4))
 
 
 def describe(registration: Registration, indices: Mapping[int, int]) -> list[str]:
-    """Describe the attempts of a registration, one a line.
-
-    Parameters
-    ----------
-    registration : Registration
-    indices : mapping of int to int
-        Numbers of frames by their stamps.
-    """
+    """Describe the attempts of a registration, one a line, with frames' numbers by their stamps."""
     against = f"against frame {indices[registration.reference_ns]}"
     answer = _answer(registration.result)
     if not registration.attempts:
@@ -225,7 +223,7 @@ def describe(registration: Registration, indices: Mapping[int, int]) -> list[str
 
 
 def _method(attempt: Trace) -> str:
-    values = attempt[0].values
+    values = attempt.find("attempt")
     if values["method"] == "descriptors":
         place = "predicted" if has_prior(attempt) else "previous"
         return f"descriptors within {values['radius_px']:g} px of the {place} pixels"
@@ -236,7 +234,7 @@ def _method(attempt: Trace) -> str:
 
 def _outcome(attempt: Trace) -> str:
     """Tell what came of an attempt that another one followed."""
-    ends = attempt.find("registration.refined") or attempt.find("registration.consensus") or {}
+    ends = attempt.find("registration.refined") or attempt.find("registration.consensus")
     answer = ends.get("refined", ends.get("consensus"))
     if answer is None:
         return "not registered"

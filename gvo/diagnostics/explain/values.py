@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo._trace import Trace
 from gvo.config import Config
 from gvo.frontend.klt import image_of
 from gvo.geometry.camera import StereoCamera
-from gvo.types import (
-    BoolArray,
-    Failure,
-    FloatArray,
-    Frame,
-    FrameResult,
-    ImageArray,
-    IntArray,
-    RelativePose,
-)
+from gvo.types import BoolArray, FloatArray, Frame, FrameResult, ImageArray, IntArray
 
 KEPT = "kept"
+
+
+class Step(SimpleNamespace):
+    """Values by name, as in `explanation.json`; `drawn` are those that only its picture needs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,146 +92,6 @@ class Sorting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SubpixelStep:
-    """The sub-pixel disparity of one keypoint.
-
-    Parameters
-    ----------
-    pixel : ndarray of float64, shape (2,)
-        In the left image.
-    left, right : ndarray of float32, shape (s, s)
-        Patches at the pixel and at its disparity.
-    columns_px, ssd : ndarray of float64, shape (m,)
-        Disparities, and the sums of squared differences of the patches there, means removed.
-    iterates_px : ndarray of float64, shape (k,)
-        Disparities at the start and after each step.
-    disparity_px : float
-        The result.
-    method : {"gauss-newton", "parabola", "none"}
-    """
-
-    pixel: FloatArray
-    left: NDArray[np.float32]
-    right: NDArray[np.float32]
-    columns_px: FloatArray
-    ssd: FloatArray
-    iterates_px: FloatArray
-    disparity_px: float
-    method: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ConsensusStep:
-    """The matches that agree on a motion, and the samples of RANSAC.
-
-    Parameters
-    ----------
-    pixels_reference, pixels_current : ndarray of float64, shape (n, 2)
-        The matches.
-    inliers : ndarray of bool, shape (n,), or None
-        None where no motion was found.
-    n_agreeing_with_prediction : int or None
-        None without a prediction.
-    n_needed : float
-        From how many on no samples are drawn.
-    is_known : bool
-        As many agreed; the samples are those that RANSAC would have drawn.
-    n_planned, n_near : int
-        Samples at most, and points with enough disparity, from which they are drawn.
-    counts : ndarray of int64, shape (k,)
-        Inliers of each sample drawn; -1 for three points on a line.
-    share_of_near : float
-        Inliers of the best sample among the near points.
-    sampled : ndarray of bool, shape (n,), or None
-        Inliers of the motion refitted to the best sample; None if too few agree.
-    reason : str
-        Why too few agree.
-    """
-
-    pixels_reference: FloatArray
-    pixels_current: FloatArray
-    inliers: BoolArray | None
-    n_agreeing_with_prediction: int | None
-    n_needed: float
-    is_known: bool
-    n_planned: int
-    n_near: int
-    counts: IntArray
-    share_of_near: float
-    sampled: BoolArray | None
-    reason: str
-
-    @property
-    def is_stopped_early(self) -> bool:
-        """Fewer samples were drawn than planned."""
-        return len(self.counts) < self.n_planned
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RefinementStep:
-    """The pose before and after the refinement: first and second row of each array.
-
-    Parameters
-    ----------
-    T_target_source : ndarray of float64, shape (2, 4, 4)
-    residuals_px, whitened : ndarray of float64, shape (2, n, 3)
-        (u, v, disparity) measured less predicted, in pixels and in sigmas.
-    inliers : ndarray of bool, shape (2, n)
-    depths : ndarray of float64, shape (n,)
-        Of the matches in the current frame, metres.
-    n_within_gate : int or None
-        After the first steps; None without a gate.
-    n_steps : int
-        Of Gauss-Newton.
-    gate_sigma : float
-    scale : float
-        Root mean square of the whitened residuals of the inliers, weighted.
-    """
-
-    T_target_source: FloatArray
-    residuals_px: FloatArray
-    whitened: FloatArray
-    inliers: BoolArray
-    depths: FloatArray
-    n_within_gate: int | None
-    n_steps: int
-    gate_sigma: float
-    scale: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KeyframeLink:
-    """What an earlier frame contributed.
-
-    Parameters
-    ----------
-    reference_ns, index : int
-        Stamp and number of the earlier frame.
-    kind : {"step", "keyframe", "standstill", "not linked"}
-    image : ndarray of uint8, shape (height, width)
-    overlap : float or None
-        Share of a keyframe's points in view, 0 to 1.
-    registration : RelativePose, Failure or None
-        Of the current frame against it; None where that was not tried.
-    chi2 : float or None
-        Of the edge, against the poses of the window, 6 degrees of freedom.
-    is_accepted : bool
-    reason : str
-        Why there is no edge, or why it was refused.
-    """
-
-    reference_ns: int
-    index: int
-    kind: str
-    image: ImageArray
-    overlap: float | None
-    registration: RelativePose | Failure | None
-    chi2: float | None
-    is_accepted: bool
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameExplanation:
     """One frame from image to pose.
 
@@ -259,14 +114,18 @@ class FrameExplanation:
         Keypoints with their disparities, or depths of an RGB-D frame.
     depth_pixels : Sorting or None
         All pixels of the depth image, row by row; None for stereo.
-    subpixel, matches, consensus, refinement
-        Steps of the last attempt to register the frame; matches are points of the reference.
+    subpixel : Step or None
+        How the disparity of one match was found.
+    matches : Sorting or None
+        Points of the reference; this and what follows are of the last attempt to register.
+    consensus, refinement : Step or None
+        Which matches agree, what the samples of RANSAC found; residuals before and after.
     attempt : Trace
         Its events; empty if there was none.
     attempts : tuple of str
         All of them, one a line.
-    links : tuple of KeyframeLink
-        Predecessor first, then the keyframes, oldest first.
+    links : tuple of Step
+        What earlier frames contributed: predecessor first, then the keyframes, oldest first.
     """
 
     recording: str
@@ -282,13 +141,13 @@ class FrameExplanation:
     keypoints: Sorting
     measured: Sorting
     depth_pixels: Sorting | None
-    subpixel: SubpixelStep | None
+    subpixel: Step | None
     matches: Sorting | None
-    consensus: ConsensusStep | None
-    refinement: RefinementStep | None
+    consensus: Step | None
+    refinement: Step | None
     attempt: Trace
     attempts: tuple[str, ...]
-    links: tuple[KeyframeLink, ...]
+    links: tuple[Step, ...]
 
     @property
     def image(self) -> ImageArray:

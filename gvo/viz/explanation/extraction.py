@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gvo.config import Config, DepthConfig, StereoConfig
-from gvo.diagnostics.explain.values import FrameExplanation, Sorting, SubpixelStep
+from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.types import FloatArray, IntArray, RgbdFrame, StereoFrame
 from gvo.viz.explanation.sheet import (
     AFTER,
@@ -26,7 +26,6 @@ from gvo.viz.explanation.sheet import (
     join_images,
     legend_below,
     paired_height,
-    set_title,
     show_image,
 )
 
@@ -63,7 +62,7 @@ def draw_keypoints(explanation: FrameExplanation) -> Picture:
     )
     stacked = is_wide(image.shape)
     height = 2 * image_height(image.shape) if stacked else image_height(image.shape, share=0.5)
-    sheet = Sheet("01_keypoints", "Keypoints and buckets", caption, height)
+    sheet = Sheet("01_keypoints", caption, height)
     first, second = sheet.panels.subplots(*((2, 1) if stacked else (1, 2)))
     show_image(first, image, "detected (grey) and kept (blue)")
     first.plot(*keypoints.pixels.T, ".", color="#CCCCCC", markersize=3.0)
@@ -92,16 +91,15 @@ def _draw_cells(
 ) -> None:
     (rows, columns), (height, width) = kept.shape, shape
     edges = (-0.5, columns * size - 0.5, rows * size - 0.5, -0.5)
-    axes.imshow(kept, cmap="Blues", vmin=0, vmax=max(2 * int(kept.max()), 1), extent=edges)
+    title = "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
+    vmax = max(2 * int(kept.max()), 1)
+    show_image(axes, kept, title, cmap="Blues", vmax=vmax, extent=edges)
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     axes.set_xticks(np.arange(size, columns * size, size) - 0.5, labels=[])
     axes.set_yticks(np.arange(size, rows * size, size) - 0.5, labels=[])
     axes.tick_params(length=0)
     axes.grid(color="#BBBBBB", linewidth=0.5)
-    set_title(
-        axes, "kept / detected in each cell" if has_numbers else "kept in each cell (darker: more)"
-    )
     if not has_numbers:
         return
     for (row, column), number in np.ndenumerate(detected):
@@ -123,9 +121,7 @@ def draw_stereo(explanation: FrameExplanation) -> Picture:
         0.95 * paired_height(shape),
         image_height(shape, share=0.93 * (1.0 if is_wide(shape) else 0.6)) + 0.5,
     ]
-    sheet = Sheet(
-        "02_stereo", "Stereo matches", _stereo_caption(explanation, stereo), sum(heights) + 0.4
-    )
+    sheet = Sheet("02_stereo", _stereo_caption(explanation, stereo), sum(heights) + 0.4)
     upper, lower = sheet.panels.subplots(2, 1, height_ratios=heights)
     canvas, shift = join_images(frame.left, frame.right)
     show_image(upper, canvas, f"left and right: {kept.sum()} matches, by disparity")
@@ -140,7 +136,6 @@ def draw_stereo(explanation: FrameExplanation) -> Picture:
         sheet.colorbar(lines, upper, fraction=0.02, extend="max", label="disparity [px]")
     show_image(lower, frame.left, "keypoints without a match, by the first test that they failed")
     draw_reasons(lower, stereo)
-    legend_below(lower, 4)
     return sheet.picture()
 
 
@@ -174,7 +169,9 @@ def _stereo_caption(explanation: FrameExplanation, stereo: Sorting) -> str:
     )
 
 
-def draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None) -> None:
+def draw_reasons(
+    axes: Axes, sorting: Sorting, pixels: FloatArray | None = None, n_columns: int = 4
+) -> None:
     """Mark the pixels dropped, or others in their place, by reason, with a legend that counts."""
     places, counts = sorting.pixels if pixels is None else pixels, sorting.counts()
     for number, name in enumerate(sorting.names[:-1]):
@@ -187,13 +184,16 @@ def draw_reasons(axes: Axes, sorting: Sorting, pixels: FloatArray | None = None)
                 markersize=6.0,
                 label=f"{name}: {counts[name]}",
             )
+    legend_below(axes, n_columns)
 
 
-def draw_depth(explanation: FrameExplanation, pixels: Sorting) -> Picture:
+def draw_depth(explanation: FrameExplanation) -> Picture:
     """Draw the depth image and which of it is valid."""
-    config, counts, frame = explanation.config.depth, pixels.counts(), explanation.frame
-    if not isinstance(frame, RgbdFrame):
+    config, frame = explanation.config.depth, explanation.frame
+    pixels = explanation.depth_pixels
+    if not isinstance(frame, RgbdFrame) or pixels is None:
         raise ValueError("a depth image needs an RGB-D frame")
+    counts = pixels.counts()
     shares = [f"{100 * count / len(pixels):.1f} % {name}" for name, count in counts.items()]
     caption = (
         f"Of all pixels: {', '.join(shares).replace('kept', 'valid')}. Valid depth is known, lies "
@@ -203,7 +203,7 @@ def draw_depth(explanation: FrameExplanation, pixels: Sorting) -> Picture:
         "colour and depth moves a point by far."
     )
     height = image_height(frame.depth.shape, share=0.5) + 0.6
-    sheet = Sheet("02_depth", "Valid depth", caption, height)
+    sheet = Sheet("02_depth", caption, height)
     first, second = sheet.panels.subplots(1, 2)
     finite = frame.depth[np.isfinite(frame.depth)]
     top = float(np.percentile(finite, 99)) if len(finite) else 1.0
@@ -234,7 +234,7 @@ def draw_depth_keypoints(explanation: FrameExplanation) -> Picture:
         "depth; the others are marked by the first test that they failed."
     )
     height = image_height(explanation.image.shape, share=0.75) + 0.5
-    sheet = Sheet("03_depth_keypoints", "Keypoints with depth", caption, height)
+    sheet = Sheet("03_depth_keypoints", caption, height)
     axes, kept = sheet.panels.subplots(1, 1), depth.are_kept
     u, v = depth.pixels[kept].T
     show_image(axes, explanation.image)
@@ -242,7 +242,6 @@ def draw_depth_keypoints(explanation: FrameExplanation) -> Picture:
     if kept.any():
         sheet.colorbar(dots, axes, fraction=0.03, label="depth [m]")
     draw_reasons(axes, depth)
-    legend_below(axes, 4)
     return sheet.picture()
 
 
@@ -271,7 +270,7 @@ def draw_histograms(explanation: FrameExplanation) -> Picture:
         f"{camera.fx * camera.baseline:.1f} px m: far points determine the rotation, near ones the "
         "translation."
     )
-    sheet = Sheet("04_disparity_and_depth", "Disparity and depth", caption, 3.6)
+    sheet = Sheet("04_disparity_and_depth", caption, 3.6)
     first, second = sheet.panels.subplots(1, 2)
     _histogram(first, disparities, "disparity [px]", (low, high))
     _histogram(second, depths, "depth [m]", (near, far))
@@ -295,51 +294,55 @@ def _histogram(axes: Axes, values: FloatArray, label: str, limits: tuple[float, 
     finish_axes(axes, label, "keypoints", fontsize=10)
 
 
-def draw_subpixel(explanation: FrameExplanation, step: SubpixelStep) -> Picture:
+def draw_subpixel(explanation: FrameExplanation) -> Picture:
     """Draw the patches of one match and how its disparity was found."""
-    sheet = Sheet(
-        "03_subpixel", "Sub-pixel disparity of one match", _subpixel_caption(explanation, step), 4.0
-    )
+    step = explanation.subpixel
+    if step is None:
+        return Picture(name="03_subpixel", caption="No match was kept.")
+    left, right = step.drawn.left, step.drawn.right
+    sheet = Sheet("03_subpixel", _subpixel_caption(explanation, step), 4.0)
     axes = sheet.panels.subplots(1, 4, width_ratios=[1, 1, 1, 2.2])
-    low, high = float(step.left.min()), float(step.left.max())
-    show_image(axes[0], step.left, "left patch", vmin=low, vmax=high)
-    show_image(axes[1], step.right, f"right, at {step.disparity_px:.2f} px", vmin=low, vmax=high)
-    difference, limit = step.right - step.left, 0.5 * max(high - low, 1.0)
+    low, high = float(left.min()), float(left.max())
+    show_image(axes[0], left, "left patch", vmin=low, vmax=high)
+    title = f"right, at {step.disparity_px:.2f} px"
+    show_image(axes[1], right, title, vmin=low, vmax=high)
+    difference, limit = right - left, 0.5 * max(high - low, 1.0)
     difference = difference - difference.mean()
     show_image(axes[2], difference, "difference (grey: none)", vmin=-limit, vmax=limit)
     _draw_curve(axes[3], step)
     return sheet.picture()
 
 
-def _subpixel_caption(explanation: FrameExplanation, step: SubpixelStep) -> str:
-    offset_px, (u, v), size = explanation.offset_px, step.pixel, len(step.left)
-    whole = max(round(step.disparity_px), 1)
+def _subpixel_caption(explanation: FrameExplanation, step: Step) -> str:
+    offset_px, (u, v), size = explanation.offset_px, step.pixel, len(step.drawn.left)
+    disparity_px = step.disparity_px
+    whole = max(round(disparity_px), 1)
     depth, whole_depth = (
-        float(explanation.camera.disparity_to_depth(d - offset_px))
-        for d in (step.disparity_px, whole)
+        float(explanation.camera.disparity_to_depth(d - offset_px)) for d in (disparity_px, whole)
     )
     return (
         f"Of all matches kept, the one of the median horizontal gradient, at ({u:.0f}, {v:.0f}) in "
         f"the left image: patches of {size} x {size} px and their difference, and the sum of "
         f"squared differences, means removed, over the disparity. {_subpixel_method(step)} It ends "
-        f"at {step.disparity_px:.3f} px, "
+        f"at {disparity_px:.3f} px, "
         + (f"less the learnt {offset_px:+.3f} px " if offset_px else "")
         + f"a depth of {depth:.2f} m; the nearest whole pixel would be {whole} px, "
         f"{whole_depth:.2f} m."
     )
 
 
-def _subpixel_method(step: SubpixelStep) -> str:
-    if step.method == "none":
+def _subpixel_method(step: Step) -> str:
+    method, iterates_px = step.method, step.iterates_px
+    if method == "none":
         return "The sub-pixel fit is off (stereo.subpixel none)."
-    if step.method == "parabola":
+    if method == "parabola":
         return (
-            f"The search starts at the keypoints' whole pixels, {step.iterates_px[0]:.0f} px; the "
+            f"The search starts at the keypoints' whole pixels, {iterates_px[0]:.0f} px; the "
             "vertex of the parabola through the best column and its neighbours gives the fraction."
         )
-    steps = np.diff(step.iterates_px)
+    steps = np.diff(iterates_px)
     return (
-        f"The coarse search gives {step.iterates_px[0]:.2f} px; {len(steps)} Gauss-Newton steps "
+        f"The coarse search gives {iterates_px[0]:.2f} px; {len(steps)} Gauss-Newton steps "
         f"follow ({', '.join(f'{each:+.3f}' for each in steps)} px). They use the gradients of the "
         "left patch: where left and right differ a little, they end beside the minimum of the "
         "curve. Between whole pixels the right image is interpolated, which smooths its noise: "
@@ -347,8 +350,8 @@ def _subpixel_method(step: SubpixelStep) -> str:
     )
 
 
-def _draw_curve(axes: Axes, step: SubpixelStep) -> None:
-    columns, ssd = step.columns_px, step.ssd
+def _draw_curve(axes: Axes, step: Step) -> None:
+    columns, ssd, iterates_px = step.columns_px, step.ssd, step.iterates_px
     is_sampled = step.method == "parabola"
     axes.plot(columns, ssd, "o-" if is_sampled else "-", color=BEFORE, label="SSD of the patches")
     if is_sampled:
@@ -358,12 +361,11 @@ def _draw_curve(axes: Axes, step: SubpixelStep) -> None:
         fitted = np.polyval(np.polyfit(columns[near], ssd[near], 2), shown)
         axes.plot(shown, fitted, color=AFTER, label="parabola")
     elif step.method == "gauss-newton":
-        at_steps = np.interp(step.iterates_px, columns, ssd)
+        at_steps = np.interp(iterates_px, columns, ssd)
         label = "Gauss-Newton steps"
-        axes.plot(step.iterates_px, at_steps, "o-", color=AFTER, markersize=5, label=label)
-    axes.axvline(
-        step.disparity_px, color=LIMIT, linestyle="--", label=f"end: {step.disparity_px:.3f} px"
-    )
+        axes.plot(iterates_px, at_steps, "o-", color=AFTER, markersize=5, label=label)
+    end_px = step.disparity_px
+    axes.axvline(end_px, color=LIMIT, linestyle="--", label=f"end: {end_px:.3f} px")
     axes.set_ylim(0.0, 1.4 * float(ssd.max()))
     place = {"loc": "upper center", "ncols": 2}
     finish_axes(axes, "disparity [px]", "squared difference [grey²]", **place)

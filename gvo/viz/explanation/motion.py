@@ -6,13 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gvo._text import number_text
 from gvo.diagnostics.explain.motion import has_prior
-from gvo.diagnostics.explain.values import (
-    ConsensusStep,
-    FrameExplanation,
-    RefinementStep,
-    Sorting,
-)
+from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.frontend.klt import image_of
 from gvo.types import FloatArray
 from gvo.viz.explanation.extraction import draw_reasons
@@ -43,35 +39,38 @@ if TYPE_CHECKING:
 _N_CROPS = 6
 
 
-def draw_matches(explanation: FrameExplanation, matches: Sorting) -> Picture:
+def draw_matches(explanation: FrameExplanation) -> Picture:
     """Draw the matches as flow, side by side, and some of them enlarged."""
-    if explanation.reference is None:
-        raise ValueError("matches need a reference frame")
-    image = explanation.image
+    image, matches, reference = explanation.image, explanation.matches, explanation.reference
+    if matches is None or reference is None:
+        return _not_reached("05_matches", explanation)
     heights = [
         image_height(image.shape, share=1.0 if is_wide(image.shape) else 0.6) + 0.4,
         paired_height(image.shape),
         2.4,
     ]
-    title = f"Matches with frame {explanation.reference_index}"
-    sheet = Sheet("05_matches", title, _matches_caption(explanation, matches), sum(heights) + 0.4)
+    sheet = Sheet("05_matches", _matches_caption(explanation, matches), sum(heights) + 0.4)
     upper, middle, lower = split(sheet.panels, heights)
     starts, ends = matches.pixels[matches.are_kept], matches.partners[matches.are_kept]
     flow, pair = upper.subplots(1, 1), middle.subplots(1, 1)
     show_image(flow, image, "flow over the current image: from where a point was to where it is")
     draw_segments(flow, starts, ends, colors=KEPT)
     flow.plot(*ends.T, ".", color=KEPT, markersize=5, label=f"kept: {len(ends)}")
-    draw_reasons(flow, matches, matches.predicted)
-    legend_below(flow, 5)
-    canvas, shift = join_images(image_of(explanation.reference), image)
+    draw_reasons(flow, matches, matches.predicted, n_columns=5)
+    canvas, shift = join_images(image_of(reference), image)
     show_image(pair, canvas, "reference and current image")
     draw_segments(pair, starts, ends + shift, colors=KEPT, linewidths=0.7)
     _draw_crops(lower.subplots(1, _N_CROPS), explanation, matches)
     return sheet.picture()
 
 
+def _not_reached(name: str, explanation: FrameExplanation) -> Picture:
+    why = explanation.result.reason or "this is the first frame, there is none to compare with"
+    return Picture(name=name, caption=f"Not reached: {why}.")
+
+
 def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
-    values, numbers, crops = explanation.attempt[0].values, "", ""
+    values, numbers, crops = explanation.attempt.find("attempt"), "", ""
     radius, is_predicted = values["radius_px"], has_prior(explanation.attempt)
     if values["method"] == "tracks":
         start = "the pixels that the predicted motion gives" if is_predicted else "their own pixels"
@@ -99,7 +98,8 @@ def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
         )
         crops = f"Below: six matches enlarged, the predicted pixel (orange-red cross), {marks}.\n"
     return (
-        f"Of {len(matches)} points of the reference: {count_text(matches.counts())}. {how}"
+        f"Of {len(matches)} points of frame {explanation.reference_index}, the reference: "
+        f"{count_text(matches.counts())}. {how}"
         f"{numbers} Dropped points are marked where they were expected; those expected outside of "
         f"the image are not shown.\n{crops}Attempts: {'; '.join(explanation.attempts)}."
     )
@@ -111,7 +111,7 @@ def _draw_crops(
     matches: Sorting,
 ) -> None:
     """Enlarge matches that spread evenly over the errors of the prediction."""
-    values, kept = explanation.attempt[0].values, np.flatnonzero(matches.are_kept)
+    values, kept = explanation.attempt.find("attempt"), np.flatnonzero(matches.are_kept)
     errors = np.linalg.norm(matches.partners - matches.predicted, axis=1)
     order = kept[np.argsort(errors[kept], kind="stable")]
     chosen = order[np.linspace(0, len(order) - 1, _N_CROPS).astype(int)] if len(order) else order
@@ -151,15 +151,16 @@ def _draw_search(
     axes.plot(*found, "o", color=KEPT, markersize=6, markerfacecolor="none", mew=1.6)
 
 
-def draw_consensus(explanation: FrameExplanation, step: ConsensusStep) -> Picture:
+def draw_consensus(explanation: FrameExplanation) -> Picture:
     """Draw which matches agree on a motion, and what the samples found."""
-    image, n = explanation.image, len(step.pixels_reference)
-    inliers = np.zeros(n, np.bool_) if step.inliers is None else step.inliers
+    image, step = explanation.image, explanation.consensus
+    if step is None:
+        return _not_reached("06_consensus", explanation)
+    inliers, (starts, ends) = step.drawn.inliers, step.drawn.pixels
     stacked = is_wide(image.shape)
     height = image_height(image.shape, share=1.0 if stacked else 0.5) + 0.4
     heights = [height, 3.0 if stacked else 0.4]
-    title = "Consensus: which matches agree on a motion"
-    sheet = Sheet("06_consensus", title, _consensus_caption(explanation, step), sum(heights))
+    sheet = Sheet("06_consensus", _consensus_caption(explanation, step), sum(heights))
     if stacked:
         upper, lower = sheet.panels.subplots(2, 1, height_ratios=heights)
     else:
@@ -170,16 +171,16 @@ def draw_consensus(explanation: FrameExplanation, step: ConsensusStep) -> Pictur
         (inliers, KEPT, "o", "agree"),
     ):
         if chosen.any():
-            start, end = step.pixels_reference[chosen], step.pixels_current[chosen]
-            draw_segments(upper, start, end, colors=colour)
-            upper.plot(*end.T, marker, color=colour, markersize=4, label=f"{name}: {chosen.sum()}")
+            draw_segments(upper, starts[chosen], ends[chosen], colors=colour)
+            label = f"{name}: {chosen.sum()}"
+            upper.plot(*ends[chosen].T, marker, color=colour, markersize=4, label=label)
     legend_below(upper, 2)
     _draw_samples(lower, step)
     return sheet.picture()
 
 
-def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep) -> str:
-    n, ransac = len(step.pixels_reference), explanation.config.ransac
+def _consensus_caption(explanation: FrameExplanation, step: Step) -> str:
+    n, ransac = step.n_matches, explanation.config.ransac
     limit = f"{ransac.inlier_threshold_px:g} px in (u, v, disparity)"
     if ransac.inlier_metric == "distance":
         limit = f"{ransac.inlier_threshold_m:g} m"
@@ -187,69 +188,72 @@ def _consensus_caption(explanation: FrameExplanation, step: ConsensusStep) -> st
     if step.n_agreeing_with_prediction is not None:
         text += (
             f"{step.n_agreeing_with_prediction} of {n} matches agree with the predicted motion; "
-            f"from {int(np.ceil(step.n_needed))} on no samples are drawn. "
+            f"from {int(np.ceil(step.drawn.n_needed))} on no samples are drawn. "
         )
     if step.is_known:
         text += (
             "So none were drawn: the refinement starts from these matches and the predicted "
             "motion. The curve shows what the samples would have found: "
         )
-    text += _samples_text(step)
-    if step.inliers is not None and not step.is_known:
-        text += f" Refitted to its inliers, {step.inliers.sum()} of {n} agree."
+    text += _samples_text(step.samples)
+    if step.n_inliers is not None and not step.is_known:
+        text += f" Refitted to its inliers, {step.n_inliers} of {n} agree."
     return text
 
 
-def _samples_text(step: ConsensusStep) -> str:
-    if not len(step.counts):
-        return step.reason + "." if step.reason else "no samples."
+def _samples_text(samples: Step) -> str:
+    n_drawn, n_planned, reason = samples.n_drawn, samples.n_planned, samples.reason
+    if not n_drawn:
+        return f"{reason or 'no samples'}."
     text = (
-        f"{len(step.counts)} of at most {step.n_planned} samples of three of the {step.n_near} "
-        f"points with enough disparity; the best one finds {step.counts.max()}"
+        f"{n_drawn} of at most {n_planned} samples of three of the {samples.n_near} "
+        f"points with enough disparity; the best one finds {samples.inliers.max()}"
     )
-    if step.is_stopped_early:
+    if n_drawn < n_planned:
         text += (
-            f"; stopped early, as {100 * step.share_of_near:.0f} % of those points agree with it: "
-            "the probability that all samples held an outlier is less than one in a thousand"
+            f"; stopped early, as {100 * samples.share_of_near:.0f} % of those points agree with "
+            "it: the probability that all samples held an outlier is less than one in a thousand"
         )
-    return f"{text}. It fails: {step.reason}." if step.reason else f"{text}."
+    return f"{text}. It fails: {reason}." if reason else f"{text}."
 
 
-def _draw_samples(axes: Axes, step: ConsensusStep) -> None:
-    counts, n_matches = step.counts, len(step.pixels_reference)
+def _draw_samples(axes: Axes, step: Step) -> None:
+    counts, n_planned, n_matches = step.samples.inliers, step.samples.n_planned, step.n_matches
     number, is_fitted = np.arange(1, len(counts) + 1), counts >= 0
     axes.plot(number[is_fitted], counts[is_fitted], ".", color=BEFORE, label="one sample")
     if len(counts):
         best = np.maximum(np.maximum.accumulate(counts), 0)
         axes.step(number, best, where="post", color=AFTER, label="best so far")
-        if step.is_stopped_early:
+        if len(counts) < n_planned:
             label = f"stopped after {len(counts)}"
             axes.axvline(len(counts), color=LIMIT, linestyle="--", label=label)
     axes.axhline(n_matches, color="black", linestyle=":", label=f"all {n_matches} matches")
-    axes.set_xlim(0, max(step.n_planned, 1) * 1.02)
+    axes.set_xlim(0, max(n_planned, 1) * 1.02)
     axes.set_ylim(0, 1.25 * max(n_matches, 1))
     set_title(axes, f"what the samples {'would have ' if step.is_known else ''}found")
     finish_axes(axes, "sample", "inliers", loc="upper right", ncols=4)
 
 
-def draw_residuals(explanation: FrameExplanation, step: RefinementStep) -> Picture:
+def draw_residuals(explanation: FrameExplanation) -> Picture:
     """Draw the residuals before and after the refinement."""
-    title = "Residuals before and after the refinement"
-    sheet = Sheet("07_residuals", title, _residuals_caption(explanation, step), 6.8)
-    axes, gate = sheet.panels.subplots(2, 3), step.gate_sigma
+    step = explanation.refinement
+    if step is None:
+        return _not_reached("07_residuals", explanation)
+    sheet = Sheet("07_residuals", _residuals_caption(explanation, step), 6.8)
+    axes, gate, whitened = sheet.panels.subplots(2, 3), step.gate_sigma, step.drawn.whitened
     for column, name in enumerate(("u", "v", "disparity")):
-        values = step.residuals_px[:, :, column]
+        values = step.drawn.residuals_px[:, :, column]
         finite = values[np.isfinite(values)]
         reach = 1.1 * (float(np.percentile(np.abs(finite), 95)) if len(finite) else 1.0) + 1e-9
         _compare(axes[0, column], values, np.linspace(-reach, reach, 41))
         axes[0, column].locator_params(axis="x", nbins=7)
         finish_axes(axes[0, column], f"residual of {name} [px], outer bins: beyond", "matches")
     norms, cloud, by_depth = axes[1]
-    lengths = np.nan_to_num(np.linalg.norm(step.whitened, axis=2), nan=np.inf)
+    lengths = np.nan_to_num(np.linalg.norm(whitened, axis=2), nan=np.inf)
     _compare(norms, lengths, np.linspace(0.0, 3.0 * gate, 46))
     norms.axvline(gate, color=LIMIT, linestyle="--", label=f"gate {gate:g}")
     finish_axes(norms, "whitened norm [sigma], last bin: beyond", "matches")
-    u, v, disparity = np.clip(step.whitened[1].T, -2.0 * gate, 2.0 * gate)
+    u, v, disparity = np.clip(whitened[1].T, -2.0 * gate, 2.0 * gate)
     _draw_after(cloud, u, v, step)
     circle = gate * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 100))
     cloud.plot(circle.real, circle.imag, "--", color=LIMIT, linewidth=1.0, label="gate")
@@ -258,7 +262,7 @@ def draw_residuals(explanation: FrameExplanation, step: RefinementStep) -> Pictu
     place: dict[str, Any] = {"loc": "upper center", "columnspacing": 0.8, "handletextpad": 0.2}
     labels = "after, whitened u [sigma], at the border: beyond", "whitened v [sigma]"
     finish_axes(cloud, *labels, ncols=3, **place)
-    _draw_after(by_depth, step.depths, disparity, step)
+    _draw_after(by_depth, step.drawn.depths, disparity, step)
     by_depth.axhline(0.0, color="black", linewidth=0.8)
     label = "after, whitened disparity [sigma],\nat the border: beyond"
     finish_axes(by_depth, "depth [m]", label, ncols=2, loc="upper center")
@@ -272,24 +276,25 @@ def _compare(axes: Axes, values: FloatArray, bins: FloatArray) -> None:
         axes.hist(shown, bins.tolist(), histtype="stepfilled", alpha=0.6, color=colour, label=name)
 
 
-def _draw_after(axes: Axes, x: FloatArray, y: FloatArray, step: RefinementStep) -> None:
+def _draw_after(axes: Axes, x: FloatArray, y: FloatArray, step: Step) -> None:
     """Draw what is left after the refinement, within twice the gate."""
-    inliers = step.inliers[1]
+    inliers, gate = step.drawn.inliers, step.gate_sigma
     axes.plot(x[~inliers], y[~inliers], "x", color=REFUSED, markersize=5, label="outliers")
     axes.plot(x[inliers], y[inliers], ".", color=KEPT, markersize=6, label="inliers")
-    axes.set_ylim(-2.1 * step.gate_sigma, 2.9 * step.gate_sigma)
+    axes.set_ylim(-2.1 * gate, 2.9 * gate)
 
 
-def _residuals_caption(explanation: FrameExplanation, step: RefinementStep) -> str:
+def _residuals_caption(explanation: FrameExplanation, step: Step) -> str:
     before, after = (
-        ", ".join(f"{each:.2f}" for each in np.nanmedian(np.abs(residuals), axis=0))
-        for residuals in step.residuals_px
+        ", ".join(number_text(each, ".2f") for each in medians.values())
+        for medians in step.median_abs_residual_px
     )
     is_known = explanation.consensus is not None and explanation.consensus.is_known
-    moved = step.T_target_source[1] @ np.linalg.inv(step.T_target_source[0])
+    T_before, T_after = step.drawn.T_target_source
+    moved = T_after @ np.linalg.inv(T_before)
     angle = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1.0, 1.0)))
     return (
-        f"Measured less predicted, of {len(step.depths)} matches. Before, at the "
+        f"Measured less predicted, of {len(step.drawn.depths)} matches. Before, at the "
         f"{'predicted pose' if is_known else 'pose of RANSAC'}: medians of the absolute residuals "
         f"of (u, v, disparity) {before} px; after {step.n_steps} Gauss-Newton steps, which moved "
         f"the pose by {1e3 * np.linalg.norm(moved[:3, 3]):.1f} mm and {angle:.3f} deg: {after} px. "
@@ -299,18 +304,18 @@ def _residuals_caption(explanation: FrameExplanation, step: RefinementStep) -> s
     )
 
 
-def _gate_text(step: RefinementStep) -> str:
-    before, after = step.inliers.sum(axis=1).tolist()
-    if step.n_within_gate is None:
+def _gate_text(step: Step) -> str:
+    (before, after), n_within_gate = step.n_inliers, step.n_within_gate
+    if n_within_gate is None:
         return f"Pose and matches stay as they are, {after} (registration.refine none)."
     gate = f"The gate of {step.gate_sigma:g} sigma (registration.gate)"
-    if step.n_within_gate == after:
+    if n_within_gate == after:
         return (
             f"{gate} chooses the matches again after the first steps: {before} before, "
             f"{after} after."
         )
     return (
-        f"{gate} would leave {step.n_within_gate} matches after the first steps, less than half: "
+        f"{gate} would leave {n_within_gate} matches after the first steps, less than half: "
         f"the {before} from before stay, those far off with less weight. The residuals are larger "
         "than the stated sigmas here."
     )

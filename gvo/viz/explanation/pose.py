@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo.diagnostics.explain.values import FrameExplanation, KeyframeLink
+from gvo.diagnostics.explain.values import FrameExplanation, Step
 from gvo.types import FloatArray, RelativePose
 from gvo.viz.explanation.sheet import (
     AFTER,
@@ -49,7 +49,7 @@ def draw_pose(explanation: FrameExplanation) -> Picture:
         name, T, covariance = "relative", relative.T_reference_current, relative.covariance
         poses.insert(0, (f"relative to frame {explanation.reference_index}", T, covariance))
     spread = 1e6 * position_covariance(T, covariance)
-    sheet = Sheet("08_pose", "The pose and its covariance", _pose_caption(explanation), 5.6)
+    sheet = Sheet("08_pose", _pose_caption(explanation), 5.6)
     above, side, numbers = sheet.panels.subplots(1, 3, width_ratios=[1.0, 1.0, 1.15])
     _draw_ellipses(above, spread[np.ix_([0, 2], [0, 2])], ("x", "z"), f"{name}, from above")
     _draw_ellipses(side, spread[np.ix_([2, 1], [2, 1])], ("z", "y"), f"{name}, from the side")
@@ -122,17 +122,14 @@ def _numbers(name: str, T: FloatArray, covariance: FloatArray) -> str:
 
 def draw_links(explanation: FrameExplanation) -> Picture:
     """Draw the earlier frames with what each contributed."""
-    title, name, links = "Links to earlier frames", "09_links", explanation.links
-    if not links:
-        return Picture(
-            name=name, title=title, caption="None: there is no earlier frame to link to."
-        )
-    shown = [link for link in links if link.kind != "standstill"]
+    if not explanation.links:
+        return Picture(name="09_links", caption="None: there is no earlier frame to link to.")
+    shown = [link for link in explanation.links if link.kind != "standstill"]
     n_columns = min(_N_COLUMNS, max(len(shown), 3))
     n_rows = -(-len(shown) // n_columns)
     rows, columns = explanation.image.shape
     height = n_rows * (12.6 / n_columns * rows / columns + 0.65)
-    sheet = Sheet(name, title, _links_caption(explanation), height)
+    sheet = Sheet("09_links", _links_caption(explanation), height)
     panels = sheet.panels.subplots(n_rows, n_columns, squeeze=False).ravel()
     for axes, link in zip(panels, shown, strict=False):
         _draw_link(axes, link)
@@ -141,24 +138,25 @@ def draw_links(explanation: FrameExplanation) -> Picture:
     return sheet.picture()
 
 
-def _draw_link(axes: Axes, link: KeyframeLink) -> None:
+def _draw_link(axes: Axes, link: Step) -> None:
     what = {"step": "predecessor", "keyframe": "keyframe", "not linked": "keyframe, not linked"}
     overlap = "" if link.overlap is None else f", overlap {link.overlap:.2f}"
     answer = "failed" if link.kind == "keyframe" else link.reason
-    show_image(axes, link.image)
-    if isinstance(link.registration, RelativePose):
-        pixels, inliers = link.registration.pixels_reference, link.registration.inliers
+    registration = link.drawn.registration
+    show_image(axes, link.drawn.image)
+    if isinstance(registration, RelativePose):
+        pixels, inliers = registration.pixels_reference, registration.inliers
         axes.plot(*pixels[~inliers].T, "x", color=REFUSED, markersize=3)
         axes.plot(*pixels[inliers].T, ".", color=KEPT, markersize=3)
         chi2 = "" if link.chi2 is None else f", chi2 {link.chi2:.2f}"
-        counts = f"{link.registration.n_inliers} of {link.registration.n_matches} inliers"
+        counts = f"{link.n_inliers} of {link.n_matches} inliers"
         answer = f"{counts}{chi2}, {'accepted' if link.is_accepted else 'refused'}"
     for spine in axes.spines.values():
         spine.set_edgecolor(
             KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
         )
         spine.set_linewidth(3)
-    text = f"frame {link.index}, {what[link.kind]}{overlap}\n{answer}"
+    text = f"frame {link.frame}, {what[link.kind]}{overlap}\n{answer}"
     axes.set_title(text, fontsize=9, loc="left")
 
 
@@ -178,7 +176,7 @@ def _links_caption(explanation: FrameExplanation) -> str:
     )
     for link in links:
         if link.kind == "standstill":
-            text += f"\nStandstill: an edge without motion to frame {link.index} was added."
+            text += f"\nStandstill: an edge without motion to frame {link.frame} was added."
         elif link.reason and link.kind != "not linked":
-            text += f"\nFrame {link.index}: {link.reason}."
+            text += f"\nFrame {link.frame}: {link.reason}."
     return text

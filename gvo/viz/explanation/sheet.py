@@ -6,7 +6,7 @@ import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -24,6 +24,20 @@ AFTER: Final = "#0072B2"
 LIMIT: Final = "#D55E00"
 REASONS: Final = ("#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#0072B2", "#009E73", "#999999")
 MARKERS: Final = "xsD^vP+"
+TITLES: Final = {
+    "01_keypoints": "Keypoints and buckets",
+    "02_stereo": "Stereo matches",
+    "02_depth": "Valid depth",
+    "03_subpixel": "Sub-pixel disparity of one match",
+    "03_depth_keypoints": "Keypoints with depth",
+    "04_disparity_and_depth": "Disparity and depth",
+    "05_matches": "Matches with the reference",
+    "06_consensus": "Consensus: which matches agree on a motion",
+    "07_residuals": "Residuals before and after the refinement",
+    "08_pose": "The pose and its covariance",
+    "09_links": "Links to earlier frames",
+}
+"""Of the pictures by name, in order."""
 _WIDTH_INCHES: Final = 13.0
 _DPI: Final = 100
 _CAPTION_CHARACTERS: Final = 165
@@ -42,16 +56,21 @@ class Picture:
     Parameters
     ----------
     name : str
-        Of the file, without its ending: `01_keypoints`.
-    title, caption : str
-    png : bytes or None
-        None if there is nothing to show; the caption says why.
+        Of the file, without its ending: one of `TITLES`.
+    caption : str
+    png, panels_png : bytes or None
+        With title and caption, and without; None if there is nothing to show: the caption says why.
     """
 
     name: str
-    title: str
     caption: str
     png: bytes | None = None
+    panels_png: bytes | None = None
+
+    @property
+    def title(self) -> str:
+        """Its title."""
+        return TITLES[self.name]
 
 
 class Sheet:
@@ -59,7 +78,7 @@ class Sheet:
 
     Parameters
     ----------
-    name, title, caption : str
+    name, caption : str
     height_inches : float
         Of the axes.
 
@@ -69,17 +88,18 @@ class Sheet:
         The room for the axes.
     """
 
-    def __init__(self, name: str, title: str, caption: str, height_inches: float) -> None:
+    def __init__(self, name: str, caption: str, height_inches: float) -> None:
         from matplotlib.figure import Figure
 
-        self._texts = {"name": name, "title": title, "caption": caption}
-        lines = _wrap(caption)
+        self._name, self._caption, lines = name, caption, _wrap(caption)
         heights = [height_inches + _TITLE_INCHES, _LINE_INCHES * (len(lines) + 0.8)]
         self._figure = Figure(figsize=(_WIDTH_INCHES, sum(heights)), dpi=_DPI, layout="constrained")
-        self.panels, footer = split(self._figure, heights)
-        self.panels.suptitle(title, x=_MARGIN, ha="left", fontsize=14, fontweight="bold")
+        self.panels, self._footer = split(self._figure, heights)
+        self._title = self.panels.suptitle(
+            TITLES[name], x=_MARGIN, ha="left", fontsize=14, fontweight="bold"
+        )
         text = "\n".join(lines)
-        footer.text(_MARGIN, 0.95, text, va="top", fontsize=_FONT_SIZE, linespacing=1.35)
+        self._footer.text(_MARGIN, 0.95, text, va="top", fontsize=_FONT_SIZE, linespacing=1.35)
 
     def colorbar(self, mappable: Any, axes: Axes, **options: Any) -> None:  # noqa: ANN401
         """Add a colour bar beside axes."""
@@ -89,10 +109,27 @@ class Sheet:
         """Return the picture drawn."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        FigureCanvasAgg(self._figure)
-        buffer = io.BytesIO()
-        self._figure.savefig(buffer, format="png", metadata={"Software": None})
-        return Picture(**self._texts, png=buffer.getvalue())
+        canvas: Any = FigureCanvasAgg(self._figure)  # has no types
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())
+        top, bottom = (
+            len(pixels) - round(height)
+            for height in (self._title.get_window_extent().y0, self._footer.bbox.y1)
+        )
+        return Picture(
+            name=self._name,
+            caption=self._caption,
+            png=_encode(pixels),
+            panels_png=_encode(pixels[top:bottom]),
+        )
+
+
+def _encode(pixels: ImageArray) -> bytes:
+    from matplotlib.image import imsave
+
+    buffer, metadata = io.BytesIO(), cast("dict[str, str]", {"Software": None})
+    imsave(buffer, pixels, format="png", dpi=_DPI, metadata=metadata)
+    return buffer.getvalue()
 
 
 def split(figure: Figure | SubFigure, heights: Sequence[float]) -> list[SubFigure]:

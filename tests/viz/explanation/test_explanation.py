@@ -2,9 +2,11 @@
 
 import json
 import re
+from base64 import b64decode
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,6 +49,21 @@ def explained_descriptors() -> FrameExplanation:
     )
 
 
+def decoded(png: bytes) -> np.ndarray[Any, Any]:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return image
+
+
+def assert_without_words(panels: np.ndarray[Any, Any], image: np.ndarray[Any, Any]) -> None:
+    """The page says title and caption as text: its picture is the file's but for these."""
+    n_rows = len(panels)
+    starts = range(1, len(image) - n_rows)
+    [top] = [n for n in starts if np.array_equal(image[n : n + n_rows], panels)]
+    assert (image[:top] < 128).any()
+    assert (image[top + n_rows :] < 128).any()
+
+
 @pytest.mark.parametrize(
     ("explain", "names"),
     [(explained_descriptors, STEREO), (partial(explained, "rgbd", 2), RGBD)],
@@ -57,12 +74,14 @@ def test_each_step_has_its_picture_in_order(
 ) -> None:
     written = write_explanation(explain(), tmp_path / "made" / "here")
     assert [path.stem for path in written] == [*names, "explanation", "explanation"]
-    for path in written[:-2]:
-        image = cv2.imread(str(path))
-        assert image is not None
-        assert image.std() > 5
+    images = [decoded(path.read_bytes()) for path in written[:-2]]
+    assert all(image.std() > 5 for image in images)
     page = written[-1].read_text()
-    assert page.count("data:image/png;base64,") == len(names)
+    shown = [
+        decoded(b64decode(each)) for each in re.findall(r"data:image/png;base64,([^\"]+)", page)
+    ]
+    for image, panels in zip(images, shown, strict=True):
+        assert_without_words(panels, image)
     assert not re.search(r"""(?:src|href)=["'](?!data:)""", page)
     numbers = json.loads(written[-2].read_text())
     assert numbers["matches"]["kept"] == numbers["relative_pose"]["n_matches"]
@@ -89,10 +108,9 @@ def test_a_folder_that_is_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("word", ["WWMM", "moved", "ill,"])
 def test_no_line_of_a_caption_leaves_the_picture(word: str) -> None:
     caption = " ".join([word] * 120)
-    picture = Sheet("name", "Title", caption, 1.0).picture()
+    picture = Sheet("08_pose", caption, 1.0).picture()
     assert picture.png is not None
-    image = cv2.imdecode(np.frombuffer(picture.png, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
+    image = decoded(picture.png)
     inked = np.flatnonzero((image < 255).any(axis=0))
     assert inked[-1] < image.shape[1] - inked[0] + 1
     assert inked[-1] > 0.5 * image.shape[1]
@@ -104,13 +122,13 @@ def test_the_caption_says_when_the_gate_would_leave_too_few() -> None:
         config = Config().model_copy(
             update={"registration": RegistrationConfig(gate=gate, huber=0.3)}
         )
-        step = explain_frame(source, 2, config=config).refinement
+        explanation = explain_frame(source, 2, config=config)
+        step = explanation.refinement
         assert step is not None
-        assert step.n_within_gate is not None
-        n_before, n_after = (int(each.sum()) for each in step.inliers)
+        n_before, n_after = step.n_inliers
         is_kept = step.n_within_gate < n_before // 2
         assert n_after == (n_before if is_kept else step.n_within_gate)
-        assert words in draw_residuals(explained("stereo", 2), step).caption
+        assert words in draw_residuals(explanation).caption
 
 
 def test_the_ellipse_is_turned_into_the_frame_of_the_picture() -> None:
