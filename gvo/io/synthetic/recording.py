@@ -26,7 +26,7 @@ from gvo.io.synthetic.worlds.deceptive import (
     traffic_drive,
     turn_away,
 )
-from gvo.io.synthetic.worlds.motion import drive, look_around
+from gvo.io.synthetic.worlds.motion import drive, hover, look_around, turn_fast
 from gvo.io.synthetic.worlds.room import room
 from gvo.io.synthetic.worlds.street import street
 from gvo.trajectory.trajectory import Trajectory
@@ -35,7 +35,9 @@ from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 _EXPOSURE_PERIOD_S = 7.3
 _BLOB_PX = 14
 _STEP_SHARE = 0.03
-WorldName: TypeAlias = Literal["driving", "handheld", "traffic", "facade", "mirror", "wall"]
+WorldName: TypeAlias = Literal[
+    "driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall"
+]
 _START_NS = 1_700_000_000_000_000_000
 
 
@@ -47,16 +49,18 @@ class SyntheticRecording:
 
     Parameters
     ----------
-    world : {"driving", "handheld", "traffic", "facade", "mirror", "wall"}
+    world : {"driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall"}
         `driving`: around a block of houses with KITTI's cameras at 10 Hz. `handheld`: a camera
-        held in the hand in a furnished room, 640 x 480 at 30 Hz. The others deceive, each with
-        the cameras of one of these. `traffic`: the car halts, and a bus fills two thirds of the
-        image; from 3 to 10 s. `facade`: sideways along a house whose windows repeat exactly, by
-        more than half a window per frame. `mirror`: the room with a large mirror that swings:
-        what is seen in it moves as one. A stereo camera sees the virtual room behind the glass;
-        the depth of an RGB-D camera is that of the glass, as of dusty ones, while its image
-        shows what is reflected. `wall`: the hand turns to a wall of one grey, which fills the
-        image from 3.8 to 7.0 s, and turns back.
+        held in the hand in a furnished room, 640 x 480 at 30 Hz. `turning`: the same, turned to
+        and fro at up to 85 deg/s. `hovering`: a drone there that flies for 2 s to another place,
+        comes to rest but for a few millimetres, and flies on 3 s later. Seeds of these two move
+        in different ways. The others deceive, each with the cameras of one of these. `traffic`:
+        the car halts, and a bus fills two thirds of the image; from 3 to 10 s. `facade`: sideways
+        along a house whose windows repeat exactly, by more than half a window per frame. `mirror`:
+        the room with a large mirror that swings: what is seen in it moves as one. A stereo camera
+        sees the virtual room behind the glass; the depth of an RGB-D camera is that of the glass,
+        as of dusty ones, while its image shows what is reflected. `wall`: the hand turns to a
+        wall of one grey, which fills the image from 3.8 to 7.0 s, and turns back.
     sensor : {"stereo", "rgbd"}
     n_frames : int
         Length; the drive closes its lap of 400 m after about 480 frames.
@@ -102,14 +106,14 @@ class SyntheticRecording:
         frame_ms = 1e3 / setting.rate_hz
         if not 0.0 <= readout_ms <= frame_ms:
             raise ValueError(f"readout_ms must be in [0, {frame_ms:.1f}], got {readout_ms}")
-        self._readout_s, self._move = 1e-3 * readout_ms, setting.move
+        self._readout_s, self._move = 1e-3 * readout_ms, setting.motion(seed)
         self._world, self._sensor, self._seed = world, sensor, seed
         self._camera = scale_camera(setting.camera, scale)
         self._baseline = setting.baseline
         self._noise = noise or SensorNoise(max_depth_m=setting.max_depth_m)
         frames = np.arange(n_frames, dtype=np.int64)
         self._elapsed_ns: IntArray = frames * 1_000_000_000 // setting.rate_hz
-        self._T_map_cam = setting.move(np.asarray(1e-9 * self._elapsed_ns, dtype=np.float64))
+        self._T_map_cam = self._move(np.asarray(1e-9 * self._elapsed_ns, dtype=np.float64))
         built = setting.build(seed)
         self._moving_scene = built if isinstance(built, MovingScene) else MovingScene(scene=built)
 
@@ -208,12 +212,16 @@ def _check(world: str, sensor: str, n_frames: int, seed: int, scale: float) -> N
         raise ValueError(f"scale must be in [0.05, 4], got {scale}")
 
 
+# T_map_cam (n, 4, 4) of seconds since the start (n,).
+_Motion: TypeAlias = Callable[[FloatArray], FloatArray]
+
+
 @dataclass(frozen=True, slots=True)
 class _World:
-    """A scene, a motion through it, and the cameras that fit."""
+    """A scene and a motion through it, by their seed, and the cameras that fit."""
 
     build: Callable[[int], Scene | MovingScene]
-    move: Callable[[FloatArray], FloatArray]
+    motion: Callable[[int], _Motion]
     camera: PinholeCamera
     baseline: float
     rate_hz: int
@@ -236,13 +244,27 @@ _by_hand = partial(
     rate_hz=30,
     max_depth_m=8.0,
 )
+
+
+def _always(move: _Motion) -> Callable[[int], _Motion]:
+    """Return the same motion for all seeds."""
+    return lambda _: move
+
+
+def _by_seed(move: Callable[[int, FloatArray], FloatArray]) -> Callable[[int], _Motion]:
+    """Return the motion of each seed."""
+    return lambda seed: partial(move, seed)
+
+
 _WORLDS = {
-    "driving": _by_car(street, drive),
-    "handheld": _by_hand(room, look_around),
-    "traffic": _by_car(traffic, traffic_drive),
-    "facade": _by_car(facade, ride),
-    "mirror": _by_hand(mirror_room, look_around),
-    "wall": _by_hand(blank_room, turn_away),
+    "driving": _by_car(street, _always(drive)),
+    "handheld": _by_hand(room, _always(look_around)),
+    "turning": _by_hand(room, _by_seed(turn_fast)),
+    "hovering": _by_hand(room, _by_seed(hover)),
+    "traffic": _by_car(traffic, _always(traffic_drive)),
+    "facade": _by_car(facade, _always(ride)),
+    "mirror": _by_hand(mirror_room, _always(look_around)),
+    "wall": _by_hand(blank_room, _always(turn_away)),
 }
 
 

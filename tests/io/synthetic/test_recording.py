@@ -14,6 +14,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import invert, rotation_angle, transform_points
 from gvo.io.recording import Source
 from gvo.io.synthetic.recording import SensorNoise, SyntheticRecording, spoil_depth
+from gvo.io.synthetic.worlds.motion import hover, turn_fast
 from gvo.types import BoolArray, DepthArray, FloatArray
 
 WORLDS = ["driving", "handheld"]
@@ -163,6 +164,53 @@ def test_poses_are_rigid_and_move_smoothly(world: str, speed: float, turn: float
     assert 0.4 * turn < turns.max() < turn
     jolts = np.diff(np.diff(T[:, :3, 3], axis=0), axis=0)
     assert np.abs(jolts).max() < 0.25 * speeds.max() * seconds[0]
+
+
+def motion(move: Any, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Return poses of 15 s at 30 Hz, and how far each is from the next: degrees and metres."""
+    T = move(seed, np.arange(450) / 30.0)
+    steps = invert(T[:-1]) @ T[1:]
+    turns, lengths = np.rad2deg(rotation_angle(steps)), np.linalg.norm(steps[:, :3, 3], axis=1)
+    return T, np.stack([turns, lengths], axis=1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_fast_hand_turns_as_fast_as_announced_and_comes_back(seed: int) -> None:
+    T, steps = motion(turn_fast, seed)
+    turns, lengths = 30.0 * steps.T
+    assert 70.0 < turns.max() < 90.0
+    assert np.median(turns) > 45.0
+    assert lengths.max() < 0.2
+    # Two seconds later at the earliest it looks the same way again, within the field of view.
+    for index in range(0, 150, 10):
+        later = rotation_angle(invert(T[index]) @ T[index + 60 :])
+        assert np.rad2deg(later.min()) < 20.0
+    assert np.rad2deg(rotation_angle(T)).max() > 40.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_drone_comes_to_rest_for_three_seconds_between_flights(seed: int) -> None:
+    T, steps = motion(hover, seed)
+    positions = T[:, :3, 3]
+    for start in (0, 150, 300):
+        resting = slice(start + 61, start + 150)
+        spread = np.linalg.norm(positions[resting] - positions[resting].mean(axis=0), axis=1)
+        assert 0.0005 < spread.max() < 0.005
+        turned = np.rad2deg(rotation_angle(invert(T[start + 61]) @ T[resting]))
+        assert turned.max() < 0.7
+        assert 0.05 < np.linalg.norm(positions[start + 62] - positions[start]) < 2.0
+    assert steps[:, 1].max() < 0.06  # no jumps
+    assert steps[:, 0].max() < 2.5
+
+
+@pytest.mark.parametrize(("world", "move"), [("turning", turn_fast), ("hovering", hover)])
+def test_another_seed_moves_in_another_way(world: Any, move: Any) -> None:
+    poses = []
+    for seed in (0, 1):
+        poses.append(perfect(world, n_frames=450, seed=seed).ground_truth().T_world_frame)
+        T, _ = motion(move, seed)
+        np.testing.assert_allclose(poses[-1], invert(T[0]) @ T, atol=1e-6)
+    assert np.abs(poses[0] - poses[1]).max() > 0.1
 
 
 def test_the_drive_turns_forward_and_comes_back_to_its_start() -> None:

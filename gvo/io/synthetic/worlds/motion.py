@@ -1,4 +1,4 @@
-"""How the camera moves: a drive around a block, a hand that looks around.
+"""How the camera moves: a drive around a block, a hand that looks around or turns fast, a drone.
 
 Map axes: z up; a camera looks along its z axis, x to the right, y down.
 """
@@ -18,6 +18,8 @@ STRAIGHT_M = 50.0
 TURN_M = 50.0
 LAP_M = 4 * (STRAIGHT_M + TURN_M)
 _START_M = 30.0
+_LEG_S, _HOVER_S = 2.0, 3.0
+_N_PLACES = 8
 R_MAP_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
@@ -129,7 +131,61 @@ def look_around(stamps_s: FloatArray) -> FloatArray:
     tilts = np.array([0.20, 0.48, 0.13, 0.03, 0.05, 0.03])  # rad about x, y, z of the camera
     rates = np.array([1.1, 0.9, 1.3, 3.1, 2.7, 2.3])
     turns = tilts * np.sin(rates * t + [0.4, 0.0, 1.2, 2.0, 0.9, 0.1])
-    turns = turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0]
+    return _level_and_turned(position, turns[:, :3] + turns[:, 3:] + [-0.12, 0.0, 0.0])
+
+
+def turn_fast(seed: int, stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a hand that turns the camera to and fro.
+
+    About all three axes, at up to some 85 deg/s, back to what was seen before within seconds.
+
+    Parameters
+    ----------
+    seed : int
+        Of rates and phases.
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    t = stamps_s[:, np.newaxis]
+    rng = np.random.default_rng([seed, 7])
+    rates = np.array([1.3, 1.0, 1.6, 2.6, 1.9, 2.3]) * rng.uniform(0.9, 1.1, 6)  # rad/s
+    waves = np.sin(rates * t + rng.uniform(0.0, 2.0 * np.pi, 6))
+    position = np.array([0.0, -0.75, 1.35]) + np.array([0.06, 0.05, 0.04]) * waves[:, :3]
+    turns = np.array([0.25, 0.5, 0.36]) * waves[:, 3:] + [-0.12, 0.0, 0.0]
+    return _level_and_turned(position, turns)
+
+
+def hover(seed: int, stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a drone that flies for 2 s and hovers for 3 s, in turn.
+
+    It goes around eight places. Where it hovers it jitters by a few millimetres.
+
+    Parameters
+    ----------
+    seed : int
+        Of the places and the jitter.
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    rng = np.random.default_rng([seed, 8])
+    reach = np.array([0.6, 0.4, 0.25, 0.12, 0.4])  # m; rad of pitch and yaw
+    places = reach * rng.uniform(-1.0, 1.0, (_N_PLACES, 5))
+    leg, on_leg_s = np.divmod(stamps_s, _LEG_S + _HOVER_S)
+    x = np.minimum(on_leg_s / _LEG_S, 1.0)[:, np.newaxis]
+    k = leg.astype(np.int64)
+    start, end = places[k % _N_PLACES], places[(k + 1) % _N_PLACES]
+    flown = start + x**3 * (10.0 - 15.0 * x + 6.0 * x * x) * (end - start)
+    rates = rng.uniform(6.0, 25.0, (2, 6))  # rad/s
+    phases = rng.uniform(0.0, 2.0 * np.pi, (2, 6))
+    waves = np.sin(rates * stamps_s[:, np.newaxis, np.newaxis] + phases).sum(axis=1)
+    jitter = 0.001 * waves  # m, rad
+    position = np.array([0.0, -0.75, 1.35]) + flown[:, :3] + jitter[:, :3]
+    turns = np.column_stack([flown[:, 3:] - [0.12, 0.0], np.zeros(len(flown))]) + jitter[:, 3:]
+    return _level_and_turned(position, turns)
+
+
+def _level_and_turned(position: FloatArray, turns: FloatArray) -> FloatArray:
+    """Return the poses of level cameras at positions (n, 3), then turned by vectors (n, 3)."""
     rotation = exp(np.column_stack([turns, np.zeros_like(turns)]))
-    level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(t), 3, 3)), position)
+    level = make_transform(np.broadcast_to(R_MAP_LEVEL, (len(turns), 3, 3)), position)
     return np.asarray(level @ rotation)
