@@ -9,10 +9,14 @@ yardstick take turns for some rounds, and medians are printed: times depend on t
 what else it does, ratios less so. Starting up and drawing are left out.
 
 `--ablation` adds the errors under settings that leave a part of the method out.
+`--seeds N` measures errors and NEES on rendered recordings of N seeds, a line for each (see
+benchmark_seeds.py): `--kind drive` (stereo), `hand` (a fast one, RGB-D), `rest` (a drone that
+hovers, stereo), with a rolling shutter by `--readout`. `--keep DIR` keeps what is rendered.
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 
 Example: python scripts/benchmark.py kitti_06_start euroc_mh01_start
+Example: python scripts/benchmark.py --seeds 10 --kind hand --readout 25 --keep rendered
 """
 
 import argparse
@@ -21,6 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
+import benchmark_seeds  # type: ignore[import-not-found]
 import benchmark_tables as tables  # type: ignore[import-not-found]
 import benchmark_window  # type: ignore[import-not-found]
 import numpy as np
@@ -37,6 +42,8 @@ def main() -> None:
         faults = benchmark_window.soak(arguments.soak, is_timed=not arguments.untimed)
         if faults:
             sys.exit("benchmark: " + "; ".join(faults))
+    if arguments.seeds:
+        benchmark_seeds.measure(recordings_of(arguments), arguments.seeds, arguments.set)
     measure_all(arguments)
 
 
@@ -56,15 +63,47 @@ def parse() -> argparse.Namespace:
         "--soak", type=int, nargs="?", const=1_000_000, metavar="N", help="a life of N poses"
     )
     parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
+    add_seeds(parser)
     arguments = parser.parse_args()
     lengths = [n for n in (arguments.window, arguments.soak) if n is not None]
-    if not (arguments.recordings or lengths):
-        parser.error("name recordings, or --window, or --soak")
+    if not (arguments.recordings or arguments.seeds or lengths):
+        parser.error("name recordings, or --seeds, --window or --soak")
     if min(lengths, default=1000) < 1000:
         parser.error("--window and --soak take at least 1000 poses")
     if arguments.rounds < 1:
         parser.error("--rounds takes at least 1")
     return arguments
+
+
+def add_seeds(parser: argparse.ArgumentParser) -> None:
+    """Add the options of rendered recordings."""
+    group = parser.add_argument_group("rendered recordings")
+    group.add_argument("--seeds", type=seeds, metavar="N", help="0 to N - 1, or as in 10-19")
+    group.add_argument("--kind", choices=benchmark_seeds.KINDS, default="drive")
+    group.add_argument("--sensor", choices=["stereo", "rgbd"], help="default: the kind's")
+    group.add_argument("--frames", type=int, choices=range(2, 100_000), default=300, metavar="N")
+    group.add_argument("--readout", type=float, default=0.0, metavar="MS", help="rolling shutter")
+    group.add_argument("--keep", type=Path, metavar="DIR", help="of bags, written once, then read")
+
+
+def seeds(text: str) -> range:
+    """Return so many seeds, or those from a first to a last one."""
+    first, dash, last = text.partition("-")
+    found = range(int(first), int(last) + 1) if dash else range(int(first))
+    if not found:
+        raise ValueError(text)
+    return found
+
+
+def recordings_of(arguments: argparse.Namespace) -> benchmark_seeds.Recordings:
+    """Return what the options of rendered recordings name."""
+    return benchmark_seeds.Recordings(
+        kind=arguments.kind,
+        sensor=arguments.sensor or benchmark_seeds.KINDS[arguments.kind][1],
+        n_frames=arguments.frames,
+        readout_ms=arguments.readout,
+        folder=arguments.keep,
+    )
 
 
 def measure_all(arguments: argparse.Namespace) -> None:

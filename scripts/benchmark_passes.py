@@ -236,21 +236,29 @@ class Track:
     ----------
     source : Source
     config : Config
+
+    Attributes
+    ----------
+    odometry : Odometry
+    estimates : dict of str to list of Estimate
+        Of the three trajectories so far.
+    totals_ms : list of float
+        Milliseconds of each frame, reading apart.
     """
 
     def __init__(self, source: Source, config: gvo.Config) -> None:
         self._source = source
-        self._odometry = gvo.Odometry(source.info.camera, config)
-        self._estimates: dict[Estimator, list[gvo.Estimate]]
-        self._estimates = {name: [] for name in get_args(Estimator)}
+        self.odometry = gvo.Odometry(source.info.camera, config)
+        self.estimates: dict[Estimator, list[gvo.Estimate]]
+        self.estimates = {name: [] for name in get_args(Estimator)}
         self.totals_ms: list[float] = []
 
     def add(self, frame: Frame) -> dict[str, float]:
         """Take a frame; return its milliseconds by stage."""
-        result = self._odometry.track(frame)
-        self._estimates["raw"].append(result.raw)
-        self._estimates["causal"].append(result.causal)
-        self._estimates["smoothed"] += result.finished
+        result = self.odometry.track(frame)
+        self.estimates["raw"].append(result.raw)
+        self.estimates["causal"].append(result.causal)
+        self.estimates["smoothed"] += result.finished
         self.totals_ms.append(sum(result.stage_ms.values()))
         return result.stage_ms
 
@@ -258,14 +266,14 @@ class Track:
         """End the run; return the errors where the recording holds its truth."""
         if not self.totals_ms:
             raise gvo.GvoError(f"{self._source.info.name}: no usable frame")
-        smoothed = [*self._estimates["smoothed"], *self._odometry.finish()]
-        self._estimates["smoothed"] = sorted(smoothed, key=lambda estimate: estimate.stamp_ns)
+        smoothed = [*self.estimates["smoothed"], *self.odometry.finish()]
+        self.estimates["smoothed"] = sorted(smoothed, key=lambda estimate: estimate.stamp_ns)
         truth = self._source.ground_truth()
         if truth is None:
             return {}
         return {
             name: gvo.evaluate(truth, gvo.Trajectory.of(estimates), name=name)
-            for name, estimates in self._estimates.items()
+            for name, estimates in self.estimates.items()
         }
 
 

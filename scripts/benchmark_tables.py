@@ -40,10 +40,13 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown, its columns aligned: names to the left, numbers to the right."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     rules = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-    lines = [
-        [row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in (header, *rows)
-    ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in [lines[0], rules, *lines[1:]]) + "\n"
+    return "".join(markdown_row(row, widths) for row in (header, rules, *rows))
+
+
+def markdown_row(cells: Sequence[str], widths: Sequence[int]) -> str:
+    """Return a line of such a table, its columns so wide at least."""
+    aligned = [cells[0].ljust(widths[0]), *map(str.rjust, cells[1:], widths[1:])]
+    return f"| {' | '.join(aligned)} |\n"
 
 
 def number(value: float | None, n_decimals: int) -> str:

@@ -37,6 +37,7 @@ WORLDS = {
 KINDS = get_args(FrontendConfig.model_fields["kind"].annotation)
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 SPAN_NS = 1_000_000_000
+MOST_OFF_NS = 500_000_000
 
 # A relative pose, with its covariance, and the stamps that it leads from and to.
 Relative = tuple[int, int, FloatArray, FloatArray]
@@ -102,33 +103,40 @@ def relative_poses(
     """Run odometry over frames and return its relative poses over about 1 s."""
     odometry = gvo.Odometry(camera, config)
     raw: list[gvo.Estimate] = []
-    in_window: list[Relative] = []
+    windowed: list[Relative] = []
     for frame in frames:
         if isinstance(frame, FaultyFrame):
             continue
         raw.append(odometry.track(frame).raw)
-        stamps = {odometry.window.stamp_ns(pose): pose for pose in odometry.window.poses()}
-        start = nearest(np.array(list(stamps)), frame.stamp_ns - SPAN_NS)
-        if start is not None:
-            edge = odometry.window.relative_pose(stamps[start], frame.stamp_ns)
-            pair = (start, frame.stamp_ns, edge.T_reference_frame, edge.covariance)
-            in_window.append(pair)
-    return {"raw": chained(raw), "window": in_window}
+        windowed += in_window(odometry.window, frame.stamp_ns)
+    return {"raw": chained(raw), "window": windowed}
+
+
+def in_window(
+    window: gvo.SlidingWindow, stamp_ns: int, *, span_ns: int = SPAN_NS
+) -> list[Relative]:
+    """Return the newest pose in one about a span older; nothing where the window holds none."""
+    stamps = {window.stamp_ns(pose): pose for pose in window.poses()}
+    start = nearest(np.array(list(stamps)), stamp_ns - span_ns)
+    if start is None:
+        return []
+    edge = window.relative_pose(stamps[start], stamp_ns)
+    return [(start, stamp_ns, edge.T_reference_frame, edge.covariance)]
 
 
 def nearest(stamps_ns: FloatArray, target_ns: int) -> int | None:
     """Return the stamp nearest to a target, None where all are half a second off."""
     best = int(stamps_ns[np.argmin(np.abs(stamps_ns - target_ns))])
-    return best if abs(best - target_ns) <= SPAN_NS // 2 else None
+    return best if abs(best - target_ns) <= MOST_OFF_NS else None
 
 
-def chained(estimates: list[gvo.Estimate]) -> list[Relative]:
-    """Return the relative poses over 1 s of a chain; only there do covariances subtract."""
+def chained(estimates: list[gvo.Estimate], *, span_ns: int = SPAN_NS) -> list[Relative]:
+    """Return the relative poses over a span of a chain; only there do covariances subtract."""
     stamps_ns = np.array([estimate.stamp_ns for estimate in estimates])
     by_stamp = dict(zip(stamps_ns.tolist(), estimates, strict=True))
     pairs: list[Relative] = []
     for b in estimates:
-        start = nearest(stamps_ns, b.stamp_ns - SPAN_NS)
+        start = nearest(stamps_ns, b.stamp_ns - span_ns)
         if start is None or start >= b.stamp_ns:
             continue
         a = by_stamp[start]
@@ -150,16 +158,22 @@ def compare(pairs: list[Relative], truth: gvo.Trajectory) -> list[tuple[FloatArr
     return compared
 
 
-def print_row(name: str, errors: FloatArray, covariances: FloatArray) -> None:
-    """Print the mean NEES per degree of freedom and the largest bias."""
-    nees = []
+def mean_nees(errors: FloatArray, covariances: FloatArray) -> tuple[float, float]:
+    """Return the mean NEES per degree of freedom of rotations and of translations."""
+    means = []
     for block in (slice(0, 3), slice(3, 6)):
         solved = np.linalg.solve(covariances[:, block, block], errors[:, block, np.newaxis])
-        nees.append(float(np.mean(np.sum(errors[:, block] * solved[..., 0], axis=1))) / 3.0)
+        means.append(float(np.mean(np.sum(errors[:, block] * solved[..., 0], axis=1))) / 3.0)
+    return means[0], means[1]
+
+
+def print_row(name: str, errors: FloatArray, covariances: FloatArray) -> None:
+    """Print the mean NEES per degree of freedom and the largest bias."""
+    rotation, translation = mean_nees(errors, covariances)
     bias = np.mean(errors / np.sqrt(np.einsum("nii->ni", covariances)), axis=0)
     worst = int(np.argmax(np.abs(bias)))
     print(
-        f"{name:<34} {len(errors):>6} {nees[0]:>9.2f} {nees[1]:>12.2f}"
+        f"{name:<34} {len(errors):>6} {rotation:>9.2f} {translation:>12.2f}"
         f"  {bias[worst]:+.2f} sigma in {AXES[worst]}"
     )
 

@@ -1,0 +1,169 @@
+"""Errors and NEES over rendered recordings of many seeds, which benchmark.py calls.
+
+One line for each seed, then the median and the worst of each column: errors of the raw and of the
+smoothed trajectory (t_err and r_err over KITTI's segments, where the path is long enough for
+them), and the NEES of relative poses per degree of freedom, rotation / translation (see
+consistency.py): of the raw chain over 1 s and 10 s, and between poses of the window so far apart,
+where it holds them. A seed gives the same images on every machine; kept as bags they can be read
+by other versions of the package.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
+import benchmark_tables as tables  # type: ignore[import-not-found]
+import consistency  # type: ignore[import-not-found]
+import numpy as np
+
+import gvo
+from gvo.io.recording import Sensor, Source
+from gvo.types import FloatArray
+
+KINDS: dict[str, tuple[str, Sensor]] = {
+    "drive": ("driving", "stereo"),
+    "hand": ("turning", "rgbd"),
+    "rest": ("hovering", "stereo"),
+}
+SPANS_S = (1, 10)
+# Raw and smoothed of each.
+DECIMALS = {"t_err [%]": 3, "r_err [deg/m]": 5, "ATE [m]": 4}
+HEADER = (
+    "seed  ",
+    *(f"{error} {name}" for error in DECIMALS for name in ("raw", "smoothed")),
+    *(f"NEES {name} {span} s".rjust(15) for name in ("raw", "window") for span in SPANS_S),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recordings:
+    """What is rendered, but for the seed.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    sensor : {"stereo", "rgbd"}
+    n_frames : int
+    readout_ms : float
+        Of a rolling shutter.
+    folder : Path, optional
+        Where they are kept as bags, and looked for.
+    """
+
+    kind: str
+    sensor: Sensor
+    n_frames: int
+    readout_ms: float
+    folder: Path | None
+
+    def of(self, seed: int) -> Source:
+        """Return the recording of a seed."""
+        if self.folder is None:
+            return self.rendered(seed)
+        name = f"{self.kind}-{self.sensor}-{self.n_frames}-{self.readout_ms:g}ms-{seed}.mcap"
+        path, unfinished = self.folder / name, self.folder / f"unfinished-{name}"
+        if not path.exists():
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                unfinished.unlink(missing_ok=True)
+                gvo.convert(self.rendered(seed), unfinished)
+                unfinished.rename(path)
+            except OSError as error:
+                raise gvo.GvoError(f"{path}: cannot be written: {error.strerror}") from error
+        return gvo.open_recording(path)
+
+    def rendered(self, seed: int) -> Source:
+        """Return the recording of a seed, rendered while it is read."""
+        try:
+            return gvo.SyntheticRecording(
+                KINDS[self.kind][0],  # type: ignore[arg-type]
+                self.sensor,
+                n_frames=self.n_frames,
+                seed=seed,
+                readout_ms=self.readout_ms,
+            )
+        except ValueError as error:
+            raise gvo.GvoError(f"{self.kind}: {error}") from error
+
+
+def measure(recordings: Recordings, seeds: Sequence[int], settings: Sequence[str]) -> None:
+    """Print one line for each seed, and what they say together."""
+    widths = [len(name) for name in HEADER]
+    print(f"\n{recordings.kind}, {recordings.sensor}, {recordings.n_frames} frames, ", end="")
+    print(f"readout {recordings.readout_ms:g} ms\n\n{tables.markdown_table(HEADER, [])}", end="")
+    found = []
+    for seed in seeds:
+        found.append(figures(recordings.of(seed), settings))
+        print(tables.markdown_row(cells(str(seed), found[-1]), widths), end="", flush=True)
+    together = np.array(found)
+    for name, summary in (("median", np.median), ("worst", np.max)):
+        print(tables.markdown_row(cells(name, known(summary, together)), widths), end="")
+    raw, smoothed = together[:, 4], together[:, 5]
+    print(f"\nsmoothed ATE <= raw ATE on {np.sum(smoothed <= raw)} of {len(found)}")
+
+
+def figures(source: Source, settings: Sequence[str]) -> FloatArray:
+    """Run odometry; return the errors, raw and smoothed in turn, then pairs of NEES.
+
+    NaN where there is none.
+    """
+    config = gvo.load_configuration(settings=settings)
+    track = passes.Track(source, config)
+    in_window: dict[int, list[consistency.Relative]] = {span: [] for span in SPANS_S}
+    for frame in passes.usable_frames(source, config):
+        track.add(frame)
+        for span, pairs in in_window.items():
+            pairs += consistency.in_window(
+                track.odometry.window, frame.stamp_ns, span_ns=span * 10**9
+            )
+    evaluations = track.evaluate()
+    chain = track.estimates["raw"]
+    raw = [consistency.chained(chain, span_ns=span * 10**9) for span in SPANS_S]
+    truth = source.ground_truth()
+    return np.array(
+        [
+            *errors(evaluations["raw"], evaluations["smoothed"]),
+            *nees([*raw, *in_window.values()], truth),
+        ]
+    )
+
+
+def errors(raw: gvo.Evaluation, smoothed: gvo.Evaluation) -> list[float]:
+    """Return t_err in %, r_err in deg/m and ATE in m, raw and smoothed in turn."""
+    rows = []
+    for each in (raw, smoothed):
+        r_err = None if each.r_deg_per_100m is None else 0.01 * each.r_deg_per_100m
+        rows.append([each.t_pct, r_err, each.ate_m])
+    return np.array(rows, dtype=np.float64).T.ravel().tolist()
+
+
+def nees(kinds: Iterable[list[consistency.Relative]], truth: gvo.Trajectory | None) -> list[float]:
+    """Return the mean NEES of rotation and translation of each kind of relative poses."""
+    means: list[float] = []
+    for pairs in kinds:
+        compared = [] if truth is None else consistency.compare(pairs, truth)
+        if compared:
+            means += consistency.mean_nees(*map(np.array, zip(*compared, strict=True)))
+        else:
+            means += [np.nan, np.nan]
+    return means
+
+
+def known(summary: Callable[[FloatArray], float], rows: FloatArray) -> FloatArray:
+    """Summarize each column by those of its figures that are known."""
+    columns = [column[np.isfinite(column)] for column in rows.T]
+    return np.array([summary(column) if column.size else np.nan for column in columns])
+
+
+def cells(name: str, row: FloatArray) -> list[str]:
+    """Return the cells of a line of the table."""
+
+    def text(value: float, n_decimals: int) -> str:
+        return "-" if np.isnan(value) else f"{value:.{n_decimals}f}"
+
+    decimals = [n for n in DECIMALS.values() for _ in ("raw", "smoothed")]
+    written = [text(value, n) for value, n in zip(row, decimals, strict=False)]
+    pairs = row[len(decimals) :].reshape(-1, 2)
+    return [name, *written, *(f"{text(r, 2)} / {text(t, 2)}" for r, t in pairs)]
