@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import cv2
@@ -150,20 +151,27 @@ def explain_subpixel(
     """Follow the match of the median horizontal gradient; None if none was kept, and for RGB-D."""
     if not isinstance(frame, StereoFrame) or not stereo.are_kept.any():
         return None
-    chosen = _choose(frame.left, stereo, config.patch_radius_px)
+    radius, searched = config.patch_radius_px, trace.find("corners.searched")
+    chosen = _choose(frame.left, stereo, radius)
     pixel, disparity = stereo.pixels[chosen], float(stereo.values[chosen])
-    searched, matched = trace.find("corners.searched"), trace.find("descriptor.stereo")
     if searched:
         method, rough = "gauss-newton", searched["rough"][chosen : chosen + 1]
-        iterates = _follow((frame.left, frame.right), pixel, rough, config, row_offset_px)
+        given = (frame.left, frame.right), pixel[np.newaxis], rough, config
+        follow = partial(follow_disparities, *given, row_offset_px=row_offset_px)
+        ends = [follow(n_steps=n)[0] for n in range(1, N_SEARCH_STEPS + 1)]
+        iterates = np.concatenate([rough, *ends])
         columns = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX) + round(disparity)
     else:
         # Patches are those of whole pixels, and so are the columns.
         method, pixel = "parabola", np.rint(pixel)
-        start = float(pixel[0] - np.rint(_partner(matched, chosen)[0]))
+        start = float(pixel[0] - np.rint(_partner(trace.find("descriptor.stereo"), chosen)[0]))
         iterates, reach = np.array([start, disparity]), config.search_radius_px
         columns = start + np.arange(-reach, reach + 1, dtype=np.float64)
-    left, *rights, right = _cut_patches(frame, pixel, [*columns, disparity], config, row_offset_px)
+    u, v = pixel
+    left = _patch(frame.left, u, v, radius)
+    *rights, right = (
+        _patch(frame.right, u - d, v + row_offset_px, radius) for d in (*columns, disparity)
+    )
     return Step(
         pixel=pixel,
         method="none" if config.subpixel == "none" else method,
@@ -187,36 +195,6 @@ def _partner(matched: Mapping[str, Any], index: int) -> FloatArray:
     """Return the right keypoint that a left one was matched with."""
     pairs, keypoints = matched["pairs"], matched["features"][1].keypoints
     return np.asarray(keypoints[pairs[pairs[:, 0] == index, 1][0]])
-
-
-def _follow(
-    images: tuple[ImageArray, ImageArray],
-    pixel: FloatArray,
-    rough: FloatArray,
-    config: StereoConfig,
-    row_offset_px: float,
-) -> FloatArray:
-    """Return the disparities at the start and after each step of the front-end."""
-    ends = [
-        follow_disparities(
-            images, pixel[np.newaxis], rough, config, n_steps=n, row_offset_px=row_offset_px
-        )[0]
-        for n in range(1, N_SEARCH_STEPS + 1)
-    ]
-    return np.concatenate([rough, *ends])
-
-
-def _cut_patches(
-    frame: StereoFrame,
-    pixel: FloatArray,
-    disparities: Iterable[float],
-    config: StereoConfig,
-    row_offset_px: float,
-) -> list[NDArray[np.float32]]:
-    """Return the patch at a pixel of the left image, then those at disparities in the right one."""
-    (u, v), radius = pixel, config.patch_radius_px
-    rights = [_patch(frame.right, u - d, v + row_offset_px, radius) for d in disparities]
-    return [_patch(frame.left, u, v, radius), *rights]
 
 
 def _patch(image: ImageArray, u: float, v: float, radius: int) -> NDArray[np.float32]:

@@ -28,16 +28,7 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.types import (
-    Failure,
-    FaultyFrame,
-    Frame,
-    FrameLink,
-    FrameResult,
-    Progress,
-    RelativePose,
-    Status,
-)
+from gvo.types import Failure, FaultyFrame, Frame, FrameResult, Progress, RelativePose, Status
 
 
 def explain_frame(
@@ -166,12 +157,16 @@ class _Drive:
         keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
         steps = [link for link in result.links if link.kind != "keyframe"]
         others = sorted({*scores} - {link.reference_ns for link in steps} | {*registrations})
+        refusals = {each.reference_id: each.reason for each in reversed(result.causal.rejected)}
         for ns, link, registration in [
             *((link.reference_ns, link, result.registration) for link in steps),
             *((ns, keyframes.get(ns), registrations.get(ns)) for ns in others),
         ]:
             is_accepted = link is not None and link.is_accepted
             unused = "keyframe" if registration is not None else "not linked"
+            reason = refusals.get(ns, "not taken by the window")
+            if link is None:
+                reason = self._why_unlinked(registration, scores.get(ns, 0.0))
             yield Step(
                 frame=self._indices[ns],
                 stamp_ns=ns,
@@ -179,28 +174,17 @@ class _Drive:
                 overlap=scores.get(ns),
                 chi2=None if link is None else link.chi2,
                 is_accepted=is_accepted,
-                reason="" if is_accepted else self._reason(ns, link, registration, scores, result),
+                reason="" if is_accepted else reason,
                 n_matches=0 if registration is None else registration.n_matches,
                 n_inliers=0 if registration is None else registration.n_inliers,
                 drawn=Step(image=image_of(self._frames[ns]), registration=registration),
             )
 
-    def _reason(
-        self,
-        ns: int,
-        link: FrameLink | None,
-        registration: RelativePose | Failure | None,
-        scores: Mapping[int, float],
-        result: FrameResult,
-    ) -> str:
-        """Tell why an earlier frame has no edge in the window."""
+    def _why_unlinked(self, registration: RelativePose | Failure | None, overlap: float) -> str:
         if isinstance(registration, Failure):
             return registration.reason
-        if link is not None:
-            reasons = [each.reason for each in result.causal.rejected if each.reference_id == ns]
-            return next(iter(reasons), "not taken by the window")
         if registration is not None:
             return "another frame must confirm it first"
-        if scores[ns] < self._config.window.min_overlap:
+        if overlap < self._config.window.min_overlap:
             return "too little overlap"
         return "steps or other keyframes constrain the pose as well"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvo.config import Config, DepthConfig, StereoConfig
+from gvo.config import Config
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.types import FloatArray, IntArray, RgbdFrame, StereoFrame
 from gvo.viz.explanation.sheet import (
@@ -247,19 +247,15 @@ def draw_depth_keypoints(explanation: FrameExplanation) -> Picture:
 
 def draw_histograms(explanation: FrameExplanation) -> Picture:
     """Draw the distribution of disparities and depths, with the limits."""
-    camera, measured = explanation.camera, explanation.measured
-    limits: StereoConfig | DepthConfig
-    if isinstance(explanation.frame, StereoFrame):
-        limits, what = explanation.config.stereo, "Disparities"
-        disparities = measured.values[measured.are_kept]
+    camera, config, measured = explanation.camera, explanation.config, explanation.measured
+    values, is_stereo = measured.values[measured.are_kept], explanation.depth_pixels is None
+    if is_stereo:
+        what, disparities = "Disparities", values
         depths = camera.disparity_to_depth(disparities - explanation.offset_px)
     else:
-        limits, what = (
-            explanation.config.depth,
-            f"Virtual disparities (baseline {camera.baseline:g} m)",
-        )
-        depths = measured.values[measured.are_kept]
+        what, depths = f"Virtual disparities (baseline {camera.baseline:g} m)", values
         disparities = camera.depth_to_disparity(depths)
+    limits = config.stereo if is_stereo else config.depth
     near, far = limits.min_depth_m, limits.max_depth_m
     high, low = (float(camera.depth_to_disparity(z)) for z in (near, far))
     caption = (
@@ -367,5 +363,5 @@ def _draw_curve(axes: Axes, step: Step) -> None:
     end_px = step.disparity_px
     axes.axvline(end_px, color=LIMIT, linestyle="--", label=f"end: {end_px:.3f} px")
     axes.set_ylim(0.0, 1.4 * float(ssd.max()))
-    place = {"loc": "upper center", "ncols": 2}
-    finish_axes(axes, "disparity [px]", "squared difference [grey²]", **place)
+    labels = "disparity [px]", "squared difference [grey²]"
+    finish_axes(axes, *labels, loc="upper center", ncols=2)

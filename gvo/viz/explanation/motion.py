@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +29,6 @@ from gvo.viz.explanation.sheet import (
     join_images,
     legend_below,
     paired_height,
-    set_title,
     show_image,
     split,
 )
@@ -105,24 +105,18 @@ def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
     )
 
 
-def _draw_crops(
-    panels: np.ndarray[tuple[int, ...], np.dtype[np.object_]],
-    explanation: FrameExplanation,
-    matches: Sorting,
-) -> None:
+def _draw_crops(panels: Sequence[Axes], explanation: FrameExplanation, matches: Sorting) -> None:
     """Enlarge matches that spread evenly over the errors of the prediction."""
-    values, kept = explanation.attempt.find("attempt"), np.flatnonzero(matches.are_kept)
+    begin, kept = explanation.attempt.find("attempt"), np.flatnonzero(matches.are_kept)
     errors = np.linalg.norm(matches.partners - matches.predicted, axis=1)
     order = kept[np.argsort(errors[kept], kind="stable")]
     chosen = order[np.linspace(0, len(order) - 1, _N_CROPS).astype(int)] if len(order) else order
     for axes, index in zip(panels, chosen, strict=False):
         (u, v), found = matches.predicted[index], matches.partners[index]
         show_image(axes, explanation.image)
-        _draw_search(
-            axes, (u, v), found, values["radius_px"], has_window=values["method"] == "tracks"
-        )
+        _draw_search(axes, (u, v), found, begin)
         away = 1.2 * float(np.abs(found - (u, v)).max()) + 6.0
-        reach = max(2.2 * values["radius_px"], 18.0, away)
+        reach = max(2.2 * begin["radius_px"], 18.0, away)
         axes.set_xlim(u - reach, u + reach)
         axes.set_ylim(v + reach, v - reach)
         axes.set_title(f"{errors[index]:.1f} px off", fontsize=10)
@@ -131,17 +125,13 @@ def _draw_crops(
 
 
 def _draw_search(
-    axes: Axes,
-    predicted: tuple[float, float],
-    found: FloatArray,
-    radius: float,
-    *,
-    has_window: bool,
+    axes: Axes, predicted: tuple[float, float], found: FloatArray, begin: Mapping[str, Any]
 ) -> None:
     from matplotlib.patches import Circle, Rectangle
 
+    radius = begin["radius_px"]
     dashed: dict[str, Any] = {"fill": False, "ec": LIMIT, "linestyle": "--", "linewidth": 1.2}
-    if has_window:
+    if begin["method"] == "tracks":
         side, (u, v), (left, top) = 2 * radius + 1, predicted, found - radius - 0.5
         axes.add_patch(Rectangle((u - side / 2, v - side / 2), side, side, **dashed))
         axes.add_patch(Rectangle((left, top), side, side, fill=False, ec=KEPT, linewidth=1.5))
@@ -230,8 +220,8 @@ def _draw_samples(axes: Axes, step: Step) -> None:
     axes.axhline(n_matches, color="black", linestyle=":", label=f"all {n_matches} matches")
     axes.set_xlim(0, max(n_planned, 1) * 1.02)
     axes.set_ylim(0, 1.25 * max(n_matches, 1))
-    set_title(axes, f"what the samples {'would have ' if step.is_known else ''}found")
-    finish_axes(axes, "sample", "inliers", loc="upper right", ncols=4)
+    title = f"what the samples {'would have ' if step.is_known else ''}found"
+    finish_axes(axes, "sample", "inliers", title, loc="upper right", ncols=4)
 
 
 def draw_residuals(explanation: FrameExplanation) -> Picture:

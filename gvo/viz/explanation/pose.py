@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +17,6 @@ from gvo.viz.explanation.sheet import (
     Picture,
     Sheet,
     finish_axes,
-    set_title,
     show_image,
 )
 
@@ -36,13 +35,10 @@ def position_covariance(T: FloatArray, covariance: FloatArray) -> FloatArray:
 def draw_pose(explanation: FrameExplanation) -> Picture:
     """Draw the covariance of the pose, with all its numbers."""
     result, relative = explanation.result, explanation.result.registration
+    names = "raw, in the world", f"causal, in the world ({result.status})"
     poses = [
-        ("raw, in the world", result.raw.T_world_frame, result.raw.covariance),
-        (
-            f"causal, in the world ({result.status})",
-            result.causal.T_world_frame,
-            result.causal.covariance,
-        ),
+        (name, each.T_world_frame, each.covariance)
+        for name, each in zip(names, (result.raw, result.causal), strict=True)
     ]
     name, (_, T, covariance) = "causal", poses[1]
     if relative is not None:
@@ -73,9 +69,9 @@ def _draw_ellipses(axes: Axes, covariance: FloatArray, names: tuple[str, str], t
     axes.set_xlim(-reach, reach)
     # Room for the legend above; y points down.
     axes.set_ylim(*((-reach, 1.3 * reach) if names[1] == "z" else (-1.3 * reach, reach)))
-    set_title(axes, title)
-    place = {"loc": "upper center", "ncols": 3, "columnspacing": 0.8}
-    finish_axes(axes, f"{names[0]} - estimate [mm]", f"{names[1]} - estimate [mm]", **place)
+    place: dict[str, Any] = {"loc": "upper center", "ncols": 3, "columnspacing": 0.8}
+    x_label, y_label = (f"{name} - estimate [mm]" for name in names)
+    finish_axes(axes, x_label, y_label, title, **place)
 
 
 def _pose_caption(explanation: FrameExplanation) -> str:

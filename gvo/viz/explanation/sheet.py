@@ -186,19 +186,19 @@ def show_image(axes: Axes, image: Any, title: str = "", **options: Any) -> None:
     axes.set_ylim(image.shape[0] - 0.5, -0.5)
     axes.set_xticks([])
     axes.set_yticks([])
-    if title:
-        set_title(axes, title)
-
-
-def set_title(axes: Axes, title: str) -> None:
-    """Set the title of axes."""
     axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
 
 
-def finish_axes(axes: Axes, x_label: str, y_label: str, **legend: Any) -> None:  # noqa: ANN401
+def finish_axes(
+    axes: Axes,
+    x_label: str,
+    y_label: str,
+    title: str = "",
+    **legend: Any,  # noqa: ANN401 - matplotlib's
+) -> None:
     """Label axes, with a grid and a legend."""
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.set_title(title, fontsize=_FONT_SIZE, loc="left")
     axes.grid(color=BEFORE, alpha=0.3)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(**{"fontsize": 9, **legend})
