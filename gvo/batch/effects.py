@@ -16,6 +16,8 @@ MIN_SHARE_OF_POSES = 0.95
 """Of the most poses that any run of a recording has; with fewer a run is not compared."""
 _MEASURES = {"error": ERROR, "time": TIME}
 _QUANTILES = {"low": 0.25, "median": 0.5, "high": 0.75}
+COUNTS = ("compared", "set aside", "failed")
+"""Kinds of runs; set aside are those too short, or not measured."""
 
 
 def comparable(table: pd.DataFrame, measure: str | None = None) -> pd.Series[bool]:
@@ -58,31 +60,27 @@ def value_medians(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     -------
     dict of str to DataFrame
         By parameter, that with the largest ratio of medians first, a row for each value: numbers
-        in rising order, others as they came. Columns `(measure, quantile)` of the measures
-        `error` and `time` and the quantiles `low`, `median` and `high` (quartiles), and
-        `("runs", kind)` of the kinds `compared`, `set aside` (too short, or not measured) and
-        `failed`.
+        in rising order, others as they came. Columns `(measure, quantile)` of `error` and `time`
+        and of `low`, `median` and `high` (quartiles), and `("runs", kind)` of `COUNTS`.
     """
-    is_used = {name: comparable(table, column) for name, column in _MEASURES.items()}
-    ratios = pd.DataFrame(
-        {name: relative(table, each).where(is_used[name]) for name, each in _MEASURES.items()}
-    )
+    is_used = pd.DataFrame({name: comparable(table, each) for name, each in _MEASURES.items()})
+    ratios = pd.DataFrame({name: relative(table, each) for name, each in _MEASURES.items()})
     main = "error" if is_used["error"].any() else "time"
     is_failed = table["status"] == "failed"
-    is_set_aside = ~is_used[main] & ~is_failed
-    counts = {"compared": is_used[main], "set aside": is_set_aside, "failed": is_failed}
-    runs = pd.DataFrame(counts)
-    effects = {name: _by_value(table[name], ratios, runs) for name in swept(table)}
+    kinds = is_used[main], ~is_used[main] & ~is_failed, is_failed
+    runs = ratios.where(is_used).assign(**dict(zip(COUNTS, kinds, strict=True)))
+    effects = {name: _by_value(table[name], runs) for name in swept(table)}
     return dict(sorted(effects.items(), key=lambda effect: -span(effect[1], main)))
 
 
-def _by_value(values: pd.Series, ratios: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    is_number = is_numeric_dtype(values)
-    grouped = ratios.groupby(values, dropna=False, sort=is_number)
-    parts = {name: grouped.quantile(share) for name, share in _QUANTILES.items()}
-    quantiles = pd.concat(parts, axis=1).swaplevel(axis=1)
-    n_runs = runs.groupby(values, dropna=False, sort=is_number).sum()
-    return pd.concat([quantiles, pd.concat({"runs": n_runs}, axis=1)], axis=1)
+def _by_value(values: pd.Series, runs: pd.DataFrame) -> pd.DataFrame:
+    grouped = runs.groupby(values, dropna=False, sort=is_numeric_dtype(values))
+    numbers = {
+        (measure, name): grouped[measure].quantile(share)
+        for measure in _MEASURES
+        for name, share in _QUANTILES.items()
+    }
+    return pd.DataFrame(numbers | {("runs", kind): grouped[kind].sum() for kind in COUNTS})
 
 
 def span(effect: pd.DataFrame, measure: str) -> float:
@@ -120,14 +118,19 @@ def variant_means(table: pd.DataFrame) -> pd.DataFrame:
        doi:10.1145/5666.5673.
     """
     is_used = comparable(table, ERROR) & comparable(table, TIME)
-    errors, times = (_log_grid(table, table[name].where(is_used)) for name in (ERROR, TIME))
-    is_done = errors.notna()
+    logs = {name: np.log(table[each].where(is_used)) for name, each in _MEASURES.items()}
+    cells, variants = table[["variant", "recording"]].assign(**logs), table["variant"].unique()
+    grids = {
+        name: cells.pivot(index="variant", columns="recording", values=name).reindex(variants)
+        for name in _MEASURES
+    }
+    is_done = grids["error"].notna()
     n_done = is_done.sum(axis=1)
     is_candidate = (n_done > 0) & (n_done == n_done.max())
     is_common = is_done[is_candidate].all(axis=0) & is_candidate.any()
-    means = pd.DataFrame(index=errors.index)
-    for name, logs in (("error", errors), ("time", times)):
-        common = logs.loc[:, is_common]
+    means = pd.DataFrame(index=is_done.index)
+    for name, grid in grids.items():
+        common = grid.loc[:, is_common]
         means[name] = np.exp((common - common[is_candidate].mean(axis=0)).mean(axis=1))
     costs = means[["error", "time"]].where(is_candidate)
     means = means.assign(
@@ -139,13 +142,6 @@ def variant_means(table: pd.DataFrame) -> pd.DataFrame:
     coverages = table["coverage_percent"].fillna(0.0).groupby(table["variant"]).mean()
     keys = means.assign(n=-n_done, coverage=-coverages, ms=table.groupby("variant")[TIME].sum())
     return means.loc[keys.sort_values(["n", "error", "coverage", "ms"]).index]
-
-
-def _log_grid(table: pd.DataFrame, values: pd.Series[float]) -> pd.DataFrame:
-    """Return logarithms, a row for each configuration, a column for each recording."""
-    cells = table[["variant", "recording"]].assign(log=np.log(values))
-    grid = cells.pivot(index="variant", columns="recording", values="log")
-    return grid.reindex(table["variant"].unique())
 
 
 def is_non_dominated(costs: FloatArray) -> BoolArray:
@@ -173,8 +169,7 @@ def is_non_dominated(costs: FloatArray) -> BoolArray:
     >>> is_non_dominated(np.array([[1.0, 3.0], [2.0, 2.0], [2.0, 3.0]])).tolist()
     [True, True, False]
     """
-    found = np.ones(len(costs), dtype=np.bool_)
-    for n, point in enumerate(costs):
-        is_as_good = np.all(costs <= point, axis=1)
-        found[n] = not np.any(is_as_good & np.any(costs < point, axis=1))
-    return found
+    is_dominated = [
+        np.any(np.all(costs <= point, axis=1) & np.any(costs < point, axis=1)) for point in costs
+    ]
+    return ~np.array(is_dominated, dtype=np.bool_)

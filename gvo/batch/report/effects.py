@@ -9,7 +9,7 @@ import pandas as pd
 from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
 from gvo._text import number_text
-from gvo.batch.effects import span, value_medians
+from gvo.batch.effects import COUNTS, span, value_medians
 from gvo.batch.report.values import (
     N_LABEL,
     Batch,
@@ -35,8 +35,7 @@ _N_LETTERS = 130
 _LEAST_LETTERS = 5
 _GREY = "#777777"
 _COLOURS = {"error": ESTIMATES["smoothed"], "time": _GREY}
-_COUNTS = ("compared", "set aside", "failed")
-_VALUES_HEADER = ("parameter", "value", "error", "quartiles", "time", "quartiles", *_COUNTS)
+_VALUES_HEADER = ("parameter", "value", "error", "quartiles", "time", "quartiles", *COUNTS)
 _MAX_NAMES = 16
 _FRONT = "Accuracy against time"
 _FRONT_HEADER = ("configuration", "number", "error", "time", "recordings")
@@ -96,31 +95,28 @@ def _values_figure(told: Mapping[str, pd.DataFrame], kind: str) -> Figure:
 def _draw_values(axes: Axes, effect: pd.DataFrame, kind: str, n_letters: int) -> None:
     is_number = is_numeric_dtype(effect.index) and not is_bool_dtype(effect.index)
     is_number &= not effect.index.hasnans
-    looks: dict[str, Any] = {"color": _COLOURS[kind], "marker": "o", "ms": 5.0}
+    low, median, high = effect[kind].to_numpy().T
+    looks: dict[str, Any] = {"color": _COLOURS[kind], "lw": 1.0, "elinewidth": 1.6, "capsize": 2.5}
     axes.axhline(1.0, color="black", lw=0.8, ls=":")
-    axes.plot(
-        range(len(effect)), effect[kind, "median"], ls="-" if is_number else "", lw=1.0, **looks
-    )
-    for x, (low, _, high) in enumerate(effect[kind].to_numpy()):
-        axes.plot([x, x], [low, high], lw=1.6, **looks | {"marker": "_"})
+    ends, style = [median - low, high - median], "o-" if is_number else "o"
+    axes.errorbar(range(len(effect)), median, ends, fmt=style, ms=5.0, **looks)
     for x, n_failed in enumerate(effect["runs", "failed"]):
         if n_failed:
             words = f"{n_failed} failed" if len(effect) < 5 else str(n_failed)
             place = axes.get_xaxis_transform()
             axes.text(x, 0.98, words, color=REFUSED, ha="center", va="top", transform=place)
-    step, texts = _tick_texts([*effect.index], n_letters, is_number)
+    texts = _tick_texts([*effect.index], n_letters, is_number)
+    step = -(-len(texts) * (max(map(len, texts)) + 1) // n_letters)
     axes.set_xticks(range(0, len(texts), step), texts[::step])
     axes.set_xlim(-0.5, len(effect) - 0.5)
 
 
-def _tick_texts(values: Sequence[object], n_letters: int, is_number: bool) -> tuple[int, list[str]]:
-    """Return texts for an axis as wide as `n_letters`, and that every n-th fits."""
+def _tick_texts(values: Sequence[object], n_letters: int, is_number: bool) -> list[str]:
+    """Return texts for an axis as wide as `n_letters`; names are cut to fit."""
     if is_number:
-        texts = [f"{each:.3g}" if isinstance(each, float) else value_text(each) for each in values]
-        return -(-len(texts) * (max(map(len, texts)) + 1) // n_letters), texts
+        return [f"{each:.3g}" if isinstance(each, float) else value_text(each) for each in values]
     n_most = max(_LEAST_LETTERS, n_letters // len(values) - 1)
-    step = -(-len(values) * _LEAST_LETTERS // n_letters)
-    return step, [shown(value_text(value), n_most) for value in values]
+    return [shown(value_text(value), n_most) for value in values]
 
 
 def _value_rows(effects: Mapping[str, pd.DataFrame]) -> Iterator[list[str]]:
@@ -128,7 +124,7 @@ def _value_rows(effects: Mapping[str, pd.DataFrame]) -> Iterator[list[str]]:
         name = printable(parameter)
         for value, row in effect.iterrows():
             numbers = [text for kind in _COLOURS for text in _quartile_texts(row[kind])]
-            counts = [str(int(row["runs", kind])) for kind in _COUNTS]
+            counts = [str(int(row["runs", kind])) for kind in COUNTS]
             yield [name, value_text(value), *numbers, *counts]
             name = ""
 
@@ -220,6 +216,5 @@ def _write_names(axes: Axes, names: Sequence[str]) -> None:
     lines = [f"{number}: {name}" for number, name in enumerate(names, start=1)]
     if len(lines) > _MAX_NAMES:
         lines = [*lines[:_MAX_NAMES], f"... {len(lines) - _MAX_NAMES} more in the table"]
-    place: dict[str, Any] = {"transform": axes.transAxes, "va": "top", "ha": "left"}
-    axes.text(1.03, 1.0, "on the front, the fastest first", color=_GREY, **place)
-    axes.text(1.03, 0.94, "\n".join(lines), linespacing=1.5, **place)
+    text = "\n".join(["on the front, the fastest first", *lines])
+    axes.text(1.03, 1.0, text, linespacing=1.5, transform=axes.transAxes, va="top", ha="left")
