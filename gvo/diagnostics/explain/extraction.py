@@ -29,7 +29,8 @@ def explain_keypoints(trace: Trace) -> Sorting:
     """Sort the keypoints detected into those within the budget and the others."""
     spread = trace.find("keypoints.spread") or {"pixels": np.zeros((0, 2)), "chosen": ()}
     pixels = np.asarray(spread["pixels"], dtype=np.float64)
-    return Sorting.by({"over the budget": as_mask(spread["chosen"], len(pixels))}, pixels)
+    tests = {"over the budget": as_mask(spread["chosen"], len(pixels))}
+    return Sorting(tests=tests, pixels=pixels)
 
 
 def explain_measured(trace: Trace, config: Config, row_offset_px: float) -> Sorting:
@@ -41,7 +42,7 @@ def explain_measured(trace: Trace, config: Config, row_offset_px: float) -> Sort
         return _sort_matches(matched, trace.find("stereo.candidates"), config.stereo)
     sampled = trace.find("depth.sampled")
     tests = depth_tests(sampled["depths"], sampled["is_valid"], config.depth)
-    return Sorting.by(tests, sampled["pixels"], values=sampled["depths"])
+    return Sorting(tests=tests, pixels=sampled["pixels"], values=sampled["depths"])
 
 
 def _sort_corners(
@@ -58,7 +59,7 @@ def _sort_corners(
     }
     shown = np.where(is_placed, disparities, searched["rough"])
     partners = np.column_stack([pixels[:, 0] - shown, pixels[:, 1] + row_offset_px])
-    return Sorting.by(tests, pixels, partners=partners, values=disparities)
+    return Sorting(tests=tests, pixels=pixels, partners=partners, values=disparities)
 
 
 def _sort_matches(
@@ -82,7 +83,7 @@ def _sort_matches(
     partners[pairs[:, 0]] = right.keypoints[pairs[:, 1]]
     is_measured = np.isfinite(disparities)
     partners[is_measured, 0] = left.keypoints[is_measured, 0] - disparities[is_measured]
-    return Sorting.by(tests, left.keypoints, partners=partners, values=disparities)
+    return Sorting(tests=tests, pixels=left.keypoints, partners=partners, values=disparities)
 
 
 def _have_rows(left: Features, right: Features, tolerance_px: float) -> BoolArray:
@@ -129,7 +130,8 @@ def explain_depth_pixels(frame: Frame, config: DepthConfig) -> Sorting | None:
         return None
     rows, columns = np.indices(frame.depth.shape, dtype=np.float64)
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    return Sorting.by(depth_tests(*sample_depth(frame.depth, pixels, config), config), pixels)
+    tests = depth_tests(*sample_depth(frame.depth, pixels, config), config)
+    return Sorting(tests=tests, pixels=pixels)
 
 
 def depth_tests(

@@ -47,7 +47,7 @@ def _sort_tracks(begin: Mapping[str, Any], attempt: Trace, config: Config) -> So
     tests = {"out of view": as_mask(indices, n), "track lost": as_mask(tracked, n)}
     for name, passes in _track_tests(attempt, config).items():
         tests[name] = as_mask(tracked[passes], n)
-    return Sorting.by(tests, pixels, partners=found, predicted=predicted)
+    return Sorting(tests=tests, pixels=pixels, partners=found, predicted=predicted)
 
 
 def _track_tests(attempt: Trace, config: Config) -> dict[str, BoolArray]:
@@ -83,7 +83,7 @@ def _sort_descriptors(begin: Mapping[str, Any], attempt: Trace, config: Config) 
         **distance_tests(candidates, n, **limits),
         "reciprocity": as_mask(matches[:, 0], n),
     }
-    return Sorting.by(tests, reference, partners=found, predicted=predicted)
+    return Sorting(tests=tests, pixels=reference, partners=found, predicted=predicted)
 
 
 def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> Step | None:
@@ -214,12 +214,9 @@ def has_prior(attempt: Trace) -> bool:
 def describe(registration: Registration, indices: Mapping[int, int]) -> list[str]:
     """Describe the attempts of a registration, one a line, with frames' numbers by their stamps."""
     against = f"against frame {indices[registration.reference_ns]}"
-    answer = _answer(registration.result)
-    if not registration.attempts:
-        return [f"{against}: {answer}"]
-    *failed, last = registration.attempts
-    lines = [f"{against}, {_method(attempt)}: {_outcome(attempt)}" for attempt in failed]
-    return [*lines, f"{against}, {_method(last)}: {answer}"]
+    methods = [f", {_method(attempt)}" for attempt in registration.attempts] or [""]
+    answers = [*map(_outcome, registration.attempts[:-1]), _answer(registration.result)]
+    return [f"{against}{method}: {each}" for method, each in zip(methods, answers, strict=True)]
 
 
 def _method(attempt: Trace) -> str:

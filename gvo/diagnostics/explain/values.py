@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,12 +25,12 @@ class Step(SimpleNamespace):
 class Sorting:
     """Pixels that were kept, and those dropped with the first test that each failed.
 
+    Arrays are empty where they do not apply.
+
     Parameters
     ----------
-    names : tuple of str
-        The tests in order, then `kept`.
-    codes : ndarray of int64, shape (n,)
-        Index into the names.
+    tests : mapping of str to ndarray of bool, shape (n,)
+        In order, True for pixels that pass.
     pixels : ndarray of float64, shape (n, 2)
         (u, v) in the left or colour image; matches: of the reference.
     partners : ndarray of float64, shape (n, 2)
@@ -41,40 +41,26 @@ class Sorting:
         Disparities, pixels, or depths, metres; NaN = not measured.
     """
 
-    names: tuple[str, ...]
-    codes: IntArray
+    tests: Mapping[str, BoolArray]
     pixels: FloatArray
-    partners: FloatArray
-    predicted: FloatArray
-    values: FloatArray
+    partners: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    predicted: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    values: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    @classmethod
-    def by(
-        cls,
-        tests: Mapping[str, BoolArray],
-        pixels: FloatArray,
-        *,
-        partners: FloatArray | None = None,
-        predicted: FloatArray | None = None,
-        values: FloatArray | None = None,
-    ) -> Sorting:
-        """Sort pixels by the first test that fails; a test is True for those that pass."""
-        codes = np.full(len(pixels), len(tests), dtype=np.int64)
-        for code, passes in reversed(list(enumerate(tests.values()))):
-            codes[~passes] = code
-        nowhere = np.full((len(pixels), 2), np.nan)
-        return cls(
-            names=(*tests, KEPT),
-            codes=codes,
-            pixels=pixels,
-            partners=nowhere if partners is None else partners,
-            predicted=nowhere if predicted is None else predicted,
-            values=nowhere[:, 0] if values is None else values,
-        )
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The tests in order, then `kept`."""
+        return (*self.tests, KEPT)
+
+    @property
+    def codes(self) -> IntArray:
+        """Indices into the names: of the first test that a pixel fails, shape (n,)."""
+        passed = np.array([*self.tests.values(), np.zeros(len(self), dtype=np.bool_)])
+        return np.asarray(np.argmin(passed, axis=0))
 
     def __len__(self) -> int:
         """Return the number of pixels."""
-        return len(self.codes)
+        return len(self.pixels)
 
     def are(self, name: str) -> BoolArray:
         """Tell which pixels have a name, shape (n,)."""
