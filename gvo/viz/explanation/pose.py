@@ -153,7 +153,7 @@ def _draw_link(axes: Axes, link: Step) -> None:
         )
         spine.set_linewidth(3)
     text = f"frame {link.frame}, {what[link.kind]}{overlap}\n{answer}"
-    axes.set_title(text, fontsize=9, loc="left")
+    axes.set_title(text, fontsize=8, loc="left")
 
 
 def _links_caption(explanation: FrameExplanation) -> str:
