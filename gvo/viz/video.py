@@ -1,7 +1,8 @@
-"""Pictures as a film, encoded by OpenCV, or as numbered PNG files."""
+"""Pictures as a film or as numbered PNG files."""
 
 from __future__ import annotations
 
+import io
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import Final, Protocol
 
 import cv2
 import numpy as np
+from PIL import Image, features
 
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.images import encode_image
@@ -21,9 +23,10 @@ CODECS: Final = {".webm": "VP80", ".mp4": "mp4v"}
 _N_PERIODS = 8  # that tell the rate
 _FALLBACK_HZ = 10.0
 _SLOWEST_HZ, _FASTEST_HZ = 0.1, 240.0
-# OpenCV takes no option of the encoder. libvpx encodes five times as fast, about as well, where
-# a frame is shown for no less than the time that FFmpeg grants it to encode one: a second.
-_VP8_HZ = 1.0
+# A lossy WebP file is a key frame of VP8 behind a header. Pillow encodes it several times as fast
+# as OpenCV, which has no option for that, encodes VP8 at the rate of a film.
+_QUALITY, _FASTEST_METHOD = 80, 0
+_WEBP_HEADER_BYTES = 20
 # OpenCV complains on the error stream where it writes VP8 to WebM, but not to Matroska, of which
 # WebM is a part: only the name of the format in the header differs. An empty element fills up.
 _CONTAINERS = {".webm": ".mkv", ".mp4": ".mp4"}
@@ -49,7 +52,7 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
     Parameters
     ----------
     path : Path
-        Ends in `.webm` or `.mp4`: a film, or PNG files in a folder beside it where OpenCV has no
+        Ends in `.webm` or `.mp4`: a film, or PNG files in a folder beside it where there is no
         encoder. Without a suffix, or an existing folder: a folder of PNG files.
     rate_hz : float, optional
         Pictures per second; by the stamps of the first ones where omitted.
@@ -74,7 +77,7 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
     if has_encoder(suffix):
         return Film(path, rate_hz)
     folder = path.with_name(f"{path.stem}_frames")
-    reason = f"{path}: OpenCV has no encoder for {suffix} here"
+    reason = f"{path}: there is no encoder for {suffix} here"
     return PngFolder(folder, decisions=(f"{reason}: PNG files in {folder} instead",))
 
 
@@ -86,7 +89,8 @@ class Film:
     path : Path
         Ends in a suffix of `CODECS`; its folder is made where it is missing.
     rate_hz : float, optional
-        Pictures per second; by the median of the first periods where omitted.
+        Pictures per second of all the film; by the median of the first eight periods where
+        omitted, until which the pictures wait in memory.
 
     Raises
     ------
@@ -132,7 +136,7 @@ class Film:
         self._size = size
         self._n += 1
         if self._writer is not None:
-            self._writer.write(picture)
+            self._writer.write(self._encoded(picture))
             return
         self._waiting.append(picture)
         self._stamps_ns.append(stamp_ns)
@@ -145,7 +149,7 @@ class Film:
         Raises
         ------
         RecordingError
-            When it cannot be written.
+            When it cannot be written, or was not written whole.
         """
         with self._folder, _refused_on_error(self.path):
             if self._waiting:
@@ -153,55 +157,53 @@ class Film:
             if self._writer is None:
                 return
             self._writer.release()
+            n_written = _count_packets(self._part)
+            if n_written != self._n:
+                raise RecordingError(
+                    f"{self.path}: was not written whole: {n_written} of {self._n} frames; is its "
+                    "disk full?"
+                )
             if self._is_vp8:
-                self._retime()
+                _name_webm(self._part)
             self._part.rename(self.path)
 
     def _begin(self) -> None:
-        self._rate_hz = self._rate_hz or rate_of(self._stamps_ns)
-        self._writer = self._open(self._part, _VP8_HZ if self._is_vp8 else self._rate_hz)
+        codec = CODECS[self.path.suffix.lower()]
+        rate_hz = self._rate_hz or rate_of(self._stamps_ns)
+        self._writer = _open_writer(self._part, codec, rate_hz, self._size)
+        if self._writer is None:
+            raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
         for picture in self._waiting:
-            self._writer.write(picture)
+            self._writer.write(self._encoded(picture))
         self._waiting.clear()
 
-    def _open(self, path: Path, rate_hz: float, *, is_encoded: bool = False) -> cv2.VideoWriter:
-        codec = CODECS[self.path.suffix.lower()]
-        writer = _open_writer(path, codec, rate_hz, self._size, is_encoded=is_encoded)
-        if writer is None:
-            raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
-        return writer
-
-    def _retime(self) -> None:
-        """Copy the encoded pictures to WebM at the rate of the film."""
-        encoded, self._part = self._part, self._part.with_stem("timed")
-        packets = _open_packets(encoded)
-        writer = self._open(self._part, self._rate_hz, is_encoded=True)
-        while (answer := packets.read())[0]:
-            writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, packets.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
-            writer.write(answer[1])
-        writer.release()
-        n_written = _count_packets(self._part)
-        if n_written != self._n:
-            raise RecordingError(
-                f"{self.path}: was not written whole: {n_written} of {self._n} frames; its disk "
-                "needs twice the size of the film"
-            )
-        with self._part.open("r+b") as stream:
-            header = stream.read(64)
-            stream.seek(0)
-            stream.write(header.replace(_MATROSKA, _WEBM))
+    def _encoded(self, picture: ImageArray) -> ImageArray:
+        return _encode_vp8(picture) if self._is_vp8 else picture
 
 
-def _open_packets(path: Path) -> cv2.VideoCapture:
-    """Open a film to read its pictures as they are encoded."""
-    return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+def _encode_vp8(picture: ImageArray) -> ImageArray:
+    """Return a BGR picture as the bytes of a key frame, shape (1, n)."""
+    height, width = picture.shape[:2]
+    webp = io.BytesIO()
+    image = Image.frombuffer("RGB", (width, height), picture.tobytes(), "raw", "BGR", 0, 1)
+    image.save(webp, "WEBP", quality=_QUALITY, method=_FASTEST_METHOD)
+    return np.frombuffer(webp.getbuffer(), dtype=np.uint8)[np.newaxis, _WEBP_HEADER_BYTES:]
+
+
+def _name_webm(path: Path) -> None:
+    """Say in the header that a Matroska film is a WebM film."""
+    with path.open("r+b") as stream:
+        header = stream.read(64)
+        stream.seek(0)
+        stream.write(header.replace(_MATROSKA, _WEBM))
 
 
 def _count_packets(path: Path) -> int:
     """Return the number of encoded pictures in a film."""
-    packets = _open_packets(path)
+    with _quiet_opencv():
+        packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     n = 0
-    while packets.read()[0]:
+    while packets.grab():
         n += 1
     return n
 
@@ -252,14 +254,12 @@ class PngFolder:
 
 
 def has_encoder(suffix: str) -> bool:
-    """Tell whether OpenCV can write films of a suffix of `CODECS`."""
+    """Tell whether films of a suffix of `CODECS` can be written."""
+    if suffix == ".webm" and not features.check("webp"):
+        return False
     with tempfile.TemporaryDirectory(prefix="gvo-film-") as folder:
         path = Path(folder) / f"film{_CONTAINERS[suffix]}"
-        writer = _open_writer(path, CODECS[suffix], _VP8_HZ, (64, 64))
-        if writer is None:
-            return False
-        writer.release()
-    return True
+        return _open_writer(path, CODECS[suffix], _FALLBACK_HZ, (64, 64)) is not None
 
 
 def rate_of(stamps_ns: Sequence[int]) -> float:
@@ -278,9 +278,10 @@ def _even(picture: ImageArray) -> ImageArray:
 
 
 def _open_writer(
-    path: Path, codec: str, rate_hz: float, size: tuple[int, int], *, is_encoded: bool = False
+    path: Path, codec: str, rate_hz: float, size: tuple[int, int]
 ) -> cv2.VideoWriter | None:
-    options = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1] if is_encoded else []
+    """Open a film: of pictures that are encoded already where it is of VP8."""
+    options = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1] if codec == "VP80" else []
     with _quiet_opencv():
         fourcc = cv2.VideoWriter.fourcc(*codec)
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, rate_hz, size, options)

@@ -32,12 +32,12 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
     ----------
     path : Path
         `.webm`: VP8, for browsers; `.mp4`: MPEG-4, for players; without a suffix: a folder of
-        PNG files, as where OpenCV has no encoder (see `decisions`).
+        PNG files, as where there is no encoder (see `decisions`).
     camera : StereoCamera or PinholeCamera
         Of the recording.
     rate_hz : float, optional
-        Pictures per second of the film; that of the first stamps where omitted, so that it
-        plays as fast as it was recorded.
+        Pictures per second of the film; by the median of the first eight periods where omitted,
+        so that it plays as fast as it was recorded.
     max_width : int, optional
         Most pixels in a row, at least 640; as many as are encoded quickly where omitted.
 
