@@ -26,7 +26,7 @@ NOTHING = -1
 _NEAR_M = 0.05
 _SMALL_BOX = 20_000  # pixels: not worth a closer look
 _BAND_SAMPLES = 24_000  # samples shaded at once: their temporaries stay in the cache
-_CULLED_ROWS = 8  # rectangles in view are looked for from every so manieth row's pose
+_CULLED_ROWS = 8  # what is in view is found out from the poses of every eighth row
 
 
 def render_image(
