@@ -146,6 +146,18 @@ class FeaturesConfig(Section):
     cell_size_px: int = _parameter(40, "size of the cells that share the budget", "px", ge=8)
 
 
+class CameraConfig(Section):
+    """The camera."""
+
+    readout_ms: float | None = _parameter(
+        None,
+        "time from the first to the last row of a rolling shutter, 0: global; null: learnt",
+        "ms",
+        ge=-100,
+        le=100,
+    )
+
+
 class StereoConfig(Section):
     """Matching of left and right."""
 
@@ -373,6 +385,7 @@ class Config(Section):
 
     sync: SyncConfig = SyncConfig()
     images: ImagesConfig = ImagesConfig()
+    camera: CameraConfig = CameraConfig()
     depth: DepthConfig = DepthConfig()
     frontend: FrontendConfig = FrontendConfig()
     klt: KltConfig = KltConfig()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,14 @@ def _check_images(kind: str, first: NDArray[Any], second: NDArray[Any], dtype: t
             f"the images of {kind} must be uint8 and {np.dtype(dtype)}, "
             f"got {first.dtype} and {second.dtype}"
         )
+
+
+class Stamped(Protocol):
+    """Anything with a stamp: a frame, or what a front-end keeps of one."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the frame, nanoseconds."""
 
 
 class Status(StrEnum):
@@ -185,7 +193,7 @@ class FaultyFrame:
 Frame: TypeAlias = StereoFrame | RgbdFrame
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class Observations:
     """What a front-end keeps of one frame: n points, seen and measured in 3-D.
 
@@ -247,6 +255,18 @@ class MotionPrior:
             _freeze_shaped(self, T_recent=(4, 4))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConstantError:
+    """By how much a constant of the camera seems too large, and the sigma of this estimate."""
+
+    value: float
+    sigma: float
+
+    def times(self, factor: float) -> ConstantError:
+        """Return it in another unit."""
+        return ConstantError(value=factor * self.value, sigma=factor * self.sigma)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
     """A registration's result.
@@ -268,10 +288,9 @@ class RelativePose:
         The matches as measured in the current frame, in its `cam` frame, metres. Likewise.
     flow_px : float or None
         Median displacement of the inliers between the images, where the front-end tells.
-    offset_px, offset_sigma_px : float or None
-        By how much the disparities of both frames seem to be measured too large, alike for all,
-        and the standard deviation of this estimate, pixels; None where it was not asked for or
-        is not observable.
+    calibration_errors : mapping of str to ConstantError
+        What the matches tell of errors of the camera's constants, by name; without those that
+        were not asked for or are not observable.
     """
 
     T_reference_current: FloatArray
@@ -282,8 +301,7 @@ class RelativePose:
     pixels_current: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     points_current: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     flow_px: float | None = None
-    offset_px: float | None = None
-    offset_sigma_px: float | None = None
+    calibration_errors: Mapping[str, ConstantError] = field(default_factory=dict)
 
     @property
     def n_matches(self) -> int:

@@ -30,6 +30,7 @@ def exit_code(is_complete: bool) -> int:
 
 def report(result: RunResult, out: Path) -> NoReturn:
     """Print the result of a run, and end with its exit code."""
+    from gvo.frontend.calibration import describe_offsets
     from gvo.trajectory.evaluation import format_evaluations
 
     for key in ("base_frame", "ground_truth"):
@@ -37,13 +38,9 @@ def report(result: RunResult, out: Path) -> NoReturn:
     if result.evaluations:
         typer.echo(format_evaluations(result.evaluations), nl=False)
     frames, tracked = result.summary["frames"], result.summary["tracked"]
-    offsets = result.summary["rig_offsets"]
-    if offsets is not None:
-        typer.echo(
-            f"learnt of the rig: disparities too large by {offsets['disparity_px']:.3f} px, "
-            f"sigma {offsets['disparity_sigma_px']:.3f}; rows of the right image too large by "
-            f"{offsets['row_px']:.3f} px"
-        )
+    learnt = describe_offsets(result.summary["rig_offsets"])
+    if learnt:
+        typer.echo(f"learnt of the camera: {learnt}")
     where = out if result.report is None else result.report
     covered = f"coverage {result.summary['coverage_percent']:.1f} %"
     segments = _segment_words(result.summary["segments"])

@@ -9,12 +9,12 @@ import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
+from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.matching import match_temporal, predict_pixels
-from gvo.frontend.registration import check_view, register_correspondences, relocalize_observations
+from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
-from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import (
@@ -39,11 +39,21 @@ class DescriptorFrontend:
     camera : StereoCamera or PinholeCamera
         Stereo pair, or the colour camera of an RGB-D sensor.
     config : Config
+    rig_offsets : RigOffsets, optional
+        What was learnt of the camera before.
     """
 
-    def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera | PinholeCamera,
+        config: Config,
+        *,
+        rig_offsets: RigOffsets | None = None,
+    ) -> None:
         self.camera = as_stereo(camera, config)
-        self.rig_offsets = RigOffsets(config.stereo, is_stereo=isinstance(camera, StereoCamera))
+        is_stereo = isinstance(camera, StereoCamera)
+        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
+        self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._extractors = [FeatureExtractor(config.features) for _ in range(2)]
         self._pool = ThreadPoolExecutor(1) if config.runtime.threads > 1 else None
@@ -168,7 +178,7 @@ class DescriptorFrontend:
         return check_view(result, reference.points_cam, self.camera)
 
     def _offset_px(self) -> float:
-        return self.rig_offsets.disparity.value_px
+        return self.rig_offsets.disparity.value
 
     def _register_within(
         self,
@@ -178,16 +188,21 @@ class DescriptorFrontend:
         radius_px: float,
     ) -> RelativePose | Failure:
         T_predicted = None if prior is None else prior.T_predicted
+        is_step = prior is None or prior.T_recent is not None
+        if is_step:
+            self.rig_offsets.velocities.expect(reference, current, T_predicted)
         matches = self._match(reference, current, T_predicted, radius_px)
-        correspondences = Correspondences.of(reference, current, matches)
-        result = register_correspondences(
-            correspondences.without_offset(self._offset_px(), self.camera),
-            matches,
-            self.camera,
+        measured = Correspondences.of(reference, current, matches)
+        result = self._calibrated.register(
+            Measurements(
+                frames=(reference, current),
+                uvd=(measured.source_uvd, measured.target_uvd),
+                sigmas=(measured.source_sigmas, measured.target_sigmas),
+                matches=matches,
+            ),
             self._config,
-            stamps_ns=(reference.stamp_ns, current.stamp_ns),
             prior=prior,
-            with_offset=self.rig_offsets.is_learning,
+            is_step=is_step,
         )
         if isinstance(result, Failure):
             return result

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from gvo.config import Config
+from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.klt import KltFrontend, KltObservations
-from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import Frame
 
 # Sections that a front-end reads; KLT too falls back on `features` and `temporal`.
 _SECTIONS = (
+    "camera",
     "frontend",
     "klt",
     "features",
@@ -40,14 +41,11 @@ def make_frontend(
         Of the rectified stereo pair, or of the colour image of an RGB-D sensor.
     config : Config, optional
     rig_offsets : RigOffsets, optional
-        What was learnt of the rig before.
+        What was learnt of the camera before.
     """
     config = config or Config()
     make = KltFrontend if config.frontend.kind == "klt" else DescriptorFrontend
-    frontend = make(camera, config)
-    if rig_offsets is not None:
-        frontend.rig_offsets = rig_offsets
-    return frontend
+    return make(camera, config, rig_offsets=rig_offsets)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +61,7 @@ class FrontendChange:
     is_of_kind : bool
         Old observations cannot be registered with new ones.
     is_of_rig : bool
-        Learnt offsets of the rig no longer hold.
+        What was learnt of the camera no longer holds.
     """
 
     is_any: bool
@@ -78,7 +76,7 @@ def find_change(former: Config, config: Config, *, is_stereo: bool) -> FrontendC
         is_any=any(getattr(former, name) != getattr(config, name) for name in _SECTIONS),
         is_of_extraction=_extraction(former, is_stereo) != _extraction(config, is_stereo),
         is_of_kind=_kind(former, is_stereo) != _kind(config, is_stereo),
-        is_of_rig=former.stereo != config.stereo,
+        is_of_rig=(former.camera, former.stereo) != (config.camera, config.stereo),
     )
 
 

@@ -6,22 +6,23 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
+from gvo.frontend.alignment import Templates, patch_warps
+from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.registration import check_view, register_correspondences, relocalize_observations
+from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import check_depths, sample_depth
 from gvo.frontend.stereo.corners import CornerDisparities, measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
-from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.frontend.tracking import detect_corners, track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.geometry.correspondences import Correspondences
 from gvo.types import (
     BoolArray,
     Contradiction,
@@ -40,8 +41,18 @@ from gvo.types import (
 _MIN_DEPTH_M = 1e-3
 # Gauss-Newton steps from the predicted disparity of a track.
 _N_TRACK_STEPS = 4
+# Steps of the alignment of a patch, from its track and from its prediction. A track that moves
+# farther, in pixels, was of something else.
+_N_ALIGN_STEPS = 3
+_N_LINK_STEPS = 4
+_MAX_ALIGN_PX = 2.0
+# Share of the points in view that an alignment from the prediction has to confirm.
+_MIN_SHARE_ALIGNED = 0.2
 # Number of frames whose descriptors are cached.
 _N_DESCRIBED = 3
+# How tracks are found: over more levels of the pyramid; near the predicted pixels; by alignment
+# alone, where the prediction is that of poses that are known.
+_Search: TypeAlias = Literal["wide", "near", "aligned"]
 
 
 class KltFrontend:
@@ -49,19 +60,29 @@ class KltFrontend:
 
     Each registration starts from the corners of its reference, so that patches do not drift
     over many frames. The tracked corners are measured in 3-D in the current frame too: in its
-    right image, or in its depth. Constant offsets of a stereo rig are calibrated online
-    (`rig_offsets`) and subtracted.
+    right image, or in its depth. Constant errors of the camera are calibrated online
+    (`rig_offsets`) and taken off.
 
     Parameters
     ----------
     camera : StereoCamera or PinholeCamera
         Stereo pair, or the colour camera of an RGB-D sensor.
     config : Config
+    rig_offsets : RigOffsets, optional
+        What was learnt of the camera before.
     """
 
-    def __init__(self, camera: StereoCamera | PinholeCamera, config: Config) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera | PinholeCamera,
+        config: Config,
+        *,
+        rig_offsets: RigOffsets | None = None,
+    ) -> None:
         self.camera = as_stereo(camera, config)
-        self.rig_offsets = RigOffsets(config.stereo, is_stereo=isinstance(camera, StereoCamera))
+        is_stereo = isinstance(camera, StereoCamera)
+        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
+        self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._descriptors = DescriptorFrontend(camera, config)
         self._described: dict[int, Observations] = {}
@@ -99,6 +120,7 @@ class KltFrontend:
             points_cam=self.camera.unproject_stereo(keypoints, disparities - offset_px),
             n_keypoints=len(corners),
             row_shift_px=row_shift_px,
+            templates=Templates.of(image_of(frame), keypoints),
         )
 
     def _measure_corners(
@@ -112,7 +134,7 @@ class KltFrontend:
 
     def _offsets_px(self) -> tuple[float, float]:
         """Return the offsets of disparities and of rows of the right image."""
-        return self.rig_offsets.disparity.value_px, self.rig_offsets.row.value_px
+        return self.rig_offsets.disparity.value, self.rig_offsets.row.value
 
     def register(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
@@ -148,24 +170,43 @@ class KltFrontend:
     ) -> RelativePose | Failure:
         if prior is None:
             return self._register_widely(reference, current, None)
-        is_step = prior.T_recent is not None
-        result = self._register_from(prior, reference, current, is_step=is_step)
-        if not is_step or isinstance(result, RelativePose | Contradiction):
+        if prior.T_recent is None:
+            return self._register_keyframe(prior, reference, current)
+        result = self._register_from(prior, reference, current, "near", is_step=True)
+        if isinstance(result, RelativePose | Contradiction):
             return result
         return self._register_widely(reference, current, prior)
+
+    def _register_keyframe(
+        self, prior: MotionPrior, reference: KltObservations, current: KltObservations
+    ) -> RelativePose | Failure:
+        """Register by alignment alone, and by tracks too where that finds few points in view.
+
+        Patches that are aligned where they were expected cannot tell that the prediction is far
+        off.
+        """
+        aligned = self._register_from(prior, reference, current, "aligned", is_step=False)
+        _, in_view = self._predict(prior.T_predicted, reference, current)
+        is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(in_view)
+        if isinstance(aligned, Contradiction) or (isinstance(aligned, RelativePose) and is_sure):
+            return aligned
+        tracked = self._register_from(prior, reference, current, "near", is_step=False)
+        if isinstance(aligned, Failure):
+            return tracked
+        is_more = isinstance(tracked, RelativePose) and tracked.n_inliers > aligned.n_inliers
+        return tracked if is_more else aligned
 
     def _register_widely(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None
     ) -> RelativePose | Failure:
         """Register in two rounds: over more levels of the pyramid, and from the result."""
-        start = MotionPrior(T_predicted=np.eye(4)) if prior is None else prior
-        rough = self._register_from(start, reference, current, is_wide=True)
+        rough = self._register_from(prior, reference, current, "wide", is_step=True)
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
             rough = self._register_descriptors(reference, current)
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_from(found, reference, current, is_step=True)
+        result = self._register_from(found, reference, current, "near", is_step=True)
         # Nothing predicted it: what else it predicts must be there too.
         return check_view(result, reference.points_cam, self.camera)
 
@@ -182,7 +223,7 @@ class KltFrontend:
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_from(prior, reference, current)
+        result = self._register_from(prior, reference, current, "near", is_step=False)
         result = check_view(result, reference.points_cam, self.camera)
         if isinstance(result, Failure):
             return result
@@ -218,58 +259,63 @@ class KltFrontend:
 
     def _register_from(
         self,
-        prior: MotionPrior,
+        prior: MotionPrior | None,
         reference: KltObservations,
         current: KltObservations,
+        search: _Search,
         *,
-        is_wide: bool = False,
-        is_step: bool = False,
+        is_step: bool,
     ) -> RelativePose | Failure:
         """Track from the pixels that a motion predicts, measure in 3-D, register."""
-        source_uvd, target_uvd, indices = self._track(
-            prior.T_predicted, reference, current, is_wide=is_wide
-        )
-        result = register_correspondences(
-            self._correspondences(
-                source_uvd[indices], target_uvd, is_stereo=isinstance(current.frame, StereoFrame)
+        T_predicted = None if prior is None else prior.T_predicted
+        if is_step:
+            self.rig_offsets.velocities.expect(reference, current, T_predicted)
+        T = np.eye(4) if T_predicted is None else T_predicted
+        source_uvd, target_uvd, indices = self._track(T, reference, current, search)
+        result = self._calibrated.register(
+            Measurements(
+                frames=(reference, current),
+                uvd=(source_uvd, target_uvd),
+                sigmas=self._sigmas(len(indices), is_stereo=isinstance(current.frame, StereoFrame)),
+                matches=np.column_stack([indices, np.full_like(indices, -1)]),
             ),
-            np.column_stack([indices, np.full_like(indices, -1)]),
-            self.camera,
             self._config,
-            stamps_ns=(reference.stamp_ns, current.stamp_ns),
-            prior=None if is_wide else prior,
-            with_offset=is_step and self.rig_offsets.is_learning,
+            prior=None if search == "wide" else prior,
+            is_step=is_step,
         )
         if isinstance(result, Failure):
             return result
         return replace(result, covariance=self._config.klt.sigma_factor**2 * result.covariance)
+
+    def _sigmas(self, n: int, *, is_stereo: bool) -> tuple[FloatArray, FloatArray]:
+        """Return the sigmas of (u, v, disparity) of corners and of their tracks."""
+        klt = self._config.klt
+        disparity = klt.disparity_sigma_px if is_stereo else self._config.depth.sigma_px
+        # A corner is where it was cut out: only the track into the current frame is noisy.
+        corner = [0.0, 0.0, disparity]
+        track = [klt.pixel_sigma_px, klt.pixel_sigma_px, disparity]
+        return np.tile(corner, (n, 1)), np.tile(track, (n, 1))
 
     def _track(
         self,
         T_reference_current: FloatArray,
         reference: KltObservations,
         current: KltObservations,
-        *,
-        is_wide: bool,
+        search: _Search,
     ) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return all (u, v, disparity) of the reference, those tracked, and whose these are."""
-        klt = self._config.klt
-        source_uvd = np.column_stack([reference.keypoints, reference.disparities])
-        predicted, indices = self._predict(T_reference_current, source_uvd)
-        pixels, is_tracked = track_pixels(
-            (reference.image, current.image),
-            source_uvd[indices, :2],
-            predicted[:, :2],
-            klt,
-            n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
-            is_checked=is_wide,
+        """Return (u, v, disparity) of corners, of their tracks, and which corners these are."""
+        source_uvd = reference.uvd
+        predicted, indices = self._predict(T_reference_current, reference, current)
+        warps = self._warps(T_reference_current, source_uvd[indices])
+        pixels, is_tracked = self._find_tracks(
+            (reference, current), indices, predicted[:, :2], warps, search
         )
         note(
             "attempt",
             method="tracks",
             prior=T_reference_current,
-            is_wide=is_wide,
-            radius_px=float(klt.window_radius_px),
+            is_wide=search == "wide",
+            radius_px=float(self._config.klt.window_radius_px),
             source_uvd=source_uvd,
             indices=indices,
             predicted=predicted,
@@ -277,40 +323,77 @@ class KltFrontend:
             is_tracked=is_tracked,
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
+        is_wide = search == "wide"
         disparities, is_valid = self._measure(current.frame, pixels, predicted[:, 2], is_wide)
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         target_uvd = np.column_stack([pixels, disparities])[is_valid]
-        return source_uvd, target_uvd, indices[is_valid]
+        return source_uvd[indices[is_valid]], target_uvd, indices[is_valid]
 
     def _predict(
-        self, T_reference_current: FloatArray, source_uvd: FloatArray
+        self,
+        T_reference_current: FloatArray,
+        reference: KltObservations,
+        current: KltObservations,
     ) -> tuple[FloatArray, IntArray]:
         """Return (u, v, disparity), as measured, of the points in view of the current camera."""
-        offset_px, _ = self._offsets_px()
-        points = se3.transform_points(
-            se3.invert(T_reference_current),
-            self.camera.unproject_stereo(source_uvd[:, :2], source_uvd[:, 2] - offset_px),
-        )
+        uvd = self._calibrated.correct(reference, reference.uvd)
+        points = self.camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
+        points = se3.transform_points(se3.invert(T_reference_current), points)
         in_front = np.flatnonzero(points[:, 2] > _MIN_DEPTH_M)
-        uvd = self.camera.project_stereo(points[in_front])
-        uvd[:, 2] += offset_px
-        is_in_view = self.camera.is_in_view(uvd[:, :2])
-        return uvd[is_in_view], in_front[is_in_view]
+        seen = self._calibrated.distort(current, self.camera.project_stereo(points[in_front]))
+        is_in_view = self.camera.is_in_view(seen[:, :2])
+        return seen[is_in_view], in_front[is_in_view]
 
-    def _correspondences(
-        self, source_uvd: FloatArray, target_uvd: FloatArray, *, is_stereo: bool
-    ) -> Correspondences:
-        config = self._config
-        disparity = config.klt.disparity_sigma_px if is_stereo else config.depth.sigma_px
-        pixel = config.klt.pixel_sigma_px
-        offset = np.array([0.0, 0.0, self._offsets_px()[0]])
-        shape = (len(source_uvd), 1)
-        return Correspondences.of_pixels(
-            (source_uvd - offset, target_uvd - offset),
-            # A corner is where it was cut out: only the track into the current frame is noisy.
-            (np.tile([0.0, 0.0, disparity], shape), np.tile([pixel, pixel, disparity], shape)),
-            self.camera,
+    def _warps(self, T_reference_current: FloatArray, source_uvd: FloatArray) -> FloatArray:
+        offset = np.array([0.0, 0.0, self.rig_offsets.disparity.value])
+        return patch_warps(source_uvd - offset, se3.invert(T_reference_current), self.camera)
+
+    def _find_tracks(
+        self,
+        frames: tuple[KltObservations, KltObservations],
+        indices: IntArray,
+        start: FloatArray,
+        warps: FloatArray,
+        search: _Search,
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return the pixels of corners of the reference in the current image, and which are found.
+
+        Lucas-Kanade finds a patch wherever it went, but as if it had only been moved. From there,
+        or from a good prediction, the patch is aligned as it looks after the predicted motion.
+        """
+        reference, current = frames
+        if search == "aligned":
+            return self._align(frames, indices, start, warps, n_steps=_N_LINK_STEPS)
+        klt, is_wide = self._config.klt, search == "wide"
+        pixels, is_tracked = track_pixels(
+            (reference.image, current.image),
+            reference.keypoints[indices],
+            start,
+            klt,
+            n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
+            is_checked=is_wide,
         )
+        if is_wide:
+            return pixels, is_tracked
+        tracked = np.flatnonzero(is_tracked)
+        chosen = indices[tracked], pixels[tracked], warps[tracked]
+        aligned, is_found = self._align(frames, *chosen, n_steps=_N_ALIGN_STEPS)
+        is_found &= np.hypot(*(aligned - pixels[tracked]).T) < _MAX_ALIGN_PX
+        pixels[tracked], is_tracked[tracked] = aligned, is_found
+        return pixels, is_tracked
+
+    def _align(
+        self,
+        frames: tuple[KltObservations, KltObservations],
+        indices: IntArray,
+        start: FloatArray,
+        warps: FloatArray,
+        *,
+        n_steps: int,
+    ) -> tuple[FloatArray, BoolArray]:
+        templates = frames[0].find_corners().templates.take(indices)
+        pixels, is_found = templates.align(frames[1].image, start, warps, n_steps=n_steps)
+        return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
         self, frame: Frame, pixels: FloatArray, predicted: FloatArray, is_wide: bool
@@ -357,6 +440,8 @@ class KltCorners:
         Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
     points_cam : ndarray of float64, shape (n, 3)
         Points in the `cam` frame, metres, the disparities corrected by the offset known then.
+    templates : Templates
+        The patches around them.
     n_keypoints : int
         Corners detected, measured or not.
     row_shift_px : float or None
@@ -366,11 +451,12 @@ class KltCorners:
     keypoints: FloatArray
     disparities: FloatArray
     points_cam: FloatArray
+    templates: Templates
     n_keypoints: int
     row_shift_px: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class KltObservations:
     """A frame to track corners into, and its own corners.
 
@@ -404,6 +490,11 @@ class KltObservations:
     def disparities(self) -> FloatArray:
         """Disparities of the corners as measured, shape (n,)."""
         return self.find_corners().disparities
+
+    @property
+    def uvd(self) -> FloatArray:
+        """Pixels and disparities of the corners as measured, shape (n, 3)."""
+        return np.column_stack([self.keypoints, self.disparities])
 
     @property
     def points_cam(self) -> FloatArray:

@@ -9,21 +9,13 @@ import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.frontend.calibration import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
+from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, Stamped
 
 # Frames and observations of the front-end's own kind.
 _Own: TypeAlias = Any
-
-
-class Stamped(Protocol):
-    """Anything with a stamp: a frame, or what a front-end keeps of one."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of the frame, nanoseconds."""
 
 
 ObservationsT = TypeVar("ObservationsT", bound=Stamped)
@@ -96,7 +88,7 @@ class HasCamera(Protocol):
 
 
 class LearnsRig(Protocol):
-    """A front-end that calibrates constant offsets of a stereo rig online."""
+    """A front-end that calibrates constant errors of its camera online."""
 
     @property
     def rig_offsets(self) -> RigOffsets:
@@ -149,7 +141,7 @@ class CheckedFrontend(Generic[ObservationsT]):
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
-        """What is learnt of a stereo rig; None where the front-end does not learn."""
+        """What is learnt of the camera; None where the front-end does not learn."""
         offsets = None if self._learner is None else self._learner.rig_offsets
         return offsets if isinstance(offsets, RigOffsets) else None
 

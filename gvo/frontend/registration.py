@@ -51,7 +51,6 @@ def register_correspondences(
     *,
     stamps_ns: tuple[int, int],
     prior: MotionPrior | None = None,
-    with_offset: bool = False,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
 
@@ -71,8 +70,6 @@ def register_correspondences(
         Where most matches agree with its prediction, RANSAC is skipped: the refinement starts
         from it, and chooses its inliers anew (not with `registration.refine` none, where the fit
         to the consensus is the result).
-    with_offset : bool
-        Estimate a constant offset of the disparities too, `RelativePose.offset_px`.
 
     Returns
     -------
@@ -85,13 +82,12 @@ def register_correspondences(
     note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
         return consensus
-    refined = _refine(consensus, correspondences, camera, config, with_offset=with_offset)
+    refined = _refine(consensus, correspondences, camera, config)
     if isinstance(refined, Refinement) and config.registration.refine != "none":
         refined = verify_motion(
             *(refined, correspondences, camera, config),
             prior=prior,
             make_rng=partial(_rng, config, stamps_ns),
-            with_offset=with_offset,
         )
         note("registration.verified", refined=refined)
     return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
@@ -120,13 +116,10 @@ def _refine(
     correspondences: Correspondences,
     camera: StereoCamera,
     config: Config,
-    *,
-    with_offset: bool,
 ) -> Refinement | Failure:
     registration = config.registration
     refined = (fit_covariance if registration.refine == "none" else refine_pose)(
-        *(consensus.T_target_source, correspondences, consensus.inliers, camera, registration),
-        with_offset=with_offset,
+        consensus.T_target_source, correspondences, consensus.inliers, camera, registration
     )
     note("registration.refined", refined=refined)
     return refined
@@ -180,7 +173,6 @@ def _rng(config: Config, stamps_ns: tuple[int, int]) -> np.random.Generator:
 def _relative_pose(
     refined: Refinement, correspondences: Correspondences, matches: IntArray
 ) -> RelativePose:
-    offset = refined.offset
     return RelativePose(
         T_reference_current=se3.invert(refined.T_target_source),
         covariance=refined.covariance,
@@ -190,8 +182,7 @@ def _relative_pose(
         pixels_current=correspondences.target_uvd[:, :2],
         points_current=correspondences.target_points,
         flow_px=_flow(correspondences, refined.inliers),
-        offset_px=None if offset is None else offset.offset_px,
-        offset_sigma_px=None if offset is None else offset.sigma_px,
+        calibration_errors=refined.calibration_errors,
     )
 
 

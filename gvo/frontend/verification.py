@@ -65,7 +65,6 @@ class _Problem:
     matches: Correspondences
     camera: StereoCamera
     config: Config
-    with_offset: bool
 
     @property
     def n_needed(self) -> float:
@@ -76,9 +75,7 @@ class _Problem:
         self, T: FloatArray, inliers: BoolArray, config: RegistrationConfig | None = None
     ) -> Refinement | Failure:
         config = config or self.config.registration
-        return refine_pose(
-            *(T, self.matches, inliers, self.camera, config), with_offset=self.with_offset
-        )
+        return refine_pose(T, self.matches, inliers, self.camera, config)
 
     def distance_px(self, T_first: FloatArray, T_second: FloatArray) -> float:
         """Return the median distance of the points as two motions project them."""
@@ -98,7 +95,6 @@ def verify_motion(
     *,
     prior: MotionPrior | None,
     make_rng: Callable[[], np.random.Generator],
-    with_offset: bool = False,
 ) -> Refinement | Failure:
     """Return the motion of the camera where matches agree on two.
 
@@ -115,15 +111,13 @@ def verify_motion(
     prior : MotionPrior or None
     make_rng : callable
         Returns the generator for the samples where there is no prior; making one is slow.
-    with_offset : bool
-        As in `refine_pose`.
 
     Returns
     -------
     Refinement or Failure
         The motion found, or the second one; a failure where nothing tells which one it is.
     """
-    problem = _Problem(matches=matches, camera=camera, config=config, with_offset=with_offset)
+    problem = _Problem(matches=matches, camera=camera, config=config)
     T_predicted = None if prior is None else se3.invert(prior.T_predicted)
     verified = _prefer_predicted_motion(found, problem, T_predicted, make_rng)
     if isinstance(verified, Failure) or prior is None or prior.T_recent is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +23,9 @@ class Correspondences:
         Pixel and disparity measured in either frame, pixels.
     source_sigmas, target_sigmas : ndarray of float64, shape (n, 3)
         Standard deviations of these, pixels.
+    sensitivities : mapping of str to ndarray of float64, shape (2, n, 3)
+        Derivatives of the measurements in source and target by the errors of constants of the
+        camera that a registration is to estimate, by name; in units of their present sigmas.
     """
 
     source_points: FloatArray
@@ -30,6 +34,7 @@ class Correspondences:
     target_uvd: FloatArray
     source_sigmas: FloatArray
     target_sigmas: FloatArray
+    sensitivities: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of correspondences."""
@@ -85,4 +90,5 @@ class Correspondences:
             target_uvd=self.target_uvd[chosen],
             source_sigmas=self.source_sigmas[chosen],
             target_sigmas=self.target_sigmas[chosen],
+            sensitivities={name: each[:, chosen] for name, each in self.sensitivities.items()},
         )

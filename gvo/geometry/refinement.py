@@ -5,9 +5,10 @@ and S the sample covariance of the matches' gradients, not that implied by their
 scale would not do: if disparities are better than stated and pixels are not, it would call the
 pixels better as well.
 
-If all disparities are too large by the same amount in both frames, near and far points disagree
-about the motion: this offset is a seventh parameter beside the pose, estimated by one step of least
-squares from the pose that assumes it is zero.
+Errors of constants of the camera show in the residuals too. If all disparities are too large by the
+same amount in both frames, near and far points disagree about the motion; if rows are exposed one
+after the other, upper and lower ones. They are further parameters beside the pose, estimated by one
+step of least squares from the pose that assumes they are zero.
 
 References
 ----------
@@ -20,7 +21,8 @@ heteroskedasticity", Econometrica 48(4), 1980, doi:10.2307/1912934 (the covarian
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -35,10 +37,9 @@ from gvo.geometry.residuals import (
     Linearization,
     StereoResiduals,
     pose_jacobian,
-    source_jacobian,
     whiten_in_place,
 )
-from gvo.types import BoolArray, Failure, FloatArray
+from gvo.types import BoolArray, ConstantError, Failure, FloatArray
 
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-3
@@ -58,25 +59,11 @@ _N_PROMISED = 24
 _MAX_LOSS = 10.0
 # The first round only has to be good enough to choose the inliers again.
 _N_FIRST_ITERATIONS = 2
-# Information on the offset, relative to that of the target disparities alone, below which it is
+# Information on a constant, relative to that of the target's measurements alone, below which it is
 # rounding.
 _MIN_SHARE = 1e-10
 _IDENTITY = np.eye(6)
 _OPEN = "the matches leave a direction of motion open"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DisparityOffset:
-    """A constant error of all disparities: how much too large they are measured.
-
-    Parameters
-    ----------
-    offset_px, sigma_px : float
-        Estimate and standard deviation, pixels.
-    """
-
-    offset_px: float
-    sigma_px: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,8 +82,8 @@ class Refinement:
         Weighted root mean square of the whitened residuals; one if the sigmas are right.
     residuals : StereoResiduals
         Of all matches, whitened at the start value.
-    offset : DisparityOffset or None
-        Estimated from the inliers if asked for; None if unobservable.
+    calibration_errors : mapping of str to ConstantError
+        See `estimate_constants`.
     """
 
     T_target_source: FloatArray
@@ -104,7 +91,7 @@ class Refinement:
     inliers: BoolArray
     scale: float
     residuals: StereoResiduals
-    offset: DisparityOffset | None = None
+    calibration_errors: Mapping[str, ConstantError] = field(default_factory=dict)
 
 
 def refine_pose(
@@ -113,8 +100,6 @@ def refine_pose(
     inliers: BoolArray,
     camera: StereoCamera,
     config: RegistrationConfig,
-    *,
-    with_offset: bool = False,
 ) -> Refinement | Failure:
     """Minimize the Huber cost of whitened (u, v, disparity) residuals.
 
@@ -133,8 +118,6 @@ def refine_pose(
         Of both frames.
     config : RegistrationConfig
         Iterations, kernel threshold, gate.
-    with_offset : bool
-        Estimate a constant offset of the disparities too.
 
     Returns
     -------
@@ -159,7 +142,7 @@ def refine_pose(
             return T
         # Orthonormal to the last digit: many motions are composed with this one.
         T = se3.normalize(T)
-        return _with_covariance(T, residuals, (chosen, every), with_offset=with_offset)
+        return _with_covariance(T, residuals, (chosen, every))
 
 
 def descend(
@@ -186,8 +169,6 @@ def fit_covariance(
     inliers: BoolArray,
     camera: StereoCamera,
     config: RegistrationConfig,
-    *,
-    with_offset: bool = False,
 ) -> Refinement | Failure:
     """Return an unrefined pose with the covariance implied by its residuals.
 
@@ -196,7 +177,7 @@ def fit_covariance(
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
     chosen = residuals.select(inliers)
-    return _with_covariance(T_target_source, chosen, (inliers, residuals), with_offset=with_offset)
+    return _with_covariance(T_target_source, chosen, (inliers, residuals))
 
 
 def _gauss_newton(
@@ -227,11 +208,7 @@ def _gauss_newton(
 
 
 def _with_covariance(
-    T: FloatArray,
-    residuals: StereoResiduals,
-    inliers: tuple[BoolArray, StereoResiduals],
-    *,
-    with_offset: bool,
+    T: FloatArray, residuals: StereoResiduals, inliers: tuple[BoolArray, StereoResiduals]
 ) -> Refinement | Failure:
     """Finish a refinement; `inliers` are the mask of the matches used and the residuals of all."""
     last = residuals.linearize(T)
@@ -245,16 +222,13 @@ def _with_covariance(
     scores = last.scores()
     sensitivity = _sensitivity(last, scores, H_inverse, residuals.huber)
     covariance = sensitivity @ _spread(last, scores, scale) @ sensitivity.T
-    offset = None
-    if with_offset:
-        offset = estimate_disparity_offset(T, residuals, last)
     return Refinement(
         T_target_source=T,
         covariance=0.5 * (covariance + covariance.T),
         inliers=inliers[0],
         scale=scale,
         residuals=inliers[1],
-        offset=offset,
+        calibration_errors=estimate_constants(T, residuals, last),
     )
 
 
@@ -288,14 +262,17 @@ def _spread(at: Linearization, scores: FloatArray, scale: float) -> FloatArray:
     return np.asarray(spread + _MIN_SCALE**2 * at.H)
 
 
-def estimate_disparity_offset(
+def estimate_constants(
     T_target_source: FloatArray, residuals: StereoResiduals, at: Linearization
-) -> DisparityOffset | None:
-    """Estimate a constant offset of the disparities of both frames.
+) -> dict[str, ConstantError]:
+    """Estimate the errors of constants of the camera, each beside the pose and the others.
+
+    Errors are in units of what is known of them: the others are around zero by a sigma of one.
 
     The Jacobian is taken at the points as estimated from both frames. At the points as measured,
     the source's noise would be in the Jacobian and in the residuals alike, and bias the estimate
-    by some hundredths of a pixel. Sigma is that of the sample, not implied by the matches' sigmas.
+    of an offset of the disparities by some hundredths of a pixel. Sigma is that of the sample, not
+    implied by the matches' sigmas.
 
     Parameters
     ----------
@@ -308,28 +285,34 @@ def estimate_disparity_offset(
 
     Returns
     -------
-    DisparityOffset or None
-        None if unobservable: for points at one depth an offset acts as a motion does.
+    dict of str to ConstantError
+        By name, without those that are unobservable: for points at one depth an offset of the
+        disparities acts as a motion does.
     """
-    camera = residuals.camera
+    if not residuals.constants:
+        return {}
     source_points = residuals.settled_points(T_target_source, at)
-    # An offset moves the measurement in the target directly, the prediction through the source.
-    J_offset = -source_jacobian(T_target_source, source_points, camera)[2]
-    J_offset[2] += 1.0
+    J_constants, J_alone = residuals.sensitivities(T_target_source, source_points)
     target_points = T_target_source[:3, :3] @ source_points + T_target_source[:3, 3:]
-    J = pose_jacobian(target_points, camera)
-    for rows in (J_offset, J):
+    J = pose_jacobian(target_points, residuals.camera)
+    for rows in (J_constants, J_alone, J):
         whiten_in_place(at.factors, rows)
-    flat, flat_pose = J_offset.ravel(), J.reshape(6, -1)
-    h_pose_offset = flat_pose @ flat
-    _, motion, info = dposv(flat_pose @ flat_pose.T, h_pose_offset)
-    # Schur complement: the information on the offset that no motion explains.
-    information = float(flat @ flat - h_pose_offset @ motion)
-    if info != 0 or not information > _MIN_SHARE * np.sum(at.factors[5] ** 2):
-        return None
-    unexplained = J_offset - np.einsum("k,kin->in", motion, J)
-    scores = np.einsum("in,in->n", unexplained, at.r)
-    return DisparityOffset(
-        offset_px=float(np.sum(scores)) / information,
-        sigma_px=float(np.sqrt(scores @ scores)) / information,
-    )
+    flat, flat_pose = J_constants.reshape(len(J_constants), -1), J.reshape(6, -1)
+    _, motion, info = dposv(flat_pose @ flat_pose.T, flat_pose @ flat.T)
+    if info != 0:
+        return {}
+    # Schur complement: what no motion explains.
+    unexplained = flat - motion.T @ flat_pose
+    information = unexplained @ unexplained.T
+    alone = np.sum(J_alone**2, axis=(1, 2))
+    told = np.flatnonzero(np.diagonal(information) > _MIN_SHARE * alone)
+    scores = np.einsum("kin,in->kn", unexplained.reshape(J_constants.shape), at.r)
+    errors = {}
+    for k in told:
+        known = np.diag(np.arange(len(scores)) != k).astype(np.float64)
+        gain = np.linalg.solve(information + known, np.eye(len(scores))[k])
+        errors[residuals.constants[k]] = ConstantError(
+            value=float(gain @ np.sum(scores, axis=1)),
+            sigma=float(np.sqrt(gain @ (scores @ scores.T + known) @ gain)),
+        )
+    return errors

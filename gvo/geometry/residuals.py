@@ -9,7 +9,7 @@ Arrays hold one match per column: all operations run along contiguous memory.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from gvo.geometry.correspondences import Correspondences
 from gvo.types import BoolArray, Failure, FloatArray
 
 _MIN_DEPTH_M = 1e-3
+_N_ROWS = 15
 # Nearer points, and points behind the camera, are no inliers: their noise is not propagated.
 _MIN_NOISE_DEPTH_M = 0.1
 
@@ -128,18 +129,22 @@ class StereoResiduals:
 
     Parameters
     ----------
-    columns : ndarray of float64, shape (15, n)
+    columns : ndarray of float64, shape (15 + 6 k, n)
         Points in the source frame, (u, v, disparity) in the target frame, the lower triangle
         (00, 10, 11, 20, 21, 22) of the factor W with W^T W the inverse covariance of the
-        residual, and the variances of (u, v, disparity) in the source frame.
+        residual, the variances of (u, v, disparity) in the source frame, and the derivatives of
+        (u, v, disparity) in source and target by each constant.
     camera : StereoCamera
     huber : float
         Threshold of the robust kernel, sigmas.
+    constants : tuple of str
+        Names of the k constants of the camera whose errors are to be estimated.
     """
 
     columns: FloatArray
     camera: StereoCamera
     huber: float
+    constants: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -149,14 +154,19 @@ class StereoResiduals:
 
         It is not propagated again: it changes by far less than its own uncertainty.
         """
-        columns = np.empty((15, len(matches)))
+        constants = tuple(matches.sensitivities)
+        columns = np.empty((_N_ROWS + 6 * len(constants), len(matches)))
         columns[:3] = matches.source_points.T
         columns[3:6] = matches.target_uvd.T
-        columns[12:] = matches.source_sigmas.T**2
+        columns[12:_N_ROWS] = matches.source_sigmas.T**2
+        for rows, name in zip(
+            columns[_N_ROWS:].reshape(len(constants), 6, len(matches)), constants, strict=True
+        ):
+            rows[:3], rows[3:] = np.swapaxes(matches.sensitivities[name], 1, 2)
         J = source_jacobian(T, columns[:3], camera)
         J *= matches.source_sigmas.T[:, np.newaxis]
         _write_factors(columns[6:12], J, matches.target_sigmas.T**2)
-        return cls(columns=columns, camera=camera, huber=huber)
+        return cls(columns=columns, camera=camera, huber=huber, constants=constants)
 
     @property
     def source_points(self) -> FloatArray:
@@ -180,7 +190,7 @@ class StereoResiduals:
         back = np.stack([f[0] * r[0] + f[1] * r[1] + f[3] * r[2], f[2] * r[1] + f[4] * r[2]])
         back = np.concatenate([back, [f[5] * r[2]]])  # W^T W times the residual
         shift = np.einsum("kin,in->kn", source_jacobian(T, self.source_points, self.camera), back)
-        shift *= self.columns[12:]
+        shift *= self.columns[12:_N_ROWS]
         camera, (x, y, z) = self.camera, self.source_points
         disparity = camera.fx * camera.baseline / z
         moved = np.maximum(disparity + shift[2], 0.5 * disparity)
@@ -192,7 +202,33 @@ class StereoResiduals:
     def select(self, chosen: BoolArray) -> StereoResiduals:
         """Return the residuals of some matches."""
         columns = self.columns.take(np.flatnonzero(chosen), axis=1)
-        return StereoResiduals(columns=columns, camera=self.camera, huber=self.huber)
+        return replace(self, columns=columns)
+
+    def sensitivities(
+        self, T: FloatArray, source_points: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives by the constants, not whitened.
+
+        Parameters
+        ----------
+        T : ndarray of float64, shape (4, 4)
+            T_target_source.
+        source_points : ndarray of float64, shape (3, n)
+            See `settled_points`.
+
+        Returns
+        -------
+        of_residuals : ndarray of float64, shape (k, 3, n)
+        of_target : ndarray of float64, shape (k, 3, n)
+            The part of the measurements in the target.
+        """
+        n = self.columns.shape[1]
+        in_source, in_target = np.swapaxes(
+            self.columns[_N_ROWS:].reshape(len(self.constants), 2, 3, n), 0, 1
+        )
+        J = source_jacobian(T, source_points, self.camera)
+        # An error moves the measurement in the target directly, the prediction through the source.
+        return in_target - np.einsum("jin,kjn->kin", J, in_source), in_target.copy()
 
     def linearize(self, T: FloatArray) -> Linearization | Failure:
         """Linearize at T; a failure if points fall behind the camera."""

@@ -15,10 +15,10 @@ from gvo._trace import note
 from gvo.backend.keyframe_policy import choose_released, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
+from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
-from gvo.frontend.protocol import CheckedFrontend, Frontend, Stamped, count_points
-from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
@@ -34,6 +34,7 @@ from gvo.types import (
     MotionPrior,
     RelativePose,
     SegmentJoin,
+    Stamped,
     Status,
 )
 
@@ -97,7 +98,7 @@ class Odometry:
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
-        """Offsets of a stereo rig, calibrated online; None where they are not."""
+        """What is learnt of the camera, calibrated online; None where nothing is."""
         offsets = self._frontend.rig_offsets
         return offsets if offsets is not None and offsets.is_learning else None
 
@@ -115,7 +116,7 @@ class Odometry:
           `depth.virtual_baseline_m`, or `kind`, `n_octaves`, `scale_factor` or `upright` of
           `features` (descriptor): then KLT keyframes, which hold their images, are extracted
           again, and those of descriptors are released.
-        - `stereo`: the offsets of the rig are estimated anew.
+        - `camera`, `stereo`: what was learnt of the camera is estimated anew.
         - `runtime`: with the next frame.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gvo.backend.batch import BatchResult
 from gvo.backend.gating import WindowCounts
-from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.frontend.calibration import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 
 _BIN_WIDTH = 0.01

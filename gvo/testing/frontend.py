@@ -10,11 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from gvo.frontend.protocol import CheckedFrontend, Frontend, Stamped, find_fault
-from gvo.frontend.stereo.offsets import RigOffsets
+from gvo.frontend.calibration import RigOffsets
+from gvo.frontend.protocol import CheckedFrontend, Frontend, find_fault
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.types import Failure, FloatArray, MotionPrior, RelativePose, RgbdFrame, StereoFrame
+from gvo.types import (
+    Failure,
+    FloatArray,
+    MotionPrior,
+    RelativePose,
+    RgbdFrame,
+    Stamped,
+    StereoFrame,
+)
 
 # Of six honest errors, 3 in 10,000 are farther off; it leaves room for covariances a little small.
 _AGREEMENT_SIGMAS = 5.0

@@ -5,6 +5,7 @@ import numpy as np
 from gvo.types import FloatArray, ImageArray
 
 SHAPE = (120, 240)
+MIDDLE = np.array([119.5, 59.5])
 _N_WAVES = 60
 _RNG = np.random.default_rng(4)
 _ANGLES = _RNG.uniform(0, np.pi, _N_WAVES)
@@ -29,3 +30,17 @@ def grid(border: int = 30, step: int = 11) -> FloatArray:
     """Return whole pixels away from the border, shape (n, 2)."""
     v, u = np.mgrid[border : SHAPE[0] - border : step, border : SHAPE[1] - border : step]
     return np.column_stack([u.ravel(), v.ravel()]).astype(float)
+
+
+def warped_image(warp: FloatArray, shift: FloatArray) -> ImageArray:
+    """Return the texture turned, stretched and sheared about the middle, and moved."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    seen = np.stack([u.ravel(), v.ravel()], axis=1) - MIDDLE - shift
+    u, v = (seen @ np.linalg.inv(warp).T + MIDDLE).T
+    along_u, along_v = _WAVE_NUMBERS * np.cos(_ANGLES), _WAVE_NUMBERS * np.sin(_ANGLES)
+    waves = np.sum(
+        [np.cos(a * u + b * v + c) for a, b, c in zip(along_u, along_v, _PHASES, strict=True)],
+        axis=0,
+    )
+    grey = 120.0 + 67.0 * waves / np.sqrt(_N_WAVES)
+    return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8).reshape(SHAPE))

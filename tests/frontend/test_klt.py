@@ -91,7 +91,8 @@ def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior
     error = se3.log(se3.invert(result.T_reference_current) @ T)
     assert np.linalg.norm(error[:3]) < 1.5e-3
     assert np.linalg.norm(error[3:]) < 4e-3
-    assert result.n_inliers > 100
+    # Patches that are aligned from a wrong prediction find some of the corners only.
+    assert result.n_inliers > (60 if prior == "wrong" else 100)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

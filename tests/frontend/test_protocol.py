@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gvo.config import Config
+from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.protocol import CheckedFrontend, count_points, find_fault
-from gvo.frontend.stereo.offsets import RigOffsets
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera
 from gvo.types import Failure, FloatArray, MotionPrior, RelativePose
@@ -87,7 +87,7 @@ class Capable(Answering):
     def __init__(self, answer: object) -> None:
         super().__init__(answer)
         self.camera = CAMERA
-        self.rig_offsets = RigOffsets(Config().stereo, is_stereo=True)
+        self.rig_offsets = RigOffsets(Config(), is_stereo=True)
         self.configs: list[Config] = []
 
     def relocalize(self, reference: Any, current: Any) -> Any:

@@ -1,5 +1,6 @@
 """Relative poses from matched observations of points at known places."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -57,7 +58,6 @@ def register_matches(
     config: Config,
     *,
     start: FloatArray | None = None,
-    with_offset: bool = False,
 ) -> RelativePose | Failure:
     return register_correspondences(
         Correspondences.of(reference, current, matches),
@@ -66,7 +66,6 @@ def register_matches(
         config,
         stamps_ns=(reference.stamp_ns, current.stamp_ns),
         prior=None if start is None else MotionPrior(T_predicted=start),
-        with_offset=with_offset,
     )
 
 
@@ -268,21 +267,23 @@ def test_without_refinement_the_fit_to_the_consensus_is_the_result_whatever_was_
 
 
 @pytest.mark.parametrize("refine", ["gauss_newton", "none"])
-def test_the_offset_of_disparities_is_told_where_asked_for(
+def test_errors_of_constants_are_told_where_asked_for(
     refine: Literal["gauss_newton", "none"],
 ) -> None:
     _, reference, current, matches = two_frames(8, n_outliers=0)
-    without = register_matches(reference, current, matches, CAMERA, configure(refine))
-    result = register_matches(
-        reference, current, matches, CAMERA, configure(refine), with_offset=True
+    given = Correspondences.of(reference, current, matches)
+    asked = replace(
+        given, sensitivities={"disparity_px": np.tile([0.0, 0.0, 1.0], (2, len(given), 1))}
+    )
+    without, result = (
+        register_correspondences(each, matches, CAMERA, configure(refine), stamps_ns=(1, 2))
+        for each in (given, asked)
     )
     assert isinstance(without, RelativePose)
     assert isinstance(result, RelativePose)
-    assert without.offset_px is None
-    assert without.offset_sigma_px is None
-    assert result.offset_px is not None
-    assert result.offset_sigma_px is not None
-    assert abs(result.offset_px) < 4.0 * result.offset_sigma_px
+    assert without.calibration_errors == {}
+    (error,) = result.calibration_errors.values()
+    assert abs(error.value) < 4.0 * error.sigma
 
 
 def test_flow_pixels_and_points_are_those_of_the_matches() -> None:

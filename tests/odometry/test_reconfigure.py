@@ -161,16 +161,16 @@ def test_what_is_learnt_of_the_rig_goes_on_unless_the_stereo_section_changes(kin
         odometry.track(frame)
     learnt = odometry.rig_offsets
     assert learnt is not None
-    before_px = learnt.disparity.sigma_px
+    before_px = learnt.disparity.sigma
     odometry.reconfigure(change(config, ransac={"n_hypotheses": 64}, klt={"n_corners": 200}))
     odometry.track(recorded("stereo")[4])
     assert odometry.rig_offsets is learnt
-    assert learnt.disparity.sigma_px < before_px
+    assert learnt.disparity.sigma < before_px
     odometry.reconfigure(change(config, stereo={"patch_radius_px": 4}))
     odometry.track(recorded("stereo")[5])
     renewed = odometry.rig_offsets
     assert renewed is not None
-    assert renewed.disparity.sigma_px == config.stereo.offset_sigma_px
+    assert renewed.disparity.sigma == config.stereo.offset_sigma_px
 
 
 class OwnFrontend(KltFrontend):

@@ -18,6 +18,7 @@ from gvo.diagnostics.explain.motion import (
     explain_consensus,
     explain_matches,
     explain_refinement,
+    explain_rows,
     registrations_of,
 )
 from gvo.diagnostics.explain.values import FrameExplanation, Step
@@ -137,6 +138,8 @@ class _Drive:
             result=result,
             offset_px=offsets.get("disparity_px", 0.0),
             row_offset_px=row_px,
+            readout_ms=offsets.get("readout_ms", 0.0),
+            row_motion_px=explain_rows(last),
             keypoints=explain_keypoints(trace),
             measured=measured,
             depth_pixels=explain_depth_pixels(frame, config.depth),

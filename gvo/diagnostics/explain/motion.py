@@ -86,6 +86,14 @@ def _sort_descriptors(begin: Mapping[str, Any], attempt: Trace, config: Config) 
     return Sorting(tests=tests, pixels=reference, partners=found, predicted=predicted)
 
 
+def explain_rows(attempt: Trace) -> float | None:
+    """Return by how many pixels matches were moved at most to the middle of the exposure."""
+    moved = attempt.find("rows.settled")
+    if not moved:
+        return None
+    return float(np.abs(moved["settled"] - moved["measured"]).max(initial=0.0))
+
+
 def explain_consensus(attempt: Trace, camera: StereoCamera, config: Config) -> Step | None:
     """Count the matches that agree, and those of each sample; None if nothing was registered.
 
@@ -198,11 +206,18 @@ def registrations_of(trace: Trace) -> list[Registration]:
         Registration(
             reference_ns=part[0].values["reference"].stamp_ns,
             result=end["result"],
-            attempts=part.before("frontend.end").split("attempt"),
+            attempts=[_last_round(each) for each in part.before("frontend.end").split("attempt")],
         )
         for part in trace.split("frontend.begin")
         if (end := part.find("frontend.end"))
     ]
+
+
+def _last_round(attempt: Trace) -> Trace:
+    """Leave out the first round of a step that was registered again with its own velocity."""
+    rounds = attempt.split("rows.settled")
+    registered = [each for each in rounds if each.find("registration.begin")]
+    return Trace([*attempt.before("rows.settled"), *registered[-1]]) if registered else attempt
 
 
 def has_prior(attempt: Trace) -> bool:

@@ -95,6 +95,10 @@ class FrameExplanation:
     result : FrameResult
     offset_px, row_offset_px : float
         Learnt of the rig before: subtracted from disparities, added to rows of the right image.
+    readout_ms : float
+        Time from the first to the last row that was assumed.
+    row_motion_px : float or None
+        By how much matches were moved at most for it; None where nothing was registered.
     keypoints : Sorting
     measured : Sorting
         Keypoints with their disparities, or depths of an RGB-D frame.
@@ -124,6 +128,8 @@ class FrameExplanation:
     result: FrameResult
     offset_px: float
     row_offset_px: float
+    readout_ms: float
+    row_motion_px: float | None
     keypoints: Sorting
     measured: Sorting
     depth_pixels: Sorting | None

@@ -1,1 +1,1 @@
-"""Stereo: matches along rows, sub-pixel disparities, offsets of the rig."""
+"""Stereo: matches along rows and sub-pixel disparities."""

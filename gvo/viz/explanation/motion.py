@@ -78,7 +78,7 @@ def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
         side = 2 * radius + 1
         how = (
             f"Windows of {side:g} x {side:g} px are tracked by Lucas-Kanade from {start}{wide}, "
-            "then measured in 3-D where they end."
+            "aligned as they look after that motion, then measured in 3-D where they end."
         )
         marks = "the window there (dashed) and where it ended (blue)"
     else:
@@ -96,6 +96,11 @@ def _matches_caption(explanation: FrameExplanation, matches: Sorting) -> str:
             f"are {np.median(error):.1f} px (median, at most {error.max():.1f}) from where they "
             "were expected."
         )
+        if explanation.row_motion_px is not None:
+            numbers += (
+                f" For a readout of {explanation.readout_ms:.1f} ms they are moved by at most "
+                f"{explanation.row_motion_px:.2f} px to the middle of the exposure."
+            )
         crops = f"Below: six matches enlarged, the predicted pixel (orange-red cross), {marks}.\n"
     return (
         f"Of {len(matches)} points of frame {explanation.reference_index}, the reference: "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -14,7 +15,7 @@ import numpy as np
 from gvo.diagnostics.explain.motion import has_prior
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.errors import ConfigurationError
-from gvo.types import StereoFrame
+from gvo.types import ConstantError, StereoFrame
 from gvo.viz.explanation.extraction import (
     budget_of,
     draw_depth,
@@ -29,7 +30,7 @@ from gvo.viz.explanation.pose import draw_links, draw_pose
 from gvo.viz.explanation.sheet import Picture
 from gvo.viz.report.page import write_page
 
-_RELATIVE = "T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px", "offset_px"
+_RELATIVE = "T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px"
 _ESTIMATE = "status", "T_world_frame", "covariance"
 
 
@@ -141,6 +142,8 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
         "attempts": list(explanation.attempts),
         "rig_offset_px": explanation.offset_px,
         "rig_row_offset_px": explanation.row_offset_px,
+        "readout_ms": explanation.readout_ms,
+        "row_motion_px": explanation.row_motion_px,
         "keypoints": {
             "n_detected": len(keypoints),
             "n_kept": keypoints.counts()["kept"],
@@ -154,7 +157,7 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
         "matches": _matches(explanation),
         "consensus": explanation.consensus,
         "refinement": explanation.refinement,
-        "relative_pose": _pick(result.registration, *_RELATIVE),
+        "relative_pose": _pick(result.registration, *_RELATIVE, "calibration_errors"),
         "raw": _pick(result.raw, *_ESTIMATE),
         "causal": _pick(result.causal, *_ESTIMATE),
         "links": explanation.links,
@@ -166,7 +169,7 @@ def explanation_json(explanation: FrameExplanation) -> dict[str, Any]:
 def _plain(value: Any) -> Any:  # noqa: ANN401 - steps, and arrays and numbers of NumPy
     if isinstance(value, Step):
         return {name: each for name, each in vars(value).items() if name != "drawn"}
-    return value.tolist()
+    return asdict(value) if isinstance(value, ConstantError) else value.tolist()
 
 
 def _pick(value: object, *names: str) -> dict[str, Any] | None:

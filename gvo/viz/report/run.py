@@ -12,6 +12,7 @@ import numpy as np
 from gvo._text import number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
+from gvo.frontend.calibration import describe_offsets
 from gvo.io.run_folder.reader import RunRecord
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.report.comparison import truth_around
@@ -198,7 +199,7 @@ def _facts(record: RunRecord) -> dict[str, str]:
         "Segments": _segment_words(summary.get("segments", ())),
         "Status": ", ".join(f"{n} {status}" for status, n in statuses.items()),
         "Ground truth": str(summary.get("ground_truth", "")),
-        "Learnt calibration errors": _rig_words(summary.get("rig_offsets")),
+        "Learnt calibration errors": describe_offsets(summary.get("rig_offsets")),
         "Median per frame": _median_words(summary.get("median_ms")),
         "Peak memory": "" if memory is None else f"{float(memory):.0f} MB",
         "Version": _version(summary),
@@ -222,18 +223,6 @@ def _duration(record: RunRecord) -> str:
         return ""
     rate = 1e9 / float(np.median(np.diff(stamps_ns)))
     return f"{float(stamps_ns[-1] - stamps_ns[0]) / 1e9:.1f} s, {rate:.3g} frames per second"
-
-
-def _rig_words(offsets: Mapping[str, Any] | None) -> str:
-    known = {key: value for key, value in (offsets or {}).items() if value is not None}
-    words = []
-    if "disparity_px" in known:
-        sigma = known.get("disparity_sigma_px")
-        suffix = "" if sigma is None else f" (sigma {sigma:.3f})"
-        words.append(f"disparities too large by {known['disparity_px']:.3f} px{suffix}")
-    if "row_px" in known:
-        words.append(f"rows of the right image too large by {known['row_px']:.3f} px")
-    return ", ".join(words)
 
 
 def _median_words(medians: Mapping[str, Any] | None) -> str:

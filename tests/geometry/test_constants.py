@@ -1,4 +1,4 @@
-"""The offset of a rig's disparities, planted in simulated matches and found again."""
+"""Errors of a camera's constants, planted in simulated matches and found again."""
 
 from dataclasses import replace
 
@@ -10,14 +10,9 @@ from scipy.spatial.transform import Rotation
 from gvo.config import RegistrationConfig
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.refinement import (
-    DisparityOffset,
-    Refinement,
-    estimate_disparity_offset,
-    refine_pose,
-)
+from gvo.geometry.refinement import Refinement, estimate_constants, refine_pose
 from gvo.geometry.residuals import Linearization, StereoResiduals
-from gvo.types import FloatArray
+from gvo.types import ConstantError, FloatArray
 from tests.geometry.scenes import (
     all_of,
     derivative,
@@ -41,14 +36,25 @@ def drive(seed: int, offset_px: float, *, noise: float = 1.0) -> tuple[FloatArra
     disparities = 350 * rng.uniform(1 / 50, 1 / 5, 400)
     pixels = rng.uniform([100, 40], [1100, 330], size=(400, 2))
     source = unproject(np.column_stack([pixels, disparities]), CAMERA)
-    uvds = [
+    first, second = [
         project(points, CAMERA) + noise * SIGMA * rng.normal(size=(400, 3)) + [0.0, 0.0, offset_px]
         for points in (source, move(T, source))
     ]
-    points = [unproject(uvd, CAMERA) for uvd in uvds]
-    return T, matched(
-        *points, source_uvd=uvds[0], target_uvd=uvds[1], source_sigmas=SIGMA, target_sigmas=SIGMA
+    return T, measured(first, second, {"offset": np.tile([0.0, 0.0, 1.0], (2, 400, 1))})
+
+
+def measured(
+    source_uvd: FloatArray, target_uvd: FloatArray, sensitivities: dict[str, FloatArray]
+) -> Correspondences:
+    points = [unproject(uvd, CAMERA) for uvd in (source_uvd, target_uvd)]
+    matches = matched(
+        *points,
+        source_uvd=source_uvd,
+        target_uvd=target_uvd,
+        source_sigmas=SIGMA,
+        target_sigmas=SIGMA,
     )
+    return replace(matches, sensitivities=sensitivities)
 
 
 def linearized(T: FloatArray, matches: Correspondences) -> tuple[StereoResiduals, Linearization]:
@@ -58,16 +64,14 @@ def linearized(T: FloatArray, matches: Correspondences) -> tuple[StereoResiduals
     return residuals, at
 
 
-def refine(T: FloatArray, matches: Correspondences, *, with_offset: bool = True) -> Refinement:
-    result = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS, with_offset=with_offset)
+def refine(T: FloatArray, matches: Correspondences) -> Refinement:
+    result = refine_pose(T, matches, all_of(matches), CAMERA, SETTINGS)
     assert isinstance(result, Refinement), result
     return result
 
 
-def estimate(T: FloatArray, matches: Correspondences) -> DisparityOffset:
-    offset = refine(T, matches).offset
-    assert offset is not None
-    return offset
+def estimate(T: FloatArray, matches: Correspondences) -> ConstantError:
+    return refine(T, matches).calibration_errors["offset"]
 
 
 @pytest.mark.parametrize("planted_px", [-0.3, 0.0, 0.1, 0.3])
@@ -75,8 +79,8 @@ def test_a_planted_offset_is_found_within_its_sigma(planted_px: float) -> None:
     errors = []
     for seed in range(40):
         found = estimate(*drive(seed, planted_px))
-        assert abs(found.offset_px - planted_px) < 4.0 * found.sigma_px
-        errors.append((found.offset_px - planted_px) / found.sigma_px)
+        assert abs(found.value - planted_px) < 4.0 * found.sigma
+        errors.append((found.value - planted_px) / found.sigma)
     assert abs(np.mean(errors)) < 3.0 / np.sqrt(40)
     assert 0.7 < np.std(errors) < 1.4
 
@@ -84,8 +88,8 @@ def test_a_planted_offset_is_found_within_its_sigma(planted_px: float) -> None:
 def test_the_mean_of_many_registrations_tells_a_small_offset_from_none() -> None:
     for planted_px in (0.0, 0.08):
         found = [estimate(*drive(seed, planted_px)) for seed in range(100, 160)]
-        weights = np.array([1.0 / each.sigma_px**2 for each in found])
-        mean = np.average([each.offset_px for each in found], weights=weights)
+        weights = np.array([1.0 / each.sigma**2 for each in found])
+        mean = np.average([each.value for each in found], weights=weights)
         sigma = 1.0 / np.sqrt(weights.sum())
         assert sigma < 0.02
         assert abs(mean - planted_px) < 3.0 * sigma
@@ -94,7 +98,7 @@ def test_the_mean_of_many_registrations_tells_a_small_offset_from_none() -> None
 @pytest.mark.parametrize("noise", [0.5, 1.5])
 def test_sigmas_are_those_of_the_residuals_not_the_stated_ones(noise: float) -> None:
     stated, actual = estimate(*drive(0, 0.0)), estimate(*drive(0, 0.0, noise=noise))
-    assert actual.sigma_px / stated.sigma_px == pytest.approx(noise, rel=0.25)
+    assert actual.sigma / stated.sigma == pytest.approx(noise, rel=0.25)
 
 
 def test_the_estimate_is_that_of_least_squares_over_pose_and_offset() -> None:
@@ -108,13 +112,73 @@ def test_the_estimate_is_that_of_least_squares_over_pose_and_offset() -> None:
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0]])
     optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
     # Other weights and one step only: equal but for the noise, which is nearly none.
-    assert estimate(T, matches).offset_px == pytest.approx(optimum.x[6], abs=0.005)
+    assert estimate(T, matches).value == pytest.approx(optimum.x[6], abs=0.005)
+
+
+def row_by_row(
+    offset_px: float, readout: float, seed: int, noise: float
+) -> tuple[FloatArray, Correspondences]:
+    """Return a drive whose rows are shifted too, by another velocity in either frame."""
+    T, matches = drive(seed, offset_px, noise=noise)
+    shifts = np.stack(
+        [
+            (uvd[:, 1:2] / CAMERA.height - 0.5) * velocity_px
+            for uvd, velocity_px in (
+                (matches.source_uvd, [12.0, 5.0, 0.0]),
+                (matches.target_uvd, [-3.0, 9.0, 0.0]),
+            )
+        ]
+    )
+    uvds = matches.source_uvd + readout * shifts[0], matches.target_uvd + readout * shifts[1]
+    return T, measured(*uvds, {**matches.sensitivities, "readout": shifts})
+
+
+def test_constants_are_those_of_least_squares_over_pose_and_all_of_them() -> None:
+    T, matches = row_by_row(0.2, 0.1, 5, 0.01)
+    shifts = matches.sensitivities["readout"]
+
+    def residuals(x: FloatArray) -> FloatArray:
+        uvds = [
+            uvd - [0.0, 0.0, x[6]] - x[7] * shift
+            for uvd, shift in zip((matches.source_uvd, matches.target_uvd), shifts, strict=True)
+        ]
+        moved = unproject(uvds[0], CAMERA) @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:6]
+        return np.asarray((uvds[1] - project(moved, CAMERA)).ravel())
+
+    start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3], [0.0, 0.0]])
+    optimum = least_squares(residuals, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    found = refine(T, matches).calibration_errors
+    assert found["offset"].value == pytest.approx(optimum.x[6], abs=0.01)
+    assert found["readout"].value == pytest.approx(optimum.x[7], abs=0.005)
+    # Alone, each takes the other's part.
+    for name, truth in (("offset", 0.2), ("readout", 0.1)):
+        alone = replace(matches, sensitivities={name: matches.sensitivities[name]})
+        error = abs(refine(T, alone).calibration_errors[name].value - truth)
+        assert error > 2.0 * abs(found[name].value - truth)
+
+
+def test_constants_are_found_together_within_their_sigmas() -> None:
+    scores = []
+    for seed in range(40):
+        found = refine(*row_by_row(0.1, 0.01, seed, 1.0)).calibration_errors
+        truths = {"offset": 0.1, "readout": 0.01}
+        scores.append([(found[name].value - truths[name]) / found[name].sigma for name in truths])
+    assert np.all(np.abs(np.mean(scores, axis=0)) < 3.0 / np.sqrt(40))
+    assert np.all(np.abs(np.log(np.std(scores, axis=0))) < np.log(1.4))
+
+
+def test_a_constant_that_shows_nowhere_leaves_the_other_as_it_is() -> None:
+    T, matches = drive(6, 0.2)
+    nowhere = {**matches.sensitivities, "readout": np.zeros((2, 400, 3))}
+    (found,) = refine(T, replace(matches, sensitivities=nowhere)).calibration_errors.items()
+    assert found[0] == "offset"
+    assert found[1].value == pytest.approx(estimate(T, matches).value)
 
 
 def test_the_pose_is_the_same_with_and_without_the_estimate() -> None:
     T, matches = drive(1, 0.2)
-    with_it, without = refine(T, matches), refine(T, matches, with_offset=False)
-    assert without.offset is None
+    with_it, without = refine(T, matches), refine(T, replace(matches, sensitivities={}))
+    assert without.calibration_errors == {}
     np.testing.assert_array_equal(with_it.T_target_source, without.T_target_source)
     np.testing.assert_array_equal(with_it.covariance, without.covariance)
 
@@ -123,7 +187,7 @@ def test_a_camera_at_rest_says_nothing_of_the_offset() -> None:
     # Both frames are wrong alike: the residuals are those of a rig without offset.
     _, matches = drive(2, 0.3, noise=0.0)
     same = replace(matches, target_points=matches.source_points, target_uvd=matches.source_uvd)
-    assert refine(np.eye(4), same).offset is None
+    assert refine(np.eye(4), same).calibration_errors == {}
 
 
 def test_settled_points_do_not_lean_to_their_own_residuals() -> None:
@@ -163,7 +227,7 @@ def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
     source = unproject(source_uvd, CAMERA)
     target = move(T, source)
     target_uvd = project(target, CAMERA)
-    return T, matched(
+    matches = matched(
         source,
         target,
         source_uvd=source_uvd,
@@ -171,6 +235,7 @@ def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
         source_sigmas=0.0,
         target_sigmas=[0.4, 0.3, 0.2],
     )
+    return T, replace(matches, sensitivities={"offset": np.tile([0.0, 0.0, 1.0], (2, 200, 1))})
 
 
 @pytest.mark.parametrize(("share", "is_told"), [(1.3e-10, True), (0.75e-10, False)])
@@ -181,16 +246,15 @@ def test_a_motion_too_small_to_tell_the_offset_from_rounding_tells_nothing(
     T, matches = barely_moved(float(step))
     assert information_share(T, matches) == pytest.approx(share, rel=0.01)
     residuals, at = linearized(T, matches)
-    assert (estimate_disparity_offset(T, residuals, at) is not None) == is_told
+    assert ("offset" in estimate_constants(T, residuals, at)) == is_told
 
 
 def test_the_sigma_of_the_offset_is_that_of_the_scores_that_the_matches_show() -> None:
     T, matches = drive(4, 0.0)
     matches = replace(matches, source_sigmas=np.full((400, 3), 1e-12))
     residuals, at = linearized(T, matches)
-    found = estimate_disparity_offset(T, residuals, at)
-    assert found is not None
+    found = estimate_constants(T, residuals, at)["offset"]
     information = information_share(T, matches) * 400 / SIGMA**2
     # Residuals are those of a noise a few times larger than stated, in each match alike.
     size = np.sqrt(np.mean(at.r**2))
-    assert found.sigma_px == pytest.approx(size / np.sqrt(information), rel=0.2)
+    assert found.sigma == pytest.approx(size / np.sqrt(information), rel=0.2)

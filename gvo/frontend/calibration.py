@@ -1,0 +1,485 @@
+"""Online calibration of constants of the camera: disparity and row offsets, and readout time.
+
+A baseline, a principal point or a rectification that is slightly off adds the same fraction of a
+pixel to every disparity: a large change of depth for far points, a small one for near ones, so
+that they disagree about the motion. A row offset shows in each match. A rolling shutter exposes the
+rows of an image one after the other, which bends the world of a camera that moves. Registrations
+tell of these; over a second of a recording they are known to a few hundredths of a pixel, and to
+a millisecond.
+
+References
+----------
+J. Hedborg, P.-E. Forssen, M. Felsberg, E. Ringaby, "Rolling shutter bundle adjustment", CVPR 2012,
+doi:10.1109/CVPR.2012.6247831.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from gvo._trace import note
+from gvo.config import Config
+from gvo.frontend.registration import register_correspondences
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.geometry.correspondences import Correspondences
+from gvo.geometry.residuals import pose_jacobian
+from gvo.types import (
+    ConstantError,
+    Failure,
+    FloatArray,
+    IntArray,
+    MotionPrior,
+    RelativePose,
+    Stamped,
+)
+
+# Names of what registrations tell.
+DISPARITY, READOUT = "disparity_px", "readout_s"
+# Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
+# by these factors.
+_DISPARITY_FACTOR = 3.0
+_READOUT_FACTOR = 7.0
+# Sigmas of the row offset measured in one frame, and of its prior, pixels.
+_ROW_SIGMA_PX = 0.1
+_ROW_PRIOR_PX = 0.3
+# Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms.
+_READOUT_PRIOR_S = 0.015
+# Drift per frame: temperature, vibration.
+_DRIFT_PX = 5e-4
+_DRIFT_S = 1e-5
+# Innovations are clipped to so many sigmas.
+_MAX_SURPRISE = 3.0
+# A step is registered again where its own velocity moves what a row shows by more, pixels.
+_MIN_CHANGE_PX = 0.02
+# Moved to the middle of the exposure, points must stay in front of the camera.
+_MIN_DEPTH_M = 0.05
+
+
+class ConstantFilter:
+    """A scalar Kalman filter of a value that hardly changes.
+
+    Parameters
+    ----------
+    prior_sigma : float
+        Standard deviation of the prior, in the unit of the value; 0: it is known.
+    drift : float
+        Standard deviation of its change per frame.
+    value : float
+        Mean of the prior.
+
+    Attributes
+    ----------
+    value : float
+        The present estimate.
+    """
+
+    def __init__(self, prior_sigma: float, drift: float, value: float = 0.0) -> None:
+        self._prior_variance = prior_sigma**2
+        self._variance = self._prior_variance
+        self._drift = drift
+        self.value = value
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the value."""
+        return math.sqrt(self._variance)
+
+    def advance(self) -> None:
+        """Let the value drift for a frame."""
+        self._variance = min(self._variance + self._drift**2, self._prior_variance)
+
+    def update(self, error: float, sigma: float) -> None:
+        """Add a measurement of what is left of the value, and its standard deviation."""
+        limit = _MAX_SURPRISE * math.sqrt(self._variance + sigma**2)
+        gain = self._variance / (self._variance + sigma**2)
+        self.value += gain * min(max(error, -limit), limit)
+        self._variance *= 1.0 - gain
+
+
+class FrameVelocities:
+    """The velocities of frames while they were exposed, of the steps before and after each.
+
+    They are those of the chain of steps alone: no pose of the window enters. Frames are forgotten
+    with their observations.
+    """
+
+    def __init__(self) -> None:
+        self._steps: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+        self._velocities: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+
+    def expect(
+        self, reference: Stamped, current: Stamped, T_reference_current: FloatArray | None
+    ) -> None:
+        """Take over the step between two frames, or that it is unknown.
+
+        The reference moves with the mean of the steps before and after; the current frame with
+        its step and half of its change. What an earlier step between the two left behind plays no
+        role.
+        """
+        elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
+        if elapsed_s == 0.0:
+            return
+        before = self._steps.get(reference)
+        if T_reference_current is None:
+            self._steps.pop(current, None)
+            for observations in (reference, current):
+                self._velocities.pop(observations, None)
+            if before is not None:
+                self._velocities[reference] = before
+            return
+        step = se3.log(T_reference_current) / elapsed_s
+        before = step if before is None else before
+        self._steps[current] = step
+        self._velocities[reference] = 0.5 * (before + step)
+        self._velocities[current] = step + 0.5 * (step - before)
+
+    def of(self, observations: Stamped) -> FloatArray | None:
+        """Return a twist per second (rad/s, m/s), right of the pose; None where it is unknown."""
+        return self._velocities.get(observations)
+
+
+class RigOffsets:
+    """What is learnt of a camera while it runs: disparity and row offsets, readout time.
+
+    Measurements take effect with `advance`, so that all registrations of one frame use the same
+    values.
+
+    Parameters
+    ----------
+    config : Config
+        `stereo.estimate_offset`, else the offsets stay at zero; `stereo.offset_sigma_px`, sigma
+        of their prior; `camera.readout_ms`, known or to be learnt.
+    is_stereo : bool
+        Other sensors have no offsets.
+
+    Attributes
+    ----------
+    disparity, row : ConstantFilter
+        By how much disparities and rows of the right image are too large, pixels.
+    readout : ConstantFilter
+        Time from the first to the last row, seconds.
+    learnt : dict of str to ConstantFilter
+        Those of them that registrations tell, by name.
+    velocities : FrameVelocities
+        Of the frames that are in use.
+    """
+
+    def __init__(self, config: Config, *, is_stereo: bool = True) -> None:
+        readout_ms = config.camera.readout_ms
+        self.disparity = ConstantFilter(config.stereo.offset_sigma_px, _DRIFT_PX)
+        self.row = ConstantFilter(_ROW_PRIOR_PX, _DRIFT_PX)
+        self.readout = (
+            ConstantFilter(_READOUT_PRIOR_S, _DRIFT_S)
+            if readout_ms is None
+            else ConstantFilter(0.0, 0.0, 1e-3 * readout_ms)
+        )
+        self.learnt = {
+            name: constant
+            for name, constant, is_learnt in (
+                (DISPARITY, self.disparity, is_stereo and config.stereo.estimate_offset),
+                (READOUT, self.readout, readout_ms is None),
+            )
+            if is_learnt
+        }
+        self.velocities = FrameVelocities()
+        self._is_stereo = is_stereo
+        self._disparity_error: ConstantError | None = None
+        self._readout_errors: list[ConstantError] = []
+        self._row_error_px: float | None = None
+        self._last_ns: int | None = None
+        self._last_row_ns: int | None = None
+
+    @property
+    def is_learning(self) -> bool:
+        """Tell whether anything is learnt."""
+        return bool(self.learnt)
+
+    def note(self, result: RelativePose, stamp_ns: int) -> None:
+        """Take what a registration tells.
+
+        The first of each frame, its step, counts for the offset of the disparities. Keyframes tell
+        the readout best, seen by a camera that moved another way; the step counts without them.
+
+        Parameters
+        ----------
+        result : RelativePose
+            With `calibration_errors`, after the present values were subtracted.
+        stamp_ns : int
+            Of the current frame.
+        """
+        errors = {k: each for k, each in result.calibration_errors.items() if k in self.learnt}
+        is_new = self._last_ns is None or stamp_ns > self._last_ns
+        if is_new and DISPARITY in errors:
+            self._last_ns = stamp_ns
+            self._disparity_error = errors[DISPARITY]
+        if READOUT in errors:
+            self._readout_errors.append(errors[READOUT])
+
+    def note_rows(self, shift_px: float | None, stamp_ns: int) -> None:
+        """Take the remaining row offset of a frame; each frame counts once.
+
+        Parameters
+        ----------
+        shift_px : float or None
+            Row in the right image minus row in the left, minus the present value.
+        stamp_ns : int
+            Of that frame.
+        """
+        is_new = self._last_row_ns is None or stamp_ns > self._last_row_ns
+        if DISPARITY in self.learnt and is_new and shift_px is not None:
+            self._last_row_ns = stamp_ns
+            self._row_error_px = shift_px
+
+    def advance(self) -> None:
+        """Apply the measurements taken since the last frame."""
+        for constant in (self.disparity, self.row, self.readout):
+            constant.advance()
+        if self._disparity_error is not None:
+            error = self._disparity_error
+            self.disparity.update(error.value, _DISPARITY_FACTOR * error.sigma)
+        if self._row_error_px is not None:
+            self.row.update(self._row_error_px, _ROW_SIGMA_PX)
+        used_s = self.readout.value
+        for error in self._readout_errors[1:] or self._readout_errors:
+            left_s = used_s + error.value - self.readout.value
+            self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
+        self._disparity_error, self._row_error_px, self._readout_errors = None, None, []
+        note(
+            "rig.offsets",
+            disparity_px=self.disparity.value,
+            row_px=self.row.value,
+            readout_ms=1e3 * self.readout.value,
+        )
+
+    def as_json(self) -> dict[str, float]:
+        """Return values and sigmas as plain numbers; a sigma of 0: it was given."""
+        readout = {
+            "readout_ms": round(1e3 * self.readout.value, 2),
+            "readout_sigma_ms": round(1e3 * self.readout.sigma, 2),
+        }
+        if not self._is_stereo:
+            return readout
+        return {
+            "disparity_px": round(self.disparity.value, 4),
+            "disparity_sigma_px": round(self.disparity.sigma, 4),
+            "row_px": round(self.row.value, 4),
+            **readout,
+        }
+
+
+def describe_offsets(offsets: Mapping[str, Any] | None) -> str:
+    """Tell in words what was learnt of a camera, as `RigOffsets.as_json` gives it; may be empty."""
+    known = {key: value for key, value in (offsets or {}).items() if value is not None}
+    words = []
+    if "disparity_px" in known:
+        sigma = known.get("disparity_sigma_px")
+        suffix = "" if sigma is None else f" (sigma {sigma:.3f})"
+        words.append(f"disparities too large by {known['disparity_px']:.3f} px{suffix}")
+    if "row_px" in known:
+        words.append(f"rows of the right image too large by {known['row_px']:.3f} px")
+    if "readout_ms" in known:
+        sigma = known.get("readout_sigma_ms")
+        suffix = f" (sigma {sigma:.1f})" if sigma else ", as given" if sigma == 0 else ""
+        words.append(f"rows read out over {known['readout_ms']:.1f} ms{suffix}")
+    return ", ".join(words)
+
+
+def settle_rows(
+    uvd: FloatArray, velocity: FloatArray | None, readout_s: float, camera: StereoCamera
+) -> FloatArray:
+    """Return what each row shows as seen in the middle of the exposure.
+
+    Row v of h is exposed at the stamp + readout * (v / h - 1/2). Until the stamp a point moves in
+    the camera's frame by exp(velocity * readout * (v / h - 1/2)).
+
+    Parameters
+    ----------
+    uvd : ndarray of float64, shape (n, 3)
+        Pixels and disparities.
+    velocity : ndarray of float64, shape (6,), or None
+        Twist of the camera per second (rad/s, m/s), right of its pose; None: left as they are.
+    readout_s : float
+        Negative: the inverse, from the middle of the exposure to when each row was exposed.
+    camera : StereoCamera
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 3)
+    """
+    if velocity is None or readout_s == 0.0 or len(uvd) == 0:
+        return uvd
+    dt = readout_s * _row_times(uvd, camera)
+    points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
+    turns, shifts = (each * dt[:, np.newaxis] for each in (velocity[:3], velocity[3:]))
+    # The motion is small: its exponential to second order.
+    moved = points + shifts + np.cross(turns, points + 0.5 * (np.cross(turns, points) + shifts))
+    settled = uvd.copy()
+    in_front = moved[:, 2] > _MIN_DEPTH_M
+    settled[in_front] = camera.project_stereo(moved[in_front])
+    return settled
+
+
+def settling_rates(
+    uvd: FloatArray, velocity: FloatArray | None, camera: StereoCamera
+) -> FloatArray:
+    """Return the derivatives of what `settle_rows` gives by the readout time, shape (n, 3)."""
+    if velocity is None:
+        return np.zeros_like(uvd)
+    points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
+    rates = np.einsum("k,kin->ni", velocity, pose_jacobian(points.T, camera))
+    return np.asarray(_row_times(uvd, camera)[:, np.newaxis] * rates)
+
+
+def _row_times(uvd: FloatArray, camera: StereoCamera) -> FloatArray:
+    """Return when rows are exposed, as a share of the readout time after its middle."""
+    return np.asarray(uvd[:, 1] / camera.height - 0.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measurements:
+    """What two frames show of the same n points.
+
+    Parameters
+    ----------
+    frames : tuple of two observations
+        Reference and current.
+    uvd : tuple of two ndarrays of float64, shape (n, 3)
+        Pixels and disparities as measured.
+    sigmas : tuple of two ndarrays of float64, shape (n, 3)
+    matches : ndarray of int64, shape (n, 2)
+    """
+
+    frames: tuple[Stamped, Stamped]
+    uvd: tuple[FloatArray, FloatArray]
+    sigmas: tuple[FloatArray, FloatArray]
+    matches: IntArray
+
+
+class CalibratedCamera:
+    """Takes what is known of a camera's errors off measurements, and registers these.
+
+    Parameters
+    ----------
+    camera : StereoCamera
+    offsets : RigOffsets
+    """
+
+    def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
+        self._camera = camera
+        self._offsets = offsets
+
+    def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
+        """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
+        velocity = self._offsets.velocities.of(observations)
+        return settle_rows(
+            uvd - self._offset(), velocity, self._offsets.readout.value, self._camera
+        )
+
+    def distort(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
+        """Return (u, v, disparity), shape (n, 3), as this camera measures them."""
+        velocity = self._offsets.velocities.of(observations)
+        readout_s = -self._offsets.readout.value
+        return settle_rows(uvd, velocity, readout_s, self._camera) + self._offset()
+
+    def _offset(self) -> FloatArray:
+        return np.array([0.0, 0.0, self._offsets.disparity.value])
+
+    def register(
+        self,
+        measured: Measurements,
+        config: Config,
+        *,
+        prior: MotionPrior | None,
+        is_step: bool,
+    ) -> RelativePose | Failure:
+        """Register what two frames measure.
+
+        Parameters
+        ----------
+        measured : Measurements
+        config : Config
+        prior : MotionPrior or None
+            As of `register_correspondences`.
+        is_step : bool
+            The result tells the velocities of both frames. Where these move what rows show, it is
+            registered once more.
+
+        Returns
+        -------
+        RelativePose or Failure
+        """
+        corrected = self._correspondences(measured)
+        result = self._register(corrected, measured, config, prior)
+        if isinstance(result, Failure) or not is_step:
+            return result
+        velocities = self._offsets.velocities
+        velocities.expect(*measured.frames, result.T_reference_current)
+        again = self._correspondences(measured)
+        if _largest_change(corrected, again) < _MIN_CHANGE_PX:
+            return result
+        result = self._register(again, measured, config, prior)
+        if isinstance(result, RelativePose):
+            velocities.expect(*measured.frames, result.T_reference_current)
+        return result
+
+    def _register(
+        self,
+        corrected: Correspondences,
+        measured: Measurements,
+        config: Config,
+        prior: MotionPrior | None,
+    ) -> RelativePose | Failure:
+        first, second = measured.frames
+        stamps_ns = first.stamp_ns, second.stamp_ns
+        result = register_correspondences(
+            corrected, measured.matches, self._camera, config, stamps_ns=stamps_ns, prior=prior
+        )
+        if isinstance(result, Failure):
+            return result
+        errors = {
+            name: each.times(self._offsets.learnt[name].sigma)
+            for name, each in result.calibration_errors.items()
+        }
+        first_pixels, second_pixels = (uvd[:, :2] for uvd in measured.uvd)
+        return replace(
+            result,
+            calibration_errors=errors,
+            pixels_reference=first_pixels,
+            pixels_current=second_pixels,
+        )
+
+    def _correspondences(self, measured: Measurements) -> Correspondences:
+        reference, current = (
+            self.correct(*each) for each in zip(measured.frames, measured.uvd, strict=True)
+        )
+        note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
+        corrected = Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
+        sensitivities = {
+            name: self._sensitivity(name, measured) * constant.sigma
+            for name, constant in self._offsets.learnt.items()
+        }
+        return replace(corrected, sensitivities=sensitivities)
+
+    def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
+        """Return the derivatives of corrected measurements by an error of a constant."""
+        if name == DISPARITY:
+            return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
+        velocities = self._offsets.velocities
+        rates = [
+            settling_rates(uvd - self._offset(), velocities.of(observations), self._camera)
+            for observations, uvd in zip(measured.frames, measured.uvd, strict=True)
+        ]
+        return -np.stack(rates)
+
+
+def _largest_change(former: Correspondences, latter: Correspondences) -> float:
+    """Return by how many pixels corrected measurements differ at most."""
+    pairs = (former.source_uvd, latter.source_uvd), (former.target_uvd, latter.target_uvd)
+    return max(float(np.abs(a - b).max(initial=0.0)) for a, b in pairs)

@@ -1,0 +1,350 @@
+"""Constant errors of a camera: the filter, a rolling shutter, and rendered planted errors."""
+
+import gc
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+import gvo
+from gvo.config import Config
+from gvo.frontend.calibration import (
+    DISPARITY,
+    READOUT,
+    ConstantFilter,
+    FrameVelocities,
+    RigOffsets,
+    describe_offsets,
+    settle_rows,
+    settling_rates,
+)
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.io.recording import Sensor
+from gvo.io.synthetic.recording import SensorNoise
+from gvo.types import ConstantError, FaultyFrame, FloatArray, RelativePose, StereoFrame
+from tests.geometry.scenes import move, project, unproject
+
+N_FRAMES = 20
+CAMERA = StereoCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480, baseline=0.1)
+READOUT_S = 0.025
+
+
+def result(**errors: float) -> RelativePose:
+    return RelativePose(
+        T_reference_current=np.eye(4),
+        covariance=np.eye(6),
+        calibration_errors={
+            name: ConstantError(value=value, sigma=0.1 * abs(value))
+            for name, value in errors.items()
+        },
+    )
+
+
+def config(readout_ms: float | None = None, *, estimate_offset: bool = True) -> Config:
+    return Config.model_validate(
+        {"camera": {"readout_ms": readout_ms}, "stereo": {"estimate_offset": estimate_offset}}
+    )
+
+
+@settings(max_examples=30)
+@given(true=st.floats(-0.2, 0.2), seed=st.integers(0, 999))
+def test_the_filter_finds_a_constant_within_its_sigma(true: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    found = ConstantFilter(0.3, 5e-4)
+    for _ in range(200):
+        found.update(true + 0.1 * rng.normal() - found.value, 0.1)
+    assert abs(found.value - true) < 4.5 * found.sigma
+    assert found.sigma < 0.012
+
+
+def test_what_is_not_measured_stays_at_the_prior() -> None:
+    for prior in (0.0, 0.3):
+        found = ConstantFilter(0.1, 5e-4, prior)
+        for _ in range(100):
+            found.advance()
+            found.update(0.5, 50.0)
+        assert abs(found.value - prior) < 0.02
+        assert found.sigma == pytest.approx(0.1, rel=0.05)
+
+
+def test_what_is_given_is_not_learnt() -> None:
+    found = ConstantFilter(0.0, 0.0, 0.02)
+    found.advance()
+    found.update(0.01, 1e-6)
+    assert (found.value, found.sigma) == (0.02, 0.0)
+
+
+def test_one_wild_measurement_moves_it_no_farther_than_three_sigmas() -> None:
+    tame, wild = ConstantFilter(0.1, 5e-4), ConstantFilter(0.1, 5e-4)
+    tame.update(3.0 * np.hypot(0.1, 0.02), 0.02)
+    wild.update(50.0, 0.02)
+    assert wild.value == pytest.approx(tame.value)
+
+
+def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
+    offsets = RigOffsets(config())
+    offsets.note(result(disparity_px=0.1), 10)
+    offsets.note(result(disparity_px=-5.0), 10)  # a link of the same frame
+    offsets.note(result(disparity_px=-5.0), 9)
+    offsets.note(result(), 11)
+    offsets.note_rows(0.2, 10)
+    offsets.note_rows(-5.0, 10)
+    offsets.note_rows(None, 11)
+    assert offsets.disparity.value == offsets.row.value == 0.0
+    offsets.advance()
+    disparity_px, row_px = offsets.disparity.value, offsets.row.value
+    assert 0.0 < disparity_px <= 0.1
+    assert 0.0 < row_px <= 0.2
+    offsets.advance()
+    assert (offsets.disparity.value, offsets.row.value) == (disparity_px, row_px)
+
+
+def test_the_readout_is_that_of_keyframes_where_there_are_any() -> None:
+    alone, with_keyframes = RigOffsets(config()), RigOffsets(config())
+    for offsets in (alone, with_keyframes):
+        offsets.note(result(readout_s=0.001), 10)
+    for _ in range(2):
+        with_keyframes.note(result(readout_s=0.02), 10)
+    for offsets in (alone, with_keyframes):
+        offsets.advance()
+    assert 0.0009 < alone.readout.value <= 0.001
+    # Both are of the value that was used, not of what the first one made of it.
+    assert 0.01 < with_keyframes.readout.value <= 0.02
+    assert with_keyframes.readout.sigma < 0.014
+
+
+def test_nothing_is_learnt_where_it_is_switched_off() -> None:
+    offsets = RigOffsets(config(12.5, estimate_offset=False))
+    offsets.note(result(**{DISPARITY: 0.1, READOUT: 0.01}), 10)
+    offsets.note_rows(0.2, 10)
+    offsets.advance()
+    assert not offsets.is_learning
+    assert offsets.as_json() == {
+        "disparity_px": 0.0,
+        "disparity_sigma_px": 0.1,
+        "row_px": 0.0,
+        "readout_ms": 12.5,
+        "readout_sigma_ms": 0.0,
+    }
+
+
+def test_what_is_learnt_is_told_in_words() -> None:
+    assert describe_offsets(None) == ""
+    assert describe_offsets(RigOffsets(config(), is_stereo=False).as_json()) == (
+        "rows read out over 0.0 ms (sigma 15.0)"
+    )
+    assert describe_offsets(RigOffsets(config(20.0)).as_json()) == (
+        "disparities too large by 0.000 px (sigma 0.100), rows of the right image too large by "
+        "0.000 px, rows read out over 20.0 ms, as given"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    stamp_ns: int
+
+
+STEPS = np.array([[0.01, -0.02, 0.005, 0.03, 0.01, 0.04], [0, 0.02, 0, 0.01, 0, 0.06]])
+
+
+def assert_velocity(velocities: FrameVelocities, frame: Seen, expected: FloatArray) -> None:
+    velocity = velocities.of(frame)
+    assert velocity is not None
+    np.testing.assert_allclose(velocity, expected)
+
+
+def test_a_frame_moves_with_the_mean_of_the_steps_around_it() -> None:
+    first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 150_000_000))
+    velocities = FrameVelocities()
+    assert velocities.of(second) is None
+    velocities.expect(first, second, se3.exp(STEPS[0]))
+    assert_velocity(velocities, first, 10.0 * STEPS[0])
+    assert_velocity(velocities, second, 10.0 * STEPS[0])
+    for _ in range(2):  # once more changes nothing
+        velocities.expect(second, third, se3.exp(STEPS[1]))
+        mean = 0.5 * (10.0 * STEPS[0] + 20.0 * STEPS[1])
+        assert_velocity(velocities, second, mean)
+        # The last step and half of its change.
+        assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
+    velocities.expect(third, third, np.eye(4))
+    assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
+
+
+def test_of_an_unknown_step_only_the_one_before_is_known() -> None:
+    first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 200_000_000))
+    velocities = FrameVelocities()
+    velocities.expect(first, second, se3.exp(STEPS[0]))
+    velocities.expect(second, third, se3.exp(STEPS[1]))
+    velocities.expect(second, third, None)
+    assert_velocity(velocities, second, 10.0 * STEPS[0])
+    assert velocities.of(third) is None
+    velocities.expect(first, third, None)
+    assert velocities.of(first) is None
+
+
+def test_velocities_are_forgotten_with_their_frames() -> None:
+    first, second = Seen(0), Seen(100_000_000)
+    velocities = FrameVelocities()
+    velocities.expect(first, second, np.eye(4))
+    del first
+    gc.collect()
+    assert velocities.of(second) is not None
+    assert len(velocities._velocities) == 1
+
+
+def screw(velocity: FloatArray, elapsed_s: float) -> FloatArray:
+    """Return the pose after some time, by the series of the exponential."""
+    (a, b, c), t = velocity[:3], velocity[3:]
+    twist = np.zeros((4, 4))
+    twist[:3, :3], twist[:3, 3] = [[0, -c, b], [c, 0, -a], [-b, a, 0]], t
+    return np.asarray(expm(elapsed_s * twist), dtype=np.float64)
+
+
+def rolling(points: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Return (u, v, disparity) of points of the middle of the exposure, each in its own row."""
+
+    def seen(point: FloatArray, row: float) -> FloatArray:
+        pose = screw(velocity, READOUT_S * (row / CAMERA.height - 0.5))
+        return np.asarray(project(move(se3.invert(pose), point[np.newaxis]), CAMERA)[0])
+
+    rows = [
+        brentq(lambda v, point=point: seen(point, v)[1] - v, -200.0, 700.0, xtol=1e-10)
+        for point in points
+    ]
+    return np.array([seen(point, row) for point, row in zip(points, rows, strict=True)])
+
+
+def points_in_view(n: int) -> FloatArray:
+    rng = np.random.default_rng(5)
+    low, high = [30.0, 30.0, 8.0], [610.0, 450.0, 50.0]
+    return unproject(rng.uniform(low, high, size=(n, 3)), CAMERA)
+
+
+VELOCITY = np.array([0.8, -1.1, 0.6, 0.4, -0.3, 0.7])
+
+
+def test_settled_rows_are_those_of_a_camera_that_opens_all_at_once() -> None:
+    points = points_in_view(60)
+    measured, truth = rolling(points, VELOCITY), project(points, CAMERA)
+    assert np.median(np.abs(measured - truth)[:, :2].max(axis=1)) > 2.0
+    settled = settle_rows(measured, VELOCITY, READOUT_S, CAMERA)
+    np.testing.assert_allclose(settled, truth, atol=2e-3)
+    # The way back is that of the middle row's time, right to first order.
+    back = settle_rows(truth, VELOCITY, -READOUT_S, CAMERA)
+    assert np.abs(back - measured).max() < 0.05 * np.abs(measured - truth).max()
+
+
+def test_what_is_not_known_or_does_not_move_is_left_as_it_is() -> None:
+    uvd = project(points_in_view(5), CAMERA)
+    assert settle_rows(uvd, None, READOUT_S, CAMERA) is uvd
+    assert settle_rows(uvd, VELOCITY, 0.0, CAMERA) is uvd
+    np.testing.assert_allclose(settle_rows(uvd, 0.0 * VELOCITY, READOUT_S, CAMERA), uvd)
+    np.testing.assert_array_equal(settling_rates(uvd, None, CAMERA), 0.0)
+    assert settle_rows(np.zeros((0, 3)), VELOCITY, READOUT_S, CAMERA).shape == (0, 3)
+    # Points that would be behind the camera stay where they were seen.
+    backwards = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1e3])
+    lower = uvd[:, 1] > 245
+    assert lower.any()
+    np.testing.assert_array_equal(settle_rows(uvd, backwards, 1.0, CAMERA)[lower], uvd[lower])
+
+
+def test_the_rates_are_the_derivatives_by_the_readout() -> None:
+    uvd = project(points_in_view(40), CAMERA)
+    ends = [settle_rows(uvd, VELOCITY, sign * 1e-6, CAMERA) for sign in (1.0, -1.0)]
+    np.testing.assert_allclose(
+        settling_rates(uvd, VELOCITY, CAMERA), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3
+    )
+
+
+@cache
+def shaken(sensor: Sensor, readout_ms: float) -> gvo.Odometry:
+    """Return the odometry of a camera in the hand, after a second and a half."""
+    recording = gvo.SyntheticRecording(
+        "handheld", sensor, n_frames=36, seed=2, readout_ms=readout_ms
+    )
+    odometry = gvo.Odometry(recording.info.camera)
+    for frame in gvo.frames(recording, Config()):
+        assert not isinstance(frame, FaultyFrame)
+        odometry.track(frame)
+    return odometry
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize("planted_ms", [0.0, 10.0, 25.0])
+def test_a_planted_readout_is_found(sensor: Sensor, planted_ms: float) -> None:
+    offsets = shaken(sensor, planted_ms).rig_offsets
+    assert offsets is not None
+    found_ms, sigma_ms = 1e3 * offsets.readout.value, 1e3 * offsets.readout.sigma
+    assert abs(found_ms - planted_ms) < 1.5
+    assert abs(found_ms - planted_ms) < 2.5 * sigma_ms
+    assert sigma_ms < 1.5
+
+
+@cache
+def frames(offset_px: float, row_px: int = 0) -> list[StereoFrame]:
+    """Return a rendered drive with an error of its disparities, and of its rows."""
+    noise = SensorNoise(max_depth_m=80.0, disparity_offset_px=offset_px)
+    recording = gvo.SyntheticRecording("driving", n_frames=N_FRAMES, seed=3, noise=noise)
+    found = []
+    for frame in gvo.frames(recording, Config()):
+        assert not isinstance(frame, FaultyFrame)
+        assert isinstance(frame, StereoFrame)
+        right = np.roll(frame.right, row_px, axis=0)
+        found.append(replace(frame, right=right))
+    return found
+
+
+def learn(frames: list[StereoFrame], kind: str, *, is_on: bool = True) -> gvo.Odometry:
+    camera = gvo.SyntheticRecording("driving", n_frames=1).info.camera
+    sections = {"frontend": {"kind": kind}, "stereo": {"estimate_offset": is_on}}
+    odometry = gvo.Odometry(camera, Config.model_validate(sections))
+    for frame in frames:
+        odometry.track(frame)
+    return odometry
+
+
+Kind = Literal["klt", "descriptor"]
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+@pytest.mark.parametrize("planted_px", [-0.15, 0.0, 0.15])
+def test_a_planted_offset_is_found_within_twenty_frames(kind: Kind, planted_px: float) -> None:
+    offsets = learn(frames(planted_px), kind).rig_offsets
+    assert offsets is not None
+    assert offsets.disparity.sigma < 0.06
+    # The prior of zero holds back a share of it, the more as rows might be read one by one.
+    assert abs(offsets.disparity.value - planted_px) < 0.03 + 0.4 * abs(planted_px)
+
+
+@pytest.mark.acceptance
+def test_rows_that_differ_are_found() -> None:
+    offsets = learn(frames(0.0, row_px=1), "klt").rig_offsets
+    assert offsets is not None
+    assert offsets.row.value == pytest.approx(1.0, abs=0.15)
+    straight = learn(frames(0.0), "klt").rig_offsets
+    assert straight is not None
+    assert abs(straight.row.value) < 0.03
+
+
+@pytest.mark.acceptance
+def test_the_length_of_the_path_is_right_with_it_and_wrong_without() -> None:
+    truth = gvo.SyntheticRecording("driving", n_frames=N_FRAMES, seed=3).ground_truth()
+    lengths = []
+    for is_on in (True, False):
+        odometry = learn(frames(0.15), "klt", is_on=is_on)
+        smoothed = gvo.Trajectory.of(
+            [odometry.window.estimate(stamp) for stamp in odometry.window.poses()]
+        )
+        lengths.append(float(np.linalg.norm(smoothed.T_world_frame[-1, :3, 3])))
+    T = np.linalg.inv(truth.T_world_frame[0]) @ truth.T_world_frame[N_FRAMES - 1]
+    errors = np.abs(np.array(lengths) - np.linalg.norm(T[:3, 3]))
+    assert errors[0] < 0.5 * errors[1]
