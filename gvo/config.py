@@ -241,21 +241,23 @@ class WindowConfig(Section):
     size: int | None = _parameter(
         5, "number of recent frames in the window; null: all frames (full smoothing)", ge=2, le=1000
     )
-    n_keyframes: int = _parameter(12, "maximum number of keyframes kept", ge=0, le=100)
+    n_keyframes: int = _parameter(20, "maximum number of keyframes kept", ge=0, le=100)
     n_links: int = _parameter(
         3, "maximum registrations per frame, with its predecessor and keyframes", ge=1, le=20
     )
     min_overlap: float = _parameter(
-        0.4, "minimum share of a keyframe's points in view; below, it is marginalized", ge=0, le=1
+        0.4, "minimum share of a keyframe's points in view to link it", ge=0, le=1
     )
     link_gain: float = _parameter(
-        2.5, "minimum number of steps since a keyframe, times its share in view, to link it", ge=0
+        0.5,
+        "minimum number of steps since a keyframe was linked, times its share in view, to link it",
+        gt=0,
     )
     keyframe_overlap: float = _parameter(
         0.9, "maximum overlap with every keyframe at which a frame becomes one", ge=0, le=1
     )
     link_sigma_factor: float = _parameter(
-        2.5, "inflation of the sigmas of links to keyframes: links of a frame share its noise", gt=0
+        1.0, "inflation of the sigmas of links to keyframes: links of a frame share its noise", gt=0
     )
     keyframe_distance_m: float = _parameter(
         1.0, "distance from all keyframes that makes a keyframe, if overlap is unknown", "m", gt=0

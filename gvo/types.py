@@ -257,14 +257,26 @@ class MotionPrior:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstantError:
-    """By how much a constant of the camera seems too large, and the sigma of this estimate."""
+    """What a registration tells of the error of a constant of the camera.
+
+    Parameters
+    ----------
+    value, sigma : float
+        By how much the constant seems too large, and the standard deviation of this estimate.
+    effect : ndarray of float64, shape (6,)
+        By how much an error of one unit moves the registered pose (rx, ry, rz, tx, ty, tz), in
+        the current camera frame.
+    """
 
     value: float
     sigma: float
+    effect: FloatArray
 
     def times(self, factor: float) -> ConstantError:
         """Return it in another unit."""
-        return ConstantError(value=factor * self.value, sigma=factor * self.sigma)
+        return ConstantError(
+            value=factor * self.value, sigma=factor * self.sigma, effect=self.effect / factor
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -285,7 +297,8 @@ class RelativePose:
     pixels_reference, pixels_current : ndarray of float64, shape (n, 2)
         Where the matches are in either image, (u, v). Empty where the front-end does not tell.
     points_current : ndarray of float64, shape (n, 3)
-        The matches as measured in the current frame, in its `cam` frame, metres. Likewise.
+        The matches as measured in the current frame, in its `cam` frame in the middle of its
+        exposure, metres. Likewise.
     flow_px : float or None
         Median displacement of the inliers between the images, where the front-end tells.
     calibration_errors : mapping of str to ConstantError

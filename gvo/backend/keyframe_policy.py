@@ -57,15 +57,14 @@ def choose_links(
     scores: Mapping[_Id, float],
     config: WindowConfig,
     *,
-    n_steps: Mapping[_Id, int],
+    n_unlinked: Mapping[_Id, int],
     exclude: Hashable = None,
 ) -> tuple[list[_Id], list[_Id]]:
     """Choose the keyframes to register the current frame against.
 
-    Half of the chosen ones are the oldest, which limit the drift, the others those with the
-    highest score. The information of a link beyond the chain of steps grows with their number,
-    because their errors accumulate, and with the overlap: the product has to be at least
-    `link_gain`.
+    A link adds what has become uncertain since the last one: the errors of steps accumulate with
+    their number, and what is seen of it grows with the overlap. The product has to be at least
+    `link_gain`; the largest come first. What is measured again from the same place adds nothing.
 
     Parameters
     ----------
@@ -73,8 +72,9 @@ def choose_links(
         Oldest first.
     config : WindowConfig
         `n_links`, of which one goes to the predecessor, `min_overlap` and `link_gain`.
-    n_steps : mapping of frame to int
-        Steps from each to the current frame.
+    n_unlinked : mapping of frame to int
+        Steps since each was linked last, or since it itself; 0 where the view has not changed
+        since.
     exclude : hashable
         The predecessor.
 
@@ -88,15 +88,35 @@ def choose_links(
     usable = [
         frame for frame, score in scores.items() if score >= config.min_overlap and frame != exclude
     ]
-    telling = [frame for frame in usable if n_steps[frame] * scores[frame] >= config.link_gain]
-    by_age, others = telling[: (n + 1) // 2], telling[(n + 1) // 2 :]
-    chosen = (by_age + _nearest_first(others, scores))[:n]
+    gains = {frame: n_unlinked[frame] * scores[frame] for frame in usable}
+    telling = [frame for frame in usable if gains[frame] >= config.link_gain]
+    chosen = sorted(telling, key=lambda frame: -gains[frame])[:n]
     rest = [frame for frame in usable if frame not in chosen]
     return chosen, _nearest_first(rest, scores)[: n - len(chosen)]
 
 
 def _nearest_first(frames: list[_Id], scores: Mapping[_Id, float]) -> list[_Id]:
     return sorted(frames, key=lambda frame: -scores[frame])
+
+
+def choose_unseen(
+    scores: Mapping[_Id, float], n_unseen: Mapping[_Id, int], n_released: int
+) -> list[_Id]:
+    """Choose keyframes of a map to release: those that were in view least recently.
+
+    Of several that were in view at the same time, those with the lowest scores. So places are
+    kept to come back to, as many as there is room for.
+
+    Parameters
+    ----------
+    scores : mapping of frame to float
+        Of those that may be released.
+    n_unseen : mapping of frame to int
+        Steps since each was in view.
+    n_released : int
+    """
+    oldest_first = sorted(scores, key=lambda frame: (-n_unseen[frame], scores[frame]))
+    return oldest_first[:n_released]
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:

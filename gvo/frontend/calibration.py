@@ -354,12 +354,15 @@ class Measurements:
         Pixels and disparities as measured.
     sigmas : tuple of two ndarrays of float64, shape (n, 3)
     matches : ndarray of int64, shape (n, 2)
+    sigma_factor : float
+        Inflation of the registration's sigmas, before the doubt about constants is added.
     """
 
     frames: tuple[Stamped, Stamped]
     uvd: tuple[FloatArray, FloatArray]
     sigmas: tuple[FloatArray, FloatArray]
     matches: IntArray
+    sigma_factor: float
 
 
 class CalibratedCamera:
@@ -443,14 +446,17 @@ class CalibratedCamera:
         )
         if isinstance(result, Failure):
             return result
-        errors = {
-            name: each.times(self._offsets.learnt[name].sigma)
-            for name, each in result.calibration_errors.items()
-        }
+        # In sigmas of what is known of each constant, as the sensitivities are.
+        in_sigmas = result.calibration_errors
+        doubts = [np.outer(each.effect, each.effect) for each in in_sigmas.values()]
         first_pixels, second_pixels = (uvd[:, :2] for uvd in measured.uvd)
         return replace(
             result,
-            calibration_errors=errors,
+            covariance=measured.sigma_factor**2 * result.covariance + sum(doubts),
+            calibration_errors={
+                name: each.times(self._offsets.learnt[name].sigma)
+                for name, each in in_sigmas.items()
+            },
             pixels_reference=first_pixels,
             pixels_current=second_pixels,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 
@@ -199,16 +198,15 @@ class DescriptorFrontend:
                 uvd=(measured.source_uvd, measured.target_uvd),
                 sigmas=(measured.source_sigmas, measured.target_sigmas),
                 matches=matches,
+                sigma_factor=self._config.registration.sigma_factor,
             ),
             self._config,
             prior=prior,
             is_step=is_step,
         )
-        if isinstance(result, Failure):
-            return result
-        self.rig_offsets.note(result, current.stamp_ns)
-        factor = self._config.registration.sigma_factor
-        return replace(result, covariance=factor**2 * result.covariance)
+        if isinstance(result, RelativePose):
+            self.rig_offsets.note(result, current.stamp_ns)
+        return result
 
     def _match(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal, TypeAlias
 
@@ -272,20 +272,18 @@ class KltFrontend:
             self.rig_offsets.velocities.expect(reference, current, T_predicted)
         T = np.eye(4) if T_predicted is None else T_predicted
         source_uvd, target_uvd, indices = self._track(T, reference, current, search)
-        result = self._calibrated.register(
+        return self._calibrated.register(
             Measurements(
                 frames=(reference, current),
                 uvd=(source_uvd, target_uvd),
                 sigmas=self._sigmas(len(indices), is_stereo=isinstance(current.frame, StereoFrame)),
                 matches=np.column_stack([indices, np.full_like(indices, -1)]),
+                sigma_factor=self._config.klt.sigma_factor,
             ),
             self._config,
             prior=None if search == "wide" else prior,
             is_step=is_step,
         )
-        if isinstance(result, Failure):
-            return result
-        return replace(result, covariance=self._config.klt.sigma_factor**2 * result.covariance)
 
     def _sigmas(self, n: int, *, is_stereo: bool) -> tuple[FloatArray, FloatArray]:
         """Return the sigmas of (u, v, disparity) of corners and of their tracks."""

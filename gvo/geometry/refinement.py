@@ -314,5 +314,6 @@ def estimate_constants(
         errors[residuals.constants[k]] = ConstantError(
             value=float(gain @ np.sum(scores, axis=1)),
             sigma=float(np.sqrt(gain @ (scores @ scores.T + known) @ gain)),
+            effect=motion[:, k],
         )
     return errors

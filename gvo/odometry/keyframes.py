@@ -20,17 +20,29 @@ from gvo.types import Edge, FloatArray, FrameLink, LinkKind
 
 # Points of a keyframe that its view overlap is estimated from.
 _N_SAMPLES = 64
+# A view has changed where these points, of which every so manieth is looked at, moved by so much:
+# then a keyframe's patches are measured anew, with other errors.
+_CHANGED_PX = 1.0
+_SPARSE = 4
+_MIN_DEPTH_M = 0.05
 # Beyond this ratio of depths a point is not matched again by patches of one size.
 _MAX_ZOOM = 1.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Keyframe(Generic[ObservationsT]):
-    """A kept frame, a sample of its points, and its number of steps since the first frame."""
+    """A kept frame, and a sample of its points."""
 
     observations: ObservationsT
     points_cam: FloatArray | None
-    n_steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """The last registration against a keyframe: from where, and whether it gave a link."""
+
+    T_frame_keyframe: FloatArray
+    is_linked: bool
 
 
 class Keyframes(Generic[ObservationsT]):
@@ -50,6 +62,10 @@ class Keyframes(Generic[ObservationsT]):
         self._camera = camera
         self._config = config
         self._kept: dict[int, _Keyframe[ObservationsT]] = {}
+        self._attempts: dict[int, _Attempt] = {}
+        # Numbers of steps at which keyframes were linked last, and in view last.
+        self._linked_at: dict[int, int] = {}
+        self._seen_at: dict[int, int] = {}
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -64,9 +80,62 @@ class Keyframes(Generic[ObservationsT]):
         """Return the number of kept frames."""
         return len(self._kept)
 
-    def n_steps(self, stamp_ns: int) -> int:
-        """Return the number of steps from the first frame to a kept one."""
-        return self._kept[stamp_ns].n_steps
+    def n_unlinked(
+        self, T_frame_keyframes: Mapping[int, FloatArray], n_steps: int
+    ) -> dict[int, int]:
+        """Return the steps since keyframes were linked, or kept; 0 where the view is the same.
+
+        Parameters
+        ----------
+        T_frame_keyframes : mapping of int to ndarray of float64, shape (4, 4)
+            By stamp of the keyframe.
+        n_steps : int
+            Of the current frame, since the first one.
+        """
+        return {
+            ns: n_steps - self._linked_at[ns] if self._is_changed(ns, T) else 0
+            for ns, T in T_frame_keyframes.items()
+        }
+
+    def note_attempt(
+        self, stamp_ns: int, T_frame_keyframe: FloatArray, n_steps: int, *, is_linked: bool
+    ) -> None:
+        """Remember from where a keyframe was registered, or could not be."""
+        attempt = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
+        self._attempts[stamp_ns] = attempt
+        if is_linked:
+            self._linked_at[stamp_ns] = n_steps
+
+    def registrable(self, scores: Mapping[int, float]) -> dict[int, float]:
+        """Return the scores without keyframes whose last registration failed."""
+        return {
+            stamp_ns: score
+            for stamp_ns, score in scores.items()
+            if stamp_ns not in self._attempts or self._attempts[stamp_ns].is_linked
+        }
+
+    def note_seen(self, scores: Mapping[int, float], n_steps: int) -> None:
+        """Remember which keyframes are in view of the current frame."""
+        for stamp_ns, score in scores.items():
+            if score >= self._config.min_overlap:
+                self._seen_at[stamp_ns] = n_steps
+
+    def n_unseen(self, n_steps: int) -> dict[int, int]:
+        """Return the number of steps since each keyframe was in view."""
+        return {stamp_ns: n_steps - seen_at for stamp_ns, seen_at in self._seen_at.items()}
+
+    def _is_changed(self, stamp_ns: int, T_frame_keyframe: FloatArray) -> bool:
+        """Tell whether a keyframe's points moved in the image since it was registered last."""
+        attempt, camera = self._attempts.get(stamp_ns), self._camera
+        points = self._kept[stamp_ns].points_cam
+        if attempt is None or points is None or camera is None or len(points) == 0:
+            return True
+        pixels = []
+        for T in (attempt.T_frame_keyframe, T_frame_keyframe):
+            moved = se3.transform_points(T, points[::_SPARSE])
+            moved[:, 2] = np.maximum(moved[:, 2], _MIN_DEPTH_M)
+            pixels.append(camera.project(moved))
+        return bool(np.median(np.abs(pixels[0] - pixels[1]).max(axis=1)) >= _CHANGED_PX)
 
     def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         """Score with another camera or configuration from now on; what is kept stays."""
@@ -79,16 +148,18 @@ class Keyframes(Generic[ObservationsT]):
         self._kept[observations.stamp_ns] = _Keyframe(
             observations=observations,
             points_cam=None if points is None else _sample_points(points),
-            n_steps=n_steps,
         )
+        self._linked_at[observations.stamp_ns] = self._seen_at[observations.stamp_ns] = n_steps
 
     def replace(self, observations: ObservationsT) -> None:
         """Keep other observations of a frame that is kept already."""
-        self.add(observations, n_steps=self.n_steps(observations.stamp_ns))
+        self.add(observations, n_steps=self._linked_at[observations.stamp_ns])
 
     def drop(self, stamp_ns: int) -> None:
         """Forget a kept frame."""
         del self._kept[stamp_ns]
+        del self._linked_at[stamp_ns], self._seen_at[stamp_ns]
+        self._attempts.pop(stamp_ns, None)
 
     def scores(self, T_current_keyframe: Mapping[int, FloatArray]) -> dict[int, float]:
         """Return how much the current frame has in common with keyframes, 0 to 1.
@@ -137,7 +208,7 @@ def link_keyframes(
     step: RawStep,
     config: WindowConfig,
     *,
-    n_steps: Mapping[int, int],
+    n_unlinked: Mapping[int, int],
 ) -> list[Edge]:
     """Register a frame against the keyframes that add information to its steps.
 
@@ -156,10 +227,10 @@ def link_keyframes(
     step : RawStep
         Of the frame.
     config : WindowConfig
-    n_steps : mapping of int to int
-        Steps since each keyframe.
+    n_unlinked : mapping of int to int
+        See `Keyframes.n_unlinked`.
     """
-    chosen, spare = choose_links(scores, config, n_steps=n_steps, exclude=step.reference_ns)
+    chosen, spare = choose_links(scores, config, n_unlinked=n_unlinked, exclude=step.reference_ns)
     if not chosen and step.is_registered and step.is_steady:
         spare = []
     links: list[Edge] = []

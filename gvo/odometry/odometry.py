@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from gvo._trace import note
-from gvo.backend.keyframe_policy import choose_released, is_needed
+from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.calibration import RigOffsets
@@ -264,10 +264,13 @@ class Odometry:
         T_frame_keyframes = self._predict_keyframes(step)
         scores = self._keyframes.scores(T_frame_keyframes)
         note("odometry.scores", scores=scores)
-        measure = partial(self._register_keyframe, observations)
-        n_steps = {ns: step.n_steps - self._keyframes.n_steps(ns) for ns in scores}
+        self._keyframes.note_seen(scores, step.n_steps)
+        measure = partial(self._register_keyframe, observations, step.n_steps)
+        n_unlinked = self._keyframes.n_unlinked(T_frame_keyframes, step.n_steps)
         config = self._config.window
-        links = link_keyframes(measure, scores, T_frame_keyframes, step, config, n_steps=n_steps)
+        links = link_keyframes(
+            measure, scores, T_frame_keyframes, step, config, n_unlinked=n_unlinked
+        )
         offered += [("keyframe", edge) for edge in links]
         still = zero_motion_edge(step, config)
         return scores, offered if still is None else [*offered, ("standstill", still)]
@@ -286,11 +289,15 @@ class Odometry:
     def _register_keyframe(
         self,
         observations: _Observations,
+        n_steps: int,
         stamp_ns: int,
         T_keyframe_frame: FloatArray,
     ) -> Edge | None:
         prior = MotionPrior(T_predicted=T_keyframe_frame)
         result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
+        is_linked = isinstance(result, RelativePose)
+        T_frame_keyframe = se3.invert(T_keyframe_frame)
+        self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, n_steps, is_linked=is_linked)
         return None if isinstance(result, Failure) else self._edge_of(stamp_ns, result)
 
     def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:
@@ -345,15 +352,17 @@ class Odometry:
         if not is_tied or causal.frame_id not in self._window:
             return
         config = self._config.window
-        if config.n_keyframes > 0 and is_needed(scores, config):
+        # A keyframe that cannot be registered stands for nothing that is in view.
+        if config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores), config):
             self._keyframes.add(observations, n_steps=step.n_steps)
             self._window.keep(causal.stamp_ns)
             self._segments.note_keyframe()
-        self._release_keyframes(scores)
+        self._release_keyframes(scores, step.n_steps)
 
-    def _release_keyframes(self, scores: dict[int, float]) -> None:
+    def _release_keyframes(self, scores: dict[int, float], n_steps: int) -> None:
         config, unjoined = self._config.window, self._unjoined()
-        released = choose_released(scores, config, n_kept=len(self._keyframes) - len(unjoined))
+        n_over = len(self._keyframes) - len(unjoined) - config.n_keyframes
+        released = choose_unseen(scores, self._keyframes.n_unseen(n_steps), max(n_over, 0))
         for stamp_ns in released + unjoined[: max(len(unjoined) - config.n_keyframes, 0)]:
             self._keyframes.drop(stamp_ns)
             self._window.release(stamp_ns)

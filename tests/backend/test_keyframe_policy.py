@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.backend.keyframe_policy import choose_links, choose_released, is_needed, proximity
+from gvo.backend.keyframe_policy import (
+    choose_links,
+    choose_released,
+    choose_unseen,
+    is_needed,
+    proximity,
+)
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 
@@ -77,35 +83,48 @@ def test_a_keyframe_is_needed_where_all_others_are_too_far(
 def choose(
     scores: Mapping[Any, float], n_steps: int = 100, *, exclude: Hashable = None, **changes: Any
 ) -> tuple[list[Any], list[Any]]:
-    since = dict.fromkeys(scores, n_steps)
-    return choose_links(scores, configure(**changes), n_steps=since, exclude=exclude)
+    unlinked = dict.fromkeys(scores, n_steps)
+    return choose_links(scores, configure(**changes), n_unlinked=unlinked, exclude=exclude)
 
 
-def test_links_go_to_the_oldest_and_to_the_nearest() -> None:
+def test_of_keyframes_linked_as_long_ago_those_most_in_view_are_linked() -> None:
     scores = {5: 0.1, 10: 0.4, 20: 0.9, 30: 0.5, 40: 0.95, 50: 0.99}
-    assert choose(scores, n_links=3, exclude=50) == ([10, 40], [])
-    assert choose(scores, n_links=5, exclude=50) == ([10, 20, 40, 30], [])
-    assert choose(scores, n_links=3) == ([10, 50], [])
+    assert choose(scores, n_links=3, exclude=50) == ([40, 20], [])
+    assert choose(scores, n_links=5, exclude=50) == ([40, 20, 30, 10], [])
+    assert choose(scores, n_links=3) == ([50, 40], [])
     assert choose(scores, n_links=1, exclude=50) == ([], [])
     assert choose({}, n_links=3, exclude=0) == ([], [])
 
 
-def test_links_go_where_many_steps_or_many_points_lie_between() -> None:
+def test_links_go_where_many_unlinked_steps_or_many_points_lie_between() -> None:
     scores = {10: 0.4, 20: 0.5, 30: 0.9}
-    n_steps = {10: 8, 20: 5, 30: 2}
+    unlinked = {10: 8, 20: 5, 30: 2}
     # Products of 3.2, 2.5 and 1.8.
     for gain, expected in (
-        (0.0, ([10, 30], [])),
+        (0.1, ([10, 20], [])),
         (2.5, ([10, 20], [])),
         (2.6, ([10], [30])),
         (3.3, ([], [30, 20])),
     ):
-        assert choose_links(scores, configure(link_gain=gain), n_steps=n_steps) == expected
+        assert choose_links(scores, configure(link_gain=gain), n_unlinked=unlinked) == expected
+
+
+def test_what_is_seen_from_the_same_place_again_is_spare() -> None:
+    scores = {10: 0.99, 20: 0.5}
+    chosen = choose_links(scores, configure(link_gain=0.1), n_unlinked={10: 0, 20: 1})
+    assert chosen == ([20], [10])
+
+
+def test_those_seen_least_recently_are_released_and_of_these_the_least_in_view() -> None:
+    scores = {1: 0.9, 2: 0.0, 3: 0.1, 4: 0.2}
+    unseen = {1: 0, 2: 7, 3: 12, 4: 7}
+    assert choose_unseen(scores, unseen, 0) == []
+    assert choose_unseen(scores, unseen, 3) == [3, 2, 4]
 
 
 def test_frames_need_no_order_of_their_own() -> None:
     scores = {"zebra": 0.4, "ape": 0.9, ("a", 1): 0.9}
-    assert choose(scores, exclude="none") == (["zebra", "ape"], [])
+    assert choose(scores, exclude="none") == (["ape", ("a", 1)], [])
     assert choose_released(scores, configure(n_keyframes=1), n_kept=3) == ["zebra", "ape"]
 
 

@@ -41,7 +41,7 @@ def result(**errors: float) -> RelativePose:
         T_reference_current=np.eye(4),
         covariance=np.eye(6),
         calibration_errors={
-            name: ConstantError(value=value, sigma=0.1 * abs(value))
+            name: ConstantError(value=value, sigma=0.1 * abs(value), effect=np.zeros(6))
             for name, value in errors.items()
         },
     )

@@ -140,14 +140,43 @@ def test_the_errors_are_of_the_size_that_the_covariance_says(sensor: Sensor) -> 
 
 def test_the_covariance_grows_with_the_factor() -> None:
     first, second = observations("stereo")[:2]
+    certain: dict[str, dict[str, Any]] = {
+        "stereo": {"estimate_offset": False},
+        "camera": {"readout_ms": 0.0},
+    }
     one, three = (
-        frontend("stereo", klt={"sigma_factor": factor}).register(first, second)
+        frontend("stereo", klt={"sigma_factor": factor}, **certain).register(first, second)
         for factor in (1.0, 3.0)
     )
     assert isinstance(one, RelativePose)
     assert isinstance(three, RelativePose)
     np.testing.assert_allclose(three.covariance, 9.0 * one.covariance)
     np.testing.assert_array_equal(three.T_reference_current, one.T_reference_current)
+
+
+def test_what_is_not_known_yet_of_the_camera_is_doubted_in_the_covariance() -> None:
+    first, second = observations("stereo")[:2]
+    results = [
+        frontend("stereo", camera={"readout_ms": 0.0}, stereo={"offset_sigma_px": sigma}).register(
+            first, second
+        )
+        for sigma in (0.001, 0.1, 0.2)
+    ]
+    small, medium, large = (
+        result.covariance for result in results if isinstance(result, RelativePose)
+    )
+    doubt = medium - small
+    # Of one direction, that in which an offset of all disparities moves the pose.
+    assert np.linalg.matrix_rank(doubt, tol=1e-3 * np.linalg.norm(doubt)) == 1
+    np.testing.assert_allclose(large - medium, 3.0 * doubt, rtol=1e-3, atol=1e-3 * abs(doubt).max())
+    moved = frontend("stereo", camera={"readout_ms": 0.0}, stereo={"estimate_offset": False})
+    moved.rig_offsets.disparity.value = 0.1
+    with_offset = moved.register(first, second)
+    assert isinstance(results[0], RelativePose)
+    assert isinstance(with_offset, RelativePose)
+    shift = se3.log(se3.invert(results[0].T_reference_current) @ with_offset.T_reference_current)
+    # It is what an offset of one sigma does.
+    np.testing.assert_allclose(np.outer(shift, shift), doubt, atol=0.3 * abs(doubt).max())
 
 
 def test_points_out_of_the_limits_of_depth_are_left_out() -> None:

@@ -97,6 +97,41 @@ def test_kept_frames_are_known_by_stamp_in_their_order() -> None:
         kept[20]
 
 
+def test_steps_are_counted_from_the_last_link() -> None:
+    kept = keyframes()
+    kept.add(observe(7, wall()), n_steps=3)
+    assert kept.n_unlinked({7: shifted(dx=0.2)}, 5) == {7: 2}
+    kept.note_attempt(7, shifted(dx=0.2), 5, is_linked=True)
+    assert kept.n_unlinked({7: shifted(dx=0.4)}, 9) == {7: 4}
+    kept.note_attempt(7, shifted(dx=0.4), 9, is_linked=False)
+    assert kept.n_unlinked({7: shifted(dx=0.6)}, 10) == {7: 5}
+
+
+@pytest.mark.parametrize("is_linked", [True, False])
+@pytest.mark.parametrize(("shift_px", "is_new"), [(0.0, False), (0.9, False), (1.1, True)])
+def test_the_same_view_adds_nothing(shift_px: float, is_new: bool, is_linked: bool) -> None:
+    kept = keyframes()
+    kept.add(observe(7, wall()), n_steps=0)
+    kept.note_attempt(7, shifted(dx=0.2), 2, is_linked=is_linked)
+    there = shifted(dx=0.2 + shift_px * 4.0 / CAMERA.fx)
+    assert (kept.n_unlinked({7: there}, 8)[7] > 0) == is_new
+
+
+def test_what_could_not_be_registered_does_not_stand_for_its_view() -> None:
+    kept = keyframes(7, 8)
+    scores = {7: 0.99, 8: 0.5}
+    kept.note_attempt(7, np.eye(4), 2, is_linked=False)
+    assert kept.registrable(scores) == {8: 0.5}
+    kept.note_attempt(7, np.eye(4), 3, is_linked=True)
+    assert kept.registrable(scores) == scores
+
+
+def test_steps_are_counted_since_a_keyframe_was_in_view() -> None:
+    kept = keyframes(7, 8)
+    kept.note_seen({7: 0.3, 8: 0.29}, 5)
+    assert kept.n_unseen(6) == {7: 1, 8: 6}
+
+
 @dataclass(frozen=True)
 class Bare:
     """Observations of a front-end that has no points to show."""

@@ -190,4 +190,4 @@ class _Drive:
             return "another frame must confirm it first"
         if overlap < self._config.window.min_overlap:
             return "too little overlap"
-        return "steps or other keyframes constrain the pose as well"
+        return "other links add more, or the view has not changed since the last one"
