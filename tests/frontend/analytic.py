@@ -44,3 +44,17 @@ def warped_image(warp: FloatArray, shift: FloatArray) -> ImageArray:
     )
     grey = 120.0 + 67.0 * waves / np.sqrt(_N_WAVES)
     return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8).reshape(SHAPE))
+
+
+def slanted_pair(
+    disparity: float, slopes: tuple[float, float]
+) -> tuple[tuple[ImageArray, ImageArray], FloatArray]:
+    """Return left and right of a slanted plane, and its disparities at all pixels of the left.
+
+    The disparity is that of the middle; slopes are per pixel, along rows and columns.
+    """
+    warp = np.array([[1.0 - slopes[0], -slopes[1]], [0.0, 1.0]])
+    right = warped_image(warp, np.array([-disparity, 0.0]))
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    offsets = np.stack([u, v], axis=2) - MIDDLE
+    return (image(), right), disparity + offsets @ np.array(slopes)

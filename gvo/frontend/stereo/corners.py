@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import StereoConfig
-from gvo.frontend.stereo.disparity import MAX_STEP_PX, Strips, have_room
+from gvo.frontend.stereo.disparity import MAX_STEP_PX, Strips, fit_slopes, have_room
 from gvo.frontend.stereo.matching import parabola_minimum
 from gvo.frontend.stereo.patches import (
     Likeness,
@@ -51,6 +51,8 @@ class CornerDisparities:
     ----------
     disparities : ndarray of float64, shape (n,)
         Pixels, NaN where not measured.
+    slopes : ndarray of float64, shape (n, 2)
+        Change of the reliable ones per pixel, along rows and columns.
     are_reliable : ndarray of bool, shape (n,)
         Left and right match there, and nowhere else along the row.
     row_shift_px : float or None
@@ -58,6 +60,7 @@ class CornerDisparities:
     """
 
     disparities: FloatArray
+    slopes: FloatArray
     are_reliable: BoolArray
     row_shift_px: float | None
 
@@ -74,7 +77,8 @@ def measure_corners(
 
     Patches are cut once: those of the left image, and strips of the right one around the result
     of the coarse search. A second peak of it is measured in the same way, as the windows of a
-    house are all alike: where two disparities match as well, either may be wrong.
+    house are all alike: where two disparities match as well, either may be wrong. What is reliable
+    is measured again together with the slope of its surface.
 
     Parameters
     ----------
@@ -108,16 +112,26 @@ def measure_corners(
     likeness = Likeness.of(left[owners, 1:-1, 1:-1], right).where(is_at_rest)
     is_reliable = _are_unrivalled(likeness, found, doubtful)
 
-    n = len(placed)
+    slopes = np.zeros((len(corners), 2))
+    if config.subpixel != "none":
+        chosen = np.flatnonzero(is_reliable)
+        pixels = corners[placed[chosen]] + [0.0, row_offset_px]
+        fitted = fit_slopes(left[chosen], images[1], pixels, found[chosen])
+        found[chosen], right[chosen] = fitted.disparities, fitted.right
+        slopes[placed[chosen]] = fitted.slopes
+        is_reliable[chosen] = fitted.are_plausible
     disparities = np.full(len(corners), np.nan)
-    disparities[placed] = found[:n]
+    disparities[placed] = found[: len(placed)]
     are_reliable = _scatter(is_reliable, placed, len(corners))
-    is_at_rest = _scatter(is_at_rest[:n], placed, len(corners))
+    is_at_rest = _scatter(is_at_rest[: len(placed)], placed, len(corners))
     searched = {"rough": rough, "is_found": is_found, "is_at_rest": is_at_rest}
     note("corners.searched", **searched, are_reliable=are_reliable)
     row_shift_px = measure_row_shift(left, right, np.flatnonzero(is_reliable))
     return CornerDisparities(
-        disparities=disparities, are_reliable=are_reliable, row_shift_px=row_shift_px
+        disparities=disparities,
+        slopes=slopes,
+        are_reliable=are_reliable,
+        row_shift_px=row_shift_px,
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gvo.config import StereoConfig
 from gvo.frontend.stereo.matching import parabola_minimum
-from gvo.frontend.stereo.patches import Patches, sample_patches, squared_differences
+from gvo.frontend.stereo.patches import Patches, SlantedPatches, sample_patches, squared_differences
 from gvo.types import BoolArray, FloatArray, ImageArray
 
 # Gauss-Newton steps after the parabola: the last moves by less than 0.01 pixels.
@@ -19,6 +19,10 @@ _MAX_FINE_STEP_PX = 0.5
 # Steps from a prediction: largest step, and largest last step of a converged search.
 MAX_STEP_PX = 1.5
 _MAX_LAST_STEP_PX = 0.3
+# Gauss-Newton steps of a disparity with its slopes, and the largest slope of a surface.
+_N_SLOPE_STEPS = 2
+_MAX_SLOPE = 0.5
+_MIN_WIDTH = 0.5
 
 
 def measure_disparities(
@@ -78,11 +82,13 @@ def follow_disparities(
     *,
     n_steps: int,
     row_offset_px: float = 0.0,
+    slopes: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Measure the disparities of pixels from predictions that are right to a pixel or two.
 
     As `measure_disparities`, by `n_steps` Gauss-Newton steps alone, in half the time; `is_valid`
-    is False where they do not converge.
+    is False where they do not converge. With the slopes of the disparities, shape (n, 2), patches
+    of the right image are sampled as those of slanted surfaces.
     """
     reach_px = config.search_radius_px
     if config.subpixel == "none":
@@ -95,7 +101,69 @@ def follow_disparities(
         places, is_at_rest = strips.follow(Patches.of(wide), n_steps=n_steps)
         return strips.disparities(places), is_at_rest
 
-    return _measure(images, pixels, predicted, follow, config, reach_px, row_offset_px)
+    return _measure(images, pixels, predicted, follow, config, reach_px, row_offset_px, slopes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SlantedDisparities:
+    """Disparities of surfaces that may be slanted.
+
+    Parameters
+    ----------
+    disparities : ndarray of float64, shape (n,)
+        Pixels.
+    slopes : ndarray of float64, shape (n, 2)
+        Their change per pixel, along rows and columns.
+    right : ndarray of float32, shape (n, s, s)
+        The patches of the right image there.
+    are_plausible : ndarray of bool, shape (n,)
+        False where a surface would be too steep to be seen by both cameras, or too far away from
+        that facing them.
+    """
+
+    disparities: FloatArray
+    slopes: FloatArray
+    right: NDArray[np.float32]
+    are_plausible: BoolArray
+
+
+def fit_slopes(
+    left: NDArray[np.float32], image: ImageArray, pixels: FloatArray, disparities: FloatArray
+) -> SlantedDisparities:
+    """Fit the disparities of pixels together with their slopes.
+
+    Parameters
+    ----------
+    left : ndarray of float32, shape (n, s + 2, s + 2)
+        Patches of the left image, one pixel wider on all sides.
+    image : ndarray of uint8, shape (height, width)
+        The right image.
+    pixels : ndarray of float64, shape (n, 2)
+        Columns in the left image, rows in the right one.
+    disparities : ndarray of float64, shape (n,)
+        Of surfaces that face the cameras, pixels.
+
+    Returns
+    -------
+    SlantedDisparities
+    """
+    patches, radius = SlantedPatches.of(left), left.shape[1] // 2 - 1
+    u, rows = pixels.T
+    planes = np.column_stack([disparities, np.zeros_like(pixels)])
+    for _ in range(_N_SLOPE_STEPS):
+        u_right, slopes = u - planes[:, 0], planes[:, 1:]
+        right = sample_patches(image, u_right, rows, radius, radius, slopes=slopes)
+        steps = patches.step(right, slopes)
+        # Steps are those of the left patch, whose columns are 1 - slope wide in the right image.
+        widths = (1.0 - slopes[:, :1]) / np.maximum(1.0 + steps[:, 1:2], _MIN_WIDTH)
+        planes += widths * steps
+    changes = np.abs(planes[:, 0] - disparities)
+    return SlantedDisparities(
+        disparities=planes[:, 0],
+        slopes=planes[:, 1:],
+        right=right,
+        are_plausible=(changes < MAX_STEP_PX) & np.all(np.abs(planes[:, 1:]) < _MAX_SLOPE, axis=1),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,6 +178,8 @@ class Strips:
         Column of the pixel in the left image, and of the middle place in the right one.
     starts : ndarray of float64, shape (n,)
         The start disparities.
+    steps : ndarray of float64, shape (n,)
+        Columns of the right image from place to place.
     reach_px : int
         Search range on either side.
     """
@@ -118,6 +188,7 @@ class Strips:
     u: FloatArray
     columns: FloatArray
     starts: FloatArray
+    steps: FloatArray
     reach_px: int
 
     @classmethod
@@ -130,19 +201,28 @@ class Strips:
         *,
         radius_px: int,
         reach_px: int,
+        slopes: FloatArray | None = None,
     ) -> Strips:
-        """Cut strips out of the right image, at its rows, for patches of a radius."""
-        columns = np.floor(u - starts)
-        values = sample_patches(image, columns, rows, radius_px + reach_px + 1, radius_px)
-        return cls(values=values, u=u, columns=columns, starts=starts, reach_px=reach_px)
+        """Cut strips out of the right image, at its rows, for patches of a radius.
+
+        With slopes, shape (n, 2), as the left image would show them.
+        """
+        # At whole columns nothing is interpolated twice; slanted strips begin where they will end.
+        columns = np.floor(u - starts) if slopes is None else u - starts
+        radius_u = radius_px + reach_px + 1
+        values = sample_patches(image, columns, rows, radius_u, radius_px, slopes=slopes)
+        steps = np.ones(len(u)) if slopes is None else 1.0 - slopes[:, 0]
+        return cls(
+            values=values, u=u, columns=columns, starts=starts, steps=steps, reach_px=reach_px
+        )
 
     def disparities(self, places: FloatArray) -> FloatArray:
         """Return the disparities, shape (n,), of places."""
-        return self.u - (self.columns + places - (self.reach_px + 1))
+        return self.u - self.columns - self.steps * (places - (self.reach_px + 1))
 
     def places(self, disparities: FloatArray) -> FloatArray:
         """Return the places, shape (n,), of disparities."""
-        return self.u - disparities - self.columns + (self.reach_px + 1)
+        return (self.u - disparities - self.columns) / self.steps + (self.reach_px + 1)
 
     def search(self, patches: NDArray[np.float32]) -> tuple[FloatArray, BoolArray]:
         """Return the places of least difference from left patches, and which are minima."""
@@ -165,6 +245,7 @@ def _measure(
     config: StereoConfig,
     reach_px: int,
     row_offset_px: float,
+    slopes: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Search for left patches, one column wider on either side, in strips of the right image."""
     radius = config.patch_radius_px
@@ -175,7 +256,15 @@ def _measure(
         (u, v), starts = pixels[chosen].T, predicted[chosen]
         wide = sample_patches(images[0], u, v, radius + 1, radius)
         rows = v + row_offset_px
-        strips = Strips.cut(images[1], u, rows, starts, radius_px=radius, reach_px=reach_px)
+        strips = Strips.cut(
+            images[1],
+            u,
+            rows,
+            starts,
+            radius_px=radius,
+            reach_px=reach_px,
+            slopes=None if slopes is None else slopes[chosen],
+        )
         disparities[chosen], is_valid[chosen] = search(wide, strips)
     return disparities, is_valid
 

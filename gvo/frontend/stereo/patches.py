@@ -14,6 +14,9 @@ from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
 # Lower bound of the gradient energy of a patch, grey values squared: the noise.
 _MIN_ENERGY = 50.0
+# Variance of grey values over that of a disparity, its slopes and a difference of sharpness: the
+# prior of a patch that faces the camera and is as sharp on the right.
+_PRIORS = np.array([1.0, 100.0, 100.0, 1000.0], dtype=np.float32)
 # Largest variance of the difference of matching patches: a share of the patch's variance, plus the
 # noise of the pixels, grey values squared.
 _MAX_UNLIKE = 0.2
@@ -23,7 +26,13 @@ _MAX_RIVALRY = 2.0
 
 
 def sample_patches(
-    image: ImageArray, u: FloatArray, v: FloatArray, radius_u: int, radius_v: int
+    image: ImageArray,
+    u: FloatArray,
+    v: FloatArray,
+    radius_u: int,
+    radius_v: int,
+    *,
+    slopes: FloatArray | None = None,
 ) -> NDArray[np.float32]:
     """Return patches around pixels, interpolated.
 
@@ -35,6 +44,9 @@ def sample_patches(
         Column and row of the centre of each patch.
     radius_u, radius_v : int
         Pixels on either side.
+    slopes : ndarray of float64, shape (n, 2), optional
+        Columns shrink by the first share, and rows are shifted to the left by the second, as
+        those of a right image whose disparities grow by so much per pixel.
 
     Returns
     -------
@@ -44,9 +56,12 @@ def sample_patches(
     if len(u) == 0:  # refused by OpenCV
         return np.zeros(shape, dtype=np.float32)
     steps_u, steps_v = _steps_around(radius_u, radius_v)
+    columns = u.astype(np.float32)[:, np.newaxis] + steps_u
+    if slopes is not None:
+        columns -= slopes.astype(np.float32) @ np.stack([steps_u, steps_v])
     patches = cv2.remap(
         image,
-        u.astype(np.float32)[:, np.newaxis] + steps_u,
+        columns,
         v.astype(np.float32)[:, np.newaxis] + steps_v,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
@@ -126,6 +141,49 @@ class Patches:
             step = np.minimum(np.maximum(step, -max_step), max_step)
             places = np.minimum(np.maximum(places - step, 0.0), n_places - 1.0)
         return places, step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlantedPatches:
+    """Patches of the left image, prepared for steps of the disparity and of its slopes.
+
+    On a slanted surface, such as the road, the disparity is linear in the pixel. A common one for
+    a whole patch is wrong by tenths of a pixel where the texture is uneven. The right patch is
+    interpolated, and blurred by that: without a parameter for it, edges would look stretched.
+    """
+
+    values: NDArray[np.float32]
+    basis: NDArray[np.float32]
+    inverses: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, wide: NDArray[np.float32]) -> SlantedPatches:
+        """Prepare patches (n, s + 2, s + 2), which are one pixel wider on all sides."""
+        n, size = len(wide), wide.shape[1] - 2
+        steps = _steps_around(size // 2, size // 2)
+        before, values, after = (wide[:, 1:-1, k : k + size] for k in range(3))
+        along = (0.5 * (after - before)).reshape(n, 1, size**2)
+        blur = (before - 2.0 * values + after).reshape(n, 1, size**2)
+        basis = np.concatenate([along, along * steps[0], along * steps[1], blur], axis=1)
+        basis -= basis.mean(axis=2, keepdims=True)
+        squares = np.matmul(basis, np.swapaxes(basis, 1, 2)) + np.diag(_PRIORS)
+        return cls(values, basis, np.linalg.inv(squares))
+
+    def step(self, right: NDArray[np.float32], slopes: FloatArray) -> NDArray[np.float32]:
+        """Return the changes of the disparity and its slopes, shape (n, 3).
+
+        Parameters
+        ----------
+        right : ndarray of float32, shape (n, s, s)
+            Patches of the right image at the present ones.
+        slopes : ndarray of float64, shape (n, 2)
+            The present ones.
+        """
+        differences = (right - self.values).reshape(len(right), self.basis.shape[2], 1)
+        pulls = np.matmul(self.basis, differences)
+        pulls[:, 1:3, 0] -= _PRIORS[1:3] * slopes
+        changes: NDArray[np.float32] = np.matmul(self.inverses, pulls)
+        return changes[:, :3, 0]
 
 
 def correlate_rows(

@@ -1,5 +1,6 @@
 """Disparities of corners, and the coarse search, on images whose disparities are exact."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +14,7 @@ from gvo.frontend.stereo.corners import (
     search_disparities,
 )
 from gvo.types import FloatArray, ImageArray
-from tests.frontend.analytic import SHAPE, grid, image
+from tests.frontend.analytic import SHAPE, grid, image, slanted_pair
 
 CONFIG = StereoConfig(patch_radius_px=5)
 
@@ -37,6 +38,28 @@ def test_they_are_right_to_hundredths_without_a_prediction(disparity: float, gai
     errors = found.disparities[found.are_reliable] - disparity
     assert abs(np.median(errors)) < 0.03
     assert np.quantile(np.abs(errors), 0.8) < 0.1
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.33), (0.1, 0.0), (-0.2, 0.2), (0.25, 0.0), (0.0, -0.3)])
+def test_slanted_surfaces_are_measured_with_their_slopes(slopes: tuple[float, float]) -> None:
+    images, disparities = slanted_pair(20.0, slopes)
+    columns, rows = grid().astype(int).T
+    found = measure(images)
+    chosen = found.are_reliable
+    assert chosen.mean() > 0.6
+    errors = (found.disparities - disparities[rows, columns])[chosen]
+    assert abs(np.median(errors)) < 0.01
+    assert np.quantile(np.abs(errors), 0.9) < 0.02
+    slope_errors = found.slopes[chosen] - slopes
+    assert np.quantile(np.abs(slope_errors), 0.9) < 0.01
+
+
+def test_what_is_less_sharp_on_the_right_is_not_taken_for_slanted() -> None:
+    right = cv2.GaussianBlur(image(-7.3), (7, 7), 0.5)
+    found = measure((image(), right))
+    chosen = found.are_reliable
+    assert np.sqrt(np.mean((found.disparities[chosen] - 7.3) ** 2)) < 0.022
+    assert np.sqrt(np.mean(found.slopes[chosen, 0] ** 2)) < 0.01
 
 
 def test_whole_disparities_are_whole() -> None:

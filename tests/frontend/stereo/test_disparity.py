@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gvo.config import StereoConfig
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.types import FloatArray, ImageArray
-from tests.frontend.analytic import SHAPE, grid, image
+from tests.frontend.analytic import MIDDLE, SHAPE, grid, image, slanted_pair
 
 CONFIG = StereoConfig(patch_radius_px=5)
 
@@ -116,6 +116,26 @@ def test_from_a_prediction_steps_alone_lead_to_the_same(
     errors = found[is_valid] - disparity
     assert abs(np.median(errors)) < 0.03
     assert np.quantile(np.abs(errors), 0.8) < 0.1
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.33), (0.25, 0.0), (-0.2, 0.2)])
+def test_on_slanted_surfaces_they_are_right_with_the_slopes_and_wrong_without(
+    slopes: tuple[float, float],
+) -> None:
+    images, _ = slanted_pair(20.0, slopes)
+    # At fractions of a pixel, as tracks are.
+    pixels = grid() + np.array([0.37, 0.61])
+    expected = 20.0 + (pixels - MIDDLE) @ slopes
+    all_slopes = np.tile(slopes, (len(pixels), 1))
+    found, is_valid = follow_disparities(
+        images, pixels, expected + 0.3, CONFIG, n_steps=4, slopes=all_slopes
+    )
+    facing, _ = follow_disparities(images, pixels, expected + 0.3, CONFIG, n_steps=4)
+    assert is_valid.mean() > 0.8
+    errors, facing_errors = (each[is_valid] - expected[is_valid] for each in (found, facing))
+    assert abs(np.median(errors)) < 0.01
+    assert np.sqrt(np.mean(errors**2)) < 0.02
+    assert np.sqrt(np.mean(facing_errors**2)) > 0.2
 
 
 def test_steps_that_do_not_come_to_rest_are_no_answer() -> None:
