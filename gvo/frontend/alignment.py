@@ -17,6 +17,10 @@ RADIUS_PX = 4
 # Variance of a gradient that is noise, grey values squared: keeps flat patches from dividing by
 # nothing.
 _NOISE = 1.0
+# Distance to a plane, as a share of the source's, below which the target is at it or behind it; and
+# the steepest slope that a surface has in the target.
+_MIN_DISTANCE = 0.05
+_MAX_SLOPE = 0.75
 # A step of the alignment moves a patch by at most so much; it is at rest below so much.
 _MAX_STEP_PX = 1.0
 _MAX_LAST_STEP_PX = 0.2
@@ -27,10 +31,7 @@ _UNLIKE_NOISE = 25.0
 
 
 def patch_warps(
-    uvd: FloatArray,
-    T_target_source: FloatArray,
-    camera: StereoCamera,
-    slopes: FloatArray | None = None,
+    uvd: FloatArray, slopes: FloatArray, T_target_source: FloatArray, camera: StereoCamera
 ) -> FloatArray:
     """Return by how much patches of surfaces are turned, stretched and sheared by a motion.
 
@@ -41,13 +42,13 @@ def patch_warps(
     ----------
     uvd : ndarray of float64, shape (n, 3)
         Pixels of the source and their disparities.
+    slopes : ndarray of float64, shape (n, 2)
+        Change of the disparity per pixel, along rows and columns; zero where a surface faces the
+        camera.
     T_target_source : ndarray of float64, shape (4, 4)
         Motion, metres.
     camera : StereoCamera
         Of both.
-    slopes : ndarray of float64, shape (n, 2), optional
-        Change of the disparity per pixel, along rows and columns; surfaces face the camera
-        without it.
 
     Returns
     -------
@@ -60,15 +61,43 @@ def patch_warps(
     R, t = T_target_source[:3, :3], T_target_source[:3, 3]
     inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
     points = rays @ R.T + inverse_depths[:, np.newaxis] * t
+    inverse_slopes = slopes / (camera.fx * camera.baseline)
     # Of the points by the pixels, shape (n, 3, 2).
-    derivatives = np.broadcast_to(R[:, :2] / f, (len(uvd), 3, 2))
-    if slopes is not None:
-        inverse_slopes = slopes / (camera.fx * camera.baseline)
-        derivatives = derivatives + t[:, np.newaxis] * inverse_slopes[:, np.newaxis]
+    derivatives = R[:, :2] / f + t[:, np.newaxis] * inverse_slopes[:, np.newaxis]
     z = points[:, 2, np.newaxis, np.newaxis]
     directions = points[:, :2, np.newaxis] / z
     warps = (derivatives[:, :2] - directions * derivatives[:, 2:]) / z
     return np.asarray(warps * f[:, np.newaxis])
+
+
+def move_slopes(
+    uvd: FloatArray, slopes: FloatArray, T_target_source: FloatArray, camera: StereoCamera
+) -> FloatArray:
+    """Return the slopes of the disparities of surfaces in the target's image, shape (n, 2).
+
+    A plane n . p = 1, whose inverse depth is n . x for a ray x, becomes R n / (1 + t . R n).
+
+    Parameters
+    ----------
+    uvd : ndarray of float64, shape (n, 3)
+        Pixels of the source and their disparities.
+    slopes : ndarray of float64, shape (n, 2)
+        Change of the disparity per pixel in the source, along rows and columns.
+    T_target_source : ndarray of float64, shape (4, 4)
+        Motion, metres.
+    camera : StereoCamera
+        Of both.
+    """
+    scales = np.array([1.0, camera.fy / camera.fx]) / camera.baseline
+    rays = (uvd[:, :2] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    normals = np.empty((len(uvd), 3))
+    normals[:, :2] = slopes * scales
+    inverse_depths = uvd[:, 2] / (camera.fx * camera.baseline)
+    normals[:, 2] = inverse_depths - np.einsum("ni,ni->n", normals[:, :2], rays)
+    normals = normals @ T_target_source[:3, :3].T
+    distances = 1.0 + normals @ T_target_source[:3, 3]
+    moved = normals[:, :2] / np.maximum(distances, _MIN_DISTANCE)[:, np.newaxis]
+    return np.clip(moved / scales, -_MAX_SLOPE, _MAX_SLOPE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.alignment import Templates, patch_warps
+from gvo.frontend.alignment import Templates, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.registration import check_view, relocalize_observations
@@ -108,15 +108,18 @@ class KltFrontend:
         row_shift_px = None
         if isinstance(frame, StereoFrame):
             measured = self._measure_corners(frame, corners, row_offset_px)
-            disparities, row_shift_px = measured.disparities, measured.row_shift_px
+            disparities, slopes = measured.disparities, measured.slopes
+            row_shift_px = measured.row_shift_px
             is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
         else:
             disparities, is_valid = self._measure_depth(frame, corners)
+            slopes = np.zeros_like(corners)
         note("klt.corners", corners=corners, disparities=disparities, is_valid=is_valid)
         keypoints, disparities = corners[is_valid], disparities[is_valid]
         return KltCorners(
             keypoints=keypoints,
             disparities=disparities,
+            slopes=slopes[is_valid],
             points_cam=self.camera.unproject_stereo(keypoints, disparities - offset_px),
             n_keypoints=len(corners),
             row_shift_px=row_shift_px,
@@ -304,7 +307,7 @@ class KltFrontend:
         """Return (u, v, disparity) of corners, of their tracks, and which corners these are."""
         source_uvd = reference.uvd
         predicted, indices = self._predict(T_reference_current, reference, current)
-        warps = self._warps(T_reference_current, source_uvd[indices])
+        warps, slopes = self._predict_patches(T_reference_current, reference, indices)
         pixels, is_tracked = self._find_tracks(
             (reference, current), indices, predicted[:, :2], warps, search
         )
@@ -321,8 +324,9 @@ class KltFrontend:
             is_tracked=is_tracked,
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
-        is_wide = search == "wide"
-        disparities, is_valid = self._measure(current.frame, pixels, predicted[:, 2], is_wide)
+        disparities, is_valid = self._measure(
+            current.frame, pixels, predicted[:, 2], None if search == "wide" else slopes[is_tracked]
+        )
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         target_uvd = np.column_stack([pixels, disparities])[is_valid]
         return source_uvd[indices[is_valid]], target_uvd, indices[is_valid]
@@ -342,9 +346,15 @@ class KltFrontend:
         is_in_view = self.camera.is_in_view(seen[:, :2])
         return seen[is_in_view], in_front[is_in_view]
 
-    def _warps(self, T_reference_current: FloatArray, source_uvd: FloatArray) -> FloatArray:
+    def _predict_patches(
+        self, T_reference_current: FloatArray, reference: KltObservations, indices: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the warps of patches by a motion, and the slopes of their disparities after it."""
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity.value])
-        return patch_warps(source_uvd - offset, se3.invert(T_reference_current), self.camera)
+        uvd, slopes = reference.uvd[indices] - offset, reference.find_corners().slopes[indices]
+        T_current_reference = se3.invert(T_reference_current)
+        warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
+        return warps, move_slopes(uvd, slopes, T_current_reference, self.camera)
 
     def _find_tracks(
         self,
@@ -394,23 +404,31 @@ class KltFrontend:
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
-        self, frame: Frame, pixels: FloatArray, predicted: FloatArray, is_wide: bool
+        self,
+        frame: Frame,
+        pixels: FloatArray,
+        predicted: FloatArray,
+        slopes: FloatArray | None,
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks, virtual ones of RGB-D."""
         if isinstance(frame, RgbdFrame):
             return self._measure_depth(frame, pixels)
-        return self._measure_stereo(frame, pixels, predicted, is_wide=is_wide)
+        return self._measure_stereo(frame, pixels, predicted, slopes)
 
     def _measure_stereo(
-        self, frame: StereoFrame, pixels: FloatArray, predicted: FloatArray, *, is_wide: bool
+        self,
+        frame: StereoFrame,
+        pixels: FloatArray,
+        predicted: FloatArray,
+        slopes: FloatArray | None,
     ) -> tuple[FloatArray, BoolArray]:
-        """Measure the disparities of tracks near predicted ones."""
+        """Measure the disparities of tracks near predicted ones; without slopes, search wider."""
         config, images = self._config.stereo, (frame.left, frame.right)
         offset_px, row_offset_px = self._offsets_px()
         measure = (
             partial(measure_disparities, reach_px=config.search_radius_px)
-            if is_wide
-            else partial(follow_disparities, n_steps=_N_TRACK_STEPS)
+            if slopes is None
+            else partial(follow_disparities, n_steps=_N_TRACK_STEPS, slopes=slopes)
         )
         disparities, is_valid = measure(
             images, pixels, predicted, config, row_offset_px=row_offset_px
@@ -436,6 +454,8 @@ class KltCorners:
         Pixels (u, v) in the left or colour image.
     disparities : ndarray of float64, shape (n,)
         Disparity in pixels, as measured; for RGB-D the virtual one, fx * baseline / depth.
+    slopes : ndarray of float64, shape (n, 2)
+        Its change per pixel, along rows and columns; zero for RGB-D.
     points_cam : ndarray of float64, shape (n, 3)
         Points in the `cam` frame, metres, the disparities corrected by the offset known then.
     templates : Templates
@@ -448,6 +468,7 @@ class KltCorners:
 
     keypoints: FloatArray
     disparities: FloatArray
+    slopes: FloatArray
     points_cam: FloatArray
     templates: Templates
     n_keypoints: int

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.config import KltConfig
-from gvo.frontend.alignment import Templates, patch_warps
+from gvo.frontend.alignment import Templates, move_slopes, patch_warps
 from gvo.frontend.tracking import detect_corners, track_pixels
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray
@@ -134,9 +134,33 @@ def test_a_warp_is_the_derivative_of_where_the_points_of_a_plane_go(
         return target
 
     uvd = np.array([[*pixel, disparity]])
-    for slope, given_slopes in (
-        (np.zeros(2), None),
-        (np.array(slopes), np.array([slopes])),
-    ):
-        found = patch_warps(uvd, T, CAMERA, given_slopes)[0]
-        np.testing.assert_allclose(found, numeric(on_plane(slope), at), atol=2e-4, rtol=2e-4)
+    found = patch_warps(uvd, np.array([slopes]), T, CAMERA)[0]
+    expected = numeric(on_plane(np.array(slopes)), at)
+    np.testing.assert_allclose(found, expected, atol=2e-4, rtol=2e-4)
+
+
+@given(
+    slopes=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)),
+    turn=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
+    shift=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
+)
+def test_slopes_are_those_of_three_points_of_the_plane_in_the_target(
+    slopes: tuple[float, float], turn: tuple[float, ...], shift: tuple[float, ...]
+) -> None:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), shift
+    uvd = np.array([[u, v, 30.0] for u in (100.0, 300.0, 500.0) for v in (80.0, 240.0, 400.0)])
+    beside = [uvd + 1e-3 * np.array(step) for step in ((1, 0, slopes[0]), (0, 1, slopes[1]))]
+    seen, *others = (project(move(T, unproject(each, CAMERA)), CAMERA) for each in (uvd, *beside))
+    changes = np.stack([each - seen for each in others], axis=1)
+    expected = np.linalg.solve(changes[:, :, :2], changes[:, :, 2:])[:, :, 0]
+    moved = move_slopes(uvd, np.tile(slopes, (len(uvd), 1)), T, CAMERA)
+    np.testing.assert_allclose(moved, np.clip(expected, -0.75, 0.75), atol=1e-3)
+
+
+def test_planes_that_are_seen_from_behind_have_finite_slopes() -> None:
+    # A wall of the street, and a camera that drove through it.
+    T = np.eye(4)
+    T[:3, 3] = 5.0, 0.0, -5.0
+    moved = move_slopes(np.array([[100.0, 240.0, 30.0]]), np.array([[-0.2, 0.0]]), T, CAMERA)
+    assert np.abs(moved).max() <= 0.75
