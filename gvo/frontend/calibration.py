@@ -46,6 +46,9 @@ DISPARITY, READOUT = "disparity_px", "readout_s"
 # by these factors.
 _DISPARITY_FACTOR = 3.0
 _READOUT_FACTOR = 7.0
+# An offset of the disparities that is not taken off, as registrations do not tell it from errors
+# that all of them share.
+_FEIGNED_PX = 0.05
 # Sigmas of the row offset measured in one frame, and of its prior, pixels.
 _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
@@ -197,6 +200,16 @@ class RigOffsets:
         self._last_row_ns: int | None = None
 
     @property
+    def disparity_px(self) -> float:
+        """The offset that is taken off disparities, pixels.
+
+        It is what was learnt beyond a twentieth of a pixel: so much is feigned by lenses and by
+        patches that hold more than one surface.
+        """
+        learnt_px = self.disparity.value
+        return math.copysign(max(abs(learnt_px) - _FEIGNED_PX, 0.0), learnt_px)
+
+    @property
     def is_learning(self) -> bool:
         """Tell whether anything is learnt."""
         return bool(self.learnt)
@@ -243,7 +256,8 @@ class RigOffsets:
             constant.advance()
         if self._disparity_error is not None:
             error = self._disparity_error
-            self.disparity.update(error.value, _DISPARITY_FACTOR * error.sigma)
+            left_px = self.disparity_px + error.value - self.disparity.value
+            self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
         if self._row_error_px is not None:
             self.row.update(self._row_error_px, _ROW_SIGMA_PX)
         used_s = self.readout.value
@@ -253,7 +267,7 @@ class RigOffsets:
         self._disparity_error, self._row_error_px, self._readout_errors = None, None, []
         note(
             "rig.offsets",
-            disparity_px=self.disparity.value,
+            disparity_px=self.disparity_px,
             row_px=self.row.value,
             readout_ms=1e3 * self.readout.value,
         )
@@ -392,7 +406,7 @@ class CalibratedCamera:
         return settle_rows(uvd, velocity, readout_s, self._camera) + self._offset()
 
     def _offset(self) -> FloatArray:
-        return np.array([0.0, 0.0, self._offsets.disparity.value])
+        return np.array([0.0, 0.0, self._offsets.disparity_px])
 
     def register(
         self,

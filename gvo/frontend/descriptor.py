@@ -177,7 +177,7 @@ class DescriptorFrontend:
         return check_view(result, reference.points_cam, self.camera)
 
     def _offset_px(self) -> float:
-        return self.rig_offsets.disparity.value
+        return self.rig_offsets.disparity_px
 
     def _register_within(
         self,

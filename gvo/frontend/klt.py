@@ -137,7 +137,7 @@ class KltFrontend:
 
     def _offsets_px(self) -> tuple[float, float]:
         """Return the offsets of disparities and of rows of the right image."""
-        return self.rig_offsets.disparity.value, self.rig_offsets.row.value
+        return self.rig_offsets.disparity_px, self.rig_offsets.row.value
 
     def register(
         self, reference: KltObservations, current: KltObservations, prior: MotionPrior | None = None
@@ -350,7 +350,7 @@ class KltFrontend:
         self, T_reference_current: FloatArray, reference: KltObservations, indices: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the warps of patches by a motion, and the slopes of their disparities after it."""
-        offset = np.array([0.0, 0.0, self.rig_offsets.disparity.value])
+        offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
         uvd, slopes = reference.uvd[indices] - offset, reference.find_corners().slopes[indices]
         T_current_reference = se3.invert(T_reference_current)
         warps = patch_warps(uvd, slopes, T_current_reference, self.camera)

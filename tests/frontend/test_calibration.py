@@ -106,6 +106,21 @@ def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:
     assert (offsets.disparity.value, offsets.row.value) == (disparity_px, row_px)
 
 
+@pytest.mark.parametrize("true_px", [-0.3, -0.04, 0.0, 0.03, 0.2])
+def test_an_offset_is_taken_off_but_for_what_lenses_and_edges_feign(true_px: float) -> None:
+    offsets = RigOffsets(config())
+    for stamp_ns in range(200):
+        # What is left of it after the present value was subtracted.
+        left_px = true_px - offsets.disparity_px
+        error = ConstantError(value=left_px, sigma=0.01, effect=np.zeros(6))
+        noted = replace(result(), calibration_errors={DISPARITY: error})
+        offsets.note(noted, stamp_ns)
+        offsets.advance()
+    assert offsets.disparity.value == pytest.approx(true_px, abs=0.01)
+    expected_px = np.sign(true_px) * max(abs(true_px) - 0.05, 0.0)
+    assert offsets.disparity_px == pytest.approx(expected_px, abs=0.01)
+
+
 def test_the_readout_is_that_of_keyframes_where_there_are_any() -> None:
     alone, with_keyframes = RigOffsets(config()), RigOffsets(config())
     for offsets in (alone, with_keyframes):

@@ -161,7 +161,8 @@ def explain_subpixel(
         given = (frame.left, frame.right), pixel[np.newaxis], rough, config
         follow = partial(follow_disparities, *given, row_offset_px=row_offset_px)
         ends = [follow(n_steps=n)[0] for n in range(1, N_SEARCH_STEPS + 1)]
-        iterates = np.concatenate([rough, *ends])
+        # The last is fitted together with the slopes of the surface.
+        iterates = np.concatenate([rough, *ends, [disparity]])
         columns = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX) + round(disparity)
     else:
         # Patches are those of whole pixels, and so are the columns.

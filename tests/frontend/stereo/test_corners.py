@@ -55,7 +55,7 @@ def test_slanted_surfaces_are_measured_with_their_slopes(slopes: tuple[float, fl
 
 
 def test_what_is_less_sharp_on_the_right_is_not_taken_for_slanted() -> None:
-    right = cv2.GaussianBlur(image(-7.3), (7, 7), 0.5)
+    right = np.asarray(cv2.GaussianBlur(image(-7.3), (7, 7), 0.5), dtype=np.uint8)
     found = measure((image(), right))
     chosen = found.are_reliable
     assert np.sqrt(np.mean((found.disparities[chosen] - 7.3) ** 2)) < 0.022
