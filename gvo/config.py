@@ -91,6 +91,9 @@ class DepthConfig(Section):
         0.075, "baseline of the virtual stereo camera that sees the depth as disparity", "m", gt=0
     )
     sigma_px: float = _parameter(1.0, "standard deviation of the virtual disparity", "px", gt=0)
+    icp: Literal["auto", "always", "never"] = _parameter(
+        "auto", "edges of their own by ICP of depth images (klt); auto: where colour contradicts"
+    )
 
 
 class FrontendConfig(Section):

@@ -148,7 +148,7 @@ class StereoFrame:
         _check_images("a stereo frame", self.left, self.right, np.uint8)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class RgbdFrame:
     """One undistorted grey image with its depth.
 
@@ -160,11 +160,14 @@ class RgbdFrame:
         Grey image made of the colour image.
     depth : ndarray of float32, shape (height, width)
         Metres along the optical axis, NaN = unknown.
+    depth_stamp_ns : int, optional
+        Stamp of the depth image; None: taken with the colour image.
     """
 
     stamp_ns: int
     image: ImageArray
     depth: DepthArray
+    depth_stamp_ns: int | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
@@ -520,7 +523,7 @@ class Estimate:
         )
 
 
-LinkKind: TypeAlias = Literal["step", "keyframe", "standstill"]
+LinkKind: TypeAlias = Literal["step", "keyframe", "depth", "standstill"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -531,8 +534,9 @@ class FrameLink:
     ----------
     reference_ns : int
         Stamp of the earlier frame.
-    kind : {"step", "keyframe", "standstill"}
-        To the frame that the raw chain goes on from, to a keyframe, or without motion.
+    kind : {"step", "keyframe", "depth", "standstill"}
+        To the frame that the raw chain goes on from, to a keyframe, to either of them by depth
+        alone, or without motion.
     chi2 : float or None
         Squared norm of the whitened residual, of 6 degrees of freedom: about 6 where the stated
         covariances are right; None where the earlier frame left the window with the update.

@@ -14,6 +14,7 @@ from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.alignment import Templates, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
+from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import check_depths, sample_depth
@@ -85,6 +86,7 @@ class KltFrontend:
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._descriptors = DescriptorFrontend(camera, config)
+        self._depths = DepthAligner(self.camera, config.depth)
         self._described: dict[int, Observations] = {}
         self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
@@ -231,6 +233,18 @@ class KltFrontend:
         if isinstance(result, Failure):
             return result
         return self._check_depth(reference, current, result)
+
+    def align_depth(
+        self,
+        reference: KltObservations,
+        current: KltObservations,
+        T_reference_current: FloatArray,
+    ) -> RelativePose | Failure:
+        """Estimate the motion from a start value by ICP of the depth images of an RGB-D camera."""
+        first, second = reference.frame, current.frame
+        if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
+            return self._depths.align(first, second, T_reference_current)
+        return Failure(reason="a stereo camera has no depth images")
 
     def _check_depth(
         self, reference: KltObservations, current: KltObservations, result: RelativePose

@@ -27,7 +27,8 @@ class Frontend(Protocol[ObservationsT]):
     Any object with these two methods will do; nothing is to be inherited. Observations are the
     front-end's own affair but for their `stamp_ns`; what else is used of them is in `HasPoints`,
     `CountsKeypoints` and their length. What else a front-end may offer is in `Relocalizer`,
-    `Reconfigurable`, `HasCamera` and `LearnsRig`, looked up once when `Odometry` is made.
+    `Reconfigurable`, `HasCamera`, `AlignsDepth` and `LearnsRig`, looked up once when `Odometry` is
+    made.
 
     `gvo.testing.check_frontend` tests the contract.
     """
@@ -87,6 +88,15 @@ class HasCamera(Protocol):
         """The camera that the points are seen by."""
 
 
+class AlignsDepth(Protocol):
+    """A front-end that measures the motion a second time, by depth images alone."""
+
+    def align_depth(
+        self, reference: _Own, current: _Own, T_reference_current: FloatArray, /
+    ) -> RelativePose | Failure:
+        """Estimate the motion between two frames from a start value."""
+
+
 class LearnsRig(Protocol):
     """A front-end that calibrates constant errors of its camera online."""
 
@@ -126,6 +136,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         self._relocalizer: Relocalizer | None = _capability(frontend, "relocalize")
         self._reconfigurable: Reconfigurable | None = _capability(frontend, "reconfigure")
         self._learner: LearnsRig | None = _capability(frontend, "rig_offsets")
+        self._aligner: AlignsDepth | None = _capability(frontend, "align_depth")
         self._camera_holder: HasCamera | None = _capability(frontend, "camera")
 
     @property
@@ -171,21 +182,33 @@ class CheckedFrontend(Generic[ObservationsT]):
         note("frontend.begin", reference=reference)
         return self._check("relocalize", self._relocalizer.relocalize(reference, current))
 
+    def align_depth(
+        self, reference: ObservationsT, current: ObservationsT, T_reference_current: FloatArray
+    ) -> RelativePose | Failure:
+        """Register two frames by depth alone; raises as `register`."""
+        if self._aligner is None:
+            return Failure(reason="the front-end aligns no depth")
+        result = self._aligner.align_depth(reference, current, T_reference_current)
+        return self._checked("align_depth", result)
+
     def reconfigure(self, config: Config) -> None:
         """Hand over a configuration, where the front-end takes one."""
         if self._reconfigurable is not None:
             self._reconfigurable.reconfigure(config)
 
     def _check(self, method: str, result: object) -> RelativePose | Failure:
+        checked = self._checked(method, result)
+        note("frontend.end", result=checked)
+        return checked
+
+    def _checked(self, method: str, result: object) -> RelativePose | Failure:
         if not isinstance(result, RelativePose | Failure):
             raise ValueError(
                 f"{method} of {type(self._frontend).__name__} must return RelativePose or "
                 f"Failure, got {type(result).__name__}"
             )
         fault = find_fault(result) if isinstance(result, RelativePose) else ""
-        checked = Failure(reason=f"the front-end is at fault: {fault}") if fault else result
-        note("frontend.end", result=checked)
-        return checked
+        return Failure(reason=f"the front-end is at fault: {fault}") if fault else result
 
 
 def _capability(frontend: object, name: str) -> Any:  # noqa: ANN401 - one of the protocols

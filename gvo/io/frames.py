@@ -216,7 +216,8 @@ def _make_frame(
         return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
     if sensor == "stereo":
         return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
-    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second)
+    depth_ns = pair[1].stamp_ns
+    return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second, depth_stamp_ns=depth_ns)
 
 
 def refuse_repeats(

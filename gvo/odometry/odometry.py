@@ -16,6 +16,7 @@ from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.calibration import RigOffsets
+from gvo.frontend.depth_icp import DepthTrust, Measured
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
@@ -83,6 +84,8 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
         self._anchor_ns: int | None = None
+        self._trust = DepthTrust(self._config.depth.icp)
+        self._previous: _Observations | None = None
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
 
@@ -161,6 +164,7 @@ class Odometry:
             scores, offered = self._link(observations, step)
             relocalized = self._relocalize(observations, step)
             offered += relocalized
+            offered += self._align_depths(observations, offered)
         with watch.stage("window"):
             causal = self._add_to_window(step, offered, is_resumed=bool(relocalized))
             joins = self._join_segments(step, causal)
@@ -215,6 +219,7 @@ class Odometry:
             return
         extracted = {} if self._is_own else self._renew_frontend(former)
         self._window.reconfigure(self._config.window)
+        self._trust.mode = self._config.depth.icp
         self._keyframes.reconfigure(self._view(), self._config.window)
         self._chain.reconfigure(self._frontend, self._config.window, extracted)
 
@@ -306,6 +311,40 @@ class Odometry:
             T_reference_frame=result.T_reference_current,
             covariance=self._config.window.link_sigma_factor**2 * result.covariance,
         )
+
+    def _align_depths(self, observations: _Observations, offered: list[_Offer]) -> list[_Offer]:
+        """Return what depth alone measured beside edges, where colour contradicts it."""
+        previous, self._previous = self._previous, observations
+        if previous is None or not self._trust.is_due():
+            return []
+        edges: list[_Offer] = []
+        for kind, edge in offered:
+            if kind == "keyframe":
+                reference = self._keyframes[int(edge.reference_id)]  # type: ignore[call-overload]
+            elif kind == "step" and edge.reference_id == previous.stamp_ns:
+                reference = previous
+            else:
+                continue
+            depth = self._align_depth(reference, observations, kind, edge)
+            edges += [] if depth is None else [("depth", depth)]
+        return edges
+
+    def _align_depth(
+        self, reference: _Observations, observations: _Observations, kind: Measured, edge: Edge
+    ) -> Edge | None:
+        """Measure an edge again by depth alone; None where that is not believed."""
+        T = edge.T_reference_frame
+        depth = self._frontend.align_depth(reference, observations, T)
+        if isinstance(depth, Failure):
+            return None
+        inflation = self._config.window.link_sigma_factor**2 if kind == "keyframe" else 1.0
+        colour = RelativePose(T_reference_current=T, covariance=edge.covariance / inflation)
+        self._trust.note(kind, colour, depth)
+        covariance = self._trust.widen(kind, inflation * depth.covariance)
+        if covariance is None:
+            return None
+        T = depth.T_reference_current
+        return Edge(reference_id=edge.reference_id, T_reference_frame=T, covariance=covariance)
 
     def _unjoined(self) -> list[int]:
         """Return the keyframes of earlier segments that the current one is not joined to."""

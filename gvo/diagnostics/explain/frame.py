@@ -158,12 +158,13 @@ class _Drive:
         """Tell what each earlier frame contributed."""
         registrations = {each.reference_ns: each.result for each in tried}
         keyframes = {link.reference_ns: link for link in result.links if link.kind == "keyframe"}
-        steps = [link for link in result.links if link.kind != "keyframe"]
+        steps = [link for link in result.links if link.kind in ("step", "standstill")]
         others = sorted({*scores} - {link.reference_ns for link in steps} | {*registrations})
         refusals = {each.reference_id: each.reason for each in reversed(result.causal.rejected)}
         for ns, link, registration in [
             *((link.reference_ns, link, result.registration) for link in steps),
             *((ns, keyframes.get(ns), registrations.get(ns)) for ns in others),
+            *((link.reference_ns, link, None) for link in result.links if link.kind == "depth"),
         ]:
             is_accepted = link is not None and link.is_accepted
             unused = "keyframe" if registration is not None else "not linked"

@@ -120,7 +120,7 @@ def draw_links(explanation: FrameExplanation) -> Picture:
     """Draw the earlier frames with what each contributed."""
     if not explanation.links:
         return Picture(name="09_links", caption="None: there is no earlier frame to link to.")
-    shown = [link for link in explanation.links if link.kind != "standstill"]
+    shown = [link for link in explanation.links if link.kind not in ("standstill", "depth")]
     n_columns = min(_N_COLUMNS, max(len(shown), 3))
     n_rows = -(-len(shown) // n_columns)
     rows, columns = explanation.image.shape
@@ -173,6 +173,8 @@ def _links_caption(explanation: FrameExplanation) -> str:
     for link in links:
         if link.kind == "standstill":
             text += f"\nStandstill: an edge without motion to frame {link.frame} was added."
+        elif link.kind == "depth" and link.is_accepted:
+            text += f"\nDepth alone gave another edge to frame {link.frame} (depth.icp)."
         elif link.reason and link.kind != "not linked":
             text += f"\nFrame {link.frame}: {link.reason}."
     return text

@@ -17,6 +17,7 @@ COLOURS = {
     "keyframes": LINKS["keyframe"],
     "step": LINKS["step"],
     "keyframe link": LINKS["keyframe"],
+    "depth": LINKS["depth"],
     "standstill": LINKS["standstill"],
     "refused": REFUSED,
     "ellipsoids": OTHERS[3],

@@ -34,6 +34,7 @@ _MEANINGS = {
     "keyframes": "keyframes of the window",
     "step": "link to the frame before",
     "keyframe link": "link to a keyframe",
+    "depth": "link by depth alone",
     "standstill": "link without motion",
     "refused": "link that the window refused",
     "ellipsoids": "position covariances",

@@ -14,7 +14,7 @@ from gvo.types import FloatArray, ImageArray, IntArray
 from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, add_points, rgb
 
 Up = Literal["-y", "+z"]
-LINKS = ("step", "keyframe link", "standstill", "refused")
+LINKS = ("step", "keyframe link", "depth", "standstill", "refused")
 """Kinds of lines between poses."""
 
 _PATHS = ("raw", "causal", "smoothed", "truth")

@@ -1,0 +1,340 @@
+"""Projective point-to-plane ICP of two depth images, and how far colour and depth agree.
+
+Points of the reference, with their normals, are projected into the current depth image; what is
+measured there should lie on their planes. Directions of motion that the planes leave open are left
+as they were at the start, and their variance is that of ignorance.
+
+The matches of a registration take their depths from pixels of the colour image. If depth belongs
+elsewhere, all of them are wrong in the same way, and their covariance does not tell. The depth
+images among themselves do not have this error.
+
+References
+----------
+Y. Chen, G. Medioni, "Object modelling by registration of multiple range images", Image and Vision
+Computing 10(3), 1992, doi:10.1016/0262-8856(92)90066-C (point to plane).
+G. Blais, M. D. Levine, "Registering multiview range data to create 3D computer objects", IEEE TPAMI
+17(8), 1995, doi:10.1109/34.400574 (matches by projection).
+J. Zhang, M. Kaess, S. Singh, "On degeneracy of optimization-based state estimation problems",
+ICRA 2016, doi:10.1109/ICRA.2016.7487211 (directions left open).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo._trace import note
+from gvo.config import DepthConfig
+from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
+from gvo.types import DepthArray, Failure, FloatArray, RelativePose, RgbdFrame
+
+# Columns of the reduced depth image, of means over four pixels each.
+_N_COLUMNS = 160
+# Normals are differences over so many columns on either side.
+_REACH = 2
+# Share by which inverse depths may differ from the plane through their neighbours.
+_MAX_BEND = 0.03
+# Every such point of the reference is matched.
+_STRIDE = 3
+# Noise of a depth camera: so many metres, and so many per metre squared.
+_SIGMA_M, _SIGMA_PER_M = 0.003, 0.003
+_N_ITERATIONS = 6
+# Largest residuals in sigmas, in the first rounds and later.
+_GATES = (4.0, 4.0, 2.5)
+_HUBER = 1.5
+# Squared length of a step, in sigmas, that no longer matters.
+_CONVERGED = 1e-2
+_MIN_POINTS = 200
+# Directions told less than this share of the best one are told by the noise of the normals.
+_MIN_SHARE = 2e-3
+# Neighbouring residuals have common errors: the information of one in so many counts.
+_N_CORRELATED = 2.0
+_MIN_SCALE = 0.1
+# Sigma of a direction left open, relative to that of one told just enough.
+_OPEN_SIGMAS = 100.0
+# A colour and a depth image taken at one time; else the motion in between is another.
+_MAX_DIFFERENCE_NS = 2_000_000
+
+Measured = Literal["step", "keyframe"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthMap:
+    """A reduced depth image.
+
+    Parameters
+    ----------
+    inverse_depths : ndarray of float32, shape (h, w)
+        Means of four pixels, 1/m; NaN where unknown or discontinuous.
+    camera : tuple of float
+        fx, fy, cx, cy of the reduced image, pixels.
+    points, normals : ndarray of float64, shape (3, n)
+        Points on smooth surfaces in the `cam` frame, metres, and unit normals.
+    """
+
+    inverse_depths: NDArray[np.float32]
+    camera: tuple[float, float, float, float]
+    points: FloatArray
+    normals: FloatArray
+
+    @classmethod
+    def of(cls, depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> DepthMap:
+        """Reduce a depth image of float32, shape (height, width), metres."""
+        step = max(round(depth.shape[1] / (2 * _N_COLUMNS)), 1)
+        inverse = _reduce(depth[::step, ::step], config)
+        scale, shift = 0.5 / step, -0.5 * 0.5
+        reduced = (
+            scale * camera.fx,
+            scale * camera.fy,
+            scale * camera.cx + shift,
+            scale * camera.cy + shift,
+        )
+        points, normals = _planes(inverse, reduced)
+        return cls(inverse_depths=inverse, camera=reduced, points=points, normals=normals)
+
+
+def _reduce(depth: DepthArray, config: DepthConfig) -> NDArray[np.float32]:
+    """Return the mean inverse depths of two by two pixels; NaN at holes and steps."""
+    rows, columns = depth.shape[0] // 2 * 2, depth.shape[1] // 2 * 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1.0 / depth[:rows, :columns]
+        a, b, c, d = inverse[::2, ::2], inverse[::2, 1::2], inverse[1::2, ::2], inverse[1::2, 1::2]
+        mean = 0.25 * (a + b + c + d)
+        spread = np.abs(a - mean) + np.abs(b - mean) + np.abs(c - mean) + np.abs(d - mean)
+        is_valid = spread < 4.0 * _MAX_BEND * mean
+        is_valid &= (mean * config.min_depth_m <= 1.0) & (mean * config.max_depth_m >= 1.0)
+    return np.where(is_valid, mean, np.float32(np.nan)).astype(np.float32)
+
+
+def _planes(
+    inverse: NDArray[np.float32], camera: tuple[float, float, float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return every third point and its normal: a plane's inverse depth is linear in the pixel."""
+    fx, fy, cx, cy = camera
+    k, middle = _REACH, inverse[_REACH:-_REACH, _REACH:-_REACH]
+    left, right = inverse[k:-k, : -2 * k], inverse[k:-k, 2 * k :]
+    above, below = inverse[: -2 * k, k:-k], inverse[2 * k :, k:-k]
+    bend = np.maximum(np.abs(left + right - 2 * middle), np.abs(above + below - 2 * middle))
+    with np.errstate(invalid="ignore"):
+        v, u = np.nonzero(bend < _MAX_BEND * middle)
+    v, u = v[::_STRIDE], u[::_STRIDE]
+    at = middle[v, u].astype(np.float64)
+    x, y = (u + k - cx) / fx, (v + k - cy) / fy
+    # 1/z = a x + b y + c on the plane, of which (a, b, c) is the normal.
+    a = (right - left)[v, u] * (fx / (2 * k))
+    b = (below - above)[v, u] * (fy / (2 * k))
+    normals = np.stack([a, b, at - a * x - b * y])
+    rays = np.stack([x, y, np.ones_like(x)])
+    return rays / at, normals / np.linalg.norm(normals, axis=0)
+
+
+def align_depth_maps(
+    reference: DepthMap, current: DepthMap, T_reference_current: FloatArray
+) -> RelativePose | Failure:
+    """Estimate the motion between two depth images, from a start value.
+
+    Parameters
+    ----------
+    reference, current : DepthMap
+    T_reference_current : ndarray of float64, shape (4, 4)
+        Start value, right to a few degrees and centimetres.
+
+    Returns
+    -------
+    RelativePose or Failure
+        Directions of motion that the planes leave open are those of the start value, with a large
+        variance.
+    """
+    T = se3.invert(T_reference_current)
+    for index in range(_N_ITERATIONS):
+        system = _linearize(T, reference, current, gate=_GATES[min(index, len(_GATES) - 1)])
+        if isinstance(system, Failure):
+            return system
+        H, g, scale = system
+        inverse, open_inverse = _invert(H, reference)
+        step = inverse @ g
+        T = se3.exp(step) @ T
+        if step @ g < _CONVERGED:
+            break
+    covariance = _N_CORRELATED * scale**2 * (inverse + open_inverse)
+    return RelativePose(
+        T_reference_current=se3.normalize(se3.invert(T)),
+        covariance=0.5 * (covariance + covariance.T),
+    )
+
+
+def _linearize(
+    T: FloatArray, reference: DepthMap, current: DepthMap, *, gate: float
+) -> tuple[FloatArray, FloatArray, float] | Failure:
+    """Return the normal equations of a left perturbation of T, and the scale of the residuals."""
+    fx, fy, cx, cy = current.camera
+    points = T[:3, :3] @ reference.points + T[:3, 3:]
+    normals = T[:3, :3] @ reference.normals
+    z = np.maximum(points[2], 1e-3)
+    u, v = (f * row / z + c for f, row, c in ((fx, points[0], cx), (fy, points[1], cy)))
+    seen = _look_up(current.inverse_depths, u, v)
+    stretch = 1.0 / (seen * z) - 1.0
+    sigmas = _SIGMA_M + _SIGMA_PER_M * z * z
+    residuals = np.einsum("in,in->n", normals, points) * stretch / sigmas
+    # Of grazing views: what is measured lies on another surface, however small the residual.
+    is_near = (np.abs(residuals) < gate) & (np.abs(stretch) * z < 10.0 * sigmas + 0.03 * z)
+    chosen = np.flatnonzero(is_near)
+    if len(chosen) < _MIN_POINTS:
+        return Failure(reason=f"{len(chosen)} points of two depth images fit each other")
+    r, points, normals = residuals[chosen], points[:, chosen], normals[:, chosen]
+    J = np.concatenate([np.cross(points, normals, axis=0), normals]) / sigmas[chosen]
+    weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-9))
+    weighted = weights * J
+    scale = max(float(np.sqrt(np.mean(r * r))), _MIN_SCALE)
+    return weighted @ J.T, weighted @ r, scale
+
+
+def _look_up(image: NDArray[np.float32], u: FloatArray, v: FloatArray) -> FloatArray:
+    """Return values between the pixels; NaN beyond the image and beside unknown ones."""
+    pixels = (u.astype(np.float32)[np.newaxis], v.astype(np.float32)[np.newaxis])
+    values = cv2.remap(image, *pixels, cv2.INTER_LINEAR, borderValue=(np.nan,) * 4)
+    return np.asarray(values[0], dtype=np.float64)
+
+
+def _invert(H: FloatArray, reference: DepthMap) -> tuple[FloatArray, FloatArray]:
+    """Return the inverse in the directions that are told, and the variance of the others.
+
+    Rotations count as much as the translations of a point at the mean distance.
+    """
+    units = np.r_[np.full(3, 1.0 / max(float(np.mean(reference.points[2])), 1e-3)), np.ones(3)]
+    values, vectors = np.linalg.eigh(units[:, np.newaxis] * H * units)
+    vectors = units[:, np.newaxis] * vectors
+    floor = _MIN_SHARE * values[-1]
+    is_open = values < 2.0 * floor
+    # What the noise of the normals seems to tell is no information.
+    gains = np.where(is_open, 0.0, 1.0 / np.maximum(values - floor, floor))
+    losses = np.where(is_open, _OPEN_SIGMAS**2 / floor, 0.0)
+    return (vectors * gains) @ vectors.T, (vectors * losses) @ vectors.T
+
+
+class DepthAligner:
+    """Aligns the depth images of frames; what is prepared of one is kept as long as its frame.
+
+    Parameters
+    ----------
+    camera : StereoCamera
+        That the depth is registered to.
+    config : DepthConfig
+    """
+
+    def __init__(self, camera: StereoCamera, config: DepthConfig) -> None:
+        self._camera = camera
+        self._config = config
+        self._maps: WeakKeyDictionary[Any, DepthMap] = WeakKeyDictionary()
+
+    def align(
+        self, reference: RgbdFrame, current: RgbdFrame, T_reference_current: FloatArray
+    ) -> RelativePose | Failure:
+        """Estimate the motion by depth alone; as `align_depth_maps`.
+
+        Fails where a depth image was not taken together with its colour image, or was repeated.
+        """
+        if not (_is_simultaneous(reference) and _is_simultaneous(current)):
+            return Failure(reason="colour and depth were not taken together")
+        first, second = self._map(reference), self._map(current)
+        if np.array_equal(first.inverse_depths, second.inverse_depths, equal_nan=True):
+            return Failure(reason="the depth image is repeated")
+        result = align_depth_maps(first, second, T_reference_current)
+        note("depth.aligned", reference=reference, result=result)
+        return result
+
+    def _map(self, frame: RgbdFrame) -> DepthMap:
+        if frame not in self._maps:
+            self._maps[frame] = DepthMap.of(frame.depth, self._camera, self._config)
+        return self._maps[frame]
+
+
+def _is_simultaneous(frame: RgbdFrame) -> bool:
+    depth_ns = frame.depth_stamp_ns
+    return depth_ns is None or abs(depth_ns - frame.stamp_ns) <= _MAX_DIFFERENCE_NS
+
+
+# Disagreements that are remembered, and those needed to judge.
+_N_REMEMBERED, _N_NEEDED = 40, 10
+# Frames left out between two samples, while links are not judged yet and later.
+_N_SKIPPED_FIRST, _N_SKIPPED = 4, 20
+# Median squared disagreement, relative to that of normal errors, at which depth is believed, and
+# below which it no longer is.
+_CONTRADICTS, _AGREES = 16.0, 8.0
+# Of chi-square of 6 degrees of freedom.
+_MEDIAN = 5.348
+
+
+class DepthTrust:
+    """Judges whether colour and depth contradict each other, and how wrong depth may be.
+
+    Motions measured twice, by colour and by depth, differ by as much as the two covariances say.
+    If they differ by more over the last frames, one of the two is wrong in a way of its own: then
+    those of depth are worth a measurement, with their covariance scaled to the difference, as if
+    depth alone was to blame.
+
+    Parameters
+    ----------
+    mode : {"auto", "always", "never"}
+    """
+
+    def __init__(self, mode: Literal["auto", "always", "never"]) -> None:
+        self.mode = mode
+        self._is_believed = False
+        self._n_unmeasured = 0
+        self._combined = {kind: _Squares() for kind in get_args(Measured)}
+        self._alone = {kind: _Squares() for kind in get_args(Measured)}
+
+    @property
+    def is_on(self) -> bool:
+        """Tell whether depth is worth edges of its own."""
+        return self.mode == "always" or (self.mode == "auto" and self._is_believed)
+
+    @property
+    def disagreement(self) -> float:
+        """Squared disagreement of steps or of links, the larger one; 1 for normal errors."""
+        return max(squares.level or 0.0 for squares in self._combined.values())
+
+    def is_due(self) -> bool:
+        """Tell, once for each frame, whether its depth is to be aligned."""
+        if self.mode == "never":
+            return False
+        self._n_unmeasured += 1
+        is_judged = self._combined["keyframe"].level is not None
+        return self.is_on or self._n_unmeasured > (_N_SKIPPED if is_judged else _N_SKIPPED_FIRST)
+
+    def note(self, kind: Measured, colour: RelativePose, depth: RelativePose) -> None:
+        """Take a motion measured by both, from the predecessor or from a keyframe."""
+        difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
+        self._alone[kind].add(difference, depth.covariance)
+        self._combined[kind].add(difference, colour.covariance + depth.covariance)
+        self._n_unmeasured = 0
+        self._is_believed = self.disagreement > (_AGREES if self._is_believed else _CONTRADICTS)
+
+    def widen(self, kind: Measured, covariance: FloatArray) -> FloatArray | None:
+        """Return the covariance of an edge by depth; None where there is to be none, or not yet."""
+        factor = self._alone[kind].level
+        return None if not self.is_on or factor is None else max(factor, 1.0) * covariance
+
+
+class _Squares:
+    """The last squared lengths of differences, in sigmas."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=_N_REMEMBERED)
+
+    def add(self, difference: FloatArray, covariance: FloatArray) -> None:
+        self._values.append(float(se3.mahalanobis(difference, covariance)))
+
+    @property
+    def level(self) -> float | None:
+        """Their median, relative to that of normal errors; None without enough."""
+        values = self._values
+        return float(np.median(values)) / _MEDIAN if len(values) >= _N_NEEDED else None
