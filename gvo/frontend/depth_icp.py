@@ -52,7 +52,7 @@ _HUBER = 1.5
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-2
 _MIN_POINTS = 200
-# Directions told less than this share of the best one are told by the noise of the normals.
+# Of what the best direction is told, this share may come from the noise of the normals.
 _MIN_SHARE = 2e-3
 # Neighbouring residuals have common errors: the information of one in so many counts.
 _N_CORRELATED = 2.0
@@ -308,14 +308,17 @@ class DepthTrust:
             return False
         self._n_unmeasured += 1
         is_judged = self._combined["keyframe"].level is not None
-        return self.is_on or self._n_unmeasured > (_N_SKIPPED if is_judged else _N_SKIPPED_FIRST)
+        n_skipped = _N_SKIPPED if is_judged else _N_SKIPPED_FIRST
+        is_due = self.is_on or self._n_unmeasured > n_skipped
+        if is_due:
+            self._n_unmeasured = 0
+        return is_due
 
     def note(self, kind: Measured, colour: RelativePose, depth: RelativePose) -> None:
         """Take a motion measured by both, from the predecessor or from a keyframe."""
         difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
         self._alone[kind].add(difference, depth.covariance)
         self._combined[kind].add(difference, colour.covariance + depth.covariance)
-        self._n_unmeasured = 0
         self._is_believed = self.disagreement > (_AGREES if self._is_believed else _CONTRADICTS)
 
     def widen(self, kind: Measured, covariance: FloatArray) -> FloatArray | None:

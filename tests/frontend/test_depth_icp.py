@@ -1,6 +1,7 @@
 """ICP of depth images against rendered poses, and when depth is believed beside colour."""
 
 import functools
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from gvo.config import Config, DepthConfig
 from gvo.frontend.depth_icp import DepthAligner, DepthMap, DepthTrust, align_depth_maps
 from gvo.frontend.descriptor import as_stereo
 from gvo.geometry import se3
+from gvo.io.recording import StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.types import DepthArray, Failure, FloatArray, RelativePose, RgbdFrame
 
@@ -92,6 +94,24 @@ def test_images_of_other_places_and_repeated_or_late_ones_fail() -> None:
         assert isinstance(result, Failure)
         assert reason in result.reason
     assert aligner.align(frames[0], frames[1], np.eye(4))
+
+
+def test_a_frame_knows_when_its_depth_was_taken() -> None:
+    rendered = SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.2)
+    moved = [
+        replace(image, stamp_ns=image.stamp_ns + 7 * image.stream) for image in rendered.images()
+    ]
+
+    class Recorded:
+        info = rendered.info
+        ground_truth = rendered.ground_truth
+
+        def images(self) -> Iterator[StampedImage]:
+            return iter(moved)
+
+    frames = [frame for frame in gvo.frames(Recorded()) if isinstance(frame, RgbdFrame)]
+    assert [frame.depth_stamp_ns for frame in frames] == [frame.stamp_ns + 7 for frame in frames]
+    assert len(frames) == 2
 
 
 def feed(trust: DepthTrust, error_sigmas: float, n: int = 60) -> int:
