@@ -22,14 +22,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._trace import note
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -232,7 +231,7 @@ class DepthAligner:
     def __init__(self, camera: StereoCamera, config: DepthConfig) -> None:
         self._camera = camera
         self._config = config
-        self._maps: WeakKeyDictionary[Any, DepthMap] = WeakKeyDictionary()
+        self._maps: WeakKeyDictionary[RgbdFrame, DepthMap] = WeakKeyDictionary()
 
     def align(
         self, reference: RgbdFrame, current: RgbdFrame, T_reference_current: FloatArray
@@ -246,9 +245,7 @@ class DepthAligner:
         first, second = self._map(reference), self._map(current)
         if np.array_equal(first.inverse_depths, second.inverse_depths, equal_nan=True):
             return Failure(reason="the depth image is repeated")
-        result = align_depth_maps(first, second, T_reference_current)
-        note("depth.aligned", reference=reference, result=result)
-        return result
+        return align_depth_maps(first, second, T_reference_current)
 
     def _map(self, frame: RgbdFrame) -> DepthMap:
         if frame not in self._maps:
