@@ -259,9 +259,6 @@ class WindowConfig(Section):
     keyframe_overlap: float = _parameter(
         0.9, "maximum overlap with every keyframe at which a frame becomes one", ge=0, le=1
     )
-    link_sigma_factor: float = _parameter(
-        1.0, "inflation of the sigmas of links to keyframes: links of a frame share its noise", gt=0
-    )
     keyframe_distance_m: float = _parameter(
         1.0, "distance from all keyframes that makes a keyframe, if overlap is unknown", "m", gt=0
     )

@@ -309,7 +309,7 @@ class Odometry:
         return Edge(
             reference_id=stamp_ns,
             T_reference_frame=result.T_reference_current,
-            covariance=self._config.window.link_sigma_factor**2 * result.covariance,
+            covariance=result.covariance,
         )
 
     def _align_depths(self, observations: _Observations, offered: list[_Offer]) -> list[_Offer]:

@@ -110,7 +110,7 @@ def test_the_report_is_one_file_with_the_plots_beside_it(drawn: Path) -> None:
     page = (drawn / "report.html").read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html>")
     assert not OUTSIDE.search(page)
-    for key in ("window.link_sigma_factor", "ransac.min_inliers"):
+    for key in ("window.link_gain", "ransac.min_inliers"):
         assert key.partition(".")[2] in page
     plots = sorted((drawn / "plots").iterdir())
     assert {path.stem for path in plots if path.suffix == ".png"} == {path.stem for path in plots}

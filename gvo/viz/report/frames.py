@@ -175,7 +175,7 @@ def _rate_words(timings: TimingTable, total: FloatArray) -> str:
     )
 
 
-def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None) -> list[Plot]:
+def edge_plots(edges: EdgeTable | None, first_ns: int) -> list[Plot]:
     """Return the chi-square of the edges over time, and its histogram.
 
     Parameters
@@ -183,8 +183,6 @@ def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None
     edges : EdgeTable or None
     first_ns : int
         Stamp of elapsed time zero.
-    link_factor : float or None
-        `window.link_sigma_factor`, which inflates the sigmas of links to keyframes.
     """
     if edges is None or not np.any(np.isfinite(edges.chi2)):
         reason = "Not drawn: the run has no edges with residuals."
@@ -197,8 +195,8 @@ def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None
             text="Squared residual of each edge over its stated covariance, after the window was "
             f"optimized with its frame; values under {_FLOOR:g} are drawn there. A residual with "
             f"six degrees of freedom has mean {N_DOF}, and 95 % are under {bound:.1f}. "
-            f"{_reserve_words(link_factor)} Look for stretches near the bound and for refused "
-            f"edges: {n_refused} of {len(edges.chi2)} here.",
+            "These lie lower: the poses are fitted to the edges. Look for stretches near the "
+            f"bound and for refused edges: {n_refused} of {len(edges.chi2)} here.",
             figure=_dots(edges, first_ns, bound),
         ),
         Plot(
@@ -210,16 +208,6 @@ def edge_plots(edges: EdgeTable | None, first_ns: int, link_factor: float | None
             figure=_histogram(edges, bound),
         ),
     ]
-
-
-def _reserve_words(link_factor: float | None) -> str:
-    words = "These lie lower: the poses are fitted to the edges"
-    if link_factor is None or link_factor == 1.0:
-        return f"{words}."
-    return (
-        f"{words}, and the sigmas of links to keyframes are inflated by {link_factor:g} "
-        "(window.link_sigma_factor), since links between frames of the same scene are correlated."
-    )
 
 
 def _is_free(edges: EdgeTable) -> Any:  # noqa: ANN401

@@ -72,7 +72,7 @@ def write_run_report(
             status_plot(record.frames),
             count_plot(record.frames),
             timing_plot(record.timings),
-            *edge_plots(record.edges, _first_ns(record), _link_factor(record.summary)),
+            *edge_plots(record.edges, _first_ns(record)),
         ]
         # The page first: it must exist even if the folder cannot be written.
         body = [*_head(record), *plots_html(sheets, lines, world), *_tail(record)]
@@ -150,11 +150,6 @@ def _covariance_plots(
 def _first_ns(record: RunRecord) -> int:
     stamps_ns = record.frames.stamps_ns
     return int(stamps_ns[0]) if len(stamps_ns) > 0 else 0
-
-
-def _link_factor(summary: Mapping[str, Any]) -> float | None:
-    factor = summary.get("configuration", {}).get("window", {}).get("link_sigma_factor")
-    return None if factor is None else float(factor)
 
 
 def _head(record: RunRecord) -> list[str]:

@@ -195,7 +195,7 @@ def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
 
 def test_what_differs_from_the_default_is_marked_with_the_default(copy: Path) -> None:
     assert 'class="changed"' not in page_of(copy)
-    rewrite_summary(copy, configuration={"window": {"n_links": 7, "n_keyframes": 12}})
+    rewrite_summary(copy, configuration={"window": {"n_links": 7, "n_keyframes": 20}})
     marked = re.findall(r'<tr class="changed">(.*?)</tr>', page_of(copy))
     assert [re.sub("<[^>]*>", " ", row).split() for row in marked] == [
         ["n_links", "7", "default", "3"]
