@@ -337,10 +337,9 @@ class Odometry:
         depth = self._frontend.align_depth(reference, observations, T)
         if isinstance(depth, Failure):
             return None
-        inflation = self._config.window.link_sigma_factor**2 if kind == "keyframe" else 1.0
-        colour = RelativePose(T_reference_current=T, covariance=edge.covariance / inflation)
+        colour = RelativePose(T_reference_current=T, covariance=edge.covariance)
         self._trust.note(kind, colour, depth)
-        covariance = self._trust.widen(kind, inflation * depth.covariance)
+        covariance = self._trust.widen(kind, depth.covariance)
         if covariance is None:
             return None
         T = depth.T_reference_current
