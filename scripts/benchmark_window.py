@@ -196,7 +196,7 @@ class Smoother(Protocol):
 class DirectSmoother:
     """The same graph in GTSAM, without a safety net."""
 
-    # The parameters are those of `gvo.backend.isam2`.
+    # The parameters are those of `gvo.backend.pose_graph`.
     def __init__(self) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from gvo.backend.batch import BatchResult, optimize_batch
 from gvo.backend.factors import Factors, Measurement
-from gvo.backend.isam2 import PoseGraph, definite, first_line
+from gvo.backend.pose_graph import BatchResult, PoseGraph, definite, first_line, optimize_batch
 from gvo.backend.validation import place_fault, pose_fault, sane_covariance
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError

@@ -11,8 +11,7 @@ import pytest
 
 import gvo
 from gvo.config import load_configuration
-from gvo.io.convert.convert import convert
-from gvo.io.convert.folder_writer import Layout
+from gvo.io.convert.convert import Layout, convert
 from gvo.io.synthetic.recording import SyntheticRecording
 
 pytestmark = pytest.mark.acceptance

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import gvo
 from gvo.geometry.se3 import make_transform
-from gvo.io.convert.convert import convert
-from gvo.io.convert.folder_writer import write_folder
+from gvo.io.convert.convert import convert, write_folder
 from gvo.io.recording import StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory

@@ -15,8 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.batch.report.boxes import MAX_ROWS, box_of
-from gvo.batch.report.report import write_batch_report
-from gvo.batch.report.table import run_address
+from gvo.batch.report.report import run_address, write_batch_report
 from gvo.batch.report.values import log_limits, log_ticks
 from gvo.batch.rows import BatchRow, Value
 from gvo.config import Config

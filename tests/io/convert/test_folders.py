@@ -18,7 +18,7 @@ from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.geometry.se3 import make_transform
 from gvo.io.convert.bag_writer import write_bag
-from gvo.io.convert.folder_writer import Layout, write_folder
+from gvo.io.convert.convert import Layout, write_folder
 from gvo.io.frames import frames
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.recording import DepthView, Source, StampedImage

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.backend.batch import optimize_batch
-from gvo.backend.isam2 import PoseGraph, definite, first_line
+from gvo.backend.pose_graph import PoseGraph, definite, first_line, optimize_batch
 from gvo.errors import SmoothingError
 from gvo.types import FloatArray
 from tests.backend import walks
