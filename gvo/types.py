@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Literal, Protocol, TypeAlias, get_args
 
@@ -280,6 +280,10 @@ class ConstantError:
         return ConstantError(
             value=factor * self.value, sigma=factor * self.sigma, effect=self.effect / factor
         )
+
+    def widened(self, factor: float) -> ConstantError:
+        """Return it with a larger sigma."""
+        return replace(self, sigma=factor * self.sigma)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -45,7 +45,7 @@ DISPARITY, READOUT = "disparity_px", "readout_s"
 # Errors of registrations are correlated (the same walls, the same lens): their sigmas are too small
 # by these factors.
 _DISPARITY_FACTOR = 3.0
-_READOUT_FACTOR = 7.0
+_READOUT_FACTOR = 5.0
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
 # that all of them share.
 _FEIGNED_PX = 0.05
@@ -53,7 +53,7 @@ _FEIGNED_PX = 0.05
 _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
 # Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms.
-_READOUT_PRIOR_S = 0.015
+_READOUT_PRIOR_S = 0.03
 # Drift per frame: temperature, vibration.
 _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
@@ -233,7 +233,9 @@ class RigOffsets:
             self._last_ns = stamp_ns
             self._disparity_error = errors[DISPARITY]
         if READOUT in errors:
-            self._readout_errors.append(errors[READOUT])
+            # Matches that a wrong readout time contradicts are outliers, the others confirm it.
+            doubt = (result.n_matches / result.n_inliers) ** 2
+            self._readout_errors.append(errors[READOUT].widened(doubt))
 
     def note_rows(self, shift_px: float | None, stamp_ns: int) -> None:
         """Take the remaining row offset of a frame; each frame counts once.

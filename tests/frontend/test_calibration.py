@@ -3,7 +3,8 @@
 import gc
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,8 +16,6 @@ from scipy.optimize import brentq
 import gvo
 from gvo.config import Config
 from gvo.frontend.calibration import (
-    DISPARITY,
-    READOUT,
     ConstantFilter,
     FrameVelocities,
     RigOffsets,
@@ -24,11 +23,20 @@ from gvo.frontend.calibration import (
     settle_rows,
     settling_rates,
 )
+from gvo.frontend.factory import make_frontend
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SensorNoise
-from gvo.types import ConstantError, FaultyFrame, FloatArray, RelativePose, StereoFrame
+from gvo.types import (
+    ConstantError,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    MotionPrior,
+    RelativePose,
+    StereoFrame,
+)
 from tests.geometry.scenes import move, project, unproject
 
 N_FRAMES = 20
@@ -36,8 +44,10 @@ CAMERA = StereoCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=
 READOUT_S = 0.025
 
 
-def result(**errors: float) -> RelativePose:
+def result(*, n_inliers: int = 20, **errors: float) -> RelativePose:
     return RelativePose(
+        matches=np.zeros((20, 2), dtype=np.int64),
+        inliers=np.arange(20) < n_inliers,
         T_reference_current=np.eye(4),
         covariance=np.eye(6),
         calibration_errors={
@@ -113,7 +123,7 @@ def test_an_offset_is_taken_off_but_for_what_lenses_and_edges_feign(true_px: flo
         # What is left of it after the present value was subtracted.
         left_px = true_px - offsets.disparity_px
         error = ConstantError(value=left_px, sigma=0.01, effect=np.zeros(6))
-        noted = replace(result(), calibration_errors={DISPARITY: error})
+        noted = replace(result(), calibration_errors={"disparity_px": error})
         offsets.note(noted, stamp_ns)
         offsets.advance()
     assert offsets.disparity.value == pytest.approx(true_px, abs=0.01)
@@ -135,9 +145,20 @@ def test_the_readout_is_that_of_keyframes_where_there_are_any() -> None:
     assert with_keyframes.readout.sigma < 0.014
 
 
+def test_a_registration_with_many_outliers_tells_less_of_the_readout() -> None:
+    sure, doubtful = RigOffsets(config()), RigOffsets(config())
+    sure.note(result(readout_s=0.02), 10)
+    doubtful.note(result(n_inliers=10, readout_s=0.02), 10)
+    for offsets in (sure, doubtful):
+        offsets.advance()
+    # Half of the matches: four times the sigma.
+    information = [each.readout.sigma**-2 - 0.03**-2 for each in (sure, doubtful)]
+    assert information[0] == pytest.approx(16.0 * information[1], rel=1e-3)
+
+
 def test_nothing_is_learnt_where_it_is_switched_off() -> None:
     offsets = RigOffsets(config(12.5, estimate_offset=False))
-    offsets.note(result(**{DISPARITY: 0.1, READOUT: 0.01}), 10)
+    offsets.note(result(disparity_px=0.1, readout_s=0.01), 10)
     offsets.note_rows(0.2, 10)
     offsets.advance()
     assert not offsets.is_learning
@@ -153,7 +174,7 @@ def test_nothing_is_learnt_where_it_is_switched_off() -> None:
 def test_what_is_learnt_is_told_in_words() -> None:
     assert describe_offsets(None) == ""
     assert describe_offsets(RigOffsets(config(), is_stereo=False).as_json()) == (
-        "rows read out over 0.0 ms (sigma 15.0)"
+        "rows read out over 0.0 ms (sigma 30.0)"
     )
     assert describe_offsets(RigOffsets(config(20.0)).as_json()) == (
         "disparities too large by 0.000 px (sigma 0.100), rows of the right image too large by "
@@ -276,6 +297,58 @@ def test_the_rates_are_the_derivatives_by_the_readout() -> None:
     np.testing.assert_allclose(
         settling_rates(uvd, VELOCITY, CAMERA), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3
     )
+
+
+@cache
+def rolling_frames(sensor: Sensor) -> tuple[gvo.SyntheticRecording, list[Frame]]:
+    recording = gvo.SyntheticRecording(
+        "handheld", sensor, n_frames=6, scale=0.5, seed=2, readout_ms=25.0
+    )
+    found = [each for each in gvo.frames(recording, Config()) if not isinstance(each, FaultyFrame)]
+    return recording, found
+
+
+def motions(kind: str, sensor: Sensor, readout_ms: float) -> list[RelativePose]:
+    """Return the steps of a camera with rolling shutter, each from the one before, and a link."""
+    recording, frames = rolling_frames(sensor)
+    given = Config.model_validate(
+        {"camera": {"readout_ms": readout_ms}, "frontend": {"kind": kind}}
+    )
+    frontend: Any = make_frontend(recording.info.camera, given)
+    seen = [frontend.extract(frame) for frame in frames]
+    found: list[RelativePose] = []
+    prior = None
+    for pair in pairwise(seen):
+        result, again = (frontend.register(*pair, prior) for _ in range(2))
+        assert isinstance(result, RelativePose)
+        np.testing.assert_array_equal(result.T_reference_current, again.T_reference_current)
+        np.testing.assert_array_equal(result.covariance, again.covariance)
+        found.append(result)
+        T = result.T_reference_current
+        prior = MotionPrior(T_predicted=T, T_recent=T)
+    T = np.linalg.multi_dot([each.T_reference_current for each in found])
+    link = frontend.register(seen[0], seen[-1], MotionPrior(T_predicted=T))
+    assert isinstance(link, RelativePose)
+    return [*found, link]
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+def test_motions_are_those_between_the_middles_of_the_exposures(kind: str, sensor: Sensor) -> None:
+    recording, frames = rolling_frames(sensor)
+    poses = recording.ground_truth().T_world_frame
+    pairs = [*pairwise(range(len(frames))), (0, len(frames) - 1)]
+    truths = [se3.invert(poses[i]) @ poses[j] for i, j in pairs]
+    errors = [
+        [
+            np.linalg.norm(se3.log(se3.invert(T) @ each.T_reference_current))
+            for T, each in zip(truths, motions(kind, sensor, readout_ms), strict=True)
+        ]
+        for readout_ms in (25.0, 0.0)
+    ]
+    known, ignored = np.array(errors)
+    # Descriptors find pixels less exactly, whatever the shutter.
+    assert np.mean(known[1:]) < (0.7 if kind == "klt" else 0.9) * np.mean(ignored[1:])
 
 
 @cache

@@ -154,7 +154,12 @@ def test_keyframes_of_other_descriptors_are_released() -> None:
 
 
 @pytest.mark.parametrize("kind", ["klt", "descriptor"])
-def test_what_is_learnt_of_the_rig_goes_on_unless_the_stereo_section_changes(kind: str) -> None:
+@pytest.mark.parametrize(
+    "section", [{"stereo": {"patch_radius_px": 4}}, {"camera": {"readout_ms": 9.0}}]
+)
+def test_what_is_learnt_goes_on_unless_its_sections_change(
+    kind: str, section: dict[str, Any]
+) -> None:
     config = change(Config(), frontend={"kind": kind})
     odometry = odometry_of("stereo", config)
     for frame in recorded("stereo")[:4]:
@@ -166,11 +171,12 @@ def test_what_is_learnt_of_the_rig_goes_on_unless_the_stereo_section_changes(kin
     odometry.track(recorded("stereo")[4])
     assert odometry.rig_offsets is learnt
     assert learnt.disparity.sigma < before_px
-    odometry.reconfigure(change(config, stereo={"patch_radius_px": 4}))
+    odometry.reconfigure(change(config, **section))
     odometry.track(recorded("stereo")[5])
     renewed = odometry.rig_offsets
     assert renewed is not None
     assert renewed.disparity.sigma == config.stereo.offset_sigma_px
+    assert renewed.readout.value == pytest.approx(0.009 if "camera" in section else 0.0)
 
 
 class OwnFrontend(KltFrontend):

@@ -12,6 +12,7 @@ from gvo.diagnostics.check.findings import CheckResult, Finding, Limits, judged,
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.diagnostics.check.images import check_images, check_usable
 from gvo.diagnostics.check.sampling import Survey, survey
+from gvo.diagnostics.check.shutter import check_shutter
 from gvo.diagnostics.check.stereo import check_stereo
 from gvo.diagnostics.check.timing import check_timing
 from gvo.errors import CalibrationError
@@ -80,6 +81,8 @@ def check_recording(
         findings += check_depth(found.samples, config)
     elif not isinstance(camera, Failure):
         findings += check_stereo(found.samples, camera, config)
+    if not isinstance(camera, Failure):
+        findings += check_shutter(source, found, config)
     if calibration_changes is not None:
         findings.append(_check_changes(calibration_changes))
     if transforms is not None:

@@ -46,11 +46,14 @@ class Sample:
     Parameters
     ----------
     first, second : StereoFrame, RgbdFrame or FaultyFrame
-        `second` is None at the end of the recording.
+        `second` is None at the end of the recording. Their stamps play no role.
+    stamp_ns : int
+        Of the first in the recording, nanoseconds.
     """
 
     first: Frame | FaultyFrame
     second: Frame | FaultyFrame | None
+    stamp_ns: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,5 +184,10 @@ def _load(info: RecordingInfo, config: Config, chosen: list[list[Pair]]) -> tupl
     config = config.model_copy(update={"sync": sync})
     loaded = frames(_Chosen(info=info, pairs=[pair for run in chosen for pair in run]), config)
     return tuple(
-        Sample(first=next(loaded), second=next(loaded) if len(run) > 1 else None) for run in chosen
+        Sample(
+            first=next(loaded),
+            second=next(loaded) if len(run) > 1 else None,
+            stamp_ns=run[0][0].stamp_ns,
+        )
+        for run in chosen
     )

@@ -237,6 +237,31 @@ def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> 
     assert offsets is not None
     assert explanation.offset_px == offsets.disparity_px
     assert explanation.row_offset_px == offsets.row.value != 0.0
+    assert explanation.readout_ms == 1e3 * offsets.readout.value
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_told_how_far_rows_are_moved_for_the_readout_assumed(kind: str) -> None:
+    moved_px = []
+    for readout_ms in (0.0, 12.0, 24.0):
+        config = load_configuration(
+            settings=[f"frontend.kind={kind}", f"camera.readout_ms={readout_ms}"]
+        )
+        explanation = explain_frame(recording("rgbd"), LAST, config=config)
+        assert explanation.readout_ms == readout_ms
+        assert explanation.row_motion_px is not None
+        moved_px.append(explanation.row_motion_px)
+        # What is shown of the refinement is the last of two rounds, the result.
+        assert explanation.refinement is not None
+        assert explanation.result.registration is not None
+        T = explanation.refinement.drawn.T_target_source[1]
+        np.testing.assert_array_equal(
+            se3.invert(T), explanation.result.registration.T_reference_current
+        )
+    assert moved_px[0] == 0.0
+    assert 0.3 < moved_px[1] < 20.0
+    assert moved_px[2] == pytest.approx(2.0 * moved_px[1], rel=0.2)
+    assert explain_frame(recording("rgbd"), 0).row_motion_px is None
 
 
 def test_a_first_frame_is_explained_without_a_motion() -> None:
