@@ -126,7 +126,7 @@ class KltConfig(Section):
         0.15, "standard deviation of the disparity of a corner or track, for stereo", "px", gt=0
     )
     sigma_factor: float = _parameter(
-        3.1, "inflation of a registration's sigmas: errors of neighbouring tracks correlate", gt=0
+        2.4, "inflation of a registration's sigmas: errors of neighbouring tracks correlate", gt=0
     )
 
 

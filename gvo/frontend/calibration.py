@@ -46,6 +46,10 @@ DISPARITY, READOUT = "disparity_px", "readout_s"
 # by these factors.
 _DISPARITY_FACTOR = 3.0
 _READOUT_FACTOR = 5.0
+# What registrations are told to doubt besides.
+_VELOCITY = "velocity"
+# Sigma of the newest frame's velocity, relative to the change from the step before to the last one.
+_SIGMA_OF_CHANGE = 1.0
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
 # that all of them share.
 _FEIGNED_PX = 0.05
@@ -116,6 +120,7 @@ class FrameVelocities:
     def __init__(self) -> None:
         self._steps: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._velocities: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+        self._doubts: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
 
     def expect(
         self, reference: Stamped, current: Stamped, T_reference_current: FloatArray | None
@@ -134,6 +139,7 @@ class FrameVelocities:
             self._steps.pop(current, None)
             for observations in (reference, current):
                 self._velocities.pop(observations, None)
+                self._doubts.pop(observations, None)
             if before is not None:
                 self._velocities[reference] = before
             return
@@ -142,10 +148,19 @@ class FrameVelocities:
         self._steps[current] = step
         self._velocities[reference] = 0.5 * (before + step)
         self._velocities[current] = step + 0.5 * (step - before)
+        self._doubts[reference] = np.zeros(6)
+        self._doubts[current] = _SIGMA_OF_CHANGE * (step - before)
 
     def of(self, observations: Stamped) -> FloatArray | None:
         """Return a twist per second (rad/s, m/s), right of the pose; None where it is unknown."""
         return self._velocities.get(observations)
+
+    def doubt(self, observations: Stamped) -> FloatArray:
+        """Return by how much the velocity may be off, one sigma; zero where the next step is known.
+
+        The newest frame's is extrapolated: the camera may go on changing its velocity, or not.
+        """
+        return self._doubts.get(observations, np.zeros(6))
 
 
 class RigOffsets:
@@ -472,6 +487,7 @@ class CalibratedCamera:
             calibration_errors={
                 name: each.times(self._offsets.learnt[name].sigma)
                 for name, each in in_sigmas.items()
+                if name in self._offsets.learnt
             },
             pixels_reference=first_pixels,
             pixels_current=second_pixels,
@@ -487,7 +503,18 @@ class CalibratedCamera:
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
         }
+        sensitivities[_VELOCITY] = self._velocity_sensitivity(measured)
         return replace(corrected, sensitivities=sensitivities)
+
+    def _velocity_sensitivity(self, measured: Measurements) -> FloatArray:
+        """Return by how much corrected measurements change if velocities are off by one sigma."""
+        offsets = self._offsets
+        return offsets.readout.value * np.stack(
+            [
+                settling_rates(uvd - self._offset(), offsets.velocities.doubt(frame), self._camera)
+                for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
+            ]
+        )
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
