@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 import gvo
+from gvo.frontend.calibration import describe_offsets
 
 Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
@@ -49,6 +50,9 @@ def test_run_writes_its_files_and_prints_the_errors(
     assert answer.code == 0, answer.err
     assert "smoothed" in answer.out
     assert "20 of 20 frames tracked" in answer.out
+    learnt = json.loads((tmp_path / "out" / "summary.json").read_text())["rig_offsets"]
+    assert f"learnt of the camera: {describe_offsets(learnt)}\n" in answer.out
+    assert f"rows read out over {learnt['readout_ms']:.1f} ms" in answer.out
     assert answer.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
