@@ -118,6 +118,8 @@ ABLATION = (
         settings=("stereo.estimate_offset=false",),
         sensors=("stereo",),
     ),
+    Row(name="global shutter, none learnt", settings=("camera.readout_ms=0",)),
+    Row(name="without edges by depth alone", settings=("depth.icp=never",), sensors=("rgbd",)),
     Row(name="without links to keyframes", settings=("window.n_links=1",)),
 )
 
