@@ -93,7 +93,7 @@ def check_frontend(
     for pair, result in zip(pairwise(observations), results, strict=True):
         _check_inverse(frontend, result, *pair)
         _check_prior(frontend, result, *pair)
-    _check_direction(frontend, frames[0])
+    _check_direction(frontend, *frames[:2])
     _check_capabilities(frontend)
     if CheckedFrontend(frontend).offers_relocalization:
         for pair, result in zip(pairwise(observations), results, strict=True):
@@ -255,7 +255,7 @@ def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) 
     )
 
 
-def _check_direction(frontend: Frontend[Any], frame: Stamped) -> None:
+def _check_direction(frontend: Frontend[Any], frame: Stamped, following: Stamped) -> None:
     """Shift images to the left: the camera has turned, or moved, to the right."""
     if not isinstance(frame, StereoFrame | RgbdFrame):
         return
@@ -266,7 +266,8 @@ def _check_direction(frontend: Frontend[Any], frame: Stamped) -> None:
         )
         for name, image in arrays.items()
     }
-    turned = replace(frame, stamp_ns=frame.stamp_ns + 1, **shifted)
+    # As long afterwards as the next frame: velocities play a role too.
+    turned = replace(frame, stamp_ns=following.stamp_ns + 1, **shifted)
     result = _check_pair(frontend, frontend.extract(frame), frontend.extract(turned))
     ahead = result.T_reference_current @ [0.0, 0.0, _SHIFT_DEPTH_M, 1.0]
     _require(
