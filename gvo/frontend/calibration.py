@@ -29,7 +29,6 @@ from gvo.frontend.registration import register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import pose_jacobian
 from gvo.types import (
     ConstantError,
     Failure,
@@ -64,7 +63,7 @@ _DRIFT_S = 1e-5
 # Innovations are clipped to so many sigmas.
 _MAX_SURPRISE = 3.0
 # A step is registered again where its own velocity moves what a row shows by more, pixels.
-_MIN_CHANGE_PX = 0.02
+_MIN_CHANGE_PX = 0.05
 # Moved to the middle of the exposure, points must stay in front of the camera.
 _MIN_DEPTH_M = 0.05
 
@@ -225,6 +224,14 @@ class RigOffsets:
         return math.copysign(max(abs(learnt_px) - _FEIGNED_PX, 0.0), learnt_px)
 
     @property
+    def readout_s(self) -> float:
+        """The readout time that is reckoned with, seconds: zero where it may be zero.
+
+        A global shutter is not to be bent by what is left of the noise.
+        """
+        return self.readout.value if abs(self.readout.value) > self.readout.sigma else 0.0
+
+    @property
     def is_learning(self) -> bool:
         """Tell whether anything is learnt."""
         return bool(self.learnt)
@@ -277,7 +284,7 @@ class RigOffsets:
             self.disparity.update(left_px, _DISPARITY_FACTOR * error.sigma)
         if self._row_error_px is not None:
             self.row.update(self._row_error_px, _ROW_SIGMA_PX)
-        used_s = self.readout.value
+        used_s = self.readout_s
         for error in self._readout_errors[1:] or self._readout_errors:
             left_s = used_s + error.value - self.readout.value
             self.readout.update(left_s, _READOUT_FACTOR * error.sigma)
@@ -286,7 +293,7 @@ class RigOffsets:
             "rig.offsets",
             disparity_px=self.disparity_px,
             row_px=self.row.value,
-            readout_ms=1e3 * self.readout.value,
+            readout_ms=1e3 * self.readout_s,
         )
 
     def as_json(self) -> dict[str, float]:
@@ -346,11 +353,12 @@ def settle_rows(
     """
     if velocity is None or readout_s == 0.0 or len(uvd) == 0:
         return uvd
-    dt = readout_s * _row_times(uvd, camera)
+    dt = (readout_s * _row_times(uvd, camera))[:, np.newaxis]
     points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
-    turns, shifts = (each * dt[:, np.newaxis] for each in (velocity[:3], velocity[3:]))
+    turn = se3.skew(velocity[:3]).T
+    rates = points @ turn + velocity[3:]
     # The motion is small: its exponential to second order.
-    moved = points + shifts + np.cross(turns, points + 0.5 * (np.cross(turns, points) + shifts))
+    moved = points + dt * (rates + 0.5 * dt * (rates @ turn))
     settled = uvd.copy()
     in_front = moved[:, 2] > _MIN_DEPTH_M
     settled[in_front] = camera.project_stereo(moved[in_front])
@@ -364,7 +372,11 @@ def settling_rates(
     if velocity is None:
         return np.zeros_like(uvd)
     points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
-    rates = np.einsum("k,kin->ni", velocity, pose_jacobian(points.T, camera))
+    moving = (points @ se3.skew(velocity[:3]).T + velocity[3:]) / points[:, 2:]
+    pixels = uvd[:, :2] - [camera.cx, camera.cy]
+    rates = np.empty_like(uvd)
+    rates[:, :2] = moving[:, :2] * [camera.fx, camera.fy] - pixels * moving[:, 2:]
+    rates[:, 2] = -uvd[:, 2] * moving[:, 2]
     return np.asarray(_row_times(uvd, camera)[:, np.newaxis] * rates)
 
 
@@ -412,14 +424,12 @@ class CalibratedCamera:
     def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""
         velocity = self._offsets.velocities.of(observations)
-        return settle_rows(
-            uvd - self._offset(), velocity, self._offsets.readout.value, self._camera
-        )
+        return settle_rows(uvd - self._offset(), velocity, self._offsets.readout_s, self._camera)
 
     def distort(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return (u, v, disparity), shape (n, 3), as this camera measures them."""
         velocity = self._offsets.velocities.of(observations)
-        readout_s = -self._offsets.readout.value
+        readout_s = -self._offsets.readout_s
         return settle_rows(uvd, velocity, readout_s, self._camera) + self._offset()
 
     def _offset(self) -> FloatArray:
@@ -503,13 +513,14 @@ class CalibratedCamera:
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
         }
-        sensitivities[_VELOCITY] = self._velocity_sensitivity(measured)
+        if self._offsets.readout_s != 0.0:
+            sensitivities[_VELOCITY] = self._velocity_sensitivity(measured)
         return replace(corrected, sensitivities=sensitivities)
 
     def _velocity_sensitivity(self, measured: Measurements) -> FloatArray:
         """Return by how much corrected measurements change if velocities are off by one sigma."""
         offsets = self._offsets
-        return offsets.readout.value * np.stack(
+        return offsets.readout_s * np.stack(
             [
                 settling_rates(uvd - self._offset(), offsets.velocities.doubt(frame), self._camera)
                 for frame, uvd in zip(measured.frames, measured.uvd, strict=True)

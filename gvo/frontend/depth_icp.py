@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -60,8 +60,6 @@ _MIN_SCALE = 0.1
 _OPEN_SIGMAS = 100.0
 # A colour and a depth image taken at one time; else the motion in between is another.
 _MAX_DIFFERENCE_NS = 2_000_000
-
-Measured = Literal["step", "keyframe"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -286,8 +284,7 @@ class DepthTrust:
         self.mode = mode
         self._is_believed = False
         self._n_unmeasured = 0
-        self._combined = {kind: _Squares() for kind in get_args(Measured)}
-        self._alone = {kind: _Squares() for kind in get_args(Measured)}
+        self._combined, self._alone = _Squares(), _Squares()
 
     @property
     def is_on(self) -> bool:
@@ -296,31 +293,30 @@ class DepthTrust:
 
     @property
     def disagreement(self) -> float:
-        """Squared disagreement of steps or of links, the larger one; 1 for normal errors."""
-        return max(squares.level or 0.0 for squares in self._combined.values())
+        """Squared disagreement, 1 for normal errors; 0 without enough measurements."""
+        return self._combined.level or 0.0
 
     def is_due(self) -> bool:
         """Tell, once for each frame, whether its depth is to be aligned."""
         if self.mode == "never":
             return False
         self._n_unmeasured += 1
-        is_judged = self._combined["keyframe"].level is not None
-        n_skipped = _N_SKIPPED if is_judged else _N_SKIPPED_FIRST
+        n_skipped = _N_SKIPPED_FIRST if self._combined.level is None else _N_SKIPPED
         is_due = self.is_on or self._n_unmeasured > n_skipped
         if is_due:
             self._n_unmeasured = 0
         return is_due
 
-    def note(self, kind: Measured, colour: RelativePose, depth: RelativePose) -> None:
-        """Take a motion measured by both, from the predecessor or from a keyframe."""
+    def note(self, colour: RelativePose, depth: RelativePose) -> None:
+        """Take a motion from a keyframe that was measured by both."""
         difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
-        self._alone[kind].add(difference, depth.covariance)
-        self._combined[kind].add(difference, colour.covariance + depth.covariance)
+        self._alone.add(difference, depth.covariance)
+        self._combined.add(difference, colour.covariance + depth.covariance)
         self._is_believed = self.disagreement > (_AGREES if self._is_believed else _CONTRADICTS)
 
-    def widen(self, kind: Measured, covariance: FloatArray) -> FloatArray | None:
+    def widen(self, covariance: FloatArray) -> FloatArray | None:
         """Return the covariance of an edge by depth; None where there is to be none, or not yet."""
-        factor = self._alone[kind].level
+        factor = self._alone.level
         return None if not self.is_on or factor is None else max(factor, 1.0) * covariance
 
 

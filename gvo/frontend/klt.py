@@ -191,8 +191,10 @@ class KltFrontend:
         off.
         """
         aligned = self._register_from(prior, reference, current, "aligned", is_step=False)
-        _, in_view = self._predict(prior.T_predicted, reference, current)
-        is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(in_view)
+        is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(reference)
+        if not is_sure:
+            _, in_view = self._predict(prior.T_predicted, reference, current)
+            is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(in_view)
         if isinstance(aligned, Contradiction) or (isinstance(aligned, RelativePose) and is_sure):
             return aligned
         tracked = self._register_from(prior, reference, current, "near", is_step=False)

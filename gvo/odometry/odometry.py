@@ -16,7 +16,7 @@ from gvo.backend.keyframe_policy import choose_unseen, is_needed
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config, WindowConfig
 from gvo.frontend.calibration import RigOffsets
-from gvo.frontend.depth_icp import DepthTrust, Measured
+from gvo.frontend.depth_icp import DepthTrust
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.factory import find_change, frame_of, make_frontend
 from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
@@ -85,7 +85,6 @@ class Odometry:
         self._segments = Segments()
         self._anchor_ns: int | None = None
         self._trust = DepthTrust(self._config.depth.icp)
-        self._previous: _Observations | None = None
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
 
@@ -271,8 +270,9 @@ class Odometry:
         note("odometry.scores", scores=scores)
         self._keyframes.note_seen(scores, step.n_steps)
         measure = partial(self._register_keyframe, observations, step.n_steps)
-        n_unlinked = self._keyframes.n_unlinked(T_frame_keyframes, step.n_steps)
         config = self._config.window
+        in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= config.min_overlap}
+        n_unlinked = self._keyframes.n_unlinked(in_view, step.n_steps)
         links = link_keyframes(
             measure, scores, T_frame_keyframes, step, config, n_unlinked=n_unlinked
         )
@@ -313,37 +313,25 @@ class Odometry:
         )
 
     def _align_depths(self, observations: _Observations, offered: list[_Offer]) -> list[_Offer]:
-        """Return what depth alone measured beside edges, where colour contradicts it."""
-        previous, self._previous = self._previous, observations
-        if previous is None or not self._trust.is_due():
+        """Return what depth alone measured beside links, where colour contradicts it."""
+        links = [edge for kind, edge in offered if kind == "keyframe"]
+        if not links or not self._trust.is_due():
             return []
-        edges: list[_Offer] = []
-        for kind, edge in offered:
-            if kind == "keyframe":
-                reference = self._keyframes[int(edge.reference_id)]  # type: ignore[call-overload]
-            elif kind == "step" and edge.reference_id == previous.stamp_ns:
-                reference = previous
-            else:
-                continue
-            depth = self._align_depth(reference, observations, kind, edge)
-            edges += [] if depth is None else [("depth", depth)]
-        return edges
+        edges = (self._align_depth(observations, link) for link in links)
+        return [("depth", edge) for edge in edges if edge is not None]
 
-    def _align_depth(
-        self, reference: _Observations, observations: _Observations, kind: Measured, edge: Edge
-    ) -> Edge | None:
-        """Measure an edge again by depth alone; None where that is not believed."""
-        T = edge.T_reference_frame
-        depth = self._frontend.align_depth(reference, observations, T)
+    def _align_depth(self, observations: _Observations, link: Edge) -> Edge | None:
+        """Measure a link again by depth alone; None where that is not believed."""
+        T, keyframe = link.T_reference_frame, self._keyframes[int(link.reference_id)]  # type: ignore[call-overload]
+        depth = self._frontend.align_depth(keyframe, observations, T)
         if isinstance(depth, Failure):
             return None
-        colour = RelativePose(T_reference_current=T, covariance=edge.covariance)
-        self._trust.note(kind, colour, depth)
-        covariance = self._trust.widen(kind, depth.covariance)
+        self._trust.note(RelativePose(T_reference_current=T, covariance=link.covariance), depth)
+        covariance = self._trust.widen(depth.covariance)
         if covariance is None:
             return None
         T = depth.T_reference_current
-        return Edge(reference_id=edge.reference_id, T_reference_frame=T, covariance=covariance)
+        return Edge(reference_id=link.reference_id, T_reference_frame=T, covariance=covariance)
 
     def _unjoined(self) -> list[int]:
         """Return the keyframes of earlier segments that the current one is not joined to."""

@@ -121,8 +121,7 @@ def feed(trust: DepthTrust, error_sigmas: float, n: int = 60) -> int:
     for _ in range(n):
         if trust.is_due():
             n_measured += 1
-            for kind in ("step", "keyframe"):
-                trust.note(kind, *measured_twice(rng, error_sigmas))
+            trust.note(*measured_twice(rng, error_sigmas))
     return n_measured
 
 
@@ -143,14 +142,14 @@ def test_depth_that_agrees_is_tried_now_and_then_and_gives_no_edge() -> None:
     assert feed(trust, 1.0, n=400) < 40
     assert not trust.is_on
     assert trust.disagreement == pytest.approx(1.0, rel=0.5)
-    assert trust.widen("step", np.eye(6)) is None
+    assert trust.widen(np.eye(6)) is None
 
 
 def test_depth_that_contradicts_gives_edges_as_wide_as_the_contradiction() -> None:
     trust = DepthTrust("auto")
     feed(trust, 8.0, n=200)
     assert trust.is_on
-    widened = trust.widen("keyframe", np.eye(6))
+    widened = trust.widen(np.eye(6))
     assert widened is not None
     # The difference is that of two measurements of equal noise.
     np.testing.assert_allclose(widened, 2.0 * 8.0**2 * np.eye(6), rtol=0.5)

@@ -27,6 +27,8 @@ _DELAY_NS = 1_000_000_000
 # Largest sigma that is of use, and the difference that is one, in sigmas and at least.
 _MAX_SIGMA_MS = 2.5
 _N_SIGMAS = 3.0
+# Links tell the readout best, also those that would add little to the poses.
+_LINK_GAIN = 0.5
 _MIN_DIFFERENCE_MS = 2.0
 
 
@@ -133,8 +135,11 @@ def _usable(source: Source, config: Config) -> Iterator[Frame]:
 
 def _learn(part: Iterator[Frame], source: Source, config: Config) -> tuple[float, float]:
     """Return what odometry learns of the readout time and its sigma, milliseconds."""
-    camera = config.camera.model_copy(update={"readout_ms": None})
-    odometry = Odometry(source.info.camera, config.model_copy(update={"camera": camera}))
+    learning = {
+        "camera": config.camera.model_copy(update={"readout_ms": None}),
+        "window": config.window.model_copy(update={"link_gain": _LINK_GAIN}),
+    }
+    odometry = Odometry(source.info.camera, config.model_copy(update=learning))
     for frame in part:
         odometry.track(frame)
     offsets = odometry.rig_offsets

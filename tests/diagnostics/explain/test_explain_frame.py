@@ -237,7 +237,7 @@ def test_the_offsets_of_the_rig_are_those_that_the_frame_was_measured_with() -> 
     assert offsets is not None
     assert explanation.offset_px == offsets.disparity_px
     assert explanation.row_offset_px == offsets.row.value != 0.0
-    assert explanation.readout_ms == 1e3 * offsets.readout.value
+    assert explanation.readout_ms == 1e3 * offsets.readout_s
 
 
 @pytest.mark.parametrize("kind", KINDS)
