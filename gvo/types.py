@@ -539,8 +539,8 @@ class FrameLink:
     reference_ns : int
         Stamp of the earlier frame.
     kind : {"step", "keyframe", "depth", "standstill"}
-        To the frame that the raw chain goes on from, to a keyframe, to either of them by depth
-        alone, or without motion.
+        To the frame that the raw chain goes on from, to a keyframe, to a keyframe by depth alone,
+        or without motion.
     chi2 : float or None
         Squared norm of the whitened residual, of 6 degrees of freedom: about 6 where the stated
         covariances are right; None where the earlier frame left the window with the update.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from gvo.frontend.stereo.patches import steps_around
 from gvo.geometry.camera import StereoCamera
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -192,9 +193,7 @@ def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> N
     """Return warped patches around pixels, shape (n, s * s), interpolated."""
     if len(pixels) == 0:  # refused by OpenCV
         return np.zeros((0, (2 * RADIUS_PX + 1) ** 2), dtype=np.float32)
-    v, u = np.mgrid[-RADIUS_PX : RADIUS_PX + 1, -RADIUS_PX : RADIUS_PX + 1]
-    steps = np.stack([u.ravel(), v.ravel()]).astype(np.float32)
-    places = np.matmul(warps.astype(np.float32), steps)
+    places = np.matmul(warps.astype(np.float32), np.stack(steps_around(RADIUS_PX, RADIUS_PX)))
     places += pixels.astype(np.float32)[:, :, np.newaxis]
     seen = cv2.remap(
         image, places[:, 0], places[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

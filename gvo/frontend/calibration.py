@@ -16,7 +16,7 @@ doi:10.1109/CVPR.2012.6247831.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -147,7 +147,7 @@ class FrameVelocities:
         self._steps[current] = step
         self._velocities[reference] = 0.5 * (before + step)
         self._velocities[current] = step + 0.5 * (step - before)
-        self._doubts[reference] = np.zeros(6)
+        self._doubts.pop(reference, None)
         self._doubts[current] = _SIGMA_OF_CHANGE * (step - before)
 
     def of(self, observations: Stamped) -> FloatArray | None:
@@ -514,29 +514,26 @@ class CalibratedCamera:
             for name, constant in self._offsets.learnt.items()
         }
         if self._offsets.readout_s != 0.0:
-            sensitivities[_VELOCITY] = self._velocity_sensitivity(measured)
+            # By how much they change if velocities are off by one sigma.
+            rates = self._settling_rates(measured, self._offsets.velocities.doubt)
+            sensitivities[_VELOCITY] = self._offsets.readout_s * rates
         return replace(corrected, sensitivities=sensitivities)
-
-    def _velocity_sensitivity(self, measured: Measurements) -> FloatArray:
-        """Return by how much corrected measurements change if velocities are off by one sigma."""
-        offsets = self._offsets
-        return offsets.readout_s * np.stack(
-            [
-                settling_rates(uvd - self._offset(), offsets.velocities.doubt(frame), self._camera)
-                for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
-            ]
-        )
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
         if name == DISPARITY:
             return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
-        velocities = self._offsets.velocities
+        return -self._settling_rates(measured, self._offsets.velocities.of)
+
+    def _settling_rates(
+        self, measured: Measurements, velocity_of: Callable[[Stamped], FloatArray | None]
+    ) -> FloatArray:
+        """Return the derivatives of corrected measurements by the readout time, (2, n, 3)."""
         rates = [
-            settling_rates(uvd - self._offset(), velocities.of(observations), self._camera)
-            for observations, uvd in zip(measured.frames, measured.uvd, strict=True)
+            settling_rates(uvd - self._offset(), velocity_of(frame), self._camera)
+            for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
         ]
-        return -np.stack(rates)
+        return np.stack(rates)
 
 
 def _largest_change(former: Correspondences, latter: Correspondences) -> float:

@@ -323,7 +323,9 @@ class KltFrontend:
         """Return (u, v, disparity) of corners, of their tracks, and which corners these are."""
         source_uvd = reference.uvd
         predicted, indices = self._predict(T_reference_current, reference, current)
-        warps, slopes = self._predict_patches(T_reference_current, reference, indices)
+        warps = slopes = None
+        if search != "wide":
+            warps, slopes = self._predict_patches(T_reference_current, reference, indices)
         pixels, is_tracked = self._find_tracks(
             (reference, current), indices, predicted[:, :2], warps, search
         )
@@ -341,7 +343,7 @@ class KltFrontend:
         )
         pixels, predicted, indices = pixels[is_tracked], predicted[is_tracked], indices[is_tracked]
         disparities, is_valid = self._measure(
-            current.frame, pixels, predicted[:, 2], None if search == "wide" else slopes[is_tracked]
+            current.frame, pixels, predicted[:, 2], None if slopes is None else slopes[is_tracked]
         )
         note("klt.measured", pixels=pixels, disparities=disparities, is_valid=is_valid)
         target_uvd = np.column_stack([pixels, disparities])[is_valid]
@@ -364,12 +366,14 @@ class KltFrontend:
 
     def _predict_patches(
         self, T_reference_current: FloatArray, reference: KltObservations, indices: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the warps of patches by a motion, and the slopes of their disparities after it."""
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Return the warps of patches by a motion; of stereo, slopes of disparities after it."""
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
         uvd, slopes = reference.uvd[indices] - offset, reference.find_corners().slopes[indices]
         T_current_reference = se3.invert(T_reference_current)
         warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
+        if not isinstance(reference.frame, StereoFrame):
+            return warps, None
         return warps, move_slopes(uvd, slopes, T_current_reference, self.camera)
 
     def _find_tracks(
@@ -377,18 +381,19 @@ class KltFrontend:
         frames: tuple[KltObservations, KltObservations],
         indices: IntArray,
         start: FloatArray,
-        warps: FloatArray,
+        warps: FloatArray | None,
         search: _Search,
     ) -> tuple[FloatArray, BoolArray]:
         """Return the pixels of corners of the reference in the current image, and which are found.
 
         Lucas-Kanade finds a patch wherever it went, but as if it had only been moved. From there,
-        or from a good prediction, the patch is aligned as it looks after the predicted motion.
+        or from a good prediction, the patch is aligned as it looks after the predicted motion;
+        a wide search has no such motion, and no warps.
         """
         reference, current = frames
-        if search == "aligned":
+        if warps is not None and search == "aligned":
             return self._align(frames, indices, start, warps, n_steps=_N_LINK_STEPS)
-        klt, is_wide = self._config.klt, search == "wide"
+        klt, is_wide = self._config.klt, warps is None
         pixels, is_tracked = track_pixels(
             (reference.image, current.image),
             reference.keypoints[indices],
@@ -397,7 +402,7 @@ class KltFrontend:
             n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
             is_checked=is_wide,
         )
-        if is_wide:
+        if warps is None:
             return pixels, is_tracked
         tracked = np.flatnonzero(is_tracked)
         chosen = indices[tracked], pixels[tracked], warps[tracked]

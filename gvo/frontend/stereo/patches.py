@@ -55,7 +55,7 @@ def sample_patches(
     shape = len(u), 2 * radius_v + 1, 2 * radius_u + 1
     if len(u) == 0:  # refused by OpenCV
         return np.zeros(shape, dtype=np.float32)
-    steps_u, steps_v = _steps_around(radius_u, radius_v)
+    steps_u, steps_v = steps_around(radius_u, radius_v)
     columns = u.astype(np.float32)[:, np.newaxis] + steps_u
     if slopes is not None:
         columns -= slopes.astype(np.float32) @ np.stack([steps_u, steps_v])
@@ -70,8 +70,8 @@ def sample_patches(
 
 
 @lru_cache(maxsize=32)
-def _steps_around(radius_u: int, radius_v: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the offsets from the centre of a patch to its pixels, row by row."""
+def steps_around(radius_u: int, radius_v: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the offsets (u, v) from the centre of a patch to its pixels, row by row."""
     v, u = np.mgrid[-radius_v : radius_v + 1, -radius_u : radius_u + 1].astype(np.float32)
     return u.ravel(), v.ravel()
 
@@ -160,7 +160,7 @@ class SlantedPatches:
     def of(cls, wide: NDArray[np.float32]) -> SlantedPatches:
         """Prepare patches (n, s + 2, s + 2), which are one pixel wider on all sides."""
         n, size = len(wide), wide.shape[1] - 2
-        steps = _steps_around(size // 2, size // 2)
+        steps = steps_around(size // 2, size // 2)
         before, values, after = (wide[:, 1:-1, k : k + size] for k in range(3))
         along = (0.5 * (after - before)).reshape(n, 1, size**2)
         blur = (before - 2.0 * values + after).reshape(n, 1, size**2)
