@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from numbers import Integral
 from typing import Any, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
@@ -47,7 +48,14 @@ def _check_kernel(kernel: str | None) -> None:
         raise ValueError(f"kernel must be one of {get_args(Kernel)}, got {kernel!r}")
 
 
-def _check_images(kind: str, first: NDArray[Any], second: NDArray[Any], dtype: type) -> None:
+def _check_images(
+    kind: str, stamp_ns: int, first: NDArray[Any], second: NDArray[Any], dtype: type
+) -> None:
+    if not isinstance(stamp_ns, Integral):
+        raise ValueError(f"the stamp of {kind} must be an int of nanoseconds, got {stamp_ns!r}")
+    for image in (first, second):
+        if not isinstance(image, np.ndarray):
+            raise ValueError(f"the images of {kind} must be arrays, got {type(image).__name__}")
     if first.ndim != 2 or first.shape != second.shape:
         raise ValueError(
             f"the images of {kind} must be (height, width) and of one size, "
@@ -145,7 +153,7 @@ class StereoFrame:
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
-        _check_images("a stereo frame", self.left, self.right, np.uint8)
+        _check_images("a stereo frame", self.stamp_ns, self.left, self.right, np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
@@ -171,7 +179,7 @@ class RgbdFrame:
 
     def __post_init__(self) -> None:
         """Check shapes and types once."""
-        _check_images("an RGB-D frame", self.image, self.depth, np.float32)
+        _check_images("an RGB-D frame", self.stamp_ns, self.image, self.depth, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,6 +63,13 @@ def test_images_of_another_type_are_refused() -> None:
         RgbdFrame(stamp_ns=0, image=grey(4, 5), depth=grey(4, 5))  # type: ignore[arg-type]
 
 
+def test_what_is_no_array_and_no_stamp_is_refused() -> None:
+    with pytest.raises(ValueError, match="must be arrays, got list"):
+        StereoFrame(stamp_ns=0, left=[[0]], right=grey(1, 1))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"int of nanoseconds, got 1\.5"):
+        RgbdFrame(stamp_ns=1.5, image=grey(1, 1), depth=grey(1, 1))  # type: ignore[arg-type]
+
+
 def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
     T, covariance = np.eye(4), np.eye(6)
     edge = Edge(reference_id="a", T_reference_frame=T, covariance=covariance)

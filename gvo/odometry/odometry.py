@@ -34,9 +34,11 @@ from gvo.types import (
     LinkKind,
     MotionPrior,
     RelativePose,
+    RgbdFrame,
     SegmentJoin,
     Stamped,
     Status,
+    StereoFrame,
 )
 
 # Whatever the front-end returns.
@@ -151,8 +153,11 @@ class Odometry:
         Raises
         ------
         ValueError
-            For a stamp that does not advance.
+            For a stamp that does not advance, and a frame of another kind or size than the
+            camera's; a front-end of one's own judges its frames itself. Nothing is changed then.
         """
+        if self._camera is not None and not self._is_own:
+            _check_frame(frame, self._camera)
         watch = Stopwatch()
         with watch.stage("extract"):
             self._take_over_configuration()
@@ -410,6 +415,20 @@ class Odometry:
         frames = {**self._frames, frame.stamp_ns: frame}
         needed = self._anchor_ns, frame.stamp_ns
         self._frames = {ns: each for ns, each in frames.items() if ns in needed}
+
+
+def _check_frame(frame: Stamped, camera: StereoCamera | PinholeCamera) -> None:
+    """Refuse what is no frame of a camera; images of another size would be tracked to nonsense."""
+    kind = StereoFrame if isinstance(camera, StereoCamera) else RgbdFrame
+    if not isinstance(frame, kind):
+        raise ValueError(
+            f"{type(camera).__name__}: expected a {kind.__name__}, got {type(frame).__name__}"
+        )
+    height, width = (frame.left if isinstance(frame, StereoFrame) else frame.image).shape
+    if (width, height) != (camera.width, camera.height):
+        raise ValueError(
+            f"the images are {width}x{height} pixels, the camera is {camera.width}x{camera.height}"
+        )
 
 
 def zero_motion_edge(step: RawStep, config: WindowConfig) -> Edge | None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gvo.config import CameraConfig, Config, WindowConfig
+from gvo.config import CameraConfig, Config, FrontendConfig, WindowConfig
 from gvo.frontend.klt import KltFrontend
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -32,6 +32,7 @@ from gvo.types import (
 )
 
 CAMERA = StereoCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200, baseline=0.12)
+PINHOLE = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
 STEP_NS = 50_000_000
 N_FRAMES = 16
 # Planes n . p = c of a room, and the two axes that their texture is laid along.
@@ -172,8 +173,7 @@ def test_a_stereo_camera_is_followed_to_centimetres() -> None:
 
 
 def test_a_depth_camera_is_followed_to_centimetres() -> None:
-    camera = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
-    results, smoothed = run(map(rgbd_frame, range(8)), configure(), camera)
+    results, smoothed = run(map(rgbd_frame, range(8)), configure(), PINHOLE)
     assert all(result.status == Status.OK for result in results)
     for estimates in ([r.raw for r in results], [r.causal for r in results], smoothed):
         assert position_errors(estimates).max() < 0.06
@@ -270,6 +270,40 @@ def test_stamps_that_go_back_are_misuse(back_ns: int) -> None:
     with pytest.raises(ValueError, match=f"stamp {stamp_ns} is not after {2 * STEP_NS}"):
         odometry.track(StereoFrame(stamp_ns=stamp_ns, left=image.left, right=image.right))
     assert odometry.track(image).status == Status.OK
+
+
+def halved(frame: Frame) -> Frame:
+    if isinstance(frame, StereoFrame):
+        return StereoFrame(stamp_ns=1, left=frame.left[::2, ::2], right=frame.right[::2, ::2])
+    return RgbdFrame(stamp_ns=1, image=frame.image[::2, ::2], depth=frame.depth[::2, ::2])
+
+
+@pytest.mark.parametrize("is_stereo", [True, False])
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+def test_images_of_another_size_than_the_camera_s_are_refused(kind: str, is_stereo: bool) -> None:
+    config = configure().model_copy(
+        update={"frontend": FrontendConfig.model_validate({"kind": kind})}
+    )
+    odometry = Odometry(CAMERA if is_stereo else PINHOLE, config)
+    frames = [(stereo_frame if is_stereo else rgbd_frame)(index) for index in range(3)]
+    odometry.track(frames[0])
+    with pytest.raises(ValueError, match="images are 160x100 pixels, the camera is 320x200"):
+        odometry.track(halved(frames[1]))
+    assert odometry.track(frames[2]).status == Status.OK
+    assert len(odometry.finish()) == 2
+
+
+def test_a_frame_of_another_sensor_is_refused() -> None:
+    with pytest.raises(ValueError, match="StereoCamera: expected a StereoFrame, got RgbdFrame"):
+        Odometry(CAMERA, configure()).track(rgbd_frame(0))
+    with pytest.raises(ValueError, match="PinholeCamera: expected a RgbdFrame, got StereoFrame"):
+        Odometry(PINHOLE, configure()).track(stereo_frame(0))
+
+
+def test_a_front_end_of_one_s_own_judges_its_frames_itself() -> None:
+    frontend = KltFrontend(CAMERA, configure())
+    odometry = Odometry(replace(CAMERA, width=99), configure(), frontend=frontend)
+    assert odometry.track(stereo_frame(0)).status == Status.OK
 
 
 def with_blanks(blanks: Iterable[int], n: int) -> list[Frame]:
@@ -510,9 +544,8 @@ def depth_frame(stamp_ns: int, x_m: float, seed: int) -> RgbdFrame:
 
 
 def walk(positions_m: Iterable[float], config: Config) -> tuple[list[FrameResult], list[Estimate]]:
-    camera = PinholeCamera(fx=200.0, fy=200.0, cx=159.5, cy=99.5, width=320, height=200)
     frames = [depth_frame(i * STEP_NS, x, i) for i, x in enumerate(positions_m)]
-    return run(frames, config, camera)
+    return run(frames, config, PINHOLE)
 
 
 def path_length(estimates: Iterable[Estimate]) -> float:
