@@ -37,6 +37,8 @@ _MIN_CORRELATION = 0.7
 # peak may be: so much do equal patches differ in the small images.
 _PEAK_STEPS = 2
 _MAX_GAP = 0.25
+# Number of further peaks that are examined.
+_N_RIVALS = 3
 # Lower bound of the energy of a patch, grey values squared: flat ones correlate with anything.
 _MIN_ENERGY = 50.0
 # Largest error of the coarse search, in pixels of the full image.
@@ -76,9 +78,9 @@ def measure_corners(
     """Search for corners of the left image along the whole row, and measure their disparities.
 
     Patches are cut once: those of the left image, and strips of the right one around the result
-    of the coarse search. A second peak of it is measured in the same way, as the windows of a
-    house are all alike: where two disparities match as well, either may be wrong. What is reliable
-    is measured again together with the slope of its surface.
+    of the coarse search. Its next peaks are measured in the same way, as the windows of a house
+    are all alike: where two disparities match as well, either may be wrong. What is reliable is
+    measured again together with the slope of its surface.
 
     Parameters
     ----------
@@ -100,9 +102,10 @@ def measure_corners(
     rough, is_found, rivals = search_disparities(images, corners, max_disparity)
     shape, radius = images[0].shape, config.patch_radius_px
     placed = np.flatnonzero(is_found & have_room(shape, corners, rough, radius))
-    doubtful = np.flatnonzero(have_room(shape, corners[placed], rivals[placed], radius))
+    have_rival = [have_room(shape, corners[placed], column, radius) for column in rivals[placed].T]
+    ranks, doubtful = np.nonzero(have_rival)
     owners = np.concatenate([np.arange(len(placed)), doubtful])
-    starts = np.concatenate([rough[placed], rivals[placed[doubtful]]])
+    starts = np.concatenate([rough[placed], rivals[placed[doubtful], ranks]])
     # One pixel wider on all sides, for the gradients along rows and across them.
     u, v = corners[placed].T
     left = sample_patches(images[0], u, v, radius + 1, radius + 1)
@@ -231,8 +234,8 @@ def search_disparities(
     disparities : ndarray of float64, shape (n,)
         Right to `COARSE_ERROR_PX`.
     is_found : ndarray of bool, shape (n,)
-    rivals : ndarray of float64, shape (n,)
-        A disparity farther away that correlates nearly as well, else NaN.
+    rivals : ndarray of float64, shape (n, 3)
+        Other disparities that correlate nearly as well, the best one first, else NaN.
     """
     left, right = (_reduce(image) for image in images)
     n_steps = min(int(np.ceil(max_disparity / _REDUCTION)), left.shape[1])
@@ -251,17 +254,18 @@ def search_disparities(
 
 
 def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
-    """Return the best steps outside the peak where they are nearly as good, else NaN."""
+    """Return the next peaks, in steps, where they are nearly as good as the best, else NaN."""
     rows = np.arange(len(best))
-    elsewhere = correlations.copy()
-    for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):
-        elsewhere[rows, np.clip(best + offset, 0, n_steps)] = -1.0
-    second = np.argmax(elsewhere, axis=1)
-    gaps = correlations[rows, best] - elsewhere[rows, second]
-    rivalled = np.flatnonzero(gaps < _MAX_GAP)
-    between, is_between = parabola_minimum(-elsewhere[rivalled])
-    rivals = np.full(len(best), np.nan)
-    rivals[rivalled] = n_steps - np.where(is_between, between, second[rivalled])
+    elsewhere, peaks = correlations.copy(), best
+    least = correlations[rows, best] - _MAX_GAP
+    rivals = np.full((len(best), _N_RIVALS), np.nan)
+    for rank in range(_N_RIVALS):
+        for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):
+            elsewhere[rows, np.clip(peaks + offset, 0, n_steps)] = -1.0
+        peaks = np.argmax(elsewhere, axis=1)
+        high = np.flatnonzero(elsewhere[rows, peaks] > least)
+        between, is_between = parabola_minimum(-elsewhere[high])
+        rivals[high, rank] = n_steps - np.where(is_between, between, peaks[high])
     return rivals
 
 

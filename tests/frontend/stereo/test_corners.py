@@ -107,6 +107,25 @@ def test_what_the_right_image_shows_twice_is_not_reliable() -> None:
     assert once.are_reliable.mean() > 0.7
 
 
+def test_a_copy_is_found_behind_what_only_resembles_it() -> None:
+    """The small images prefer two windows that differ, half a small pixel nearer to their own."""
+    left, right = image(), image(-8.0)
+    corners = grid()[grid()[:, 0] == 184.0]
+    seen = right[:, 164:189].astype(float)
+    speckles = np.random.default_rng(0).choice([-25.0, 25.0], size=seen.shape)
+    for column in (60, 100):
+        right[:, column : column + 25] = np.clip(seen + speckles, 0, 255)
+    assert measure((left, right), corners).are_reliable.mean() > 0.7
+    right[:, 138:163] = seen
+    rough, _, rivals = search_disparities((left, right), corners, 160.0)
+    copied = np.abs(rivals - 34.0) < COARSE_ERROR_PX
+    assert np.all(np.abs(rough - 8.0) < COARSE_ERROR_PX)
+    assert copied[:, 1:].any()
+    assert copied.any(axis=1).all()
+    found = measure_corners((left, right), corners, CONFIG, max_disparity=160.0)
+    assert not found.are_reliable.any()
+
+
 def test_corners_across_a_step_of_depth_are_not_reliable() -> None:
     rows = np.arange(SHAPE[0])
     corners = grid(step=3)
