@@ -19,7 +19,7 @@ from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder
 from gvo.runs.loop import RunLoop
 from gvo.runs.summary import summarize
-from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.round_trip import RoundTripError, round_trip_error
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FaultyFrame, Frame, Progress, StereoFrame
@@ -306,7 +306,7 @@ def _doubled(on_progress: Callable[[Progress], None]) -> Callable[[Progress], No
 
 
 def _read_errors(folder: Path, turn_ns: int, name: str) -> dict[str, RoundTripError]:
-    trajectories = {name: _read(folder, name) for name in TRAJECTORIES}
+    trajectories = {name: read_trajectory(folder / f"{name}.txt") for name in TRAJECTORIES}
     path_m = float(trajectories["smoothed"].distances()[-1])
     errors: dict[str, RoundTripError] = {}
     for label, trajectory in trajectories.items():
@@ -315,12 +315,6 @@ def _read_errors(folder: Path, turn_ns: int, name: str) -> dict[str, RoundTripEr
             raise RecordingError(f"{name}: no round trip: {error.reason}")
         errors[label] = error
     return errors
-
-
-def _read(folder: Path, name: str) -> Trajectory:
-    trajectory = read_trajectory(folder / f"{name}.txt")
-    _, covariances = read_covariances(folder / f"{name}_covariance.csv")
-    return replace(trajectory, covariances=covariances)
 
 
 def _summary(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import cut, read_text
+from gvo._text import cut, exists, read_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
@@ -49,7 +49,8 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside it (or
     `sequences/NN/times.txt` for `poses/NN.txt`); without one, row n gets n seconds, and
     `stamps_from` is "rows". Of successive rows of a TUM file with the same stamp the last is
-    kept.
+    kept. Where `NAME_covariance.csv` lies beside `NAME.txt`, as in a run's folder, and holds all
+    its stamps, the poses have these covariances.
 
     Parameters
     ----------
@@ -75,6 +76,10 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
         return _read_growing(rows)
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
+    return _with_covariances(_parse(path, header, rows), path)
+
+
+def _parse(path: Path, header: str, rows: list[Row]) -> Trajectory:
     n_columns = len(rows[0].fields)
     if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(header[:_MAX_HEADER])):
         return _read_euroc(rows)
@@ -83,6 +88,14 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     if n_columns == 8:
         return _read_tum(rows)
     raise rows[0].error(f"expected {_FORMATS}, got {n_columns}")
+
+
+def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
+    beside = path.with_name(f"{path.stem}_covariance.csv")
+    stamps_ns, covariances = read_covariances(beside, is_growing=True)
+    _, _, rows = np.intersect1d(trajectory.stamps_ns, stamps_ns, return_indices=True)
+    is_whole = len(rows) == len(trajectory)
+    return replace(trajectory, covariances=covariances[rows]) if is_whole else trajectory
 
 
 def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[IntArray, FloatArray]:
@@ -286,13 +299,15 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
 def _read_growing(rows: list[Row]) -> Trajectory:
     if not rows:
         return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
-    order = np.argsort(read_stamps(rows, unit_ns=1_000_000_000), kind="stable")
-    return _read_tum([rows[index] for index in order])
+    return _read_tum(rows, is_sorted=False)
 
 
-def _read_tum(rows: list[Row]) -> Trajectory:
+def _read_tum(rows: list[Row], *, is_sorted: bool = True) -> Trajectory:
     values = read_numbers(rows, slice(1, 8), n_columns=8)
     stamps_ns = read_stamps(rows, unit_ns=1_000_000_000)
+    if not is_sorted:
+        order = np.argsort(stamps_ns, kind="stable")
+        rows, values, stamps_ns = [rows[n] for n in order], values[order], stamps_ns[order]
     # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
     is_last = np.diff(stamps_ns, append=stamps_ns[-1] + 1) != 0
     rows = [row for row, is_kept in zip(rows, is_last, strict=True) if is_kept]
@@ -388,7 +403,7 @@ def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, li
     TrajectoryError
         If the file cannot be read.
     """
-    if is_growing and not path.exists():
+    if is_growing and not exists(path):
         return "", []
     try:
         content = read_text(path, encoding="utf-8-sig")

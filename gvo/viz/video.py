@@ -46,7 +46,7 @@ class PictureSink(Protocol):
         """Finish what was written."""
 
 
-def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
+def open_sink(path: Path) -> PictureSink:
     """Open a film or a folder of pictures, by the name of the path.
 
     Parameters
@@ -54,8 +54,6 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
     path : Path
         Ends in `.webm` or `.mp4`: a film, or PNG files in a folder beside it where there is no
         encoder. Without a suffix, or an existing folder: a folder of PNG files.
-    rate_hz : float, optional
-        Pictures per second; by the stamps of the first ones where omitted.
 
     Raises
     ------
@@ -75,7 +73,7 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
     if path.exists():
         raise RecordingError(f"{path}: exists already; give another path or remove it")
     if has_encoder(suffix):
-        return Film(path, rate_hz)
+        return Film(path)
     folder = path.with_name(f"{path.stem}_frames")
     reason = f"{path}: there is no encoder for {suffix} here"
     return PngFolder(folder, decisions=(f"{reason}: PNG files in {folder} instead",))
@@ -84,13 +82,12 @@ def open_sink(path: Path, rate_hz: float | None = None) -> PictureSink:
 class Film:
     """A film, written under another name in its folder until it is closed.
 
+    Its rate is that of the median of the first eight periods, until which pictures wait in memory.
+
     Parameters
     ----------
     path : Path
         Ends in a suffix of `CODECS`; its folder is made where it is missing.
-    rate_hz : float, optional
-        Pictures per second of all the film; by the median of the first eight periods where
-        omitted, until which the pictures wait in memory.
 
     Raises
     ------
@@ -98,10 +95,9 @@ class Film:
         When the folder cannot be written.
     """
 
-    def __init__(self, path: Path, rate_hz: float | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.decisions: tuple[str, ...] = ()
-        self._rate_hz = rate_hz or 0.0  # unknown
         self._waiting: list[ImageArray] = []
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
@@ -140,7 +136,7 @@ class Film:
             return
         self._waiting.append(picture)
         self._stamps_ns.append(stamp_ns)
-        if self._rate_hz or len(self._waiting) > _N_PERIODS:
+        if len(self._waiting) > _N_PERIODS:
             self._begin()
 
     def close(self) -> None:
@@ -169,8 +165,7 @@ class Film:
 
     def _begin(self) -> None:
         codec = CODECS[self.path.suffix.lower()]
-        rate_hz = self._rate_hz or rate_of(self._stamps_ns)
-        self._writer = _open_writer(self._part, codec, rate_hz, self._size)
+        self._writer = _open_writer(self._part, codec, rate_of(self._stamps_ns), self._size)
         if self._writer is None:
             raise RecordingError(f"{self.path}: OpenCV could not open it as a film")
         for picture in self._waiting:

@@ -61,6 +61,22 @@ def test_the_covariance_line_holds_the_upper_triangle_row_by_row() -> None:
     )  # fmt: skip
 
 
+def test_poses_have_the_covariances_of_the_file_beside_them(tmp_path: Path) -> None:
+    trajectory = random_trajectory(0, 5)
+    write_tum(tmp_path / "smoothed.txt", trajectory)
+    assert read_trajectory(tmp_path / "smoothed.txt").covariances is None
+    write_covariances(tmp_path / "smoothed_covariance.csv", trajectory)
+    read = read_trajectory(tmp_path / "smoothed.txt")
+    assert read.covariances is not None
+    assert trajectory.covariances is not None
+    np.testing.assert_array_equal(np.triu(read.covariances), np.triu(trajectory.covariances))
+    lines = (tmp_path / "smoothed_covariance.csv").read_text().splitlines(keepends=True)
+    # as of a run that was killed: the last line is cut off, or a line is missing
+    for cut in ("".join(lines)[:-9], "".join([*lines[:2], *lines[3:]])):
+        (tmp_path / "smoothed_covariance.csv").write_text(cut)
+        assert read_trajectory(tmp_path / "smoothed.txt").covariances is None
+
+
 def test_an_empty_covariance_file_reads_as_none(tmp_path: Path) -> None:
     path = tmp_path / "covariances.csv"
     path.write_text(COVARIANCE_HEADER + "\n")

@@ -14,7 +14,7 @@ import numpy as np
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import Event, InputFaults, PoseEvent, anchor
-from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import Edge, FloatArray
 
@@ -117,8 +117,7 @@ class StepSigma:
 class TrajectoryStream:
     """The poses of a TUM, KITTI or EuRoC file.
 
-    Where a file `NAME_covariance.csv` of a run folder lies beside `NAME.txt`, with the same
-    stamps, the poses have its covariances.
+    They have the covariances of the file beside it, see `read_trajectory`.
 
     Parameters
     ----------
@@ -131,7 +130,6 @@ class TrajectoryStream:
     n_poses: int = field(init=False)
     stamps_from: StampsFrom = field(init=False)
     _trajectory: Trajectory = field(init=False)
-    _covariances: FloatArray | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         """Read the file.
@@ -145,20 +143,17 @@ class TrajectoryStream:
         self.name = self.path.stem
         self.n_poses = len(self._trajectory)
         self.stamps_from = self._trajectory.stamps_from
-        beside = self.path.with_name(f"{self.path.stem}_covariance.csv")
-        if beside.is_file():
-            stamps_ns, covariances = read_covariances(beside)
-            if np.array_equal(stamps_ns, self._trajectory.stamps_ns):
-                self._covariances = covariances
-                self.decisions.append(f"{self.name}: covariances of {beside.name}")
+        if self._trajectory.covariances is not None:
+            self.decisions.append(f"{self.name}: covariances of {self.name}_covariance.csv")
 
     def samples(self, faults: InputFaults) -> Iterator[PoseSample]:
         """Yield the poses."""
+        covariances = self._trajectory.covariances
         for i, stamp_ns in enumerate(self._trajectory.stamps_ns):
             yield PoseSample(
                 stamp_ns=int(stamp_ns),
                 T_world_frame=self._trajectory.T_world_frame[i],
-                covariance=None if self._covariances is None else self._covariances[i],
+                covariance=None if covariances is None else covariances[i],
             )
 
 

@@ -24,9 +24,10 @@ _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
 class RunOverlay(AbstractContextManager["RunOverlay"]):
     """A film of a run, open inside a `with` block: one picture per frame, also of faulty ones.
 
-    A thread draws and encodes; the run waits for it only where it is four frames behind. The film
-    is written under another name in the same folder and takes its own when it is closed, also
-    where the run is interrupted. Without a single frame no file is left.
+    It plays as fast as it was recorded, by the median of the first eight periods. A thread draws
+    and encodes; the run waits for it only where it is four frames behind. The film is written
+    under another name in the same folder and takes its own when it is closed, also where the run
+    is interrupted. Without a single frame no file is left.
 
     Parameters
     ----------
@@ -35,11 +36,6 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         PNG files, as where there is no encoder (see `decisions`).
     camera : StereoCamera or PinholeCamera
         Of the recording.
-    rate_hz : float, optional
-        Pictures per second of the film; by the median of the first eight periods where omitted,
-        so that it plays as fast as it was recorded.
-    max_width : int, optional
-        Most pixels in a row, at least 640; as many as are encoded quickly where omitted.
 
     Attributes
     ----------
@@ -54,17 +50,10 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         When the path exists or cannot be written.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        camera: PinholeCamera,
-        *,
-        rate_hz: float | None = None,
-        max_width: int | None = None,
-    ) -> None:
+    def __init__(self, path: str | Path, camera: PinholeCamera) -> None:
         self._camera = camera
-        self._max_width = film_width(camera) if max_width is None else max_width
-        self._sink = open_sink(Path(path), rate_hz)
+        self._max_width = film_width(camera)
+        self._sink = open_sink(Path(path))
         self.decisions = self._sink.decisions
         self._n = 0
         self._is_open = True

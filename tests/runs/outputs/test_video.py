@@ -77,7 +77,7 @@ def test_faulty_frames_have_dark_pictures_in_their_place(drive: _Run, tmp_path: 
     recording, pairs = drive
     camera = recording.info.camera
     faulty = FaultyFrame(stamp_ns=pairs[4][0].stamp_ns, reason="image_0/000004.png: is cut off")
-    with RunOverlay(tmp_path / "film.mp4", camera, rate_hz=5.0) as output:
+    with RunOverlay(tmp_path / "film.mp4", camera) as output:
         for n, (frame, result) in enumerate(pairs):
             if n == 4:
                 output.add_faulty(faulty)
@@ -88,7 +88,6 @@ def test_faulty_frames_have_dark_pictures_in_their_place(drive: _Run, tmp_path: 
     expected = compose_faulty(faulty, camera, index=4, max_width=film_width(camera))
     assert np.abs(pictures[4].astype(int) - expected).mean() < 4.0
     assert pictures[4].mean() < 0.3 * pictures[5].mean()
-    assert cv2.VideoCapture(str(tmp_path / "film.mp4")).get(cv2.CAP_PROP_FPS) == 5.0
 
 
 @pytest.mark.parametrize("n_done", [1, 7, 10])
