@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -27,6 +28,7 @@ MAX_CHARACTERS = 1 << 18
 MAX_VALUES = 100_000
 """Largest number of YAML values and keys, with aliases expanded."""
 
+_LONG_WORD = re.compile(r"\S{251,}")
 _MAX_NUMBER = 250  # characters; no float needs more
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 
@@ -62,6 +64,17 @@ def cut(text: str, n_characters: int) -> str:
             character if character.isprintable() else repr(character)[1:-1] for character in start
         )
     return start if len(start) <= n_characters else f"{start[:n_characters]}..."
+
+
+def shortened_words(text: str) -> str:
+    """Return a message in which no word is longer than a path may be in a message.
+
+    Examples
+    --------
+    >>> len(shortened_words("no number: " + 5000 * "9"))
+    214
+    """
+    return _LONG_WORD.sub(lambda word: f"{word[0][:150]}...{word[0][-50:]}", text)
 
 
 def exists(path: Path) -> bool:

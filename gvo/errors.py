@@ -1,6 +1,13 @@
 """Errors of the input: files, topics, configurations, calibrations."""
 
-from gvo._text import cut
+import json
+import shlex
+import sys
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from gvo._text import cut, shortened_words
 
 _MAX_MESSAGE = 4000  # characters
 
@@ -14,7 +21,7 @@ class GvoError(Exception):
 
     def __str__(self) -> str:
         """Return the message."""
-        return cut(super().__str__(), _MAX_MESSAGE)
+        return cut(shortened_words(super().__str__()), _MAX_MESSAGE)
 
 
 class RecordingError(GvoError):
@@ -53,3 +60,32 @@ class SmoothingError(GvoError):
 
 class TrajectoryError(GvoError):
     """A trajectory file is missing, malformed or cannot be associated."""
+
+
+def missing_extra(what: str, extra: str) -> ConfigurationError:
+    """Return the error of a package that is not installed, with the line that installs it.
+
+    Parameters
+    ----------
+    what : str
+        What needs which package.
+    extra : str
+        Of gvo's own packages.
+    """
+    line = shlex.join([sys.executable, "-m", "pip", "install", f"{_origin()}[{extra}]"])
+    return ConfigurationError(f"{what}; install it by: {line}")
+
+
+def _origin() -> str:
+    """Return what pip is to be given: the folder or file that gvo was installed from."""
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    clone = Path(__file__).parents[1]
+    if (clone / "pyproject.toml").is_file():
+        return str(clone)
+    try:
+        url = json.loads(distribution("gvo").read_text("direct_url.json") or "{}").get("url", "")
+    except PackageNotFoundError:
+        url = ""
+    path = url2pathname(urlsplit(url).path)
+    return path if url.startswith("file:") and Path(path).exists() else "gvo"

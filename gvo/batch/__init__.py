@@ -1,6 +1,6 @@
 """Many recordings, many configurations, on one machine or a Dask cluster.
 
-Needs `pip install 'gvo[batch]'`; Dask is loaded with the first name.
+Needs the extra `batch`; Dask is loaded with the first name.
 
 Examples
 --------
@@ -13,7 +13,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from gvo.errors import ConfigurationError
+from gvo.errors import missing_extra
 
 if TYPE_CHECKING:
     from gvo.batch.engine import BatchProgress, ClusterError, connected
@@ -56,7 +56,7 @@ def __getattr__(name: str) -> object:
         package = (error.name or "").partition(".")[0]
         if package not in _NEEDED:
             raise
-        raise ConfigurationError(f"batches need {package}: pip install 'gvo[batch]'") from error
+        raise missing_extra(f"batches need {package}", "batch") from error
 
 
 def __dir__() -> list[str]:

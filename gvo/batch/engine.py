@@ -19,7 +19,7 @@ from gvo._text import cut
 from gvo.batch.rows import BatchRow
 from gvo.batch.tasks import Task, TaskOptions
 from gvo.batch.worker import work
-from gvo.errors import ConfigurationError, GvoError
+from gvo.errors import GvoError, missing_extra
 
 # An adaptive cluster grows with the tasks that it sees.
 _MIN_IN_FLIGHT = 100
@@ -116,7 +116,7 @@ def _make_security() -> Security:
     try:
         security: Security = Security.temporary()
     except ImportError as error:
-        raise ConfigurationError("batches need cryptography: pip install 'gvo[batch]'") from error
+        raise missing_extra("batches need cryptography", "batch") from error
     return security
 
 

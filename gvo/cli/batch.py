@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +22,16 @@ from gvo.cli.options import (
     Start,
     recording_options,
 )
-from gvo.cli.terminal import both, exit_code, interruptible, told_where_it_stands, warn
+from gvo.cli.terminal import (
+    Command,
+    both,
+    exit_code,
+    interruptible,
+    is_shown,
+    say,
+    told_where_it_stands,
+    warn,
+)
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -35,7 +43,7 @@ _MAX_WARNINGS = 20
 
 def add_commands(app: typer.Typer) -> None:
     """Add the command to the `gvo` command."""
-    app.command()(batch)
+    app.command(cls=Command)(batch)
 
 
 def batch(
@@ -64,7 +72,8 @@ def batch(
         typer.Option(min=1, metavar="N", help="Worker processes here; one a core if omitted."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="URL", help="Of a Dask cluster, such as tcp://host:8786.")
+        str | None,
+        typer.Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Run finished runs again.")] = False,
     start: Start = 0.0,
@@ -103,7 +112,7 @@ def batch(
         plots=plots,
     )
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
-    typer.echo(", ".join(counts))
+    say(", ".join(counts))
     with (
         interruptible() as check,
         told_where_it_stands(out, and_then=": the same command goes on"),
@@ -137,7 +146,7 @@ def _sort_arguments(
 @contextmanager
 def _progress() -> Iterator[Callable[[BatchProgress], None]]:
     """Yield a callback: a status line on a terminal, elsewhere a line for each run."""
-    if not sys.stderr.isatty():
+    if not is_shown():
         yield _print_row
         return
     from rich.console import Console
@@ -152,7 +161,7 @@ def _print_row(progress: BatchProgress) -> None:
     if row is not None:
         what = f"{row.status}, found" if row.is_found else row.status
         reason = f": {row.reason}" if row.reason else ""
-        typer.echo(f"[{progress.n_done}/{progress.n_total}] {row.folder}: {what}{reason}", err=True)
+        say(f"[{progress.n_done}/{progress.n_total}] {row.folder}: {what}{reason}", err=True)
 
 
 def _words(progress: BatchProgress) -> str:
@@ -180,7 +189,7 @@ def _report(counts: Mapping[str, int], reasons: list[str], out: str) -> NoReturn
         warn([f"{len(reasons) - _MAX_WARNINGS} more runs are not complete, see the table"])
     words = ", ".join(f"{n} {status}" for status, n in counts.items())
     n_runs = sum(counts.values())
-    typer.echo(f"{_count(n_runs, 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
+    say(f"{_count(n_runs, 'run')}: {words}; {out.rstrip('/')}/{REPORT}")
     if counts.get("failed") == n_runs:
         raise ConfigurationError("all runs failed")
     raise typer.Exit(exit_code(not reasons))

@@ -26,7 +26,7 @@ from gvo.cli.options import (
     open_source,
     recording_options,
 )
-from gvo.cli.terminal import both, exit_code, interruptible, progress, warn
+from gvo.cli.terminal import Command, both, exit_code, interruptible, progress, say, warn
 from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
@@ -44,14 +44,15 @@ _SIGNALS_S = 0.1
 def add_commands(app: typer.Typer) -> None:
     """Add the commands to the `gvo` command."""
     for command in (explain, view, round_trip):
-        app.command()(command)
+        app.command(cls=Command)(command)
 
 
 def explain(
     recordings: Recordings,
     out: Out,
     frame: Annotated[
-        int, typer.Option("--frame", min=0, metavar="N", help="Which frame; 0 is the first.")
+        int,
+        typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0."),
     ],
     start: Start = 0.0,
     every: Every = 1,
@@ -83,7 +84,7 @@ def explain(
         )
         written = write_explanation(explanation, out)
     for path in written:
-        typer.echo(path)
+        say(path)
 
 
 def view(
@@ -94,7 +95,7 @@ def view(
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = (
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = (
         _DEFAULT_PORT
     ),
     config: ConfigFile = None,
@@ -125,7 +126,7 @@ def view(
             shown, truth = player, _find_truth(player.source)
         server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])
-        typer.echo(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
+        say(f"{server.url} shows {recordings[0].name}; Ctrl-C ends")
         while not server.wait(_SIGNALS_S):
             check(None)
 
@@ -176,12 +177,12 @@ def round_trip(
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
     for line in source.info.decisions:
-        typer.echo(line)
+        say(line)
     with interruptible() as check, progress(source.info.name) as show:
         result = run_round_trip(
             source, out, config=parameters, excerpt=excerpt, on_progress=both(show, check)
         )
-    typer.echo(format_round_trip_errors(result.errors), nl=False)
-    typer.echo(out / "round_trip.png")
+    say(format_round_trip_errors(result.errors), nl=False)
+    say(out / "round_trip.png")
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))

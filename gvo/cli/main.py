@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer.main import get_command
 
 from gvo._version import __version__
 from gvo.cli import batch as cli_batch
@@ -33,12 +35,14 @@ from gvo.cli.options import (
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
+    Command,
     both,
     exit_code,
     interruptible,
     progress,
     report,
     report_smoothed,
+    say,
     told_where_it_stands,
     warn,
 )
@@ -50,11 +54,14 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="gvo",
-    help="Visual odometry: a stereo or RGB-D recording in, trajectories with covariances out.",
-    no_args_is_help=True,
-    add_completion=False,
+    help="Visual odometry: stereo or RGB-D in, trajectories with covariances out.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
 )
+_command = partial(app.command, cls=Command)
+# What is refused of a command line; Typer gives the class no name of its own.
+_UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -86,6 +93,7 @@ def _print_version(value: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option(
@@ -93,23 +101,26 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Take the options that stand before a command."""
+    """Take the options that stand before a command; without one, show what there is."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(EXIT_UNUSABLE)
 
 
-@app.command()
+@_command()
 def demo(
     out: Out = Path("gvo-demo"),
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.runs.demo import BAG_NAME, run_demo
 
-    typer.echo(f"rendering a drive into {out / BAG_NAME}")
+    say(f"rendering a drive into {out / BAG_NAME}")
     with interruptible() as check, progress("demo") as show:
         result = run_demo(out, on_rendered=check, on_progress=both(show, check))
     report(result, out)
 
 
-@app.command()
+@_command()
 def run(
     recordings: Recordings,
     out: Out,
@@ -120,12 +131,12 @@ def run(
     every: Every = 1,
     frame: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Write poses of this frame of tf, not the camera's."),
+        typer.Option(metavar="NAME", help="Frame of tf whose poses are written."),
     ] = None,
     initial_pose: Annotated[
         str | None,
         typer.Option(
-            metavar="POSE", help="Of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
+            metavar="POSE", help="Pose of the first frame: X,Y,Z[,QX,QY,QZ,QW] in metres, or truth."
         ),
     ] = None,
     ground_truth: Annotated[
@@ -178,7 +189,7 @@ def run(
         None if ground_truth is None else read_truth(source, ground_truth, base_frame=base_frame)
     )
     for line in source.info.decisions:
-        typer.echo(line)
+        say(line)
     with (
         interruptible() as check,
         told_where_it_stands(out),
@@ -198,7 +209,7 @@ def run(
     report(result, out)
 
 
-@app.command("check")
+@_command("check")
 def check_(
     recordings: Recordings,
     config: ConfigFile = None,
@@ -231,11 +242,11 @@ def check_(
     if as_json:
         typer.echo(json.dumps(result.as_json(), allow_nan=False))
     else:
-        typer.echo(format_check(result), nl=False)
+        say(format_check(result), nl=False)
     raise typer.Exit(0 if result.is_healthy else EXIT_FAULTS)
 
 
-@app.command()
+@_command()
 def smooth(
     inputs: Annotated[
         list[str],
@@ -276,7 +287,7 @@ def smooth(
     sigmas = [parse_sigma(text) for text in sigma or []]
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
     for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
-        typer.echo(decision)
+        say(decision)
     with interruptible() as check, progress(source.name, "poses") as show:
         result = smooth_edges(
             source,
@@ -320,7 +331,7 @@ def _smooth_lines(
     report_smoothed(result, out, is_stdout_taken=True)
 
 
-@app.command()
+@_command()
 def compare(
     reference: Annotated[
         str,
@@ -370,7 +381,7 @@ def compare(
     if as_json:
         typer.echo(json.dumps(evaluations_json(evaluations), allow_nan=False))
     else:
-        typer.echo(format_evaluations(evaluations), nl=False)
+        say(format_evaluations(evaluations), nl=False)
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
@@ -383,12 +394,13 @@ def compare(
         )
 
 
-@app.command("convert")
+@_command("convert")
 def convert_(
     recordings: Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
-        _Layout | None, typer.Option(help="Of the folder; a data set's for a bag, else a bag's.")
+        _Layout | None,
+        typer.Option(help="Layout of the folder that is written."),
     ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
@@ -416,12 +428,12 @@ def convert_(
             config=settings,
             progress=check,
         )
-    typer.echo(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
+    say(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
     warn(written.skipped)
     raise typer.Exit(exit_code(not written.skipped))
 
 
-@app.command("config")
+@_command("config")
 def config_(config: ConfigFile = None, set_: Settings = None) -> None:
     """Print all parameters with units, ranges and meaning."""
     from gvo.config import describe_configuration
@@ -445,10 +457,28 @@ cli_batch.add_commands(app)
 cli_inspect.add_commands(app)
 
 
+def _run() -> Any:  # noqa: ANN401 - an exit code, or None
+    group: Any = get_command(app)
+    for option in group.params:
+        option.hidden = option.name == "show_completion"
+        if option.name == "install_completion":
+            option.help = "Complete commands in this shell."
+    try:
+        return group(prog_name="gvo", standalone_mode=False)
+    except _UsageError as error:
+        refusal: Any = error
+        words = refusal.format_message().rstrip(".")
+        command = refusal.ctx.command_path if refusal.ctx else "gvo"
+        message = f"{words[:1].lower()}{words[1:]}; see `{command} --help`"
+        raise ConfigurationError(message) from error
+
+
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     try:
-        app()
+        raise SystemExit(_run())
+    except typer.Abort:
+        raise SystemExit(130) from None
     except GvoError as error:
         typer.echo(f"gvo: error: {error}", err=True)
         is_partly = isinstance(error, OutputError) and error.is_partly

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from gvo.io.opening import RecordingOptions
     from gvo.io.recording import Source
 
+_LOGGER = logging.getLogger(__name__)
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change a parameter; repeatable."),
@@ -30,13 +32,13 @@ CalibrationFiles = Annotated[
         metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
     ),
 ]
-Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Left images.")]
-Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Right images.")]
-Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Colour images.")]
-Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Depth images.")]
+Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the left images.")]
+Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the right images.")]
+Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the colour images.")]
+Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the depth images.")]
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")]
-Start = Annotated[float, typer.Option(metavar="S", help="Skip the first seconds.")]
-Duration = Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")]
+Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
+Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to read from there.")]
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
 
 
@@ -44,7 +46,9 @@ def load(path: Path | None, settings: list[str] | None) -> Config:
     """Return the parameters of a file, changed by settings."""
     from gvo.config import load_configuration
 
-    return load_configuration(path, settings or [])
+    config = load_configuration(path, settings or [])
+    _LOGGER.debug("parameters: %s", config.model_dump(exclude_defaults=True) or "defaults")
+    return config
 
 
 def recording_options(
@@ -66,4 +70,6 @@ def open_source(recordings: Sequence[Path], config: Config, options: RecordingOp
     """Open a recording as the options say."""
     from gvo.io.opening import open_recording
 
-    return open_recording(recordings, config=config, options=options)
+    source = open_recording(recordings, config=config, options=options)
+    _LOGGER.debug("opened %s: %s", source.info.name, "; ".join(source.info.decisions))
+    return source

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
+from typer.core import TyperCommand
+from typer.main import get_command
 
 if TYPE_CHECKING:
     from gvo.runs.run import RunResult
@@ -23,6 +26,49 @@ EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
 
 
+_LOGGER = logging.getLogger("gvo")
+_LEVELS = {True: logging.DEBUG, None: logging.WARNING, False: logging.ERROR}
+
+
+def _set_verbosity(value: bool | None) -> None:
+    _LOGGER.setLevel(_LEVELS[value])
+    _LOGGER.handlers.clear()
+    if value:
+        _LOGGER.addHandler(logging.StreamHandler())
+        _LOGGER.handlers[0].setFormatter(logging.Formatter("%(name)s: %(message)s"))
+
+
+def _every_command(
+    verbose: Annotated[
+        bool | None,
+        typer.Option(
+            "--verbose/--quiet",
+            "-v/-q",
+            callback=_set_verbosity,
+            expose_value=False,
+            help="Log what is done; or print nothing but errors.",
+        ),
+    ] = None,
+) -> None:
+    """Hold the options of every command."""
+
+
+class Command(TyperCommand):
+    """A command with the options that all of them have."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 - Typer's
+        super().__init__(*args, **options)
+        shared = typer.Typer(add_completion=False)
+        shared.command()(_every_command)
+        self.params += get_command(shared).params
+
+
+def say(text: object, *, nl: bool = True, err: bool = False) -> None:
+    """Print what is not an error, unless --quiet was given."""
+    if _LOGGER.isEnabledFor(logging.WARNING):
+        typer.echo(text, nl=nl, err=err)
+
+
 def exit_code(is_complete: bool) -> int:
     """Return 0 for a complete result, 3 for a part of it."""
     return 0 if is_complete else 3
@@ -34,17 +80,17 @@ def report(result: RunResult, out: Path) -> NoReturn:
     from gvo.trajectory.evaluation import format_evaluations
 
     for key in ("base_frame", "ground_truth"):
-        typer.echo(f"{key.replace('_', ' ')}: {result.summary[key]}")
+        say(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
-        typer.echo(format_evaluations(result.evaluations), nl=False)
+        say(format_evaluations(result.evaluations), nl=False)
     frames, tracked = result.summary["frames"], result.summary["tracked"]
     learnt = describe_offsets(result.summary["rig_offsets"])
     if learnt:
-        typer.echo(f"learnt of the camera: {learnt}")
+        say(f"learnt of the camera: {learnt}")
     where = out if result.report is None else result.report
     covered = f"coverage {result.summary['coverage_percent']:.1f} %"
     segments = _segment_words(result.summary["segments"])
-    typer.echo(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
+    say(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))
 
@@ -63,14 +109,14 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     from gvo.trajectory.evaluation import format_evaluations
 
     if result.evaluations:
-        typer.echo(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
+        say(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
     summary = result.summary
     if summary["batch"] is not None:
         errors = summary["batch"]
         text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} in a batch"
-        typer.echo(text, err=is_stdout_taken)
+        say(text, err=is_stdout_taken)
     counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
-    typer.echo(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
+    say(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))
 
@@ -86,13 +132,18 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
 def warn(warnings: Sequence[str]) -> None:
     """Print warnings, a line each, to standard error."""
     for warning in warnings:
-        typer.echo(f"gvo: warning: {warning}", err=True)
+        say(f"gvo: warning: {warning}", err=True)
+
+
+def is_shown() -> bool:
+    """Tell whether progress is drawn: on a terminal, unless --quiet or --verbose was given."""
+    return sys.stderr.isatty() and _LOGGER.level == logging.WARNING
 
 
 @contextmanager
 def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], None]]:
     """Yield a callback that draws a bar on a terminal, and nothing in a pipe."""
-    if not sys.stderr.isatty():
+    if not is_shown():
         yield lambda progress: None
         return
     from rich.console import Console

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -16,6 +17,8 @@ from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class Output(Protocol):
@@ -166,12 +169,14 @@ class RunLoop:
             finished=self._placed(result.finished),
             stage_ms={"read": self._read_ms, **result.stage_ms},
         )
+        _log(placed)
         self.statistics.add_result(placed)
         for output in outputs:
             output.add_frame(item, placed)
 
     def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
+        _LOGGER.debug("frame at %d: skipped: %s", item.stamp_ns, item.reason)
         self.statistics.add_duration("read", self._read_ms)
         self.statistics.add_faulty(item, is_loss=is_loss)
         for output in outputs if is_loss else ():
@@ -179,3 +184,17 @@ class RunLoop:
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)
+
+
+def _log(result: FrameResult) -> None:
+    _LOGGER.debug(
+        "frame at %d: %s, %d points, %d matches, %d inliers, %d links, %.1f ms%s",
+        result.stamp_ns,
+        result.status.value,
+        result.n_points,
+        result.n_matches,
+        result.n_inliers,
+        result.n_links,
+        sum(result.stage_ms.values()),
+        f": {result.reason}" if result.reason else "",
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -35,6 +36,8 @@ from gvo.trajectory.evaluation import Evaluation
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,6 +118,7 @@ def run_recording(
     base_frame = base_frame or BaseFrame(source.info.frame_id)
     outputs = outputs or RunOutputs()
     truth = _find_truth(source, ground_truth, base_frame)
+    _LOGGER.debug("ground truth: %s", truth.decision if isinstance(truth, Truth) else truth.reason)
     first_pose = partial(initial_pose, truth) if starts_at_truth else None
     start = truth.trajectory if starts_at_truth and isinstance(truth, Truth) else None
     identity = run_identity(source, base_frame, excerpt, start=start)
@@ -126,6 +130,7 @@ def run_recording(
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
             faults = _close(files)
+        _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
         result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
     return _drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
@@ -237,6 +242,7 @@ def _drawn(result: RunResult, folder: Path, *, plots: Path | None) -> RunResult:
 
 def _draw(folder: Path, *, plots: Path | None) -> None:
     """Draw the picture and write the report."""
+    _LOGGER.debug("drawing %s and %s", folder / PICTURE, folder / REPORT)
     from gvo.viz.plots import plot_trajectories
     from gvo.viz.report import write_run_report
 

@@ -155,8 +155,47 @@ def test_bad_input_gets_one_line_and_exit_code_2(
         assert word in answer.err
 
 
-def test_a_missing_argument_is_exit_code_2(command: Command) -> None:
-    assert command("run").code == 2
+def test_a_long_value_is_shortened(command: Command) -> None:
+    for arguments in (["run", "9" * 5000], ["compare", "a", "b", "--segments", "9" * 5000]):
+        answer = command(*arguments, *(["--out", "out"] if arguments[0] == "run" else []))
+        assert answer.code == 2
+        assert is_one_line(answer.err)
+        assert len(answer.err) < 700
+
+
+def test_without_a_command_all_are_listed(command: Command) -> None:
+    answer = command()
+    assert answer.code == 2
+    assert answer.out == command("-h").out
+
+
+@pytest.mark.parametrize("arguments", [["config", "-q"], ["compare", "a.txt", "a.txt", "-q"]])
+def test_quiet_prints_errors_alone(
+    command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_poses(Path("a.txt"))
+    assert command(*arguments)[::2] == (0, "")
+    answer = command("compare", "a.txt", "a.txt", "-q")
+    assert answer == (0, "", "")
+    assert is_one_line(command("compare", "a.txt", "missing.txt", "-q").err)
+    assert "a" in command("compare", "a.txt", "a.txt").out
+
+
+def test_verbose_logs_what_is_done(command: Command, room_bag: Path, tmp_path: Path) -> None:
+    answer = command("run", room_bag, "--out", tmp_path / "out", "--no-report", "-v")
+    assert answer.code == 0
+    lines = answer.err.splitlines()
+    assert sum(line.startswith("gvo.runs.loop: frame at ") for line in lines) == 20
+    assert any("parameters: defaults" in line for line in lines)
+    assert command("check", room_bag).err == ""
+
+
+def test_a_shell_completes_options(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    monkeypatch.setenv("_GVO_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "gvo run --grou")
+    monkeypatch.setenv("COMP_CWORD", "2")
+    assert command().out == "--ground-truth\n"
 
 
 @pytest.mark.recorded

@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gvo.config import Config, describe_configuration
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import ConfigurationError, RecordingError, missing_extra
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.frames import RunFrames
@@ -166,4 +166,4 @@ class RunRerun(AbstractContextManager["RunRerun"]):
 
 def _check_sdk() -> None:
     if importlib.util.find_spec("rerun") is None:
-        raise ConfigurationError("--rerun needs rerun-sdk: pip install 'gvo[rerun]'")
+        raise missing_extra("--rerun needs rerun-sdk", "rerun")

@@ -1,6 +1,6 @@
 """The page in the browser: a recording that is tracked live, or a finished run.
 
-It needs viser (`pip install 'gvo[view]'`), which is imported when a page is served.
+It needs viser (the extra `view`), which is imported when a page is served.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gvo.errors import ConfigurationError
+from gvo.errors import missing_extra
 
 if TYPE_CHECKING:
     from gvo.trajectory.trajectory import Trajectory
@@ -51,7 +51,7 @@ def serve(
     try:
         import viser  # noqa: F401 - only whether it is there
     except ImportError as error:
-        raise ConfigurationError("gvo view needs viser: pip install 'gvo[view]'") from error
+        raise missing_extra("gvo view needs viser", "view") from error
     if isinstance(source, str | Path):
         from gvo.viz.view.finished import serve_record
 
