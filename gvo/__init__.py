@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gvo.io.convert.convert import convert
     from gvo.io.edges.opening import open_edges
     from gvo.io.excerpt import Excerpt
-    from gvo.io.frames import frames
+    from gvo.io.frames import Rig, frames
     from gvo.io.opening import RecordingOptions, open_recording
     from gvo.io.poses.inputs import read_ground_truth
     from gvo.io.synthetic.recording import SyntheticRecording
@@ -63,7 +63,7 @@ _MODULES = {
     "gvo.runs.smooth": ("smooth_edges",),
     "gvo.io.edges.opening": ("open_edges",),
     "gvo.io.excerpt": ("Excerpt",),
-    "gvo.io.frames": ("frames",),
+    "gvo.io.frames": ("Rig", "frames"),
     "gvo.io.opening": ("RecordingOptions", "open_recording"),
     "gvo.io.synthetic.recording": ("SyntheticRecording",),
     "gvo.trajectory.evaluation": ("Evaluation", "evaluate", "format_evaluations"),
@@ -109,6 +109,7 @@ __all__ = [
     "Rejected",
     "RelativePose",
     "RgbdFrame",
+    "Rig",
     "RunOutputs",
     "RunResult",
     "SlidingWindow",

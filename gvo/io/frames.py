@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import cv2
@@ -14,9 +15,11 @@ from numpy.typing import NDArray
 
 from gvo.config import Config, SyncConfig
 from gvo.errors import GvoError, RecordingError
-from gvo.geometry.camera import Calibration, rectification_maps
+from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera, rectification_maps
+from gvo.io.calibration.files import read_cameras
 from gvo.io.depth_registration import DepthRegistration
 from gvo.io.excerpt import Excerpt, take_excerpt
+from gvo.io.images import depth_from_counts, depth_from_metres
 from gvo.io.recording import DepthView, RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.sync import Pair, StampFilter, pair_images
 from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, StereoFrame
@@ -24,6 +27,7 @@ from gvo.types import DepthArray, FaultyFrame, Frame, ImageArray, RgbdFrame, Ste
 _ROW_STEP = 64
 # Colour takes longer to decode than depth: with one frame ahead the thread of the depth idles.
 _N_AHEAD = 2
+_MILLIMETRES = 1000.0
 # What reading or decoding one image may raise besides, in a source of one's own as well.
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Item: TypeAlias = Pair | FaultyFrame
@@ -209,14 +213,20 @@ def _prepare(
 def _make_frame(
     pair: Pair, results: list[NDArray[Any] | str], sensor: Sensor
 ) -> Frame | FaultyFrame:
-    stamp_ns = pair[0].stamp_ns
     first, second = results
     if isinstance(first, str) or isinstance(second, str):
         reasons = [result for result in results if isinstance(result, str)]
-        return FaultyFrame(stamp_ns=stamp_ns, reason="; ".join(reasons))
+        return FaultyFrame(stamp_ns=pair[0].stamp_ns, reason="; ".join(reasons))
+    return _frame_of(sensor, (pair[0].stamp_ns, pair[1].stamp_ns), first, second)
+
+
+def _frame_of(
+    sensor: Sensor, stamps_ns: tuple[int, int], first: NDArray[Any], second: NDArray[Any]
+) -> Frame:
+    """Return the frame of two prepared images, stamped as the first one."""
+    stamp_ns, depth_ns = stamps_ns
     if sensor == "stereo":
         return StereoFrame(stamp_ns=stamp_ns, left=first, right=second)
-    depth_ns = pair[1].stamp_ns
     return RgbdFrame(stamp_ns=stamp_ns, image=first, depth=second, depth_stamp_ns=depth_ns)
 
 
@@ -315,6 +325,91 @@ def make_preparers(info: RecordingInfo) -> _Preparers:
     return first, ImagePreparer(info.calibrations[0], is_depth=True, depth_view=info.depth_view)
 
 
+class Rig:
+    """A calibrated camera of your own: makes frames of its raw images.
+
+    Parameters
+    ----------
+    calibration : str or Path
+        A file or a folder in any form that `--calibration` takes; for two files that of the left
+        camera.
+    right : str or Path, optional
+        The file of the right camera, where it has one of its own.
+    sensor : {"stereo", "rgbd"}
+        What the camera is; of an RGB-D camera the files describe the colour images.
+    is_rectified : bool
+        The images are rectified already: of a pair with P only that counts.
+
+    Attributes
+    ----------
+    info : RecordingInfo
+        What a recording of this camera has; for a `Source` of your own.
+
+    Raises
+    ------
+    CalibrationError
+        When a file is missing or malformed, or does not describe such a camera.
+    """
+
+    def __init__(
+        self,
+        calibration: str | Path,
+        right: str | Path | None = None,
+        *,
+        sensor: Sensor = "stereo",
+        is_rectified: bool = False,
+    ) -> None:
+        paths = [Path(path) for path in (calibration, right) if path is not None]
+        cameras = read_cameras(paths, sensor=sensor, is_rectified=is_rectified)
+        self.info = RecordingInfo(
+            name=cameras.origin,
+            sensor=sensor,
+            calibrations=cameras.calibrations,
+            n_images=0,
+            T_body_cam=cameras.T_body_cam,
+        )
+        self._depth_scale = cameras.depth_scale or _MILLIMETRES
+        self._preparers = make_preparers(self.info)
+
+    @property
+    def camera(self) -> StereoCamera | PinholeCamera:
+        """The camera of the frames, which `Odometry` takes."""
+        return self.info.camera
+
+    def frame(self, stamp_ns: int, first: NDArray[Any], second: NDArray[Any]) -> Frame:
+        """Return the frame of two images taken together: grey and rectified.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            When they were taken, nanoseconds.
+        first : ndarray of uint8, shape (h, w) or (h, w, 3)
+            Left or colour image, as the camera gives it; colours in the order of OpenCV (BGR).
+        second : ndarray
+            Right image likewise; or depth as seen by the colour camera, shape (h, w): uint16 in
+            counts (of `depth_scale` in the calibration file, else millimetres) or float in metres.
+
+        Returns
+        -------
+        StereoFrame or RgbdFrame
+
+        Raises
+        ------
+        RecordingError
+            When size or type are not what the calibration says, or no depth is known.
+        """
+        if self.info.sensor == "rgbd":
+            second = self._metres(np.asarray(second))
+        images = zip(self._preparers, (first, second), strict=True)
+        prepared = [prepare(image) for prepare, image in images]
+        return _frame_of(self.info.sensor, (stamp_ns, stamp_ns), *prepared)
+
+    def _metres(self, depth: NDArray[Any]) -> DepthArray:
+        if depth.dtype.kind == "f":
+            return depth_from_metres(depth)
+        return depth_from_counts(depth, self._depth_scale, "depth image")
+
+
 class ImagePreparer:
     """Prepare raw pixels of one stream for a frame: check, make grey, rectify.
 
@@ -367,7 +462,8 @@ class ImagePreparer:
         if pixels.shape[:2] != self._size:
             raise RecordingError(
                 f"expected {_size_text(self._size)} pixels by the calibration, got "
-                f"{_size_text(pixels.shape)}; give that of these images by --calibration FILE"
+                f"{_size_text(pixels.shape)}; give the calibration of these images "
+                "(--calibration FILE)"
             )
         return self._depth(pixels) if self._is_depth else self._grey(pixels)
 

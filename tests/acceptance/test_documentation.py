@@ -58,6 +58,8 @@ def workplace(
     """Return a working folder with the recordings that the documentation names."""
     for path, name in ((drive_bag, "drive.mcap"), (room_bag, "room.bag"), (robot, "robot.mcap")):
         shutil.copy(path, tmp_path / name)
+    (shown,) = (block for page, block in blocks("yaml") if page == "own-camera.md")
+    (tmp_path / "stereo.yaml").write_text(shown)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

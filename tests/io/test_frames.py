@@ -1,5 +1,6 @@
 """From images to frames; images that repeat."""
 
+import json
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,12 +13,12 @@ import numpy as np
 import pytest
 
 from gvo.config import Config, RuntimeConfig, SyncConfig
-from gvo.errors import RecordingError
-from gvo.geometry.camera import Calibration, PinholeCamera
+from gvo.errors import CalibrationError, RecordingError
+from gvo.geometry.camera import Calibration, PinholeCamera, StereoCamera
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
 from gvo.io.depth_registration import DepthRegistration
-from gvo.io.frames import frames, refuse_repeats
+from gvo.io.frames import Rig, frames, refuse_repeats
 from gvo.io.recording import DepthView, StampedImage
 from gvo.io.sync import pair_images
 from gvo.types import FaultyFrame, Frame, RgbdFrame, StereoFrame
@@ -70,8 +71,8 @@ def test_each_fault_is_one_faulty_frame_and_the_others_are_read(tiny: Any, threa
         (20, "left image: a.png: damaged"),
         (
             30,
-            "right image: expected 48x32 pixels by the calibration, got 48x31; give that of these "
-            "images by --calibration FILE",
+            "right image: expected 48x32 pixels by the calibration, got 48x31; give the "
+            "calibration of these images (--calibration FILE)",
         ),
         (40, "no right image within sync.stereo_tolerance_ms=0: the nearest is 1e-05 ms away"),
         (50, "left image: b; right image: c"),
@@ -115,6 +116,64 @@ def test_raw_images_are_rectified(tiny: Any) -> None:
     assert not np.array_equal(frame.left, ramp)
 
 
+def _written(path: Path, tiny: Any, **changes: Any) -> Path:
+    """Write the camera of tiny recordings, by default with a lens, as a file; return the path."""
+    D = {"distortion_coefficients": {"data": [-0.2, 0.05, 0.001, -0.001, 0.0]}}
+    path.write_text(json.dumps(tiny.ros_camera(**(D | changes))))
+    return path
+
+
+def test_a_rig_makes_the_frames_that_a_recording_of_it_has(tiny: Any, tmp_path: Path) -> None:
+    for name, baseline in (("left", 0.0), ("right", 0.5)):
+        P = Calibration.from_camera(tiny.camera, baseline=baseline).P
+        matrix = {"data": P.ravel().tolist()}
+        _written(tmp_path / f"{name}.yaml", tiny, projection_matrix=matrix)
+    rig = Rig(tmp_path / "left.yaml", str(tmp_path / "right.yaml"))
+    assert isinstance(rig.camera, StereoCamera)
+    assert rig.camera.baseline == pytest.approx(0.5)
+    images = [tiny.texture(n, is_color=True) for n in range(2)]
+    source = tiny.stereo(
+        [(n, 7, image) for n, image in enumerate(images)], calibrations=rig.info.calibrations
+    )
+    (expected,) = _read(source)
+    frame = rig.frame(7, *images)
+    assert isinstance(frame, StereoFrame)
+    assert frame.stamp_ns == 7
+    assert not np.array_equal(frame.left, cv2.cvtColor(images[0], cv2.COLOR_BGR2GRAY))
+    np.testing.assert_array_equal(frame.left, expected.left)
+    np.testing.assert_array_equal(frame.right, expected.right)
+
+
+@pytest.mark.parametrize(("changes", "scale"), [({}, 1000.0), ({"depth_scale": 5000.0}, 5000.0)])
+def test_a_rig_takes_depth_in_counts_or_metres(
+    tiny: Any, tmp_path: Path, changes: Any, scale: float
+) -> None:
+    rig = Rig(
+        _written(tmp_path / "rgb.yaml", tiny, distortion_coefficients=None, **changes),
+        sensor="rgbd",
+    )
+    counts = np.full((32, 48), 2500, dtype=np.uint16)
+    counts[0] = 0
+    metres = counts / scale  # where 0 m is as little known as 0 counts
+    for depth in (counts, metres, metres.astype(np.float32)):
+        frame = rig.frame(7, tiny.texture(1), depth)
+        assert isinstance(frame, RgbdFrame)
+        assert np.isnan(frame.depth[0]).all()
+        np.testing.assert_allclose(frame.depth[1:], metres[1:], rtol=1e-6)
+
+
+def test_a_rig_refuses_images_of_another_camera(tiny: Any, tmp_path: Path) -> None:
+    rig = Rig(_written(tmp_path / "rgb.yaml", tiny), sensor="rgbd")
+    with pytest.raises(RecordingError, match=r"expected 48x32 pixels .* got 48x31"):
+        rig.frame(7, tiny.texture(1)[:-1], tiny.depth(1))
+    with pytest.raises(RecordingError, match="expected depth as 16-bit grey, got uint8"):
+        rig.frame(7, tiny.texture(1), tiny.texture(1))
+    with pytest.raises(RecordingError, match="expected an array of pixels, got NoneType"):
+        rig.frame(7, None, tiny.depth(1))  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="holds one camera, expected two"):
+        Rig(tmp_path / "rgb.yaml")
+
+
 def test_only_images_of_a_free_running_sensor_may_be_left_out(tiny: Any) -> None:
     good, depth = tiny.texture(1), tiny.depth(1)
     stereo = tiny.stereo([(0, 0, good), (1, 0, good), (0, 9_000_000_000, good)])
@@ -154,8 +213,8 @@ def test_the_size_of_depth_is_checked_against_its_own_camera(tiny: Any) -> None:
     (faulty,) = _read(source)
     assert isinstance(faulty, FaultyFrame)
     assert faulty.reason == (
-        "depth image: expected 24x16 pixels by the calibration, got 48x32; give that of these "
-        "images by --calibration FILE"
+        "depth image: expected 24x16 pixels by the calibration, got 48x32; give the "
+        "calibration of these images (--calibration FILE)"
     )
 
 
