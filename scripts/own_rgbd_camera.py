@@ -28,7 +28,7 @@ def read_frames(folder: Path, *, rate_hz: float, depth_scale: float) -> Iterator
             continue
         depth = counts.astype(np.float32) / np.float32(depth_scale)
         depth[counts == 0] = np.nan  # unknown
-        grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY))
+        grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY).astype(np.uint8)
         yield gvo.RgbdFrame(stamp_ns=round(n * 1e9 / rate_hz), image=grey, depth=depth)
 
 

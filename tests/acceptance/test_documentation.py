@@ -178,6 +178,12 @@ def test_programs_that_a_page_names_are_there(page: Path) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+def test_the_reference_has_every_public_name() -> None:
+    page = (ROOT / "docs/api.md").read_text()
+    shown = re.findall(r"^\.\. auto\w+:: (?:gvo\.)?(\w+)$", page, re.MULTILINE)
+    assert {*gvo.__all__} - {"__version__", *shown} == set()
+
+
 def test_the_public_names_can_be_imported() -> None:
     for name in gvo.__all__:
         assert getattr(gvo, name) is not None
