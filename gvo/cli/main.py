@@ -476,7 +476,7 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     try:
-        raise SystemExit(_run())
+        raise SystemExit(_run() or 0)
     except typer.Abort:
         raise SystemExit(130) from None
     except GvoError as error:
