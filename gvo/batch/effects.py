@@ -14,6 +14,8 @@ ERROR = "ate_smoothed_m"
 TIME = "frame_ms"
 MIN_SHARE_OF_POSES = 0.95
 """Of the most poses that any run of a recording has; with fewer a run is not compared."""
+MIN_RUNS = 3
+"""Runs of which the spread is told: of two it says nothing."""
 _MEASURES = {"error": ERROR, "time": TIME}
 _QUANTILES = {"low": 0.25, "median": 0.5, "high": 0.75}
 COUNTS = ("compared", "set aside", "failed")
@@ -61,7 +63,8 @@ def value_medians(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     dict of str to DataFrame
         By parameter, that with the largest ratio of medians first, a row for each value: numbers
         in rising order, others as they came. Columns `(measure, quantile)` of `error` and `time`
-        and of `low`, `median` and `high` (quartiles), and `("runs", kind)` of `COUNTS`.
+        and of `low`, `median` and `high` (quartiles, NaN of fewer than `MIN_RUNS` runs), and
+        `("runs", kind)` of `COUNTS`.
     """
     is_used = pd.DataFrame({name: comparable(table, each) for name, each in _MEASURES.items()})
     ratios = pd.DataFrame({name: relative(table, each) for name, each in _MEASURES.items()})
@@ -80,6 +83,10 @@ def _by_value(values: pd.Series, runs: pd.DataFrame) -> pd.DataFrame:
         for measure in _MEASURES
         for name, share in _QUANTILES.items()
     }
+    for measure in _MEASURES:
+        for name in ("low", "high"):
+            quartile = numbers[measure, name]
+            numbers[measure, name] = quartile.where(grouped[measure].count() >= MIN_RUNS)
     return pd.DataFrame(numbers | {("runs", kind): grouped[kind].sum() for kind in COUNTS})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,10 @@ _HEADER = (
     "r_err [deg/100 m]",
     "path ratio",
 )
-_JSON_NAMES = ("name", "n", "ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
+_JSON_NAMES = (
+    *("name", "n", "coverage", "ate_m", "ate_max_m", "rpe_m", "rpe_deg"),
+    *("n_segments", "segments_m", "t_pct", "r_deg_per_100m", "path_ratio"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -292,8 +296,8 @@ def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
 
 def evaluations_json(
     evaluations: Sequence[Evaluation],
-) -> dict[str, list[dict[str, str | int | float | None]]]:
-    """Return the errors as plain values, `{"estimates": [{"name", "n", "ate_m", ...}, ...]}`."""
+) -> dict[str, list[dict[str, Any]]]:
+    """Return all columns of the table as plain values: `{"estimates": [{"name", ...}, ...]}`."""
     rows = [{name: getattr(each, name) for name in _JSON_NAMES} for each in evaluations]
     return {"estimates": rows}
 

@@ -64,10 +64,16 @@ def test_a_table_without_evaluations_is_its_header() -> None:
     assert len(format_evaluations([]).splitlines()) == 2
 
 
-def test_the_json_holds_exactly_the_agreed_keys() -> None:
-    keys = ("name", "n", "ate_m", "rpe_m", "rpe_deg", "t_pct", "r_deg_per_100m")
+def test_the_json_holds_all_columns_of_the_table() -> None:
+    keys = "n coverage ate_m ate_max_m rpe_m rpe_deg n_segments t_pct r_deg_per_100m path_ratio"
     content = json.loads(json.dumps(evaluations_json([FULL, BARE]), allow_nan=False))
     assert content == {
-        "estimates": [{key: getattr(each, key) for key in keys} for each in (FULL, BARE)]
+        "estimates": [
+            {key: getattr(each, key) for key in ("name", *keys.split())}
+            | {"segments_m": list(each.segments_m)}
+            for each in (FULL, BARE)
+        ]
     }
+    n_columns = len(format_evaluations([]).splitlines()[0].split("  ")) - 1
+    assert len(content["estimates"][0]) > n_columns
     assert (FULL.n, FULL.ate_m, BARE.ate_m) == (2, 12.5**0.5, 1234.5)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.batch.effects import ERROR, TIME, relative
+from gvo.batch.effects import ERROR, MIN_RUNS, TIME, relative
 from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.palette import ESTIMATES, REFUSED
@@ -58,11 +58,12 @@ def box_plot(batch: Batch) -> Plot:
     rows, words = _variant_rows(batch) if batch.is_sweep else _recording_rows(batch)
     if any(panel.reference is not None for panel in panels):
         words += " The relative ATE is that over the median of all runs of its recording."
-    words += (
-        " Boxes hold the middle half of the runs, the line is the median; whiskers reach to the "
-        f"farthest run within {_WHISKER} box lengths. Points are runs: all of up to {_MAX_POINTS} "
-        "in a row, of more those beyond the whiskers."
-    )
+    if any(np.sum(row.is_in) >= MIN_RUNS for row in rows):
+        words += (
+            " Boxes hold the middle half of the runs, the line is the median; whiskers reach to "
+            f"the farthest run within {_WHISKER} box lengths. Points are runs: all of up to "
+            f"{_MAX_POINTS} in a row, of more those beyond the whiskers."
+        )
     if np.any(~batch.is_comparable() & ~np.isnan(batch.numbers(ERROR))):
         words += (
             " Hollow points are runs with less than 95 % of the poses of the best run of their "
@@ -139,7 +140,7 @@ def _recording_rows(batch: Batch) -> tuple[list[_Row], str]:
     sorting = "error" if batch.has_errors else "coverage"
     words = f"A row per recording, sorted by {sorting}, the best first."
     rows, words = _capped(rows, [False] * len(rows), words, "recordings that did not fail")
-    return ([_Row(name=f"all {n_run}", is_in=is_run), *rows] if n_run > 2 else rows), words
+    return ([_Row(name=f"all {n_run}", is_in=is_run), *rows] if n_run >= MIN_RUNS else rows), words
 
 
 def _capped(
@@ -197,7 +198,7 @@ def _draw_row(axes: Axes, y: float, panel: _Panel, row: _Row) -> None:
     hollow = panel.values[is_there & ~panel.is_counted][:_MAX_POINTS]
     colour = panel.colour
     points = values
-    if len(values) > 2:
+    if len(values) >= MIN_RUNS:
         low, left, middle, right, high = box_of(values, is_logarithmic=panel.is_logarithmic)
         axes.plot([low, high], [y, y], color=colour, lw=1.0, zorder=2.0)
         axes.fill_betweenx([y - 0.3, y + 0.3], left, right, color=colour, alpha=0.35, lw=0)

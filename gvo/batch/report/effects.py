@@ -57,9 +57,11 @@ def _values_plot(effects: Mapping[str, pd.DataFrame], kind: str) -> Plot:
     if not told:
         return Plot(slug=slug, title=title, text=f"Not drawn: no run has a comparable {kind}.")
     words = (
-        f"Medians of the {kind} at each value, each run relative to the median of its recording; "
-        "bars hold the middle half of the runs, all other parameters mixed."
+        f"Medians of the {kind} at each value, each run relative to the median of its recording, "
+        "all other parameters mixed."
     )
+    if any(effect[kind, "low"].notna().any() for effect in told.values()):
+        words += " Bars hold the middle half of the runs."
     if any(effect["runs", "failed"].any() for effect in told.values()):
         words += (
             " Failed runs (red) are in no median: a value with more of them is worse than it looks."
@@ -80,8 +82,8 @@ def _values_figure(told: Mapping[str, pd.DataFrame], kind: str) -> Figure:
         axes.set_title(shown(name, _N_TITLE))
     for axes in panels.flat[len(told) :]:
         axes.set_axis_off()
-    low = min(float(effect[kind, "low"].min()) for effect in told.values())
-    high = max(float(effect[kind, "high"].max()) for effect in told.values())
+    low = min(float(effect[kind].min().min()) for effect in told.values())
+    high = max(float(effect[kind].max().max()) for effect in told.values())
     if any(effect["runs", "failed"].any() for effect in told.values()):
         high *= max(high / low, 1.2) ** 0.15  # room for the words on top
     for row in panels:
@@ -131,7 +133,7 @@ def _value_rows(effects: Mapping[str, pd.DataFrame]) -> Iterator[list[str]]:
 
 def _quartile_texts(quartiles: pd.Series[float]) -> list[str]:
     low, median, high = (number_text(number, ".3f") for number in quartiles)
-    return [median, "-" if median == "-" else f"{low} to {high}"]
+    return [median, "-" if low == "-" else f"{low} to {high}"]
 
 
 def front_sheet(batch: Batch) -> tuple[Plot, str]:

@@ -53,10 +53,12 @@ _NOTHING = np.zeros((0, 3))
 def serve_player(
     player: Player, *, host: str, port: int, truth: Trajectory | None = None, name: str = ""
 ) -> ViewServer:
-    """Serve a player's page; see `gvo.viz.view.serve`."""
+    """Serve a player's page, at its first frame or where it is; see `gvo.viz.view.serve`."""
     view = open_server(host, port, title=f"gvo {name or player.info.name}".strip())
     page = Page(view.viser, player, truth=truth)
     view.on_close(page.close)
+    if player.frame_view is None:
+        player.seek(player.first_index)
     return view
 
 
@@ -131,7 +133,7 @@ class Page:
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
             self._message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
-            start = {"frame": f"none of {self._player.n_frames} yet: play or step"}
+            start = {"frame": f"the first of {self._player.n_frames} is coming"}
             self._numbers = gui.add_html(numbers_html(start))
             hidden = {"standstill"} if self._truth is not None else {"standstill", "truth"}
             gui.add_html(legend_html(name for name in COLOURS if name not in hidden))

@@ -360,6 +360,14 @@ def test_one_row_is_enough(is_failed: bool, tmp_path: Path) -> None:
     assert len(page.rows["runs"]) == 2
 
 
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_two_runs_have_no_spread(n: int, tmp_path: Path) -> None:
+    page = page_of(tmp_path, made_up({"window.n_links": [1, 3]}, n))
+    quartiles = {text for row in page.rows["time_by_value"][1:] for text in (row[3], row[5])}
+    assert (quartiles == {"-"}) == (n < 3)
+    assert ("middle half" in page.text) == (n == 3)
+
+
 def test_values_of_every_kind_stand_in_order(tmp_path: Path) -> None:
     sweep: dict[str, list[Value]] = {"a.kind": ["orb", "klt"], "b.limit": [2.5, None, 1.0]}
     page = page_of(tmp_path, made_up(sweep, 2))

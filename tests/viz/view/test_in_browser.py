@@ -40,8 +40,7 @@ def page(browser: Browser, player: Player) -> Iterator[ViewPage]:
 
 
 def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> None:
-    page.press("step")
-    page.wait_for_frame(0)
+    page.wait_for_frame(0)  # shown without being asked for
     first = page.scene()
     page.press("play")
     page.browser.wait(lambda: page.number("frame") >= 5, message="it does not play")
@@ -65,8 +64,7 @@ def test_it_plays_pauses_steps_and_goes_back(page: ViewPage, player: Player) -> 
 
 
 def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player: Player) -> None:
-    page.press("step")
-    page.wait_for_frame(0)
+    page.wait_for_frame(0)  # shown without being asked for
     before = page.number("keypoints")
     assert before > 100, "too few keypoints to halve them"
 

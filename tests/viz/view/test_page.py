@@ -13,10 +13,13 @@ from hypothesis.extra.numpy import arrays
 
 from gvo.config import Config, load_configuration
 from gvo.geometry import se3
+from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
+from gvo.viz.view import serve
 from gvo.viz.view.clouds import empty_cloud
 from gvo.viz.view.page import Page, TruthPath
+from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
 from tests.viz.view.fakes import FakePlayer, cells, frame_view_of, pose_of, stamps_of
 
@@ -179,6 +182,17 @@ def test_a_closed_page_lets_go_of_the_player(view: ViewServer, player: FakePlaye
     assert len(player.callbacks) == 1
     page.close()
     assert player.callbacks == []
+
+
+def test_a_page_opens_with_the_first_frame_or_where_its_player_is() -> None:
+    recording = SyntheticRecording("handheld", "rgbd", n_frames=3, scale=0.25)
+    with Player(lambda config: recording, Config()) as player:
+        for expected in (0, 2):
+            with serve(player, port=0):
+                assert player.wait(30.0)
+                assert player.index == expected
+            player.seek(2)
+            assert player.wait(30.0)
 
 
 def test_the_painter_draws_the_last_frame(page: Page, player: FakePlayer, view: ViewServer) -> None:
