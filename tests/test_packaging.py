@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
+import gvo
+
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CI = (ROOT / ".ci/run").read_text(encoding="utf-8")
@@ -122,6 +124,13 @@ def test_every_extra_that_a_page_names_is_there(page: str) -> None:
     extras = {extra for names in named for extra in names.split(",")}
     assert extras
     assert extras <= set(PROJECT["optional-dependencies"])
+
+
+def test_the_entry_to_cite_names_this_version_and_no_address() -> None:
+    entry = re.search(r"```bibtex\n(.*?)```", README, re.DOTALL)
+    assert entry is not None
+    assert f"version = {{{gvo.__version__}}}" in entry[1]
+    assert not re.search(r"url|doi|http", entry[1])
 
 
 def test_the_metadata_name_no_address() -> None:
