@@ -254,10 +254,14 @@ class MotionPrior:
         T_reference_current at the recent mean velocity, of consecutive frames. What passes the
         camera slowly draws the last velocity along, but not this one: it tells which of two
         motions is the camera's.
+    is_confirmed : bool
+        False where the frames before could not be registered either: what is found is not believed
+        before enough of the view is seen again.
     """
 
     T_predicted: FloatArray
     T_recent: FloatArray | None = None
+    is_confirmed: bool = True
 
     def __post_init__(self) -> None:
         """Copy the arrays."""

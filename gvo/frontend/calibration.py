@@ -25,7 +25,7 @@ import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.registration import register_correspondences
+from gvo.frontend.registration import check_rows, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -461,17 +461,19 @@ class CalibratedCamera:
         """
         corrected = self._correspondences(measured)
         result = self._register(corrected, measured, config, prior)
-        if isinstance(result, Failure) or not is_step:
+        if isinstance(result, Failure):
             return result
+        if not is_step:
+            return check_rows(result, self._camera)
         velocities = self._offsets.velocities
         velocities.expect(*measured.frames, result.T_reference_current)
         again = self._correspondences(measured)
-        if _largest_change(corrected, again) < _MIN_CHANGE_PX:
-            return result
-        result = self._register(again, measured, config, prior)
-        if isinstance(result, RelativePose):
+        if _largest_change(corrected, again) >= _MIN_CHANGE_PX:
+            result = self._register(again, measured, config, prior)
+            if isinstance(result, Failure):
+                return result
             velocities.expect(*measured.frames, result.T_reference_current)
-        return result
+        return check_rows(result, self._camera)
 
     def _register(
         self,

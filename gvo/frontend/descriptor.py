@@ -150,6 +150,8 @@ class DescriptorFrontend:
         narrow, wide = self._config.temporal.radius_px, self._config.temporal.wide_radius_px
         if prior is not None:
             result = self._register_within(reference, current, prior, narrow)
+            if not prior.is_confirmed:
+                result = check_view(result, reference.points_cam, self.camera)
             if isinstance(result, RelativePose | Contradiction):
                 return result
         rough = self._register_within(reference, current, prior, wide)

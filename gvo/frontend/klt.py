@@ -162,6 +162,8 @@ class KltFrontend:
             The second column of `matches` is -1: tracks do not end at observations.
         """
         result = self._register(reference, current, prior)
+        if prior is not None and not prior.is_confirmed:
+            result = check_view(result, reference.points_cam, self.camera)
         if isinstance(result, RelativePose):
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):

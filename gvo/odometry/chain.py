@@ -268,6 +268,7 @@ class RawChain(Generic[ObservationsT]):
         return MotionPrior(
             T_predicted=T_node_world @ T_world_predicted,
             T_recent=T_node_world @ T_world_newest @ T_newest_recent,
+            is_confirmed=len(self._nodes) == 1,
         )
 
     def _begin(self, current: ObservationsT) -> RawStep:

@@ -274,7 +274,7 @@ class Odometry:
         scores = self._keyframes.scores(T_frame_keyframes)
         note("odometry.scores", scores=scores)
         self._keyframes.note_seen(scores, step.n_steps)
-        measure = partial(self._register_keyframe, observations, step.n_steps)
+        measure = partial(self._register_keyframe, observations, step)
         config = self._config.window
         in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= config.min_overlap}
         n_unlinked = self._keyframes.n_unlinked(in_view, step.n_steps)
@@ -299,15 +299,15 @@ class Odometry:
     def _register_keyframe(
         self,
         observations: _Observations,
-        n_steps: int,
+        step: RawStep,
         stamp_ns: int,
         T_keyframe_frame: FloatArray,
     ) -> Edge | None:
-        prior = MotionPrior(T_predicted=T_keyframe_frame)
+        prior = MotionPrior(T_predicted=T_keyframe_frame, is_confirmed=step.is_registered)
         result = self._frontend.register(self._keyframes[stamp_ns], observations, prior)
         is_linked = isinstance(result, RelativePose)
         T_frame_keyframe = se3.invert(T_keyframe_frame)
-        self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, n_steps, is_linked=is_linked)
+        self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, step.n_steps, is_linked=is_linked)
         return None if isinstance(result, Failure) else self._edge_of(stamp_ns, result)
 
     def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:

@@ -96,6 +96,27 @@ def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
+def test_what_follows_a_failure_is_believed_where_enough_of_the_view_is_seen(
+    sensor: Sensor,
+) -> None:
+    first, second = observations(sensor)[:2]
+    T = true_motion(sensor, 0, 1)
+    priors = [MotionPrior(T_predicted=T, T_recent=T, is_confirmed=told) for told in (True, False)]
+    for prior in priors:
+        assert isinstance(frontend(sensor).register(first, second, prior), RelativePose)
+    frame = second.frame
+    left = second.image.copy()
+    left[48:] = 0  # a sixth of the view is left
+    covered = frontend(sensor).extract(
+        replace(frame, left=left) if isinstance(frame, StereoFrame) else replace(frame, image=left)
+    )
+    sure, doubtful = (frontend(sensor).register(first, covered, prior) for prior in priors)
+    assert isinstance(sure, RelativePose)
+    assert isinstance(doubtful, Failure)
+    assert "to know a place again" in doubtful.reason
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_what_a_registration_rests_on_is_told(sensor: Sensor) -> None:
     first, second = observations(sensor)[:2]
     result = frontend(sensor).register(first, second)
@@ -176,7 +197,7 @@ def test_what_is_not_known_yet_of_the_camera_is_doubted_in_the_covariance() -> N
     assert isinstance(with_offset, RelativePose)
     shift = se3.log(se3.invert(results[0].T_reference_current) @ with_offset.T_reference_current)
     # It is what an offset of one sigma does.
-    np.testing.assert_allclose(np.outer(shift, shift), doubt, atol=0.3 * abs(doubt).max())
+    np.testing.assert_allclose(np.outer(shift, shift), doubt, atol=0.5 * abs(doubt).max())
 
 
 def test_points_out_of_the_limits_of_depth_are_left_out() -> None:

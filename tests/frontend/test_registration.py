@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.config import Config
 from gvo.frontend import registration
-from gvo.frontend.registration import register_correspondences
+from gvo.frontend.registration import check_rows, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -296,3 +296,29 @@ def test_flow_pixels_and_points_are_those_of_the_matches() -> None:
     np.testing.assert_array_equal(result.pixels_reference, reference.keypoints[matches[:, 0]])
     np.testing.assert_array_equal(result.pixels_current, current.keypoints[matches[:, 1]])
     np.testing.assert_array_equal(result.points_current, current.points_cam[matches[:, 1]])
+
+
+def seen_at(rows: FloatArray, inliers: list[bool]) -> RelativePose:
+    pixels = np.column_stack([np.full(len(rows), 320.0), rows])
+    return RelativePose(
+        T_reference_current=np.eye(4),
+        covariance=1e-6 * np.eye(6),
+        matches=np.tile([0, -1], (len(rows), 1)),
+        inliers=np.array(inliers),
+        pixels_reference=pixels,
+        pixels_current=pixels,
+    )
+
+
+def test_inliers_of_a_band_of_rows_are_no_consensus_of_matches_all_over_the_image() -> None:
+    rows = np.linspace(-1.0, 480.0, 97)
+    band = seen_at(rows, [240.0 <= row < 300.0 for row in rows])
+    failure = check_rows(band, CAMERA)
+    assert isinstance(failure, Failure)
+    assert "12 of 97 matches agree, but in few rows" in failure.reason
+    assert (failure.n_matches, failure.n_inliers) == (97, 12)
+    half = seen_at(rows, [row < 240.0 for row in rows])
+    assert check_rows(half, CAMERA) is half
+    # All that is textured: a horizon.
+    horizon = seen_at(rows[48:60], [True] * 12)
+    assert check_rows(horizon, CAMERA) is horizon

@@ -16,6 +16,7 @@ from gvo.testing.faults import (
     Frozen,
     Lagging,
     PixelFault,
+    RowsShifted,
 )
 from tests.testing.catalogue import FAULTS, NamedFault, parameters
 from tests.testing.fault_bench import Outcome, complaints, faulty, run, sound
@@ -137,6 +138,23 @@ def test_a_run_over_a_bad_recording_does_what_the_table_says(
         _all_is_finite(outcome)
         _a_coasting_pose_gets_less_sure(outcome)
         _wrong_poses_are_told(fault, outcome, source)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_rows_that_lost_their_place_hardly_ever_give_a_wrong_pose(
+    sensor: Sensor, tmp_path: Path
+) -> None:
+    recording = sound(sensor, 20)
+    n_wrong = 0
+    for number in range(12):
+        bands = RowsShifted(first=8, end=10, seed=number // 2, most_px=20 + 20 * (number % 2))
+        out = tmp_path / str(number)
+        outcome = run(FaultySource(recording, bands), recording.truth, out)
+        assert outcome.n("coasting") > 0
+        n_wrong += bool(outcome.deviations.max() > _MAX_DEVIATION)
+    # Without a check of rows and of the view it is 11 of 12.
+    assert n_wrong <= 3
 
 
 def _nothing_is_lost(fault: NamedFault, outcome: Outcome) -> None:

@@ -133,7 +133,8 @@ def test_on_slanted_surfaces_they_are_right_with_the_slopes_and_wrong_without(
     facing, _ = follow_disparities(images, pixels, expected + 0.3, CONFIG, n_steps=4)
     assert is_valid.mean() > 0.8
     errors, facing_errors = (each[is_valid] - expected[is_valid] for each in (found, facing))
-    assert abs(np.median(errors)) < 0.01
+    # OpenCV 4 interpolates at 32nds of a pixel.
+    assert abs(np.median(errors)) < 0.015
     assert np.sqrt(np.mean(errors**2)) < 0.02
     assert np.sqrt(np.mean(facing_errors**2)) > 0.2
 
