@@ -9,7 +9,8 @@ from __future__ import annotations
 import errno
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 MAX_TEXT_BYTES = 1 << 28
 """Largest text file, bytes: poses of a day at 30 Hz."""
+
+MAX_LINE = 1 << 20
+"""Characters of a line; an edge with its covariance has a thousandth."""
 
 MAX_SHOWN = 80
 """Largest length of a value in a message, characters."""
@@ -58,11 +62,7 @@ def cut(text: str, n_characters: int) -> str:
     >>> cut("a\nb", 20)
     'a\\nb'
     """
-    start = text[: n_characters + 1]
-    if not start.isprintable():
-        start = "".join(
-            character if character.isprintable() else repr(character)[1:-1] for character in start
-        )
+    start = visible(text[: n_characters + 1])
     return start if len(start) <= n_characters else f"{start[:n_characters]}..."
 
 
@@ -77,12 +77,65 @@ def shortened_words(text: str) -> str:
     return _LONG_WORD.sub(lambda word: f"{word[0][:150]}...{word[0][-50:]}", text)
 
 
+def visible(text: str) -> str:
+    r"""Return a text with what cannot be seen, or orders others about, escaped.
+
+    Those are line ends, escape sequences, and marks that turn the direction of writing.
+
+    Examples
+    --------
+    >>> visible("/cam\x1b[2J\u202e")
+    '/cam\\x1b[2J\\u202e'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def plain_number(text: str) -> str:
+    """Return the text of a number for `float`, `int` or `Decimal`.
+
+    Raises
+    ------
+    ValueError
+        For digits of other scripts and underscores, which those take.
+    """
+    if not text.isascii() or "_" in text:
+        raise ValueError(f"{shortened(text)} is no decimal number")
+    return text
+
+
+def access_fault(path: Path) -> str:
+    """Return why a path is not there, as the end of a message; empty where it is."""
+    try:
+        path.stat()
+    except PermissionError as error:
+        return f"cannot be read: {error.strerror}"
+    except (OSError, ValueError):
+        return "does not exist"
+    return ""
+
+
 def exists(path: Path) -> bool:
     """Tell whether a path exists and can be accessed; False for an invalid name."""
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
+    return not access_fault(path)
+
+
+def text_lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file, one at a time.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or a line has more than `MAX_LINE` characters; `strerror` says so.
+    UnicodeDecodeError
+        If it is no text.
+    """
+    with path.open(encoding="utf-8-sig") as file:
+        for line in iter(partial(file.readline, MAX_LINE + 1), ""):
+            if len(line) > MAX_LINE:
+                raise OSError(errno.EFBIG, f"a line has more than {MAX_LINE} characters")
+            yield line
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:

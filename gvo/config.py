@@ -15,7 +15,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gvo._text import MAX_CHARACTERS, MAX_SHOWN, YamlError, cut, load_yaml, read_text, shortened
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, named_faults
 
 
 def _parameter(
@@ -440,9 +440,11 @@ def _parse_value(setting: str, text: str) -> object:
 
 def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
     try:
-        content = load_yaml(read_text(path, max_bytes=MAX_CHARACTERS))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+        with named_faults(ConfigurationError, path):
+            text = read_text(path, max_bytes=MAX_CHARACTERS)
+        content = load_yaml(text)
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path}: is no text") from error
     except YamlError as error:
         raise ConfigurationError(f"{path}: no YAML ({error})") from error
     if content is None:

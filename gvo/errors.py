@@ -3,6 +3,8 @@
 import json
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
@@ -60,6 +62,18 @@ class SmoothingError(GvoError):
 
 class TrajectoryError(GvoError):
     """A trajectory file is missing, malformed or cannot be associated."""
+
+
+@contextmanager
+def named_faults(kind: type[GvoError], where: object) -> Iterator[None]:
+    """Raise errors of the operating system as a `GvoError` that names the file."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        name = where if error.filename is None else error.filename
+        raise kind(f"{name}: {error.strerror or error}") from error
 
 
 def missing_extra(what: str, extra: str) -> ConfigurationError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from enum import StrEnum
 from functools import partial
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from typer.main import get_command
 
+from gvo._text import plain_number
 from gvo._version import __version__
 from gvo.cli import batch as cli_batch
 from gvo.cli import inspect as cli_inspect
@@ -46,7 +48,7 @@ from gvo.cli.terminal import (
     told_where_it_stands,
     warn,
 )
-from gvo.errors import ConfigurationError, GvoError, OutputError
+from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
 
 if TYPE_CHECKING:
     from gvo.config import Config
@@ -443,7 +445,7 @@ def config_(config: ConfigFile = None, set_: Settings = None) -> None:
 
 def _parse_lengths(text: str) -> list[float]:
     try:
-        lengths = [float(part) for part in text.split(",")]
+        lengths = [float(plain_number(part)) for part in text.split(",")]
     except ValueError:
         lengths = []
     if not lengths or not all(0 < length < float("inf") for length in lengths):
@@ -476,9 +478,13 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     try:
-        raise SystemExit(_run() or 0)
+        with named_faults(GvoError, "gvo"):
+            raise SystemExit(_run() or 0)
     except typer.Abort:
         raise SystemExit(130) from None
+    except BrokenPipeError:  # as of `gvo config | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except GvoError as error:
         typer.echo(f"gvo: error: {error}", err=True)
         is_partly = isinstance(error, OutputError) and error.is_partly

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvo._text import exists
+from gvo._text import access_fault
 from gvo.config import Config
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, named_faults
 from gvo.io.bag.reader import STORAGE_SUFFIXES, is_storage
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import TopicChoice
@@ -81,9 +81,16 @@ def open_recording(
         raise ValueError("expected at least one path of a recording")
     config = config or Config()
     options = options or RecordingOptions()
+    with named_faults(RecordingError, paths[0]):
+        return _open(paths, config, options)
+
+
+def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> Source:
     for one in paths:
-        if not exists(one):
-            raise RecordingError(f"{one}: does not exist; {_KINDS}")
+        if fault := access_fault(one):
+            raise RecordingError(f"{one}: {fault}; {_KINDS}")
+        if not (one.is_file() or one.is_dir()):
+            raise RecordingError(f"{one}: is a pipe, a socket or a device; {_KINDS}")
     if all(is_bag(one) for one in paths):
         topics = TopicChoice(
             left=options.left, right=options.right, color=options.color, depth=options.depth
@@ -99,6 +106,8 @@ def is_bag(path: Path) -> bool:
     """Tell whether a path that exists is a bag of ROS, by its name or by what it holds."""
     if path.is_file():
         return path.suffix == ".bag" or is_storage(path)
+    if not path.is_dir():
+        return False  # a pipe or a device
     return (path / "metadata.yaml").is_file() or any(map(is_storage, path.iterdir()))
 
 

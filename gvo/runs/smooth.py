@@ -38,6 +38,9 @@ from gvo.viz.plots import plot_trajectories
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
 """Columns of `frames.csv` in the folder of smoothed edges."""
 
+_MAX_FOREIGN_LINES = 1000
+"""A stream that begins with so many lines that are not understood holds something else."""
+
 # What a pose graph's file says: its noise is stated, its loops reach far back.
 _GRAPH_DEFAULTS: dict[str, tuple[object, str]] = {
     "size": (None, "loops refer to poses of any age"),
@@ -368,15 +371,18 @@ def smooth_lines(
     """
     config = config or Config()
     faults = InputFaults()
+    broken_off = ""
     with RunFolder(Path(out), columns=POSES_HEADER) as folder:
         smoother = Smoother(folder, config, keyframes=keyframes)
         try:
             _answer_all(lines, answer, smoother, faults)
         except OSError as error:
             faults.add("answers could not be written", f"the stream ends there: {error.strerror}")
+        except TrajectoryError as error:
+            broken_off = str(error)
         finally:
             smoother.finish()
-    notes = SmoothingNotes(warnings=faults.warnings())
+    notes = SmoothingNotes(warnings=faults.warnings(), broken_off=broken_off)
     return conclude(
         "standard input", folder, smoother, config=config, notes=notes, truth=ground_truth
     )
@@ -402,6 +408,10 @@ def _answer_all(
         except ValueError as error:
             faults.add("lines were not understood", f"line {number}: {error}")
             reply = format_error(f"line {number}: {error}")
+            if number >= _MAX_FOREIGN_LINES and smoother.n_poses == 0:
+                raise TrajectoryError(
+                    f"{number} lines hold no pose; line {number}: {error}"
+                ) from error
         answer(reply)
 
 

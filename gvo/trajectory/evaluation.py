@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gvo._text import format_table, number_text
+from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
 from gvo.trajectory.trajectory import Trajectory
@@ -24,6 +25,7 @@ SHORT_STEP = 1
 """Poses between the starts of those segments."""
 
 _MIN_PATH_M = 1e-6
+_MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 _HEADER = (
     "estimate",
     "poses",
@@ -152,11 +154,17 @@ def evaluate(
     Raises
     ------
     TrajectoryError
-        If nothing can be associated, `sim3` finds no scale, or `origin` lacks a rotation.
+        If fewer than three poses can be associated, `sim3` finds no scale, or `origin` lacks a
+        rotation.
     ValueError
         If a segment length, the step or the delta is not positive.
     """
     ref, est = pair(reference, estimate, max_difference_ns=max_difference_ns, name=name)
+    if len(ref) < _MIN_POSES:
+        raise TrajectoryError(
+            f"{name} and the reference have poses in common: {len(ref)}, expected at least "
+            f"{_MIN_POSES}"
+        )
     aligned = alignment(ref, est, align).apply(est)
     is_long = _path_length(ref) >= KITTI_SEGMENTS_M[-1]
     if segments is None:

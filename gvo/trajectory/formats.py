@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import cut, exists, read_text
+from gvo._text import cut, exists, plain_number, read_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
@@ -49,8 +49,8 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
     A KITTI file holds no stamps. They are read from a `times.txt` of as many rows beside it (or
     `sequences/NN/times.txt` for `poses/NN.txt`); without one, row n gets n seconds, and
     `stamps_from` is "rows". Of successive rows of a TUM file with the same stamp the last is
-    kept. Where `NAME_covariance.csv` lies beside `NAME.txt`, as in a run's folder, and holds all
-    its stamps, the poses have these covariances.
+    kept, see `Trajectory.n_repeated`. Where `NAME_covariance.csv` lies beside `NAME.txt`, as in a
+    run's folder, and holds all its stamps, the poses have these covariances.
 
     Parameters
     ----------
@@ -316,6 +316,7 @@ def _read_tum(rows: list[Row], *, is_sorted: bool = True) -> Trajectory:
     return Trajectory(
         stamps_ns=check_increasing(rows, stamps_ns[is_last]),
         T_world_frame=se3.make_transform(R, values[:, :3]),
+        n_repeated=int(np.count_nonzero(~is_last)),
     )
 
 
@@ -460,7 +461,7 @@ def read_numbers(
                 f"expected {n_columns} columns, got {len(row.fields)}; remove or complete the row"
             )
         try:
-            values.append([float(field) for field in row.fields[columns]])
+            values.append([float(plain_number(field)) for field in row.fields[columns]])
         except ValueError as error:
             raise row.error(f"{error}; expected {n_columns} numbers") from None
     array = np.array(values).reshape(len(rows), len(range(n_columns)[columns]))

@@ -26,6 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gvo._text import plain_number
 from gvo.geometry import se3
 from gvo.trajectory.formats import MAX_POSITION_M, from_upper_triangle, upper_triangle
 from gvo.types import FloatArray, FrameId, GraphEdge
@@ -118,7 +119,7 @@ def parse_line(text: str) -> Line | None:
     if len(fields) != n_expected:
         raise ValueError(f"{tag} needs {n_expected - 1} numbers, got {len(fields) - 1}")
     ids = [_id(field) for field in fields[1 : 1 + n_ids]]
-    numbers = np.array([float(field) for field in fields[1 + n_ids :]])
+    numbers = np.array([float(plain_number(field)) for field in fields[1 + n_ids :]])
     T = _transform(numbers[:n_pose])
     if n_ids == 1:
         return Vertex(frame_id=ids[0], T_world_frame=T)
@@ -132,7 +133,7 @@ def parse_line(text: str) -> Line | None:
 
 def _id(text: str) -> int:
     try:
-        return int(text)
+        return int(plain_number(text))
     except ValueError:
         raise ValueError(f"the id {text!r} is no whole number") from None
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from gvo._html import trajectory_html
+from gvo._text import plain_number, shortened
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray, IntArray
 
@@ -40,6 +41,8 @@ class Trajectory:
     has_rotations : bool
         False if only positions were measured, as by GNSS: the rotations are identities without
         meaning, and there are no covariances.
+    n_repeated : int
+        Rows of the file that were left out, since the next has the same stamp.
 
     Raises
     ------
@@ -53,6 +56,7 @@ class Trajectory:
     covariances: FloatArray | None = None
     stamps_from: StampsFrom = "file"
     has_rotations: bool = True
+    n_repeated: int = 0
 
     def __post_init__(self) -> None:
         """Check the arrays and keep read-only copies."""
@@ -318,7 +322,7 @@ def parse_stamp(text: str, *, unit_ns: int) -> int:
     Parameters
     ----------
     text : str
-        A number in any notation.
+        A number in ASCII, in any notation.
     unit_ns : int
         Nanoseconds of a unit: 1_000_000_000 for seconds, 1 for nanoseconds.
 
@@ -338,10 +342,10 @@ def parse_stamp(text: str, *, unit_ns: int) -> int:
     1305031102175304000
     """
     try:
-        stamp = Decimal(text) * unit_ns
-    except ArithmeticError:
-        raise ValueError(f"the stamp {text!r} is no number") from None
+        stamp = Decimal(plain_number(text)) * unit_ns
+    except (ArithmeticError, ValueError):
+        raise ValueError(f"the stamp {shortened(text)} is no number") from None
     if not stamp.is_finite() or abs(stamp) >= 2**63 - 1:
         unit = "seconds" if unit_ns > 1 else "nanoseconds"
-        raise ValueError(f"the stamp {text} is out of range; expected {unit}")
+        raise ValueError(f"the stamp {shortened(text)} is out of range; expected {unit}")
     return round(stamp)

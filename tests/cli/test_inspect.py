@@ -133,16 +133,16 @@ def test_the_film_shows_each_frame_and_the_stream_is_of_rerun(drawn: Path) -> No
 def test_a_film_is_a_player_s_or_a_folder_of_pictures_where_it_is_asked_for(
     command: Command, drive_bag: Path, tmp_path: Path
 ) -> None:
-    options = ["--out", tmp_path / "out", "--duration", "0.2", "--no-report"]
+    options = ["--out", tmp_path / "out", "--duration", "0.3", "--no-report"]
     for name in ("film.mp4", "pictures"):
         answer = command("run", drive_bag, *options, "--overlay", tmp_path / name)
         assert (answer.code, answer.err) == (0, "")
     start = (tmp_path / "film.mp4").read_bytes()
     assert start[4:8] == b"ftyp"
     assert b"mp4v" in start
-    assert len(film_frames(tmp_path / "film.mp4")) == 2
+    assert len(film_frames(tmp_path / "film.mp4")) == 3
     pictures = sorted((tmp_path / "pictures").iterdir())
-    assert len(pictures) == 2
+    assert len(pictures) == 3
     assert all(starts_rightly(path) for path in pictures)
 
 

@@ -114,6 +114,22 @@ def test_estimates_of_one_name_are_told_apart(command: Command, tmp_path: Path) 
     assert [entry["name"] for entry in estimates] == ["a/raw", "b/raw"]
 
 
+def test_compare_counts_rows_that_come_again_and_needs_three_poses(
+    command: Command, tmp_path: Path
+) -> None:
+    rows = [f"{k} {k} 0 0 0 0 0 1\n" for k in range(4)]
+    (tmp_path / "truth.txt").write_text("".join(rows))
+    (tmp_path / "twice.txt").write_text("".join([*rows, rows[-1], rows[-1]]))
+    (tmp_path / "one.txt").write_text(50 * rows[0])
+    answer = command("compare", tmp_path / "truth.txt", tmp_path / "twice.txt")
+    assert answer.code == 0
+    assert "twice.txt: 2 rows were left out, the next has the same stamp" in answer.err
+    answer = command("compare", tmp_path / "truth.txt", tmp_path / "one.txt")
+    assert answer.code == 2
+    assert "one.txt: 49 rows were left out" in answer.err
+    assert "one and the reference have poses in common: 1, expected at least 3" in answer.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

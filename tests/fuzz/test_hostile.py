@@ -18,7 +18,7 @@ from backports import zstd
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
 
-from gvo._text import MAX_VALUES, cut, read_text
+from gvo._text import MAX_LINE, MAX_VALUES, cut, read_text
 from gvo.config import load_configuration
 from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
 from gvo.io.bag.image_encodings import decode_rvl
@@ -27,7 +27,7 @@ from gvo.io.bag.reader import BagReader, typestore
 from gvo.io.bag.recovery import inflate
 from gvo.io.bag.recovery.mcap import MAGIC
 from gvo.io.calibration.files import read_cameras
-from gvo.io.edges.lines import MAX_LINE, parse_line, read_lines
+from gvo.io.edges.lines import parse_line, read_lines
 from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
 from gvo.io.poses.ground_truth import parse_truth
 from gvo.io.run_folder.reader import read_run
@@ -336,6 +336,8 @@ def test_a_damaged_name_in_a_database_is_no_traceback(tmp_path: Path) -> None:
         "b,1,a,1e300,0,0,0,0,0,1",
         "b,1,a,0,0,0,1e308,1e308,0,1",
         "a,9223372036854775807",
+        "a,1_0",
+        "b,1,a,0,0,0,0,0,0,\u0661",
     ],
     ids=lambda line: line[:12],
 )

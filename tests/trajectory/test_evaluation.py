@@ -218,17 +218,25 @@ def test_the_segments_of_kitti_are_for_paths_as_long_as_the_longest_of_them() ->
 def test_the_ratio_of_paths_needs_a_reference_that_moves(
     reference_m: float, estimate_m: float, ratio: float | None
 ) -> None:
-    reference, estimate = straight(2, reference_m), straight(2, estimate_m)
+    reference, estimate = straight(3, 0.5 * reference_m), straight(3, 0.5 * estimate_m)
     found = evaluate(reference, estimate, name="e", align="none")
     assert found.path_ratio == pytest.approx(ratio)
 
 
 def test_what_cannot_be_measured_is_none() -> None:
-    one = straight(1, 1.0)
-    evaluation = evaluate(one, one, name="one")
+    still = straight(3, 0.0)
+    evaluation = evaluate(still, still, name="still", rpe_delta=3)
     assert measures(evaluation) == [0.0, None, None, None, None]
     assert (evaluation.path_ratio, evaluation.coverage, evaluation.n_segments) == (None, 1.0, 0)
     assert evaluate(straight(20, 1.0), straight(20, 1.0), name="short").t_pct is None
+
+
+@pytest.mark.parametrize("align", ["none", "origin", "se3", "sim3"])
+def test_fewer_than_three_poses_in_common_measure_nothing(align: AlignMode) -> None:
+    for n in (1, 2):
+        with pytest.raises(TrajectoryError, match=rf"^few and .*: {n}, expected at least 3$"):
+            evaluate(straight(30, 1.0), straight(n, 1.0), name="few", align=align)
+    assert evaluate(straight(30, 1.0), straight(3, 1.0), name="few", align=align).n == 3
 
 
 def test_coverage_is_the_share_of_the_reference_that_the_estimate_reaches() -> None:
@@ -273,9 +281,9 @@ def test_segments_of_less_than_a_metre_and_a_single_one_are_measured() -> None:
     assert found.n_segments == 1
     assert found.t_pct == pytest.approx(30.0)
     assert found.r_deg_per_100m == pytest.approx(0.0, abs=1e-9)
-    two = evaluate(straight(2, 1.0), straight(2, 1.2), name="e", align="none")
-    assert two.rpe_m == pytest.approx(0.2)
-    assert two.rpe_deg == pytest.approx(0.0, abs=1e-9)
+    three = evaluate(straight(3, 1.0), straight(3, 1.2), name="e", align="none")
+    assert three.rpe_m == pytest.approx(0.2)
+    assert three.rpe_deg == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(ValueError, match="got 1 and"):
         segment_errors(reference, estimate, lengths_m=[0.5, 0.0], step=1)
 

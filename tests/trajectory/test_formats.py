@@ -152,6 +152,7 @@ def test_of_repeated_stamps_in_a_tum_file_the_last_row_is_kept(tmp_path: Path) -
     path.write_text("1 0 0 0 0 0 0 1\n2.0 5 0 0 0 0 0 1\n2.00 6 0 0 0 0 0 1\n3 7 0 0 0 0 0 1\n")
     trajectory = read_trajectory(path)
     assert trajectory.positions[:, 0].tolist() == [0.0, 6.0, 7.0]
+    assert trajectory.n_repeated == 1
 
 
 @pytest.mark.parametrize("columns", [8, 17])
@@ -197,8 +198,12 @@ def test_kitti_poses_take_the_stamps_of_a_times_file_of_as_many_rows(
         (GOOD + "hello world\n", r":2: expected 8 columns, got 2"),
         ("hello world\n", r":1: expected 8 columns \(TUM.*got 2"),
         (GOOD + "2 0 0 x 0 0 0 1\n", r":2: could not convert.*'x'.*expected 8 numbers"),
+        (GOOD + "2 0 0 0_100000 0 0 0 1\n", r":2: '0_100000' is no decimal number"),
+        (GOOD + "2 0 0 \u0663 0 0 0 1\n", r":2: '\u0663' is no decimal number"),
+        (GOOD + "1_0 0 0 0 0 0 0 1\n", r":2: the stamp '1_0' is no number"),
+        (GOOD + "\u0662 0 0 0 0 0 0 1\n", r":2: the stamp '\u0662' is no number"),
         (GOOD + "two 0 0 0 0 0 0 1\n", r":2: the stamp 'two' is no number"),
-        (GOOD + "nan 0 0 0 0 0 0 1\n", r":2: the stamp nan is out of range"),
+        (GOOD + "nan 0 0 0 0 0 0 1\n", r":2: the stamp 'nan' is out of range"),
         ("1403636579763555584 0 0 0 0 0 0 1\n", r":1: .*out of range; expected seconds"),
         ("1e999999999999 0 0 0 0 0 0 1\n", r":1: the stamp"),
         (GOOD + "2 0 0 nan 0 0 0 1\n", r":2: a number is not finite"),

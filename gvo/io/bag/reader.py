@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from gvo._text import YamlError, load_yaml, read_text
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, named_faults
 from gvo.io.bag.file import FAULTS, BagFile
 from gvo.io.bag.recovery.inflate import inflate_file
 from gvo.io.bag.recovery.scan import FoundMessage
@@ -92,9 +92,10 @@ class BagReader:
         if not paths:
             raise ValueError("expected at least one path of a bag")
         for path in paths:
-            self._files += (
-                self._open_folder(path) if path.is_dir() else [BagFile(self._unpacked(path))]
-            )
+            with named_faults(RecordingError, path):
+                self._files += (
+                    self._open_folder(path) if path.is_dir() else [BagFile(self._unpacked(path))]
+                )
         self.notes += [file.note for file in self._files if file.note]
         self.topics = _merge_topics(self._files)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo._text import cut
+from gvo._text import cut, plain_number
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
@@ -164,7 +164,7 @@ def _read_projections(path: Path) -> dict[str, FloatArray]:
         if not fields[0].startswith("P"):
             continue
         try:
-            projection = np.array([float(field) for field in fields[1:]])
+            projection = np.array([float(plain_number(field)) for field in fields[1:]])
         except ValueError as error:
             raise CalibrationError(f"{path}, line {number}: {cut(str(error), 300)}") from error
         if projection.size != 12 or not np.all(np.isfinite(projection)):

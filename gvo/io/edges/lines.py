@@ -15,7 +15,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import shortened
+from gvo._text import MAX_LINE, plain_number, shortened
+from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.pose_streams import StepSigma
 from gvo.trajectory.formats import (
@@ -27,9 +28,6 @@ from gvo.trajectory.formats import (
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, PositionPrior, Prior, Rejected
 
 LineFormat: TypeAlias = Literal["csv", "json"]
-
-MAX_LINE = 1 << 20
-"""Characters of a line; an edge with its covariance has a thousandth."""
 
 _MAX_ID = 1000  # characters
 _NORM_TOLERANCE = 1e-2
@@ -51,6 +49,7 @@ _CHUNK_BYTES = 65536
 _POLL_SECONDS = 0.2
 # What is cut off here is still longer than what is understood.
 _MAX_LINE_BYTES = 4 * MAX_LINE + 1
+_MAX_UNENDED_BYTES = 1 << 26
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -197,7 +196,7 @@ def _is_writable(text: str) -> bool:
 
 def _csv_stamp(text: str) -> int:
     try:
-        return _json_stamp(int(text))
+        return _json_stamp(int(plain_number(text)))
     except ValueError:
         raise ValueError(f"the stamp {shortened(text)} is no whole number of nanoseconds") from None
 
@@ -288,7 +287,7 @@ def _json_numbers(content: Mapping[str, object], name: str) -> FloatArray:
 
 def _numbers(fields: list[str]) -> FloatArray:
     try:
-        return np.array([float(field) for field in fields])
+        return np.array([float(plain_number(field)) for field in fields])
     except ValueError as error:
         raise ValueError(f"{error}; expected numbers after the reference") from None
 
@@ -397,14 +396,23 @@ def read_lines(descriptor: int, check: Callable[[], None]) -> Iterator[str]:
         Of the file, such as 0 for standard input.
     check : callable
         Called while waiting; what it raises ends the waiting.
+
+    Raises
+    ------
+    TrajectoryError
+        Where a line has no end.
     """
     rest = b""
+    n_cut = 0
     while True:
         check()
         if not select.select([descriptor], [], [], _POLL_SECONDS)[0]:
             continue
         chunk = os.read(descriptor, _CHUNK_BYTES)
         *lines, rest = (rest + chunk).split(b"\n")
+        n_cut = max(0, len(rest) - _MAX_LINE_BYTES) + (0 if lines else n_cut)
+        if n_cut > _MAX_UNENDED_BYTES:
+            raise TrajectoryError(f"a line has more than {_MAX_UNENDED_BYTES} bytes")
         rest = rest[:_MAX_LINE_BYTES]
         for line in lines:
             check()

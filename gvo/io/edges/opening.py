@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvo._text import exists
+from gvo._text import access_fault, plain_number, text_lines
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.io.bag.poses import open_streams
 from gvo.io.edges.events import EdgeSource
@@ -48,8 +48,8 @@ def open_edges(
     """
     inputs = [Path(path) for path in paths]
     for path in inputs:
-        if not exists(path):
-            raise TrajectoryError(f"{path}: does not exist; {_KINDS}")
+        if fault := access_fault(path):
+            raise TrajectoryError(f"{path}: {fault}; {_KINDS}")
     bags = [path for path in inputs if path.is_dir() or path.suffix in BAG_SUFFIXES]
     if topics and not bags:
         raise ConfigurationError(
@@ -78,7 +78,7 @@ def parse_sigma(text: str) -> StepSigma:
         Where it is something else.
     """
     try:
-        rotation_deg, translation_m = (float(part) for part in text.split(","))
+        rotation_deg, translation_m = (float(plain_number(part)) for part in text.split(","))
     except ValueError:
         rotation_deg = translation_m = 0.0
     if not (0 < rotation_deg < np.inf and 0 < translation_m < np.inf):
@@ -107,13 +107,15 @@ def _spread(sigmas: Sequence[StepSigma], streams: Sequence[PoseStream]) -> list[
 
 
 def _is_pose_graph(path: Path) -> bool:
-    """Tell by the first word of the file: that of a row of poses is a number."""
+    """Tell by the first word of the file: that of a row of poses is a number.
+
+    A pipe can be read once only, a pose graph is read more often.
+    """
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            for line in file:
-                text = line.partition("#")[0].strip()
-                if text:
-                    return text[0].isupper()
+        for line in text_lines(path) if path.is_file() else ():
+            text = line.partition("#")[0].strip()
+            if text:
+                return text[0].isupper()
     except (OSError, UnicodeDecodeError):
         return False
     return False

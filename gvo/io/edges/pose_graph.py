@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo._text import text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
 from gvo.trajectory.g2o import (
@@ -172,11 +173,10 @@ class PoseGraphSource:
     def _texts(self) -> Iterator[tuple[int, str]]:
         """Yield line numbers and lines that hold anything."""
         try:
-            with self._path.open(encoding="utf-8-sig") as file:
-                for number, line in enumerate(file, start=1):
-                    text = line.partition("#")[0].strip()
-                    if text:
-                        yield number, text
+            for number, line in enumerate(text_lines(self._path), start=1):
+                text = line.partition("#")[0].strip()
+                if text:
+                    yield number, text
         except OSError as error:
             raise TrajectoryError(f"{self._path}: cannot be read: {error.strerror}") from error
         except UnicodeDecodeError as error:

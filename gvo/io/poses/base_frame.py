@@ -15,6 +15,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gvo._text import plain_number
 from gvo.errors import ConfigurationError, RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.poses.tf import TfBuffer
@@ -311,7 +312,7 @@ def parse_initial_pose(text: str) -> InitialPose:
     if text.strip() == "truth":
         return "truth"
     try:
-        numbers = np.array([float(word) for word in text.split(",")])
+        numbers = np.array([float(plain_number(word)) for word in text.split(",")])
     except ValueError:
         numbers = np.empty(0)
     if len(numbers) not in (3, 7) or not np.isfinite(numbers).all():

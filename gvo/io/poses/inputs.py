@@ -105,7 +105,10 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
         When they cannot be read.
     """
     if not is_in_bag(text):
-        return PoseInput(name=Path(text).stem, trajectory=read_trajectory(text))
+        trajectory = read_trajectory(text)
+        return PoseInput(
+            name=Path(text).stem, trajectory=trajectory, warning=_repeats(text, trajectory)
+        )
     path, _, what = (text, "", "") if exists(Path(text)) else text.partition(_MARK)
     reader = BagReader(Path(path))
     truth = _read(reader, what, path)
@@ -120,6 +123,11 @@ def read_pose_input(text: str, *, frame: str = "") -> PoseInput:
     if not frame or found.child_frame in ("", frame):
         return found
     return _brought(found, truth, reader, frame)
+
+
+def _repeats(name: str, trajectory: Trajectory) -> str:
+    n = trajectory.n_repeated
+    return f"{name}: {n} rows were left out, the next has the same stamp" if n else ""
 
 
 def _read(reader: BagReader, what: str, path: str) -> BagTruth:
@@ -213,7 +221,9 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
     base_frame = base_frame or BaseFrame()
     spec = parse_truth(text)
     if isinstance(spec, FileTruth):
-        return Truth(trajectory=read_ground_truth(spec.path), decision=str(spec.path))
+        trajectory = read_ground_truth(spec.path)
+        repeats = _repeats(str(spec.path), trajectory)
+        return Truth(trajectory=trajectory, decision=repeats or str(spec.path))
     if not isinstance(source, BagSource):
         raise TrajectoryError(
             f"{text}: names what is in a bag, and {source.info.name} is none; give a file"
@@ -297,7 +307,8 @@ def read_compared(
         first = read_pose_input(reference)
         truth, frame, warnings = first.trajectory, first.child_frame, [first.warning]
     else:
-        truth, frame, warnings = read_ground_truth(reference), "", []
+        truth, frame = read_ground_truth(reference), ""
+        warnings = [_repeats(reference, truth)]
     found = [read_pose_input(text, frame=frame) for text in estimates]
     warnings += [one.warning for one in found]
     names = _short_names(estimates, [one.name for one in found])
@@ -329,8 +340,8 @@ def read_ground_truth(path: str | Path) -> Trajectory:
     path = Path(path)
     if (path / "groundtruth.txt").is_file():
         return read_trajectory(path / "groundtruth.txt")
-    if path.is_file() or not exists(path):
-        return read_trajectory(path)
+    if not path.is_dir():
+        return read_trajectory(path)  # of a pipe too
     truth = open_recording(path).ground_truth()
     if truth is None:
         raise TrajectoryError(f"{path}: this recording holds no ground truth")

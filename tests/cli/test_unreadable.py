@@ -1,0 +1,223 @@
+"""What is no file: devices, pipes, sockets, folders without permission. One line, exit code 2."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Command
+
+GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+POSES = "".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(9))
+RECORDING_COMMANDS = (
+    ("run", "{}", "--out", "{out}"),
+    ("check", "{}"),
+    ("convert", "{}", "{out}.mcap"),
+    ("explain", "{}", "--frame", "0", "--out", "{out}"),
+    ("round-trip", "{}", "--out", "{out}"),
+    ("view", "{}", "--port", "0"),
+)
+POSE_COMMANDS = (
+    ("smooth", "{}", "--out", "{out}"),
+    ("smooth", "{poses}", "--out", "{out}", "--ground-truth", "{}"),
+    ("compare", "{}", "{poses}"),
+    ("compare", "{poses}", "{}"),
+)
+TEXT_COMMANDS = (*POSE_COMMANDS, ("config", "--config", "{}"))
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    path = tmp_path / "poses.txt"
+    path.write_text(POSES)
+    return path
+
+
+def filled(words: tuple[str, ...], path: object, poses: Path) -> list[str]:
+    out = poses.parent / "out"
+    return [word.format(path, out=out, poses=poses) for word in words]
+
+
+def is_one_error(text: str) -> bool:
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def make_socket(path: Path) -> None:
+    # the name of a socket is short, the folder of a test is not
+    before = Path.cwd()
+    os.chdir(path.parent)
+    try:
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(path.name)
+    finally:
+        os.chdir(before)
+
+
+@contextmanager
+def written(path: Path, text: str) -> Iterator[None]:
+    """Write into a pipe while it is read."""
+    os.mkfifo(path)
+    writer = threading.Thread(target=path.write_text, args=[text], daemon=True)
+    writer.start()
+    yield
+    writer.join()
+
+
+@pytest.mark.parametrize("words", RECORDING_COMMANDS, ids=lambda words: words[0])
+@pytest.mark.parametrize("kind", ["null", "zero", "pipe", "socket"])
+def test_what_is_no_file_is_no_recording(
+    command: Command, poses: Path, words: tuple[str, ...], kind: str
+) -> None:
+    path = poses.with_name("a.bag")
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        make_socket(path)
+    else:
+        path = Path("/dev") / kind
+    answer = command(*filled(words, path, poses))
+    assert answer.code == 2
+    assert is_one_error(answer.err), answer.err
+    assert "is a pipe, a socket or a device" in answer.err
+
+
+@pytest.mark.parametrize("words", TEXT_COMMANDS)
+def test_a_device_without_an_end_is_refused(
+    command: Command, poses: Path, words: tuple[str, ...]
+) -> None:
+    answer = command(*filled(words, "/dev/zero", poses))
+    assert answer.code == 2
+    assert is_one_error(answer.err)
+    assert "holds more than" in answer.err
+
+
+@pytest.mark.parametrize("words", POSE_COMMANDS)
+def test_a_device_without_content_holds_no_poses(
+    command: Command, poses: Path, words: tuple[str, ...]
+) -> None:
+    answer = command(*filled(words, "/dev/null", poses))
+    assert answer.code == 2
+    assert is_one_error(answer.err)
+    assert "holds no poses" in answer.err
+
+
+@pytest.mark.parametrize("words", TEXT_COMMANDS)
+def test_a_socket_holds_no_text(command: Command, poses: Path, words: tuple[str, ...]) -> None:
+    make_socket(poses.with_name("a.txt"))
+    answer = command(*filled(words, poses.with_name("a.txt"), poses))
+    assert answer.code == 2
+    assert is_one_error(answer.err)
+
+
+@pytest.mark.parametrize("words", POSE_COMMANDS)
+def test_poses_come_through_a_pipe(command: Command, poses: Path, words: tuple[str, ...]) -> None:
+    pipe = poses.with_name("pipe")
+    with written(pipe, POSES):
+        answer = command(*filled(words, pipe, poses))
+    assert answer.code == 0, answer.err
+
+
+def test_a_pose_graph_through_a_pipe_is_refused(command: Command, poses: Path) -> None:
+    pipe = poses.with_name("pipe")
+    with written(pipe, "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"):
+        answer = command(*filled(POSE_COMMANDS[0], pipe, poses))
+    assert answer.code == 2
+    assert is_one_error(answer.err)
+
+
+def test_a_line_of_a_pose_graph_without_an_end_is_refused(command: Command, poses: Path) -> None:
+    graph = poses.with_name("endless.g2o")
+    with graph.open("wb") as file:
+        file.write(b"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n")
+        file.truncate(1 << 33)  # a hole in the file takes no room on the disk
+    answer = command("smooth", graph, "--out", poses.with_name("out"))
+    assert answer.code == 2
+    assert is_one_error(answer.err)
+    assert "a line has more than" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        pytest.param("cat /dev/zero", "a line has more than", marks=pytest.mark.acceptance),
+        ("yes", "1000 lines hold no pose"),
+    ],
+)
+def test_standard_input_without_an_end_that_holds_nothing_is_refused(
+    tmp_path: Path, given: str, reason: str
+) -> None:
+    with subprocess.Popen(given.split(), stdout=subprocess.PIPE) as source:
+        answer = subprocess.run(
+            [*GVO, "smooth", "-", "--out", str(tmp_path / "out")],
+            stdin=source.stdout,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        source.kill()
+    assert answer.returncode == 2
+    assert is_one_error(answer.stderr)
+    assert reason in answer.stderr
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("words", [*RECORDING_COMMANDS, *TEXT_COMMANDS])
+@pytest.mark.parametrize("endless", ["/dev/zero", "/dev/stdin"])
+def test_what_has_no_end_takes_less_than_a_gigabyte(
+    poses: Path, words: tuple[str, ...], endless: str
+) -> None:
+    with subprocess.Popen(["yes"], stdout=subprocess.PIPE) as source:
+        with subprocess.Popen(
+            [*GVO, *filled(words, endless, poses)],
+            stdin=source.stdout,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            assert process.stderr is not None
+            text = process.stderr.read()
+            _, status, usage = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+        source.kill()
+    assert process.returncode == 2
+    assert is_one_error(text)
+    assert usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) < 1 << 30
+
+
+@contextmanager
+def without_rights(path: Path) -> Iterator[None]:
+    """Take all rights to a path, and from the process those of root."""
+    mode = path.stat().st_mode
+    path.chmod(0)
+    is_root = os.geteuid() == 0
+    if is_root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if is_root:
+            os.seteuid(0)
+        path.chmod(mode)
+
+
+@pytest.mark.parametrize("words", [*RECORDING_COMMANDS, *POSE_COMMANDS])
+@pytest.mark.parametrize("inside", ["", "a.bag", "deep/a.bag"])
+def test_a_folder_without_permission_is_named(
+    command: Command, poses: Path, words: tuple[str, ...], inside: str
+) -> None:
+    folder = poses.with_name("locked")
+    (folder / "deep").mkdir(parents=True)
+    for path in (folder / "a.bag", folder / "deep" / "a.bag"):
+        path.write_bytes(b"#ROSBAG V2.0\n")
+    command(*filled(words, "/dev/null", poses))  # loads what the command imports
+    for parent in (poses.parent, poses.parent.parent, poses.parent.parent.parent):
+        parent.chmod(parent.stat().st_mode | 0o055)
+    with without_rights(folder):
+        answer = command(*filled(words, folder / inside, poses))
+    assert answer.code == 2
+    assert "Permission denied" in answer.err or "not readable" in answer.err
