@@ -27,7 +27,7 @@ from gvo.diagnostics.explain import explain_frame
 from gvo.errors import GvoError, RecordingError
 from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
-from gvo.runs.demo import write_demo_bag
+from gvo.runs.demo import BAG_NAME, write_demo_bags
 from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.explanation.extraction import draw_stereo
 from gvo.viz.overlay import compose_overlay
@@ -85,9 +85,9 @@ def main() -> None:
         parser.error("--frame must be at least 1: the first frame has no matches")
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
-        bag = arguments.recording or Path(name) / "drive.mcap"
+        bag = arguments.recording or Path(name) / BAG_NAME
         if arguments.recording is None:
-            write_demo_bag(bag)
+            write_demo_bags(Path(name))
         task = Task(bag, arguments.frame, Path(name))
         for kind in arguments.only or PICTURES:
             picture = PICTURES[kind](task)

@@ -11,10 +11,11 @@ from tests.conftest import Command
 def test_the_demo_its_comparison_and_its_smoothing(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 20)
     out = tmp_path / "gvo-demo"
-    assert command("demo", "--out", out).code == 0
-    assert {"drive.mcap", "summary.json", "report.html", "trajectories.png"} <= {
+    for n_frames in (2, 20):  # into its own folder again
+        monkeypatch.setattr("gvo.runs.demo.N_FRAMES", n_frames)
+        assert command("demo", "--out", out).code == 0
+    assert {"drive.mcap", "robot.mcap", "summary.json", "report.html", "trajectories.png"} <= {
         path.name for path in out.iterdir()
     }
     estimates = [out / f"{name}.txt" for name in ("raw", "causal", "smoothed")]

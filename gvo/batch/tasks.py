@@ -208,6 +208,7 @@ def _find_or_run(
         config=task.config,
         excerpt=options.batch.excerpt,
         outputs=outputs,
+        force=True,
         on_progress=on_progress,
     )
     return result, False

@@ -16,6 +16,7 @@ from gvo.cli.options import (
     Depth,
     Duration,
     Every,
+    Force,
     Left,
     Out,
     Recordings,
@@ -23,6 +24,7 @@ from gvo.cli.options import (
     Settings,
     Start,
     load,
+    new_folder,
     open_source,
     recording_options,
 )
@@ -49,11 +51,12 @@ def add_commands(app: typer.Typer) -> None:
 
 def explain(
     recordings: Recordings,
-    out: Out,
     frame: Annotated[
         int,
         typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0."),
     ],
+    out: Out = None,
+    force: Force = False,
     start: Start = 0.0,
     every: Every = 1,
     config: ConfigFile = None,
@@ -67,13 +70,13 @@ def explain(
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.diagnostics.explain import explain_frame
     from gvo.io.excerpt import make_excerpt
-    from gvo.viz.explanation import open_folder, write_explanation
+    from gvo.viz.explanation import write_explanation
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, None, every)
     options = recording_options(calibration, left, right, color, depth)
+    out = new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
     source = open_source(recordings, parameters, options)
-    open_folder(out)
     with interruptible() as check, progress(source.info.name) as show:
         explanation = explain_frame(
             source,
@@ -155,7 +158,8 @@ def _find_truth(source: Source) -> Trajectory | None:
 
 def round_trip(
     recordings: Recordings,
-    out: Out,
+    out: Out = None,
+    force: Force = False,
     start: Start = 0.0,
     duration: Duration = None,
     every: Every = 1,
@@ -174,13 +178,19 @@ def round_trip(
 
     parameters = load(config, set_)
     excerpt = make_excerpt(start, duration, every)
+    out = new_folder(out, recordings[0], what="-round-trip", force=force)
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
     for line in source.info.decisions:
         say(line)
     with interruptible() as check, progress(source.info.name) as show:
         result = run_round_trip(
-            source, out, config=parameters, excerpt=excerpt, on_progress=both(show, check)
+            source,
+            out,
+            config=parameters,
+            excerpt=excerpt,
+            force=force,
+            on_progress=both(show, check),
         )
     say(format_round_trip_errors(result.errors), nl=False)
     say(out / "round_trip.png")

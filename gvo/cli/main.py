@@ -24,6 +24,7 @@ from gvo.cli.options import (
     Depth,
     Duration,
     Every,
+    Force,
     Left,
     Out,
     Recordings,
@@ -31,6 +32,7 @@ from gvo.cli.options import (
     Settings,
     Start,
     load,
+    new_folder,
     open_source,
     recording_options,
 )
@@ -111,7 +113,7 @@ def _options(
 
 @_command()
 def demo(
-    out: Out = Path("gvo-demo"),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("gvo-demo"),
 ) -> None:
     """Render a drive as a bag, run on it, compare with the truth."""
     from gvo.runs.demo import BAG_NAME, run_demo
@@ -125,7 +127,8 @@ def demo(
 @_command()
 def run(
     recordings: Recordings,
-    out: Out,
+    out: Out = None,
+    force: Force = False,
     config: ConfigFile = None,
     set_: Settings = None,
     start: Start = 0.0,
@@ -184,6 +187,8 @@ def run(
     outputs = RunOutputs(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
+    out = new_folder(out, recordings[0], force=force)
+    outputs.check()
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
     base_frame = find_base_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
@@ -194,7 +199,7 @@ def run(
         say(line)
     with (
         interruptible() as check,
-        told_where_it_stands(out),
+        told_where_it_stands(out, and_then="; --force begins anew"),
         progress(source.info.name) as show,
     ):
         result = run_recording(
@@ -206,6 +211,7 @@ def run(
             starts_at_truth=isinstance(pose, str),
             excerpt=excerpt,
             outputs=outputs,
+            force=force,
             on_progress=both(show, check),
         )
     report(result, out)
@@ -256,7 +262,8 @@ def smooth(
             metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
         ),
     ],
-    out: Out,
+    out: Out = None,
+    force: Force = False,
     topic: Annotated[
         list[str] | None,
         typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
@@ -282,10 +289,12 @@ def smooth(
     from gvo.runs.smooth import configuration_for, smooth_edges
 
     parameters = load(config, set_)
-    truth = None if ground_truth is None else read_ground_truth(ground_truth)
     if "-" in inputs:
         _refuse_with_lines(inputs, topic=topic, sigma=sigma)
-        _smooth_lines(out, config=parameters, keyframes=keyframes, ground_truth=truth)
+    out = new_folder(out, "lines" if "-" in inputs else inputs[0], force=force)
+    truth = None if ground_truth is None else read_ground_truth(ground_truth)
+    if "-" in inputs:
+        _smooth_lines(out, force, config=parameters, keyframes=keyframes, ground_truth=truth)
     sigmas = [parse_sigma(text) for text in sigma or []]
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
     for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
@@ -297,6 +306,7 @@ def smooth(
             config=parameters,
             keyframes=keyframes.value,
             ground_truth=truth,
+            force=force,
             on_progress=both(show, check),
         )
     report_smoothed(result, out)
@@ -311,7 +321,12 @@ def _refuse_with_lines(inputs: list[str], **options: object) -> None:
 
 
 def _smooth_lines(
-    out: Path, *, config: Config, keyframes: _KeyframePolicy, ground_truth: Trajectory | None
+    out: Path,
+    force: bool,
+    *,
+    config: Config,
+    keyframes: _KeyframePolicy,
+    ground_truth: Trajectory | None,
 ) -> NoReturn:
     """Answer standard input line by line; nothing else goes to standard output."""
     from gvo.io.edges.lines import read_lines
@@ -329,6 +344,7 @@ def _smooth_lines(
             config=config,
             keyframes=keyframes.value,
             ground_truth=ground_truth,
+            force=force,
         )
     report_smoothed(result, out, is_stdout_taken=True)
 
@@ -415,8 +431,10 @@ def convert_(
     set_: Settings = None,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
+    from gvo.io.convert.common import check_new
     from gvo.io.convert.convert import convert
 
+    check_new(target)
     options = recording_options(calibration, left, right, color, depth)
     settings = load(config, set_)
     source = open_source(recordings, settings, options)

@@ -36,7 +36,10 @@ Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the le
 Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the right images.")]
 Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the colour images.")]
 Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the depth images.")]
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")]
+Out = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result in the folder.")]
 Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
 Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to read from there.")]
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
@@ -49,6 +52,17 @@ def load(path: Path | None, settings: list[str] | None) -> Config:
     config = load_configuration(path, settings or [])
     _LOGGER.debug("parameters: %s", config.model_dump(exclude_defaults=True) or "defaults")
     return config
+
+
+def new_folder(
+    out: Path | None, recording: str | Path, *, what: str = "", force: bool = False
+) -> Path:
+    """Return the folder to write, a new one if none is given; refused before any work."""
+    from gvo.io.run_folder.writer import check_unused, free_folder
+
+    folder = free_folder(recording, what) if out is None else out
+    check_unused(folder, force=force)
+    return folder
 
 
 def recording_options(

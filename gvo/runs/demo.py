@@ -4,41 +4,77 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from gvo.config import Config
 from gvo.errors import RecordingError
+from gvo.io.convert.bag_messages import BagWriter, FramePose, write_transforms
 from gvo.io.convert.bag_writer import write_bag
 from gvo.io.opening import open_recording
+from gvo.io.run_folder.line_file import check_new
+from gvo.io.run_folder.writer import check_unused
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.run import RunResult, run_recording
+from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress
 
 BAG_NAME = "drive.mcap"
+ROBOT_NAME = "robot.mcap"
 N_FRAMES = 100
 
+# The camera looks ahead, 0.5 m in front of the robot's middle and 1.2 m high: x forward, z up.
+_T_BASE_CAM = np.array([[0.0, 0, 1, 0.5], [-1, 0, 0, 0.1], [0, -1, 0, 1.2], [0, 0, 0, 1]])
 
-def write_demo_bag(path: Path, *, progress: Callable[[int], None] | None = None) -> None:
-    """Render a drive with a stereo camera and write it as a bag with its exact truth.
+
+def write_demo_bags(folder: Path, *, progress: Callable[[int], None] | None = None) -> None:
+    """Render a drive with a stereo camera; write it, and the tf of the robot that carries it.
 
     Parameters
     ----------
-    path : Path
-        `.bag` or `.mcap` file; replaced where it exists.
+    folder : Path
+        Gets `drive.mcap`, with the exact truth of the camera, and `robot.mcap`, which has
+        `map` to `base_link` in `/tf`, and `base_link` to the camera in `/tf_static`. Both are
+        replaced where they exist.
     progress : callable, optional
         Called with the number of images written so far.
 
     Raises
     ------
     RecordingError
-        When the file cannot be written.
+        When a file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
     drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
-    write_bag(drive, path, progress=progress)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (BAG_NAME, ROBOT_NAME):
+            (folder / name).unlink(missing_ok=True)
+        write_robot_bag(drive.ground_truth(), folder / ROBOT_NAME)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot be written: {error.strerror}") from error
+    write_bag(drive, folder / BAG_NAME, progress=progress)
+
+
+def write_robot_bag(truth: Trajectory, path: Path) -> None:
+    """Write the tf of a robot that carries the left camera of a stereo bag of gvo's own.
+
+    Parameters
+    ----------
+    truth : Trajectory
+        Of the camera, from the identity.
+    path : Path
+        `.mcap`.
+    """
+    with TemporaryDirectory(dir=path.parent, prefix=".gvo-part-") as part:
+        with BagWriter(Path(part) / path.name) as bag:
+            stamps_ns = truth.stamps_ns.tolist()
+            mount = FramePose(stamps_ns[0], "base_link", "camera_left_optical", _T_BASE_CAM)
+            write_transforms(bag, "/tf_static", [mount], is_latched=True)
+            poses = _T_BASE_CAM @ truth.T_world_frame @ np.linalg.inv(_T_BASE_CAM)
+            for stamp_ns, T_map_base in zip(stamps_ns, poses, strict=True):
+                write_transforms(bag, "/tf", [FramePose(stamp_ns, "map", "base_link", T_map_base)])
+        bag.result.rename(path)
 
 
 def run_demo(
@@ -47,18 +83,27 @@ def run_demo(
     on_rendered: Callable[[int], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
-    """Write the demo's bag into a folder, run on it, compare with the exact truth.
+    """Write the demo's bags into a folder, run on the drive, compare with the exact truth.
 
     Parameters
     ----------
     out : Path
-        Folder for the bag and the run's files.
+        Folder for the bags and the run's files. That of an earlier demonstration, known by its
+        `robot.mcap`, is made anew.
     on_rendered : callable, optional
         Called with the number of images written to the bag so far.
     on_progress : callable, optional
         Called after each frame of the run.
+
+    Raises
+    ------
+    RecordingError
+        When the folder holds something else of these names, or cannot be written.
     """
-    write_demo_bag(out / BAG_NAME, progress=on_rendered)
-    return run_recording(
-        open_recording(out / BAG_NAME), out, config=Config(), on_progress=on_progress
-    )
+    is_own = (out / ROBOT_NAME).is_file()
+    check_unused(out, force=is_own)
+    if not is_own:
+        check_new(out / BAG_NAME)
+    write_demo_bags(out, progress=on_rendered)
+    source = open_recording(out / BAG_NAME)
+    return run_recording(source, out, config=Config(), force=True, on_progress=on_progress)

@@ -16,7 +16,7 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, pair_limit_key
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
-from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder
+from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.runs.loop import RunLoop
 from gvo.runs.summary import summarize
 from gvo.trajectory.formats import read_trajectory
@@ -224,6 +224,7 @@ def run_round_trip(
     *,
     config: Config | None = None,
     excerpt: Excerpt | None = None,
+    force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RoundTripResult:
     """Run odometry over a recording forward, then backward, and measure how far it ends off.
@@ -240,6 +241,8 @@ def run_round_trip(
     config : Config, optional
     excerpt : Excerpt, optional
         Which frames are read; all where omitted.
+    force : bool
+        Replace an earlier run in the folder, complete or not.
     on_progress : callable, optional
         Called after each frame.
 
@@ -252,7 +255,9 @@ def run_round_trip(
     RecordingError
         When fewer than two frames are usable, or the recording cannot be read again.
     OutputError
-        When something cannot be written.
+        When the folder holds an earlier run, or something cannot be written.
+    RunBusyError
+        When another process is writing a run into the folder.
 
     Notes
     -----
@@ -277,11 +282,13 @@ def run_round_trip(
     way = RoundTripFrames(source, config, excerpt)
     base_frame = BaseFrame(source.info.frame_id)
     loop = RunLoop(source, config, base_frame, excerpt=excerpt, items=way)
-    with RunFolder(Path(out)) as folder:
+    with written_alone(Path(out), force=force), RunFolder(Path(out)) as folder:
         loop.run([folder], None if on_progress is None else _doubled(on_progress))
+        if way.turn_ns is None:
+            folder.discard()
+            reason = loop.statistics.reason()
+            raise RecordingError(f"{source.info.name}: no usable frame: {reason}")
     turn_ns = way.turn_ns
-    if turn_ns is None:
-        raise RecordingError(f"{source.info.name}: no usable frame: {loop.statistics.reason()}")
     errors = _read_errors(folder.path, turn_ns, source.info.name)
     warnings = loop.statistics.warnings()
     summary = _summary(loop, warnings, turn_ns, errors)

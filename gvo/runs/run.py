@@ -23,7 +23,6 @@ from gvo.io.run_folder.reader import read_run
 from gvo.io.run_folder.writer import (
     PICTURE,
     REPORT,
-    SUMMARY,
     TRAJECTORIES,
     RunFolder,
     written_alone,
@@ -75,6 +74,7 @@ def run_recording(
     starts_at_truth: bool = False,
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
+    force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Run odometry over a recording and write a run folder.
@@ -84,8 +84,7 @@ def run_recording(
     source : Source
         From `open_recording`, or a rendered one.
     out : str or Path
-        Folder for the trajectories, covariances, tables, summary and report; replaces an earlier
-        run.
+        Folder for the trajectories, covariances, tables, summary and report.
     config : Config, optional
     ground_truth : Trajectory or Truth, optional
         Poses of the base frame; the recording's own where omitted.
@@ -98,6 +97,8 @@ def run_recording(
         Which frames are read; all where omitted.
     outputs : RunOutputs, optional
         What is written besides the folder's tables; the report where omitted.
+    force : bool
+        Replace an earlier run in the folder, complete or not.
     on_progress : callable, optional
         Called after each frame.
 
@@ -110,13 +111,15 @@ def run_recording(
     RecordingError
         When no frame is usable.
     OutputError
-        When something cannot be written; the files hold what was written before.
+        When the folder holds an earlier run, or something cannot be written; the files hold what
+        was written before.
     RunBusyError
         When another process is writing a run into the folder.
     """
     config = config or Config()
     base_frame = base_frame or BaseFrame(source.info.frame_id)
     outputs = outputs or RunOutputs()
+    outputs.check()
     truth = _find_truth(source, ground_truth, base_frame)
     _LOGGER.debug("ground truth: %s", truth.decision if isinstance(truth, Truth) else truth.reason)
     first_pose = partial(initial_pose, truth) if starts_at_truth else None
@@ -124,8 +127,8 @@ def run_recording(
     identity = run_identity(source, base_frame, excerpt, start=start)
     loop = RunLoop(source, config, base_frame, excerpt=excerpt, first_pose=first_pose)
     with ExitStack() as stack, ExitStack() as files:
+        stack.enter_context(written_alone(Path(out), force=force))
         others, notes = outputs.open(loop, files)
-        stack.enter_context(written_alone(Path(out)))
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
@@ -176,7 +179,7 @@ def _conclude(
 ) -> RunResult:
     """Compare with the truth; write truth and summary."""
     if loop.statistics.n_with_pose == 0:
-        (folder.path / SUMMARY).unlink(missing_ok=True)
+        folder.discard()
         raise RecordingError(
             f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
         )

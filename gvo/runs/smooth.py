@@ -25,7 +25,7 @@ from gvo.io.edges.lines import (
     parse_line,
 )
 from gvo.io.edges.pose_graph import GraphFile, PoseGraphSource
-from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder
+from gvo.io.run_folder.writer import PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.run import RunResult
 from gvo.runs.summary import peak_memory_mb
@@ -163,6 +163,7 @@ def smooth_edges(
     config: Config | None = None,
     keyframes: Keeping = "distance",
     ground_truth: Trajectory | None = None,
+    force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
     """Smooth the edges of an input and write a run folder.
@@ -180,6 +181,8 @@ def smooth_edges(
         Which poses stay in the window when they are no longer recent: none, or by distance.
     ground_truth : Trajectory, optional
         True poses of the same frame.
+    force : bool
+        Replace an earlier run in the folder, complete or not.
     on_progress : callable, optional
         Called after each pose and each edge.
 
@@ -190,11 +193,11 @@ def smooth_edges(
     Raises
     ------
     RecordingError
-        When the input holds no pose, or the folder cannot be written.
+        When the input holds no pose, or the folder holds an earlier run or cannot be written.
     """
     config, decisions = configuration_for(source, config or Config())
     notes = SmoothingNotes(decisions=[*source.decisions, *decisions])
-    with _opened(Path(out), source) as (folder, graph_file):
+    with _opened(Path(out), source, force=force) as (folder, graph_file):
         smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
         try:
             for event in _events(source, notes):
@@ -210,9 +213,11 @@ def smooth_edges(
 
 
 @contextmanager
-def _opened(out: Path, source: EdgeSource) -> Iterator[tuple[RunFolder, GraphFile | None]]:
+def _opened(
+    out: Path, source: EdgeSource, *, force: bool
+) -> Iterator[tuple[RunFolder, GraphFile | None]]:
     """Open the files of a run; complete them also where it is interrupted."""
-    with RunFolder(out, columns=POSES_HEADER) as folder:
+    with written_alone(out, force=force), RunFolder(out, columns=POSES_HEADER) as folder:
         if not isinstance(source, PoseGraphSource):
             yield folder, None
             return
@@ -262,6 +267,7 @@ def conclude(
 ) -> RunResult:
     """Write summary and picture of a finished run, and compare with the truth."""
     if smoother.n_poses == 0:
+        folder.discard()
         reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
         raise RecordingError(f"{name}: nothing to smooth: {reason}")
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
@@ -341,6 +347,7 @@ def smooth_lines(
     config: Config | None = None,
     keyframes: Keeping = "distance",
     ground_truth: Trajectory | None = None,
+    force: bool = False,
 ) -> RunResult:
     """Smooth a stream of poses and edges, answering each line at once.
 
@@ -358,6 +365,8 @@ def smooth_lines(
         Which poses stay in the window, besides those of the stream's own `keep`.
     ground_truth : Trajectory, optional
         True poses of the same frame.
+    force : bool
+        Replace an earlier run in the folder, complete or not.
 
     Returns
     -------
@@ -367,12 +376,13 @@ def smooth_lines(
     Raises
     ------
     RecordingError
-        When no line held a pose, or the folder cannot be written.
+        When no line held a pose, or the folder holds an earlier run or cannot be written.
     """
     config = config or Config()
     faults = InputFaults()
     broken_off = ""
-    with RunFolder(Path(out), columns=POSES_HEADER) as folder:
+    out = Path(out)
+    with written_alone(out, force=force), RunFolder(out, columns=POSES_HEADER) as folder:
         smoother = Smoother(folder, config, keyframes=keyframes)
         try:
             _answer_all(lines, answer, smoother, faults)

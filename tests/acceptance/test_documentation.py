@@ -5,11 +5,8 @@ import importlib
 import re
 import shlex
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 import gvo
@@ -17,7 +14,8 @@ from gvo.config import CheckConfig, Config, describe_configuration
 from gvo.geometry.lens import N_COEFFICIENTS
 from gvo.io.bag.image_encodings import DEPTHS, IMAGES
 from gvo.io.bag.reader import BagReader
-from tests.io.pose_bags import PoseBag
+from gvo.runs.demo import write_robot_bag
+from tests.conftest import Command
 
 pytestmark = pytest.mark.acceptance
 
@@ -43,6 +41,8 @@ def commands() -> list[tuple[str, list[str]]]:
     """Return the commands of each block; none of a block whose commands another one has, too."""
     found: list[tuple[str, list[str]]] = []
     for page, text in blocks("sh"):
+        if page == "README.md":  # typed from its first line to its last, see below
+            continue
         lines = [line for line in text.splitlines() if line.startswith("gvo ")]
         # A word in capitals stands for a file of the reader's own.
         lines = [line for line in lines if not any(word.isupper() for word in shlex.split(line))]
@@ -52,33 +52,31 @@ def commands() -> list[tuple[str, list[str]]]:
 
 
 @pytest.fixture
-def workplace(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, drive_bag: Path, room_bag: Path, robot: Path
-) -> Path:
-    """Return a working folder with the recordings that the documentation names."""
-    for path, name in ((drive_bag, "drive.mcap"), (room_bag, "room.bag"), (robot, "robot.mcap")):
-        shutil.copy(path, tmp_path / name)
-    (shown,) = (block for page, block in blocks("yaml") if page == "own-camera.md")
-    (tmp_path / "stereo.yaml").write_text(shown)
+def clone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, drive_bag: Path) -> Path:
+    """Return a working folder as the README's first command leaves it, with a shorter drive."""
+    folder = tmp_path / "gvo-demo"
+    folder.mkdir()
+    shutil.copy(drive_bag, folder / "drive.mcap")
+    write_robot_bag(true_poses(drive_bag), folder / "robot.mcap")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def robot(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the tf of the robot that carries the camera of the drive: base_link goes forward."""
-    truth = gvo.open_recording(drive_bag).ground_truth()
+@pytest.fixture
+def workplace(clone: Path, room_bag: Path) -> Path:
+    """Return a working folder with the recordings that the documentation names."""
+    for name in ("drive.mcap", "robot.mcap"):
+        shutil.copy(clone / "gvo-demo" / name, clone / name)
+    shutil.copy(room_bag, clone / "room.bag")
+    (shown,) = (block for page, block in blocks("yaml") if page == "own-camera.md")
+    (clone / "stereo.yaml").write_text(shown)
+    return clone
+
+
+def true_poses(bag: Path) -> gvo.Trajectory:
+    truth = gvo.open_recording(bag).ground_truth()
     assert truth is not None
-    T_base_cam = np.array(
-        [[0.0, 0.0, 1.0, 0.5], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]]
-    )
-    bag = PoseBag(tmp_path_factory.mktemp("robot") / "robot.mcap")
-    stamps_ns = truth.stamps_ns.tolist()
-    bag.tf(stamps_ns[0], "base_link", "camera_left_optical", T_base_cam, is_static=True)
-    for stamp_ns, T_world_cam in zip(stamps_ns, truth.T_world_frame, strict=True):
-        T_map_base = T_base_cam @ T_world_cam @ np.linalg.inv(T_base_cam)
-        bag.tf(stamp_ns, "map", "base_link", T_map_base)
-    return bag.write()
+    return truth
 
 
 def shown_after(page: str, command_line: str) -> str:
@@ -112,19 +110,32 @@ def page_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gvo.viz.view.server.ViewServer.wait", lambda *_: True)
 
 
+@pytest.mark.usefixtures("page_that_ends", "clone")
+def test_the_readme_works_line_by_line_after_its_first_command(command: Command) -> None:
+    lines = [
+        line for page, text in blocks("sh") if page == "README.md" for line in text.splitlines()
+    ]
+    assert len(lines) > 8
+    for line in lines:
+        program, *words = shlex.split(line)
+        if program == "pip":
+            assert re.fullmatch(r"pip install '\.\[[a-z]+\]'", line)
+            continue
+        answer = command(*words)
+        assert (program, answer.code) == ("gvo", 0), f"{line}: {answer.err}"
+
+
 @pytest.mark.usefixtures("page_that_ends")
 @pytest.mark.parametrize(("page", "lines"), commands())
 def test_commands_in_the_documentation_run(
-    workplace: Path, command: Callable[..., Any], page: str, lines: list[str]
+    workplace: Path, command: Command, page: str, lines: list[str]
 ) -> None:
     for line in lines:
         answer = command(*shlex.split(line)[1:])
         assert answer.code == 0, f"{page}: {line}: {answer.err}"
 
 
-def test_the_shown_check_has_the_lines_of_a_real_one(
-    workplace: Path, command: Callable[..., Any]
-) -> None:
+def test_the_shown_check_has_the_lines_of_a_real_one(workplace: Path, command: Command) -> None:
     def names(text: str) -> list[str]:
         return [re.split(r"  +", line)[0] for line in text.splitlines()]
 
@@ -132,9 +143,7 @@ def test_the_shown_check_has_the_lines_of_a_real_one(
     assert names(shown_after("check.md", "gvo check drive.mcap")) == names(answer.out)
 
 
-def test_the_shown_run_has_the_decisions_of_a_real_one(
-    workplace: Path, command: Callable[..., Any]
-) -> None:
+def test_the_shown_run_has_the_decisions_of_a_real_one(workplace: Path, command: Command) -> None:
     shown = shown_after("recordings.md", "gvo run drive.mcap --out out")
     assert command("run", "drive.mcap", "--out", "out").out.startswith(shown)
 
@@ -151,9 +160,7 @@ def test_all_thresholds_of_a_check_are_listed() -> None:
     assert [name for name in names if not re.search(rf"`(check\.)?{name}`", page)] == []
 
 
-def test_all_topics_of_the_bag_of_a_run_are_listed(
-    workplace: Path, command: Callable[..., Any]
-) -> None:
+def test_all_topics_of_the_bag_of_a_run_are_listed(workplace: Path, command: Command) -> None:
     assert command("run", "drive.mcap", "--out", "out", "--bag", "run.mcap").code == 0
     page = (ROOT / "docs/bags.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("| `/")]

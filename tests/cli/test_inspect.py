@@ -133,9 +133,10 @@ def test_the_film_shows_each_frame_and_the_stream_is_of_rerun(drawn: Path) -> No
 def test_a_film_is_a_player_s_or_a_folder_of_pictures_where_it_is_asked_for(
     command: Command, drive_bag: Path, tmp_path: Path
 ) -> None:
-    options = ["--out", tmp_path / "out", "--duration", "0.3", "--no-report"]
+    options = ["--duration", "0.3", "--no-report"]
     for name in ("film.mp4", "pictures"):
-        answer = command("run", drive_bag, *options, "--overlay", tmp_path / name)
+        out = ["--out", tmp_path / f"run of {name}"]
+        answer = command("run", drive_bag, *out, *options, "--overlay", tmp_path / name)
         assert (answer.code, answer.err) == (0, "")
     start = (tmp_path / "film.mp4").read_bytes()
     assert start[4:8] == b"ftyp"
@@ -481,8 +482,8 @@ def test_wrong_use_gets_one_line_and_exit_code_2(
         ["explain", "{bag}", "--frame", "-1", "--out", "out"],
         ["explain", "{bag}", "--frame", "one", "--out", "out"],
         ["explain", "{bag}", "--out", "out"],
-        ["explain", "{bag}", "--frame", "1"],
-        ["round-trip", "{bag}"],
+        ["explain"],
+        ["round-trip"],
         ["view"],
         ["view", "{bag}", "--port", "70000"],
         ["view", "{bag}", "--prot", "0"],

@@ -68,6 +68,58 @@ def test_run_writes_its_files_and_prints_the_errors(
     }
 
 
+def test_a_run_takes_a_new_folder_where_none_is_named(
+    command: Command, room_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("gvo-room", "gvo-room-2"):
+        answer = command("run", room_bag, "--no-report", "--duration", "0.3")
+        assert answer.code == 0
+        assert (tmp_path / name / "summary.json").is_file()
+    assert f"{name}\n" in answer.out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "missing.bag", "--out", "taken"],
+        ["smooth", "missing.g2o", "--out", "taken"],
+        ["explain", "missing.bag", "--frame", "1", "--out", "taken"],
+        ["round-trip", "missing.bag", "--out", "taken"],
+        ["run", "missing.bag", "--bag", "taken"],
+        ["run", "missing.bag", "--overlay", "taken/summary.json"],
+        ["run", "missing.bag", "--rerun", "taken/summary.json"],
+        ["run", "missing.bag", "--plots", "taken/summary.json"],
+        ["convert", "missing.bag", "taken"],
+        ["demo", "--out", "taken"],
+    ],
+)
+def test_what_is_there_is_refused_before_a_recording_is_opened(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "summary.json").write_text("mine")
+    answer = command(*arguments)
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "error: taken" in answer.err
+    assert (tmp_path / "taken" / "summary.json").read_text() == "mine"
+    assert [path.name for path in tmp_path.rglob("*")] == ["taken", "summary.json"]
+
+
+def test_a_run_is_replaced_where_that_is_asked_for(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    run = ["run", room_bag, "--out", tmp_path, "--no-report", "--duration"]
+    assert command(*run, "0.3").code == 0
+    before = (tmp_path / "raw.txt").read_text()
+    assert command(*run, "0.4").code == 2
+    assert (tmp_path / "raw.txt").read_text() == before
+    assert command(*run, "0.4", "--force").code == 0
+    assert (tmp_path / "raw.txt").read_text() != before
+
+
 def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("window: {size: 4}\nfeatures: {n_features: 300}\n")
     settings = ["--config", tmp_path / "c.yaml", "--set", "features.n_features=400"]
@@ -262,7 +314,8 @@ def test_a_signal_ends_the_run_with_its_code_and_complete_files(
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == code
-    assert errors == f"gvo: interrupted; the poses so far are in {tmp_path}\n".encode()
+    said = f"gvo: interrupted; the poses so far are in {tmp_path}; --force begins anew\n"
+    assert errors.decode() == said
     assert json.loads((tmp_path / "summary.json").read_text())["state"] == "interrupted"
     n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
     assert len(n_poses) == 1

@@ -112,7 +112,7 @@ def test_the_summary_says_how_far_the_run_is(drive: Reference, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("n_frames", [None, 5])
-def test_a_run_that_was_stopped_is_replaced(
+def test_a_run_that_was_stopped_is_replaced_only_where_that_is_asked_for(
     drive: Reference, tmp_path: Path, n_frames: int | None
 ) -> None:
     out = tmp_path / "out"
@@ -121,7 +121,12 @@ def test_a_run_that_was_stopped_is_replaced(
             drive.run(out, on_progress=interrupt_at(7))
     else:
         shutil.copytree(drive.killed / str(n_frames), out)
-    assert drive.run(out).is_complete
+        (out / "run.lock").unlink()
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(OutputError, match=r"out: holds an earlier result .*--force"):
+        drive.run(out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert drive.run(out, force=True).is_complete
     drive.assert_same(out)
 
 

@@ -260,15 +260,15 @@ def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path:
     assert "2 images have no partner" in result.warnings[0]
 
 
-def test_a_run_that_fails_leaves_no_summary_of_an_earlier_one(
+def test_a_run_without_poses_leaves_nothing_also_not_of_an_earlier_one(
     room: SyntheticRecording, tmp_path: Path
 ) -> None:
     (tmp_path / "summary.json").write_text("{}")
     (tmp_path / "trajectories.png").write_text("")
+    (tmp_path / "mine.txt").write_text("")
     with pytest.raises(RecordingError):
-        gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path)
-    assert not (tmp_path / "summary.json").exists()
-    assert not (tmp_path / "trajectories.png").exists()
+        gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def test_poses_without_stamps_belong_to_the_frames_in_their_order(

@@ -18,7 +18,7 @@ from gvo.runs.smooth import smooth_lines
 
 def run(lines: list[str], out: Path) -> tuple[RunResult, list[str]]:
     answers: list[str] = []
-    result = smooth_lines(iter(lines), answers.append, out)
+    result = smooth_lines(iter(lines), answers.append, out, force=True)
     return result, answers
 
 

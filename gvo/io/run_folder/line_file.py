@@ -9,7 +9,40 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gvo.errors import RecordingError
+from gvo.errors import OutputError, RecordingError
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written, before any work; nothing is made.
+
+    Raises
+    ------
+    OutputError
+        With the reason.
+    """
+    try:
+        place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        is_folder = place.is_dir()
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    if not is_folder:
+        raise OutputError(f"{folder}: cannot be written: {place} is no folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: cannot be written: no permission to write to {place}")
+
+
+def check_new(path: Path) -> None:
+    """Refuse a path that holds something, or whose folder cannot be written, before any work.
+
+    Raises
+    ------
+    RecordingError
+        With what to do.
+    """
+    check_folder(path.parent)
+    is_empty = path.is_dir() and not any(path.iterdir())
+    if os.path.lexists(path) and not is_empty:
+        raise RecordingError(f"{path}: exists already; give another path or remove it")
 
 
 def append_whole(file: io.FileIO, data: bytes) -> None:
@@ -114,8 +147,7 @@ class PartFile:
     def __init__(self, path: Path, *errors: type[Exception]) -> None:
         self.path = path
         self._errors: tuple[type[Exception], ...] = (OSError, *errors)
-        if path.exists():
-            raise RecordingError(f"{path}: exists already; give another path or remove it")
+        check_new(path)
         with self.refused_on_error():
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-part-")

@@ -8,14 +8,15 @@ import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gvo.errors import OutputError, RunBusyError
-from gvo.io.run_folder.line_file import LineFile, replace_text
+from gvo.io.run_folder.line_file import LineFile, check_folder, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
     format_covariance_line,
@@ -60,18 +61,66 @@ _OF_EARLIER_RUNS = (
 )
 
 
-@contextmanager
-def written_alone(folder: Path) -> Iterator[None]:
-    """Lock a run folder, made where it is missing, against other processes.
+_RESULTS = (
+    *_OF_EARLIER_RUNS,
+    "frames.csv",
+    *(f"{name}.txt" for name in TRAJECTORIES),
+    "explanation.json",
+)
+
+
+def free_folder(recording: str | Path, what: str = "") -> Path:
+    """Return a new folder in the working folder: `gvo-RECORDING`, numbered where that is taken."""
+    path = Path(recording)
+    path = path if path.name not in ("", "..") else path.resolve()
+    name = path.name if path.is_dir() else Path(path.name.removesuffix(".zst")).stem
+    first = Path(f"gvo-{name}{what}")
+    numbered = (first.with_name(f"{first.name}-{n}") for n in count(2))
+    return next(path for path in chain([first], numbered) if not os.path.lexists(path))
+
+
+def check_unused(folder: Path, *, force: bool = False) -> None:
+    """Refuse a folder that cannot be written, or holds an earlier result; nothing is made.
+
+    Parameters
+    ----------
+    folder : Path
+    force : bool
+        Let them be replaced.
 
     Raises
     ------
     OutputError
-        When it cannot be written.
+        With the way out.
+    """
+    check_folder(folder)
+    there = [name for name in _RESULTS if os.path.lexists(folder / name)]
+    if there and not force:
+        raise OutputError(
+            f"{folder}: holds an earlier result ({there[0]}); give another folder by --out, or "
+            "--force to replace it"
+        )
+
+
+@contextmanager
+def written_alone(folder: Path, *, force: bool = False) -> Iterator[None]:
+    """Lock a run folder, made where it is missing, against other processes.
+
+    Parameters
+    ----------
+    folder : Path
+    force : bool
+        Let an earlier run be replaced.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written, or holds an earlier run, complete or not.
     RunBusyError
         When another process is writing it.
     """
     path = folder / LOCK
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = io.FileIO(path, "ab", opener=_open_no_link)
@@ -87,9 +136,13 @@ def written_alone(folder: Path) -> Iterator[None]:
         except OSError:
             pass  # a file system without locks
         try:
+            check_unused(folder, force=force)
             yield
         finally:
             path.unlink(missing_ok=True)
+            if is_new:
+                with suppress(OSError):  # of a run that gave something it is not empty
+                    folder.rmdir()
 
 
 def _open_no_link(path: str, flags: int) -> int:
@@ -225,6 +278,12 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         path = self.path / SUMMARY
         with self._refused_on_error(path):
             replace_text(path, text)
+
+    def discard(self) -> None:
+        """Remove the files of a run that gave nothing."""
+        self._is_writable = False
+        for name in (*_RESULTS, *self._files):
+            (self.path / name).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close all files and sort the smoothed poses by stamp."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
+from gvo.io.run_folder.line_file import check_folder, check_new
 from gvo.runs.loop import Output, RunLoop
 from gvo.runs.outputs.frames import RunFrames
 
@@ -44,6 +45,20 @@ class RunOutputs:
         """Refuse contradictory options."""
         if self.plots is not None and not self.report:
             raise ConfigurationError("--plots are those of the report: not with --no-report")
+
+    def check(self) -> None:
+        """Refuse files that exist or cannot be written, before any work; nothing is made.
+
+        Raises
+        ------
+        RecordingError
+            With what to do.
+        """
+        for path in (self.bag, self.overlay, self.rerun):
+            if path is not None:
+                check_new(path)
+        if self.plots is not None:
+            check_folder(self.plots)
 
     def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[Output], list[str]]:
         """Open the files that are written as the run goes.

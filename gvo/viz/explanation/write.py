@@ -7,7 +7,6 @@ from base64 import b64encode
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -53,12 +52,12 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     ConfigurationError
         When the folder cannot be written to.
     """
-    open_folder(out)
     pictures = draw_pictures(explanation)
     files = {out / f"{each.name}.png": each.png for each in pictures if each.png is not None}
     numbers = json.dumps(explanation_json(explanation), indent=2, allow_nan=False, default=_plain)
     files[out / "explanation.json"] = numbers.encode()
     try:
+        out.mkdir(parents=True, exist_ok=True)
         for path, content in files.items():
             path.write_bytes(content)
     except OSError as error:
@@ -67,24 +66,6 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     opening = f"<h1>{escape(title)}</h1>\n<p>{escape(_summary(explanation))}</p>"
     write_page(page, title, [opening, *map(_section, pictures)])
     return [*files, page]
-
-
-def open_folder(out: Path) -> None:
-    """Create the folder and check that it can be written to, before anything is computed.
-
-    Raises
-    ------
-    ConfigurationError
-        When it cannot be written to.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise ConfigurationError(
-            f"{out}: cannot be written: {error.strerror}; give a folder to write into"
-        ) from error
 
 
 def draw_pictures(explanation: FrameExplanation) -> list[Picture]:

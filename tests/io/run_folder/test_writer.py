@@ -1,5 +1,6 @@
 """Two processes do not write one run folder."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gvo.errors import OutputError, RunBusyError
-from gvo.io.run_folder.writer import written_alone
+from gvo.io.run_folder.writer import check_unused, free_folder, written_alone
 
 # Holds a folder until its standard input ends.
 _HOLDER = """
@@ -46,6 +47,9 @@ def test_a_folder_is_free_again_whatever_ended_the_run(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), written_alone(tmp_path):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
+    with written_alone(tmp_path / "new"):
+        assert (tmp_path / "new").is_dir()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
@@ -63,3 +67,56 @@ def test_a_link_leads_nowhere(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"), written_alone(tmp_path / "out"):
         pytest.fail("it leads out of the folder")
     assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["summary.json", "smoothed.txt", "frames.csv", "report.html", "explanation.json"]
+)
+def test_a_folder_with_an_earlier_result_is_refused_with_the_way_out(
+    tmp_path: Path, name: str
+) -> None:
+    check_unused(tmp_path)
+    (tmp_path / name).write_text("")
+    said = rf"{tmp_path}: holds an earlier result \({name}\); .*--out, or --force"
+    with pytest.raises(OutputError, match=said):
+        check_unused(tmp_path)
+    with pytest.raises(OutputError, match=said), written_alone(tmp_path):
+        pytest.fail("it is taken")
+    check_unused(tmp_path, force=True)
+    with written_alone(tmp_path, force=True):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_folder_below_a_file_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=f"{tmp_path / 'file'} is no folder"):
+        check_unused(tmp_path / "file" / "a" / "out")
+    check_unused(tmp_path / "a" / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OutputError, match=f"no permission to write to {tmp_path}"):
+        check_unused(tmp_path / "a" / "out")
+
+
+def test_a_folder_is_named_after_the_recording_and_numbered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "kitti.06").mkdir()
+    monkeypatch.chdir(tmp_path / "kitti.06")
+    names = {
+        "../gvo-demo/drive.mcap": "gvo-drive",
+        "day.2.db3.zst": "gvo-day.2",
+        str(tmp_path / "kitti.06"): "gvo-kitti.06",
+        ".": "gvo-kitti.06",
+        "lines": "gvo-lines",
+    }
+    assert {given: str(free_folder(given)) for given in names} == names
+    assert str(free_folder("drive.bag", "-frame-3")) == "gvo-drive-frame-3"
+    for number in ("", "-2", "-3"):
+        assert str(free_folder("drive.bag")) == f"gvo-drive{number}"
+        Path(f"gvo-drive{number}").mkdir()
