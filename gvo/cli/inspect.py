@@ -28,7 +28,16 @@ from gvo.cli.options import (
     open_source,
     recording_options,
 )
-from gvo.cli.terminal import Command, both, exit_code, interruptible, progress, say, warn
+from gvo.cli.terminal import (
+    Command,
+    both,
+    exit_code,
+    interruptible,
+    progress,
+    say,
+    told_where_it_stands,
+    warn,
+)
 from gvo.errors import ConfigurationError, GvoError
 
 if TYPE_CHECKING:
@@ -77,13 +86,9 @@ def explain(
     options = recording_options(calibration, left, right, color, depth)
     out = new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
     source = open_source(recordings, parameters, options)
-    with interruptible() as check, progress(source.info.name) as show:
+    with progress(source.info.name) as show:
         explanation = explain_frame(
-            source,
-            frame,
-            config=parameters,
-            excerpt=excerpt,
-            on_progress=both(show, check),
+            source, frame, config=parameters, excerpt=excerpt, on_progress=show
         )
         written = write_explanation(explanation, out)
     for path in written:
@@ -183,7 +188,11 @@ def round_trip(
     source = open_source(recordings, parameters, options)
     for line in source.info.decisions:
         say(line)
-    with interruptible() as check, progress(source.info.name) as show:
+    with (
+        interruptible() as check,
+        told_where_it_stands(out),
+        progress(source.info.name) as show,
+    ):
         result = run_round_trip(
             source,
             out,

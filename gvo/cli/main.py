@@ -41,12 +41,14 @@ from gvo.cli.terminal import (
     EXIT_UNUSABLE,
     Command,
     both,
+    ended_by_signals,
     exit_code,
     interruptible,
     progress,
     report,
     report_smoothed,
     say,
+    told_what_stands,
     told_where_it_stands,
     warn,
 )
@@ -119,7 +121,11 @@ def demo(
     from gvo.runs.demo import BAG_NAME, run_demo
 
     say(f"rendering a drive into {out / BAG_NAME}")
-    with interruptible() as check, progress("demo") as show:
+    with (
+        interruptible() as check,
+        told_what_stands(f"what is done is in {out}; the same command begins anew"),
+        progress("demo") as show,
+    ):
         result = run_demo(out, on_rendered=check, on_progress=both(show, check))
     report(result, out)
 
@@ -199,7 +205,7 @@ def run(
         say(line)
     with (
         interruptible() as check,
-        told_where_it_stands(out, and_then="; --force begins anew"),
+        told_where_it_stands(out),
         progress(source.info.name) as show,
     ):
         result = run_recording(
@@ -239,14 +245,13 @@ def check_(
     parameters = load(config, set_)
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
-    with interruptible():
-        result = check_recording(
-            source,
-            parameters,
-            transforms=read_transforms(source, (source.info.frame_id, frame)),
-            base_frame=frame,
-            calibration_changes=count_calibration_changes(source),
-        )
+    result = check_recording(
+        source,
+        parameters,
+        transforms=read_transforms(source, (source.info.frame_id, frame)),
+        base_frame=frame,
+        calibration_changes=count_calibration_changes(source),
+    )
     if as_json:
         typer.echo(json.dumps(result.as_json(), allow_nan=False))
     else:
@@ -299,7 +304,11 @@ def smooth(
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
     for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
         say(decision)
-    with interruptible() as check, progress(source.name, "poses") as show:
+    with (
+        interruptible() as check,
+        told_where_it_stands(out),
+        progress(source.name, "poses") as show,
+    ):
         result = smooth_edges(
             source,
             out,
@@ -336,7 +345,7 @@ def _smooth_lines(
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
 
-    with interruptible() as check:
+    with interruptible() as check, told_where_it_stands(out):
         result = smooth_lines(
             read_lines(sys.stdin.fileno(), lambda: check(None)),
             answer,
@@ -438,7 +447,10 @@ def convert_(
     options = recording_options(calibration, left, right, color, depth)
     settings = load(config, set_)
     source = open_source(recordings, settings, options)
-    with interruptible() as check:
+    with (
+        interruptible() as check,
+        told_what_stands(f"{target} is not written; the same command begins anew"),
+    ):
         written = convert(
             source,
             target,
@@ -496,7 +508,7 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
 def main() -> None:
     """Run the command; one line and exit code 2 for bad input."""
     try:
-        with named_faults(GvoError, "gvo"):
+        with ended_by_signals(), named_faults(GvoError, "gvo"):
             raise SystemExit(_run() or 0)
     except typer.Abort:
         raise SystemExit(130) from None

@@ -6,7 +6,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
@@ -190,6 +190,34 @@ def both(
 
 
 @contextmanager
+def _handling(receive: Callable[[int, object], None]) -> Iterator[None]:
+    """Handle signals by a function as long as the context lasts."""
+    before = {number: signal.signal(number, receive) for number in _EXIT_CODES_OF_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Let a signal end the command at once, with one line and its exit code."""
+    received: list[int] = []
+
+    def receive(number: int, frame: object) -> None:
+        received.append(number)
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[number])
+
+    try:
+        with _handling(receive):
+            yield
+    finally:
+        if received:
+            typer.echo("gvo: interrupted; the same command begins anew", err=True)
+
+
+@contextmanager
 def interruptible() -> Iterator[Callable[[object], None]]:
     """Yield a function that ends the work once a signal has come; call it between frames.
 
@@ -206,21 +234,25 @@ def interruptible() -> Iterator[Callable[[object], None]]:
         if received:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, receive) for number in _EXIT_CODES_OF_SIGNALS}
     try:
-        yield check
+        with _handling(receive):
+            yield check
     except KeyboardInterrupt:
         raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
-def told_where_it_stands(out: Path | str, *, and_then: str = "") -> Iterator[None]:
-    """Say, if the work is interrupted, where its files are, and how to go on."""
+def told_what_stands(words: str) -> Iterator[None]:
+    """Say, if the work is interrupted, what of it stands, and how to go on."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"gvo: interrupted; the poses so far are in {out}{and_then}", err=True)
+        typer.echo(f"gvo: interrupted; {words}", err=True)
         raise
+
+
+def told_where_it_stands(
+    out: Path | str, *, and_then: str = "; --force begins anew"
+) -> AbstractContextManager[None]:
+    """Say, if the work is interrupted, where its poses are, and how to go on."""
+    return told_what_stands(f"the poses so far are in {out}{and_then}")

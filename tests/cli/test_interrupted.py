@@ -1,0 +1,110 @@
+"""A signal while a command works: one line says what stands, and how to go on."""
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import gvo
+from gvo.frontend.klt import KltFrontend
+from gvo.io.bag.reader import BagMessage
+from gvo.runs.smooth import Smoother
+from gvo.trajectory import evaluation
+from tests.conftest import Command
+
+ANEW = "the same command begins anew"
+POSES_STAND = "the poses so far are in {out}; --force begins anew"
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+@pytest.fixture
+def interrupt(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that makes a call of a method raise a signal in this process."""
+
+    def at_call(owner: object, name: str, n: int, number: int = signal.SIGTERM) -> None:
+        calls = []
+        original = getattr(owner, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            calls.append(1)
+            if len(calls) == n:
+                os.kill(os.getpid(), number)
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(owner, name, call)
+
+    return at_call
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("words", "stands"),
+    [
+        (("check", "{bag}"), ANEW),
+        (("convert", "{bag}", "{out}.bag"), f"{{out}}.bag is not written; {ANEW}"),
+        (("explain", "{bag}", "--frame", "9", "--out", "{out}"), ANEW),
+        (("round-trip", "{bag}", "--out", "{out}"), POSES_STAND),
+        (("run", "{bag}", "--out", "{out}"), POSES_STAND),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_signal_while_a_recording_is_read_ends_in_one_line(
+    command: Command,
+    interrupt: Callable[..., None],
+    drive_bag: Path,
+    tmp_path: Path,
+    *,
+    words: tuple[str, ...],
+    stands: str,
+    number: signal.Signals,
+) -> None:
+    out = tmp_path / "out"
+    interrupt(BagMessage, "decode", 12, number)
+    answer = command(*(word.format(bag=drive_bag, out=out) for word in words))
+    assert answer.code == CODES[number]
+    assert answer.err.startswith(f"gvo: interrupted; {stands.format(out=out)}")
+    assert answer.err.count("\n") == 1
+    left = {path.name for path in tmp_path.iterdir()} - {"out"}
+    assert not left
+    if "poses" in stands:
+        n_poses = {len(gvo.read_trajectory(out / f"{name}.txt")) for name in ("raw", "smoothed")}
+        assert len(n_poses) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_poses_are_smoothed_leaves_those_before(
+    command: Command, interrupt: Callable[..., None], tmp_path: Path, number: signal.Signals
+) -> None:
+    poses, out = tmp_path / "poses.txt", tmp_path / "out"
+    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    interrupt(Smoother, "take", 7, number)
+    answer = command("smooth", poses, "--out", out)
+    assert answer.code == CODES[number]
+    assert answer.err == f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
+    for name in ("raw", "causal", "smoothed"):
+        assert len(gvo.read_trajectory(out / f"{name}.txt")) == 7
+
+
+def test_a_signal_while_trajectories_are_compared_ends_in_one_line(
+    command: Command, interrupt: Callable[..., None], tmp_path: Path
+) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    interrupt(evaluation, "relative_errors", 1)
+    assert command("compare", poses, poses) == (143, "", f"gvo: interrupted; {ANEW}\n")
+
+
+def test_a_signal_while_the_demo_runs_ends_in_one_line(
+    command: Command,
+    interrupt: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 3)
+    interrupt(KltFrontend, "extract", 1)
+    answer = command("demo", "--out", tmp_path)
+    assert answer.code == 143
+    assert answer.err == f"gvo: interrupted; what is done is in {tmp_path}; {ANEW}\n"
