@@ -240,7 +240,7 @@ def check_(
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.diagnostics.check import check_recording, format_check
-    from gvo.io.poses.inputs import count_calibration_changes, read_transforms
+    from gvo.io.poses.inputs import read_transforms
 
     parameters = load(config, set_)
     options = recording_options(calibration, left, right, color, depth)
@@ -250,7 +250,6 @@ def check_(
         parameters,
         transforms=read_transforms(source, (source.info.frame_id, frame)),
         base_frame=frame,
-        calibration_changes=count_calibration_changes(source),
     )
     if as_json:
         typer.echo(json.dumps(result.as_json(), allow_nan=False))

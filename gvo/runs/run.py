@@ -16,7 +16,12 @@ from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.poses.inputs import initial_pose, recorded_truth
+from gvo.io.poses.inputs import (
+    CAMERA_CHANGED,
+    describe_camera_changes,
+    initial_pose,
+    recorded_truth,
+)
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run
@@ -184,7 +189,8 @@ def _conclude(
             f"{loop.source.info.name}: no usable frame: {loop.statistics.reason()}"
         )
     compared = _compare(truth, folder, loop)
-    warnings = [*loop.statistics.warnings(), *notes, *faults, *_warnings_of_truth(compared)]
+    warnings = [*loop.statistics.warnings(), *_warnings_of_camera(loop.source)]
+    warnings += [*notes, *faults, *_warnings_of_truth(compared)]
     evaluations: tuple[Evaluation, ...] = ()
     if isinstance(compared, TruthComparison):
         folder.write_truth(compared.truth.trajectory)
@@ -222,6 +228,11 @@ def _within(truth: Truth, folder: RunFolder, loop: RunLoop) -> Truth:
         start, end = np.searchsorted(trajectory.stamps_ns, [first, last])
         trajectory = trajectory.select(slice(int(start), int(end)))
     return replace(truth, trajectory=trajectory)
+
+
+def _warnings_of_camera(source: Source) -> list[str]:
+    changes = describe_camera_changes(source)
+    return [f"CameraInfo changes on the way ({changes}): {CAMERA_CHANGED}"] if changes else []
 
 
 def _warnings_of_truth(compared: TruthComparison | Failure) -> list[str]:

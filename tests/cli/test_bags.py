@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -271,6 +272,49 @@ def test_split_bags_give_the_same_bytes_as_the_whole(
     answer = command("run", "--no-report", *parts, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     assert_same_bytes(tmp_path / "out", walk_run)
+
+
+def test_halves_in_a_folder_are_one_recording(walk_bag: Path, tmp_path: Path) -> None:
+    for part in in_halves(walk_bag, tmp_path):
+        part.rename(tmp_path / part.name)
+        (part.parent / "metadata.yaml").unlink()
+    stamps = [image.stamp_ns for image in gvo.open_recording(tmp_path).images()]
+    assert stamps == [image.stamp_ns for image in gvo.open_recording(walk_bag).images()]
+
+
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_bags_of_two_recordings_are_refused_with_what_to_type(
+    command: Command, walk_bag: Path, tmp_path: Path, *, is_folder: bool
+) -> None:
+    bags = [tmp_path / "first.mcap", tmp_path / "second.mcap"]
+    for bag in bags:
+        shutil.copy(walk_bag, bag)
+    answer = command("check", *([tmp_path] if is_folder else bags))
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "before first.mcap ends" in answer.err
+    assert f"{bags[0]}, {bags[1]}; give one of them" in answer.err
+    assert f"`gvo batch {tmp_path if is_folder else bags[0]}" in answer.err
+
+
+def test_a_folder_with_a_bag_for_each_camera_is_refused(
+    command: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    for part in by_camera(walk_bag, tmp_path):
+        part.rename(tmp_path / part.name)
+    answer = command("check", tmp_path)
+    assert answer.code == 2
+    assert "holds other image topics than" in answer.err
+
+
+def test_the_bag_of_a_run_is_no_part_of_its_recording(
+    command: Command, walk_bag: Path, tmp_path: Path
+) -> None:
+    bag = PoseBag(tmp_path / "run.mcap")
+    bag.pose("/gvo/raw/odometry", ODOMETRY, int(STAMPS_NS[0]), np.eye(4), child="camera")
+    answer = command("check", walk_bag, bag.write())
+    assert answer.code == 2
+    assert "run.mcap was written by a run" in answer.err
 
 
 def test_a_bag_and_a_folder_are_not_one_recording(

@@ -15,6 +15,7 @@ import yaml
 
 import gvo
 from gvo.frontend.calibration import describe_offsets
+from gvo.io.bag.source import BagSource
 
 Command = Callable[..., Any]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
@@ -257,6 +258,20 @@ def test_verbose_logs_what_is_done(command: Command, room_bag: Path, tmp_path: P
     assert sum(line.startswith("gvo.runs.loop: frame at ") for line in lines) == 20
     assert any("parameters: defaults" in line for line in lines)
     assert command("check", room_bag).err == ""
+
+
+def test_a_run_warns_of_a_calibration_that_changes(
+    command: Command, monkeypatch: pytest.MonkeyPatch, room_bag: Path, tmp_path: Path
+) -> None:
+    changes = {"/camera/color/camera_info": 7}
+    monkeypatch.setattr(BagSource, "camera_info_changes", changes)
+    arguments = ["run", room_bag, "--out", tmp_path / "out", "--no-report", "--duration", "0.1"]
+    answer = command(*arguments)
+    assert answer.code == 0
+    assert answer.err.startswith(
+        "gvo: warning: CameraInfo changes on the way (7 of /camera/color/camera_info): "
+    )
+    assert command("check", room_bag).out.count("7 of /camera/color/camera_info") == 1
 
 
 def test_a_shell_completes_options(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from gvo.diagnostics.check.stereo import check_stereo
 from gvo.diagnostics.check.timing import check_timing
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.io.poses.inputs import CAMERA_CHANGED, describe_camera_changes
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import RecordingInfo, Source
 from gvo.types import Failure
@@ -32,7 +33,6 @@ def check_recording(
     n_samples: int | None = None,
     transforms: TfBuffer | None = None,
     base_frame: str = "base_link",
-    calibration_changes: Mapping[str, int] | None = None,
 ) -> CheckResult:
     """Check a recording for what makes odometry fail or err.
 
@@ -51,8 +51,6 @@ def check_recording(
         Transforms of the same bag; if None, the tree of frames is not checked.
     base_frame : str
         The robot's own frame in that tree.
-    calibration_changes : mapping of str to int, optional
-        For each `CameraInfo` topic of a bag, the number of messages that differ from its first.
 
     Returns
     -------
@@ -83,8 +81,9 @@ def check_recording(
         findings += check_stereo(found.samples, camera, config)
     if not isinstance(camera, Failure):
         findings += check_shutter(source, found, config)
-    if calibration_changes is not None:
-        findings.append(_check_changes(calibration_changes))
+    changes = describe_camera_changes(source)
+    if changes is not None:
+        findings.append(_check_changes(changes))
     if transforms is not None:
         findings += check_frame_tree(
             transforms,
@@ -96,15 +95,14 @@ def check_recording(
     return CheckResult(recording=info.name, findings=tuple(findings))
 
 
-def _check_changes(changes: Mapping[str, int]) -> Finding:
-    changed = [f"{n} of {name}" for name, n in changes.items() if n]
+def _check_changes(changes: str) -> Finding:
     return judged(
         "changed CameraInfo",
-        ", ".join(changed) or "0 messages differ from the first",
-        is_ok=not changed,
+        changes or "0 messages differ from the first",
+        is_ok=not changes,
         threshold="0",
         otherwise="warning",
-        fix="the first one is used; give the right one by --calibration FILE, or cut the bag there",
+        fix=CAMERA_CHANGED,
     )
 
 

@@ -22,6 +22,10 @@ _MIN_PER_STRETCH = 3
 _MIN_STRETCHES = 4
 # A drift is real beyond so many standard deviations.
 _DRIFT_SIGMAS = 4.0
+# Near half a period, images are paired with the partners of others; streams that have nothing to
+# do with each other have differences of any size up to there.
+_MAX_SHARE_OF_PERIOD = 0.4
+_MIN_SHARE_OF_PERIOD = 0.1
 # A period outside is mostly one in a wrong unit.
 _PERIODS_MS = (0.5, 10_000.0)
 
@@ -149,22 +153,27 @@ def _check_partners(
     first, second = (stream.stamps_ns for stream in survey.streams)
     n_frames = min(len(first), len(second)) if info.sensor == "rgbd" else len(first)
     n_alone = max(n_frames - survey.n_pairs, 0)
-    limit_ms, enough_ms = getattr(config.sync, key), math.ceil(float(np.percentile(sizes_ms, 95)))
+    limit_ms, period_ms = getattr(config.sync, key), min(_period_ms(first), _period_ms(second))
+    low_ms, middle_ms, high_ms = np.percentile(sizes_ms, [25, 50, 95])
+    enough_ms = math.ceil(high_ms)
+    if limit_ms < enough_ms <= _MAX_SHARE_OF_PERIOD * period_ms:
+        fix = f"--set sync.{key}={enough_ms} pairs 95 % of them"
+    elif middle_ms > limit_ms and low_ms > _MIN_SHARE_OF_PERIOD * period_ms:
+        fix = "the two are not taken together: trigger both by one signal; no tolerance pairs them"
+    else:
+        fix = f"images of one stream are missing: see dropped frames and gaps of {name}"
     return measured(
         f"{name}: frames without partner",
         n_alone / n_frames,
         lost_limits(config.check),
         unit="%",
         text=f"{n_alone} of {n_frames} at sync.{key}={limit_ms:g}",
-        # Beyond half a period, images are paired with the partners of others.
-        fix=f"--set sync.{key}={enough_ms} pairs 95 % of them"
-        if limit_ms < enough_ms <= _half_period_ms(first) + 1.0
-        else f"images of one stream are missing: see dropped frames and gaps of {name}",
+        fix=fix,
     )
 
 
-def _half_period_ms(stamps_ns: IntArray) -> float:
-    return 0.5 * float(np.median(np.diff(stamps_ns))) / 1e6 if len(stamps_ns) > 1 else math.inf
+def _period_ms(stamps_ns: IntArray) -> float:
+    return float(np.median(np.diff(stamps_ns))) / 1e6 if len(stamps_ns) > 1 else math.inf
 
 
 def _nearest_differences(first_ns: IntArray, second_ns: IntArray) -> FloatArray:

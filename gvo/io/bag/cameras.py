@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import combinations, pairwise
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
+from gvo.io.bag.file import BagFile
 from gvo.io.bag.messages import (
     camera_fields,
     decode_compressed,
     decode_compressed_depth,
     stamp_of,
 )
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import BagMessage, BagReader
 from gvo.io.bag.topics import (
+    CAMERA_INFO_TYPE,
+    COMPRESSED_TYPE,
     IMAGE_TYPE,
     CameraTopics,
     Topic,
@@ -28,6 +32,14 @@ from gvo.io.bag.topics import (
 from gvo.io.calibration.camera_info import CameraFields
 from gvo.io.poses.tf_paths import bare
 
+# Written by a run for viewers, beside the poses.
+_OF_RUN = "/gvo/"
+# Pieces of one recording follow each other but for what a recorder writes late.
+_MAX_OVERLAP_S = 1.0
+_MAX_GAP_S = 5.0
+# The header of a serialised message begins with what changes: of ROS 1 the number, the stamp.
+_N_STAMP_BYTES = 12
+_Numbers: TypeAlias = tuple[object, ...]
 _FLOAT_TYPE = "std_msgs/msg/Float32"
 # Beside the stream of depth of a bag that librealsense wrote: metres per count.
 _REALSENSE_DEPTH = re.compile(r"(/device_\d+/sensor_\d+)/[^/]+/image/data")
@@ -104,37 +116,100 @@ def read_bag_cameras(
     return cameras[0], cameras[1] if len(cameras) > 1 else None
 
 
-def camera_info_changes(reader: BagReader, names: Collection[str]) -> dict[str, int]:
-    """Count the `CameraInfo` that differ from the first of their topic, which is the one used.
+class CameraInfoWatch:
+    """Counts the `CameraInfo` that differ from the first of their topic, which is the one used.
+
+    Attributes
+    ----------
+    counts : dict of str to int
+        By topic, for those topics that have any.
+    """
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        self._first: dict[str, _Numbers] = {}
+        self._last: dict[str, tuple[bytes, bool]] = {}
+
+    def take(self, message: BagMessage) -> None:
+        """Compare the next message."""
+        name, content = message.topic.name, message.data[_N_STAMP_BYTES:]
+        last = self._last.get(name)
+        if last is None or last[0] != content:
+            numbers = _numbers_of(message)
+            if numbers is None:
+                return
+            last = content, self._first.setdefault(name, numbers) != numbers
+            self._last[name] = last
+        if last[1]:
+            self.counts[name] = self.counts.get(name, 0) + 1
+
+
+def _numbers_of(message: BagMessage) -> _Numbers | None:
+    """Return what of a `CameraInfo` can be compared; None where it says nothing."""
+    try:
+        content = message.decode()
+        return _comparable(camera_fields(content, "")) if _is_calibrated(content) else None
+    except RecordingError:
+        return None
+
+
+def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
+    """Say why files that nothing vouches for are not one recording; empty where they may be.
+
+    Of those with images of the same topics one must follow the other, with the same `CameraInfo`.
+    Files that were found in a folder, not given together, must also hold the same image topics
+    and follow without a gap. A bag that a run wrote is none of a recording.
 
     Parameters
     ----------
     reader : BagReader
-        The bag; all messages of the topics are read.
-    names : collection of str
-        Topics of `CameraInfo`.
-
-    Returns
-    -------
-    dict
-        Number of messages by topic, for those topics that have any.
-
-    Raises
-    ------
-    RecordingError
-        When the bag cannot be read.
+    by_camera_info : bool
+        Compare the `CameraInfo`, the first of each file.
     """
-    first: dict[str, tuple[object, ...]] = {}
-    counts: dict[str, int] = {}
-    for message in reader.messages(names):
-        name = message.topic.name
-        try:
-            numbers = _comparable(camera_fields(message.decode(), name))
-        except RecordingError:
-            continue
-        if first.setdefault(name, numbers) != numbers:
-            counts[name] = counts.get(name, 0) + 1
-    return counts
+    own = [file.path.name for file in reader.loose_files if _is_of_run(file)]
+    if own:
+        return f"{own[0]} was written by a run"
+    parts = [(file, _image_names(file)) for file in reader.loose_files]
+    parts = sorted([part for part in parts if part[1]], key=lambda part: part[0].start_time_ns)
+    for (before, images), (after, others) in combinations(parts, 2):
+        overlap_s = 1e-9 * (min(before.end_time_ns, after.end_time_ns) - after.start_time_ns)
+        shorter_s = 1e-9 * min(file.end_time_ns - file.start_time_ns for file in (before, after))
+        if images & others and overlap_s > min(_MAX_OVERLAP_S, 0.5 * shorter_s):
+            return f"{after.path.name} begins {overlap_s:.3g} s before {before.path.name} ends"
+    for (before, images), (after, others) in pairwise(parts if reader.is_found else ()):
+        if images != others:
+            return f"{after.path.name} holds other image topics than {before.path.name}"
+        gap_s = 1e-9 * (after.start_time_ns - before.end_time_ns)
+        if gap_s > _MAX_GAP_S:
+            return f"{after.path.name} begins {gap_s:.3g} s after {before.path.name} ends"
+    return _other_camera(reader, [file for file, _ in parts]) if by_camera_info else ""
+
+
+def _is_of_run(file: BagFile) -> bool:
+    return any(channel.name.startswith(_OF_RUN) for channel in file.counts)
+
+
+def _image_names(file: BagFile) -> set[str]:
+    types = (IMAGE_TYPE, COMPRESSED_TYPE)
+    return {c.name for c, n in file.counts.items() if n > 0 and c.type in types}
+
+
+def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:
+    """Say which file has another `CameraInfo` than one before; empty where none has."""
+    first: dict[str, tuple[_Numbers, str]] = {}
+    for file in files:
+        wanted = {c.name for c, n in file.counts.items() if n > 0 and c.type == CAMERA_INFO_TYPE}
+        for message in reader.messages(frozenset(wanted), files=[file]) if wanted else ():
+            name, numbers = message.topic.name, _numbers_of(message)
+            if numbers is None:
+                continue
+            known, where = first.setdefault(name, (numbers, file.path.name))
+            if known != numbers:
+                return f"{name} of {file.path.name} is not that of {where}"
+            wanted.discard(name)
+            if not wanted:
+                break
+    return ""
 
 
 def image_frame(reader: BagReader, image: Topic) -> str:
@@ -226,6 +301,6 @@ def _image_size(reader: BagReader, image: Topic, where: str) -> tuple[int, int]:
     )
 
 
-def _comparable(fields: CameraFields) -> tuple[object, ...]:
+def _comparable(fields: CameraFields) -> _Numbers:
     matrices = (np.asarray(getattr(fields, name)).tobytes() for name in "KDRP")
     return (fields.width, fields.height, fields.model, fields.binning, fields.roi, *matrices)

@@ -99,10 +99,11 @@ class BagFile:
         try:
             with self._opened() as reader:
                 self.counts = _counts(reader)
-                self.start_time_ns = reader.start_time
+                self.start_time_ns, self.end_time_ns = reader.start_time, reader.end_time
         except DAMAGE as error:
             self._recovered = scan = _recover(path, error)
-            self.counts, self.start_time_ns = scan.counts, scan.start_time_ns
+            self.counts = scan.counts
+            self.start_time_ns, self.end_time_ns = scan.start_time_ns, scan.end_time_ns
             if not scan.damage:
                 self.note = _describe_missing_index(path, error, scan.tool)
 

@@ -77,6 +77,11 @@ class BagReader:
     paths : Path or sequence of Path
         `.bag`, `.mcap` or `.db3` files, or ROS 2 bag folders.
 
+    Attributes
+    ----------
+    is_found : bool
+        The files are what a folder holds of which no metadata say so.
+
     Raises
     ------
     RecordingError
@@ -88,6 +93,7 @@ class BagReader:
         self._missing: list[str] = []
         self._files: list[BagFile] = []
         self._origins: dict[Path, Path] = {}
+        self.is_found = False
         paths = [paths] if isinstance(paths, Path) else list(paths)
         if not paths:
             raise ValueError("expected at least one path of a bag")
@@ -96,6 +102,7 @@ class BagReader:
                 self._files += (
                     self._open_folder(path) if path.is_dir() else [BagFile(self._unpacked(path))]
                 )
+        self._are_loose = self.is_found or len(paths) > 1
         self.notes += [file.note for file in self._files if file.note]
         self.topics = _merge_topics(self._files)
 
@@ -108,7 +115,14 @@ class BagReader:
             text = text.replace(str(unpacked), str(path))
         return text
 
-    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+    @property
+    def loose_files(self) -> list[BagFile]:
+        """The files where no metadata say that they are one recording; none if it is one file."""
+        return self._files if self._are_loose and len(self._files) > 1 else []
+
+    def messages(
+        self, names: Collection[str], *, files: Sequence[BagFile] | None = None
+    ) -> Iterator[BagMessage]:
         """Yield the messages of some topics in the order of recording, over all files.
 
         What is damaged is left out, see `damage`; in a file without an index the order is that
@@ -118,10 +132,15 @@ class BagReader:
         ----------
         names : collection of str
             Topics as listed.
+        files : sequence of BagFile, optional
+            Some of the files; all where omitted.
         """
         topics = {(topic.name, topic.type): topic for topic in self.topics}
-        wanted = [file for file in self._files if any(c.name in names for c in file.counts)]
-        streams = [_begin(file, names) for file in wanted]
+        streams = [
+            _begin(file, names)
+            for file in files or self._files
+            if any(channel.name in names for channel in file.counts)
+        ]
         for _, message in merge(*streams, key=lambda item: item[0]):
             if message is None:
                 continue
@@ -137,6 +156,7 @@ class BagReader:
         found = find_files(folder)
         self.notes += found.notes
         self._missing += found.damage
+        self.is_found |= not found.is_listed
         files: list[BagFile] = []
         refusals: list[RecordingError] = []
         for path in found.paths:
@@ -199,11 +219,14 @@ class FolderFiles:
         What was decided.
     damage : tuple of str
         What is missing.
+    is_listed : bool
+        Whether the metadata name them.
     """
 
     paths: tuple[Path, ...]
     notes: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
+    is_listed: bool = True
 
 
 def find_files(folder: Path) -> FolderFiles:
@@ -235,9 +258,8 @@ def find_files(folder: Path) -> FolderFiles:
             )
         state = "names other files" if counts else "is malformed" if has_metadata else "is missing"
         names = ", ".join(path.name for path in held)
-        return FolderFiles(
-            paths=tuple(held), notes=(f"bag: metadata.yaml {state}: read {names} without it",)
-        )
+        note = f"bag: metadata.yaml {state}: read {names} without it"
+        return FolderFiles(paths=tuple(held), notes=(note,), is_listed=False)
     others = [path.name for path in held if path not in found]
     return FolderFiles(
         paths=found,

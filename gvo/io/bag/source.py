@@ -16,7 +16,7 @@ from gvo.io.bag.calibration import (
     calibrations_of_file,
     calibrations_of_messages,
 )
-from gvo.io.bag.cameras import camera_info_changes
+from gvo.io.bag.cameras import CameraInfoWatch, find_contradiction
 from gvo.io.bag.messages import (
     decode_compressed,
     decode_compressed_depth,
@@ -41,6 +41,8 @@ from gvo.io.poses.truth import Truth, find_truth
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
+
+_N_LISTED = 12
 
 
 class BagSource:
@@ -80,8 +82,16 @@ class BagSource:
         self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self._tf: TfBuffer | None = None
         self._takes_log_time = config.sync.stamps == "recording"
+        is_given = bool(paths_of(calibration))
+        contradiction = find_contradiction(self._reader, by_camera_info=not is_given)
+        if contradiction:
+            raise RecordingError(_describe_parts(paths, self._reader, contradiction))
         self._topics = self._choose_topics(topics or TopicChoice())
-        if paths_of(calibration):
+        images = (self._topics.first, self._topics.second)
+        infos = [find_camera_info(image, self._reader.topics) for image in images]
+        self._info_names = set() if is_given else {name for name in infos if name}
+        self._watch = CameraInfoWatch()
+        if is_given:
             found = calibrations_of_file(calibration, self._topics, self._reader)
         else:
             found = calibrations_of_messages(self._reader, self._topics, self._where)
@@ -109,7 +119,11 @@ class BagSource:
             messages yields none.
         """
         counts = [0, 0]
-        for message in self._reader.messages(self.image_topics):
+        self._watch = watch = CameraInfoWatch()
+        for message in self._reader.messages({*self.image_topics, *self._info_names}):
+            if message.topic.name in self._info_names:
+                watch.take(message)
+                continue
             stream = self.image_topics.index(message.topic.name)
             counts[stream] += 1
             yield self._stamped(message, stream)
@@ -139,17 +153,10 @@ class BagSource:
             self._tf = read_tf(self._reader, frames=frames)
         return self._tf if self._tf.is_whole else read_tf(self._reader, frames=frames)
 
+    @property
     def camera_info_changes(self) -> dict[str, int]:
-        """Count, by topic, the `CameraInfo` that differ from the first one, which is used.
-
-        Raises
-        ------
-        RecordingError
-            When the bag cannot be read.
-        """
-        topics = (self._topics.first, self._topics.second)
-        names = [find_camera_info(topic, self._reader.topics) for topic in topics]
-        return camera_info_changes(self._reader, [name for name in names if name])
+        """Of the images read last: the number of `CameraInfo` that differ from the one used."""
+        return self._watch.counts
 
     def truth(
         self,
@@ -245,6 +252,19 @@ class BagSource:
             return partial(decode_counts, scale=self._scale, where=topic.name)
         decode = decode_compressed if is_compressed else decode_grey_or_color
         return partial(decode, where=topic.name, grey_range=self._grey_range)
+
+
+def _describe_parts(paths: Sequence[Path], reader: BagReader, reason: str) -> str:
+    """Say that files are not one recording, which they are, and what to type."""
+    files = [file.path for file in reader.loose_files]
+    listed = [str(path) for path in files[:_N_LISTED]]
+    if len(files) > len(listed):
+        listed.append(f"{len(files) - len(listed)} more")
+    each = " ".join(map(str, paths[:_N_LISTED]))
+    return (
+        f"{len(files)} bags are not one recording, {reason}: {', '.join(listed)}; give one of "
+        f"them, or those that belong together; `gvo batch {each} --out DIR` runs each"
+    )
 
 
 def _fail(reason: str) -> NDArray[Any]:

@@ -32,6 +32,9 @@ _DEPTH = re.compile(r"depth")
 _REGISTERED = re.compile(r"aligned|registered")
 # at the start of a word: not in "unrectified" or "direct"
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
+# How the images of one camera differ in name.
+_SORT = re.compile(r"_?(raw|rect(ified)?|colou?r|rgb|mono|gr[ae]y)")
+_NEEDED = "gvo needs a stereo pair, or colour with depth (RGB-D)"
 _N_LISTED = 12
 _Names: TypeAlias = tuple[str | None, str | None]
 _Score: TypeAlias = tuple[int, ...]
@@ -303,8 +306,10 @@ def _explain(where: str, images: Sequence[Topic], candidates: Sequence[CameraTop
     if candidates:
         choices = " or ".join(candidate.flags for candidate in candidates)
         return f"{where}: holds more than one camera; choose {choices}"
+    held = describe_topics(images)
+    if len({_SORT.sub("", topic.base.lower()) for topic in images}) == 1:
+        return f"{where}: holds one camera alone, {held}; {_NEEDED}"
     return (
-        f"{where}: no stereo pair and no RGB-D camera among the image topics "
-        f"{describe_topics(images)}; choose --left TOPIC --right TOPIC or --color TOPIC --depth "
-        "TOPIC"
+        f"{where}: {_NEEDED}, and none is known by the names of the image topics {held}; choose "
+        "--left TOPIC --right TOPIC or --color TOPIC --depth TOPIC"
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from gvo._text import exists
 from gvo.errors import RecordingError, TrajectoryError
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, BagReader
 from gvo.io.bag.source import BagSource
 from gvo.io.opening import is_bag, open_recording
 from gvo.io.poses.base_frame import BaseFrame
@@ -31,6 +31,10 @@ from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
+CAMERA_CHANGED = (
+    "the first one is used; give the right one by --calibration FILE, or cut the bag there"
+)
+"""What follows where a `CameraInfo` changes on the way, and what to do."""
 _MARK = "#"
 # A run's bag writes the robot's frames with the name of the estimate before theirs.
 _OWN_FRAME = re.compile(r"^gvo/(raw|causal|smoothed)/")
@@ -136,10 +140,12 @@ def _read(reader: BagReader, what: str, path: str) -> BagTruth:
     truth = find_named_truth(reader, where=path)
     if not isinstance(truth, Failure):
         return truth
-    held = [f"{path}{_MARK}{topic.name}" for topic in reader.topics if topic.type in TRUTH_TYPES]
-    raise RecordingError(
-        f"{path}: name the poses: {', '.join([f'{path}{_MARK}tf:PARENT:CHILD', *held])}"
-    )
+    held = [topic.name for topic in reader.topics if topic.type in TRUTH_TYPES]
+    if any(topic.type in (TF_TYPE, OLD_TF_TYPE) for topic in reader.topics):
+        held.insert(0, "tf:PARENT:CHILD")
+    if not held:
+        raise RecordingError(f"{path}: holds no poses: neither tf nor a topic of poses")
+    raise RecordingError(f"{path}: name the poses: {', '.join(f'{path}#{name}' for name in held)}")
 
 
 def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -> PoseInput:
@@ -272,9 +278,11 @@ def read_transforms(source: Source, frames: Collection[str]) -> TfBuffer | None:
     return source.transforms([name for name in frames if name])
 
 
-def count_calibration_changes(source: Source) -> dict[str, int] | None:
-    """Count the `CameraInfo` of a bag that differ from the first, by topic; None for no bag."""
-    return source.camera_info_changes() if isinstance(source, BagSource) else None
+def describe_camera_changes(source: Source) -> str | None:
+    """Say which `CameraInfo` of the images read differ from the one used; None for no bag."""
+    if not isinstance(source, BagSource):
+        return None
+    return ", ".join(f"{n} of {name}" for name, n in source.camera_info_changes.items())
 
 
 def read_compared(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.diagnostics.check import check_recording
 from gvo.errors import RecordingError
+from gvo.io.bag.source import BagSource
 from gvo.io.opening import open_recording
 from tests.diagnostics.check.planted import check, complaints, find, render
 
@@ -323,10 +324,13 @@ def test_damage_ends_the_reading_but_not_the_check() -> None:
 
 
 @pytest.mark.parametrize(("n_changed", "verdict"), [(0, "ok"), (3, "warning")])
-def test_a_calibration_that_changes_on_the_way_is_told(n_changed: int, verdict: str) -> None:
-    recording = render("handheld", "rgbd")
-    changes = {"/camera/camera_info": n_changed}
-    result = check_recording(recording, Config(), n_samples=2, calibration_changes=changes)
+def test_a_calibration_that_changes_on_the_way_is_told(
+    monkeypatch: pytest.MonkeyPatch, room_bag: Path, n_changed: int, verdict: str
+) -> None:
+    changes = {"/camera/camera_info": n_changed} if n_changed else {}
+    monkeypatch.setattr(BagSource, "camera_info_changes", changes)
+    source = open_recording(room_bag)
+    result = check_recording(source, Config(), n_samples=2)
     found = find(result, "changed CameraInfo")
     assert found.verdict == verdict
     assert ("3 of /camera/camera_info" in str(found.value)) == (n_changed > 0)

@@ -139,6 +139,16 @@ def test_missing_partners_are_counted_and_blamed_on_the_stream() -> None:
     assert "dropped frames" in finding.fix
 
 
+@pytest.mark.parametrize(("late_ms", "fix"), [(70, "max_difference_ms=70"), (102, "by one signal")])
+def test_no_tolerance_is_advised_that_pairs_wrong_frames(late_ms: int, fix: str) -> None:
+    colour = np.arange(60, dtype=np.int64) * 205 * MS
+    findings = timing(colour, colour + late_ms * MS, n_pairs=0)
+    assert fix in findings["colour/depth: frames without partner"].fix
+    # at any phase: neither clock follows the other
+    findings = timing(colour, np.arange(60, dtype=np.int64) * 197 * MS, n_pairs=20)
+    assert "by one signal" in findings["colour/depth: frames without partner"].fix
+
+
 def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
     def late(stamp_ns: int, _: int) -> int:
         return stamp_ns + 5 * MS - 1000

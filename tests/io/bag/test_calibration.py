@@ -18,7 +18,7 @@ from gvo.io.bag.calibration import (
     calibrations_of_file,
     calibrations_of_messages,
 )
-from gvo.io.bag.cameras import camera_info_changes
+from gvo.io.bag.cameras import CameraInfoWatch
 from gvo.io.bag.reader import TF_TYPE, BagReader
 from gvo.io.bag.topics import (
     COMPRESSED_TYPE,
@@ -209,8 +209,10 @@ def test_camera_info_that_changes_is_counted_and_the_first_one_used(tmp_path: Pa
         *(camera_info("/c/depth/camera_info", stamp_ns=n) for n in range(5)),
     ]
     assert _found(tmp_path / "a.bag", messages).calibrations[0].K[0, 0] == 50.0
-    reader = BagReader(tmp_path / "a.bag")
-    assert camera_info_changes(reader, [name, "/c/depth/camera_info"]) == {name: 2}
+    watch = CameraInfoWatch()
+    for message in BagReader(tmp_path / "a.bag").messages([name, "/c/depth/camera_info"]):
+        watch.take(message)
+    assert watch.counts == {name: 2}
 
 
 def _rgbd(depth_name: str = "/c/depth/image_raw", **depth: Any) -> list[Message]:

@@ -1,6 +1,7 @@
 """Bags as recordings."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ import yaml
 
 from gvo.config import Config
 from gvo.errors import CalibrationError, GvoError, RecordingError
+from gvo.io.bag.cameras import find_contradiction
 from gvo.io.bag.reader import TF_TYPE
+from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import IMAGE_TYPE, TopicChoice
 from gvo.io.frames import frames
 from gvo.io.opening import open_recording
+from gvo.io.poses.inputs import describe_camera_changes
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
 from tests.io.camera_bags import K, Message, camera_info, header, image, make, write
 
@@ -237,6 +241,47 @@ def test_several_bags_are_one_recording(tmp_path: Path, tiny: Any) -> None:
     assert len(found) == whole.info.n_images > 1
 
 
+def test_bags_of_two_cameras_are_not_one_recording(tmp_path: Path, tiny: Any) -> None:
+    wide = [2.0 * number for number in _P_LEFT]
+    messages = _stereo(tiny)
+    other = [(name, type_, ns + 10, message) for name, type_, ns, message in messages]
+    other[0] = (*other[0][:3], _info("/s/left/camera_info", wide)[3])
+    paths = [write(tmp_path / "a.bag", messages), write(tmp_path / "b.bag", other)]
+    with pytest.raises(RecordingError, match=r"/s/left/camera_info of b.bag is not that of a.bag"):
+        BagSource(paths)
+    other[0] = (*other[0][:3], messages[0][3])
+    assert BagSource([paths[0], write(tmp_path / "c.bag", other)]).info.n_images == 6
+
+
+@pytest.mark.parametrize(("gap_s", "is_one"), [(-2, False), (0, True), (4, True), (6, False)])
+def test_files_of_a_folder_follow_each_other(gap_s: int, is_one: bool) -> None:
+    files = [
+        SimpleNamespace(
+            path=Path(f"{n}.mcap"),
+            counts={Channel("/image", IMAGE_TYPE, False): 9},
+            start_time_ns=start_s * 10**9,
+            end_time_ns=(start_s + 10) * 10**9,
+        )
+        for n, start_s in enumerate((0, 10 + gap_s))
+    ]
+    reader: Any = SimpleNamespace(loose_files=files, is_found=True)
+    assert (find_contradiction(reader, by_camera_info=False) == "") == is_one
+    reader.is_found = False
+    assert (find_contradiction(reader, by_camera_info=False) == "") == (gap_s >= 0)
+
+
+def test_camera_info_that_changes_on_the_way_is_told(tmp_path: Path, tiny: Any) -> None:
+    messages = _stereo(tiny)
+    wide = _info("/s/left/camera_info", [2.0 * number for number in _P_LEFT])
+    path = write(tmp_path / "a.bag", [*messages, (*wide[:2], 2, wide[3])])
+    source = BagSource(path)
+    assert describe_camera_changes(source) == ""
+    assert len(list(source.images())) == 6
+    assert describe_camera_changes(source) == "1 of /s/left/camera_info"
+    assert len(list(source.images())) == 6
+    assert describe_camera_changes(source) == "1 of /s/left/camera_info"
+
+
 def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny: Any) -> None:
     plain: list[tuple[str, str, int, Any]] = list(_stereo(tiny))
     for _, _, _, message in plain:
@@ -326,7 +371,7 @@ def test_no_recorded_bag_is_left_out(gvo_data: Path) -> None:
         ("bad/version1.bag", "older format"),
         ("bad/empty-file.bag", "empty"),
         ("good/nav2_turtlebot.mcap", "no image topics; it holds /odom"),
-        ("good/compressed_image.bag", "--left TOPIC --right TOPIC"),
+        ("good/compressed_image.bag", "one camera alone"),
     ],
 )
 def test_the_message_says_what_to_do(gvo_data: Path, name: str, words: str) -> None:

@@ -119,17 +119,30 @@ def test_any_two_topics_can_be_named() -> None:
 
 
 def test_no_camera_is_refused_with_what_there_is() -> None:
-    with pytest.raises(RecordingError, match=r"/raspicam/image .*--left TOPIC --right TOPIC"):
-        _choose(_topics("/raspicam/image", "/tf"))
+    with pytest.raises(RecordingError, match=r"/front/image .*--left TOPIC --right TOPIC"):
+        _choose(_topics("/front/image", "/rear/image", "/tf"))
     with pytest.raises(RecordingError, match=r"no image topics; it holds /tf \(tf2_msgs"):
         _choose(_topics("/tf"))
     with pytest.raises(RecordingError, match="no messages"):
         _choose([])
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["/raspicam/image"],
+        ["/usb_cam/image_raw", "/usb_cam/image_raw/compressed", "/usb_cam/image_rect_color"],
+    ],
+)
+def test_one_camera_is_too_few_whatever_is_chosen(names: list[str]) -> None:
+    with pytest.raises(RecordingError, match=r"one camera alone.*needs a stereo pair") as caught:
+        _choose(_topics(*names))
+    assert "--left" not in str(caught.value)
+
+
 def test_topics_without_messages_are_no_camera() -> None:
     topics = _topics("/left/image", "/right/image", n_messages=0)
-    with pytest.raises(RecordingError, match="no stereo pair"):
+    with pytest.raises(RecordingError, match="gvo needs a stereo pair"):
         _choose(topics)
 
 

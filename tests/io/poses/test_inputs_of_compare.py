@@ -11,6 +11,7 @@ from gvo.io.poses.inputs import is_in_bag, read_pose_input, read_poses
 from gvo.trajectory.evaluation import Evaluation, evaluate
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
+from tests.io import camera_bags
 from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
 
 T_BASE_CAM = se3.exp(np.array([0.4, -0.8, 1.0, 0.3, 0.1, 0.5]))
@@ -76,7 +77,14 @@ def test_a_bag_that_names_no_truth_lists_what_can_be_asked_for(tmp_path: Path) -
     bag = PoseBag(tmp_path / "b.bag")
     bag.pose("/odom", ODOMETRY, 0, np.eye(4))
     path = bag.write()
-    with pytest.raises(RecordingError, match=r"name the poses: .*b.bag#tf:PARENT.*b.bag#/odom$"):
+    with pytest.raises(RecordingError, match=r"name the poses: \S*b.bag#/odom$"):
+        read_poses(str(path))
+    bag = PoseBag(tmp_path / "c.bag")
+    bag.tf(0, "map", "odom", np.eye(4))
+    with pytest.raises(RecordingError, match=r"name the poses: \S*c.bag#tf:PARENT:CHILD$"):
+        read_poses(str(bag.write()))
+    path = camera_bags.write(tmp_path / "d.bag", [camera_bags.camera_info("/info")])
+    with pytest.raises(RecordingError, match=r"d.bag: holds no poses: neither tf nor"):
         read_poses(str(path))
 
 

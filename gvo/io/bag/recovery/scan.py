@@ -87,14 +87,16 @@ class Scan(ABC):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.start_time_ns = 2**63 - 1
+        self.start_time_ns, self.end_time_ns = 2**63 - 1, 0
         self.losses = Losses()
         self._channels: dict[int, Channel] = {}
         self._n_bytes = path.stat().st_size
         counts: Counter[int] = Counter()
         for batch in self._batches(self.losses):
             counts.update(entry.channel_id for entry in batch)
-            self.start_time_ns = min(self.start_time_ns, min(entry.log_time_ns for entry in batch))
+            log_times_ns = [entry.log_time_ns for entry in batch]
+            self.start_time_ns = min(self.start_time_ns, *log_times_ns)
+            self.end_time_ns = max(self.end_time_ns, *log_times_ns)
         self.counts = self._name(counts)
         self.damage = self._describe_damage()
 
