@@ -210,10 +210,19 @@ def test_labels_are_text_and_keep_their_digits(folder: Path) -> None:
     assert f"raw (RMSE {ate_m:.3g} m)" in text
 
 
-def test_two_frames_are_enough(tmp_path: Path) -> None:
-    recording = SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
+@pytest.mark.parametrize(
+    ("n_frames", "missing"),
+    [
+        (2, {"drift", "covariance", "errors_over_distance", "errors_over_time", "nees"}),
+        (3, {"drift"}),
+    ],
+)
+def test_few_frames_are_enough_and_three_for_errors(
+    n_frames: int, missing: set[str], tmp_path: Path
+) -> None:
+    recording = SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=0.25)
     run_recording(recording, tmp_path)
-    assert {*SECTIONS} - {*_Page(page_of(tmp_path)).drawn} <= {"drift"}
+    assert {*SECTIONS} - {*_Page(page_of(tmp_path)).drawn} <= missing
 
 
 def test_a_lone_point_between_gaps_is_drawn() -> None:
