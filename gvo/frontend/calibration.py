@@ -49,6 +49,8 @@ _READOUT_FACTOR = 5.0
 _VELOCITY = "velocity"
 # Sigma of the newest frame's velocity, relative to the change from the step before to the last one.
 _SIGMA_OF_CHANGE = 1.0
+# Stamps nearer to each other than this, in seconds, tell no velocity.
+_MIN_ELAPSED_S = 1e-4
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
 # that all of them share.
 _FEIGNED_PX = 0.05
@@ -131,7 +133,7 @@ class FrameVelocities:
         role.
         """
         elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
-        if elapsed_s == 0.0:
+        if abs(elapsed_s) < _MIN_ELAPSED_S:
             return
         before = self._steps.get(reference)
         if T_reference_current is None:

@@ -209,8 +209,10 @@ def test_a_frame_moves_with_the_mean_of_the_steps_around_it() -> None:
         assert_velocity(velocities, second, mean)
         # The last step and half of its change.
         assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
-    velocities.expect(third, third, np.eye(4))
-    assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
+    # Neither a frame itself nor one a nanosecond later tells a velocity.
+    for later in (third, Seen(third.stamp_ns + 1)):
+        velocities.expect(third, later, se3.exp(STEPS[1]))
+        assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
 
 
 def test_of_an_unknown_step_only_the_one_before_is_known() -> None:
