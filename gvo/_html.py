@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gvo._text import html_text
 
 _FloatArray = NDArray[np.float64]
 
@@ -104,14 +105,14 @@ def card(title: str, rows: Iterable[tuple[str, str]]) -> str:
     True
     """
     lines = "".join(
-        f'<tr><th style="{_CELL};font-weight:normal;opacity:0.7">{escape(name)}</th>'
-        f'<td style="{_CELL}">{escape(value)}</td></tr>'
+        f'<tr><th style="{_CELL};font-weight:normal;opacity:0.7">{html_text(name)}</th>'
+        f'<td style="{_CELL}">{html_text(value)}</td></tr>'
         for name, value in rows
     )
     table = f'<table style="color:inherit">{lines}</table>' if lines else ""
     return (
         '<div style="font-variant-numeric:tabular-nums">'
-        f"<strong>{escape(title)}</strong>{table}</div>"
+        f"<strong>{html_text(title)}</strong>{table}</div>"
     )
 
 

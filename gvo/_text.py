@@ -7,6 +7,7 @@ million digits: `load_yaml` checks the size before any value is constructed.
 from __future__ import annotations
 
 import errno
+import html
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -90,6 +91,11 @@ def visible(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def html_text(text: str) -> str:
+    """Return a text for a page of HTML: `visible`, its markup escaped."""
+    return html.escape(visible(text))
 
 
 def plain_number(text: str) -> str:
@@ -197,7 +203,7 @@ def format_table(
     raw       1.25
     smoothed   0.5
     """
-    table = [header, *rows]
+    table = [[visible(cell) for cell in row] for row in (header, *rows)]
     by = table if measured is None else [header, *measured]
     widths = [max(map(len, column)) for column in zip(*by, strict=True)]
     justify = str.ljust if is_text else str.rjust

@@ -14,6 +14,8 @@ import typer
 from typer.core import TyperCommand
 from typer.main import get_command
 
+from gvo._text import visible
+
 if TYPE_CHECKING:
     from gvo.runs.run import RunResult
     from gvo.types import Progress
@@ -64,9 +66,20 @@ class Command(TyperCommand):
 
 
 def say(text: object, *, nl: bool = True, err: bool = False) -> None:
-    """Print what is not an error, unless --quiet was given."""
+    """Print what is not an error, unless --quiet was given.
+
+    Parameters
+    ----------
+    text : object
+        A line in which names may stand that a recording holds.
+    nl : bool
+        False for lines that end themselves, as of a table.
+    err : bool
+        To standard error.
+    """
     if _LOGGER.isEnabledFor(logging.WARNING):
-        typer.echo(text, nl=nl, err=err)
+        lines = [str(text)] if nl else str(text).split("\n")
+        typer.echo("\n".join(map(visible, lines)), nl=nl, err=err)
 
 
 def exit_code(is_complete: bool) -> int:
@@ -151,7 +164,7 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
     from rich.progress import Progress as Bar
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]:.1f} " + unit + "/s, {task.fields[tracked]:.0%} tracked,"),
@@ -159,7 +172,7 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
         TextColumn("left"),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None, start=False, rate=0.0, tracked=1.0)
+        task = bar.add_task(visible(title), total=None, start=False, rate=0.0, tracked=1.0)
 
         def update(progress: Progress) -> None:
             bar.start_task(task)
@@ -247,7 +260,7 @@ def told_what_stands(words: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"gvo: interrupted; {words}", err=True)
+        typer.echo(f"gvo: interrupted; {visible(words)}", err=True)
         raise
 
 

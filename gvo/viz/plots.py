@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gvo._text import visible
 from gvo.errors import ConfigurationError, TrajectoryError
 from gvo.trajectory.alignment import AlignMode, alignment, pair
 from gvo.trajectory.round_trip import RoundTripError
@@ -396,6 +397,6 @@ def ground_plane(reference: Trajectory) -> tuple[int, int]:
 
 
 def plain(name: str) -> str:
-    """Escape what matplotlib takes for markup: dollars, a leading underscore."""
-    text = name.replace("$", r"\$")
+    """Escape what matplotlib takes for markup: dollars, a leading underscore; else `visible`."""
+    text = visible(name).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text

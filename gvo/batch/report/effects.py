@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
-from gvo._text import number_text
+from gvo._text import number_text, visible
 from gvo.batch.effects import COUNTS, span, value_medians
 from gvo.batch.report.values import (
     N_LABEL,
     Batch,
     logarithmic_axis,
-    printable,
     shown,
     value_text,
 )
@@ -123,7 +122,7 @@ def _tick_texts(values: Sequence[object], n_letters: int, is_number: bool) -> li
 
 def _value_rows(effects: Mapping[str, pd.DataFrame]) -> Iterator[list[str]]:
     for parameter, effect in effects.items():
-        name = printable(parameter)
+        name = visible(parameter)
         for value, row in effect.iterrows():
             numbers = [text for kind in _COLOURS for text in _quartile_texts(row[kind])]
             counts = [str(int(row["runs", kind])) for kind in COUNTS]
@@ -151,7 +150,7 @@ def front_sheet(batch: Batch) -> tuple[Plot, str]:
     plot = Plot(slug="front", title=_FRONT, text=words, figure=figure)
     rows = [
         [
-            printable(str(name)),
+            visible(str(name)),
             str(number),
             *(number_text(mean[kind], ".3f") for kind in ("error", "time")),
             f"{mean['n_compared']} of {mean['n_recordings']}",

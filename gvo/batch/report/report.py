@@ -7,17 +7,16 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from html import escape
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 import numpy as np
 
-from gvo._text import number_text
+from gvo._text import html_text, number_text, visible
 from gvo.batch.effects import ERROR, relative, swept
 from gvo.batch.report.boxes import box_plot
 from gvo.batch.report.effects import effect_sheets, front_sheet
-from gvo.batch.report.values import Batch, printable
+from gvo.batch.report.values import Batch
 from gvo.batch.rows import BatchRow
 from gvo.io.run_folder.writer import REPORT
 from gvo.types import FloatArray
@@ -81,7 +80,7 @@ def write_batch_report(
             *(part for plot, table in sheets for part in (*plots_html([plot]), table)),
             _runs_html(batch, path.parent),
         ]
-        write_page(path, printable(title), body)
+        write_page(path, title, body)
         if plots is not None:
             write_plots([plot for plot, _ in sheets], plots)
 
@@ -97,8 +96,8 @@ def _sheets(batch: Batch) -> list[tuple[Plot, str]]:
 
 def _head(batch: Batch, title: str, note: str) -> list[str]:
     parts = [
-        f"<h1>{escape(printable(title))}</h1>",
-        f"<p>{escape(printable(note))}</p>" if note else "",
+        f"<h1>{html_text(title)}</h1>",
+        f"<p>{html_text(note)}</p>" if note else "",
         list_html("Failed", _failures(batch), kind="warnings"),
         facts_html(_facts(batch)),
         '<p class="note"><a href="#runs">All runs, the worst first</a></p>',
@@ -108,7 +107,7 @@ def _head(batch: Batch, title: str, note: str) -> list[str]:
 
 def _failures(batch: Batch) -> list[str]:
     """Return the reasons of failed runs with their numbers, the commonest first."""
-    reasons = Counter(printable(row.reason) for row in batch.rows if row.status == "failed")
+    reasons = Counter(visible(row.reason) for row in batch.rows if row.status == "failed")
     lines = [
         f"{n} {'run' if n == 1 else 'runs'}: {reason or 'no reason was given'}"
         for reason, n in reasons.most_common(_MAX_LISTED)
@@ -127,7 +126,7 @@ def _facts(batch: Batch) -> dict[str, str]:
     return {
         "Recordings": str(len({row.recording for row in rows})),
         "Configurations": str(len(batch.means)),
-        "Swept": ", ".join(map(printable, swept(batch.table))),
+        "Swept": ", ".join(map(visible, swept(batch.table))),
         "Runs": f"{len(rows)}: {statuses['complete']} complete, {statuses['partly']} partly, "
         f"{statuses['failed']} failed",
         "Found finished": str(n_found) if n_found else "",
@@ -195,7 +194,7 @@ def _number_columns(
 
 def _outcome(row: BatchRow, numbers: Sequence[str]) -> str:
     """Return the cells of the status and of the numbers; of a failed run the reason."""
-    reason = escape(printable(row.reason))
+    reason = html_text(row.reason)
     if row.status == "failed":
         return f'<td>failed</td><td colspan="{max(1, len(numbers))}">{reason}</td>'
     status = f'{row.status}<div class="note">{reason}</div>' if reason else row.status
@@ -204,12 +203,12 @@ def _outcome(row: BatchRow, numbers: Sequence[str]) -> str:
 
 def _name(text: str) -> str:
     # may break where a parameter ends
-    return escape(printable(text)).replace(",", ",<wbr>")
+    return html_text(text).replace(",", ",<wbr>")
 
 
 def _linked(row: BatchRow, folder: Path) -> str:
     name, address = _name(row.recording), run_address(row.folder, folder)
-    return f'<a href="{escape(address)}">{name}</a>' if address else name
+    return f'<a href="{html_text(address)}">{name}</a>' if address else name
 
 
 def run_address(run: str, folder: Path) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import pandas as pd
 
+from gvo._text import visible
 from gvo.batch.effects import ERROR, comparable, variant_means
 from gvo.batch.results import to_frame
 from gvo.batch.rows import BatchRow
@@ -101,7 +102,7 @@ def _labels(rows: Sequence[BatchRow]) -> tuple[dict[str, str], str]:
         keys = {name: name for name in parameters}
     labels = {}
     for variant in own:
-        labels[variant] = printable(variant)
+        labels[variant] = visible(variant)
         for name, key in keys.items():
             labels[variant] = labels[variant].replace(f"{name}=", f"{key}=")
     if max(map(len, labels.values())) <= N_LABEL:
@@ -111,7 +112,7 @@ def _labels(rows: Sequence[BatchRow]) -> tuple[dict[str, str], str]:
     }
     if len(set(short.values())) < len(short) or max(map(len, short.values())) > N_LABEL:
         return _without_same_ends(labels), ""
-    return short, f" Names are the values of {printable(' / '.join(keys.values()))}."
+    return short, f" Names are the values of {visible(' / '.join(keys.values()))}."
 
 
 def _without_same_ends(labels: Mapping[str, str]) -> dict[str, str]:
@@ -143,18 +144,6 @@ def _default_of(rows: Sequence[BatchRow]) -> str | None:
     )
 
 
-def printable(text: str) -> str:
-    """Replace what cannot be printed or would reverse the text; join its lines.
-
-    Examples
-    --------
-    >>> printable("a" + chr(0) + "b" + chr(10) + "c")
-    'a?b c'
-    """
-    words = " ".join(text.split())
-    return "".join(letter if letter.isprintable() else "?" for letter in words)
-
-
 def shown(text: str, n_most: int) -> str:
     """Return a name as a label of a picture, the middle of a long one left out.
 
@@ -163,7 +152,7 @@ def shown(text: str, n_most: int) -> str:
     >>> shown("window.n_links=3", 11)
     'wind...ks=3'
     """
-    text = printable(text)
+    text = visible(text)
     if len(text) > n_most:
         n_end = (n_most - 3) // 2
         text = f"{text[: n_most - 3 - n_end]}...{text[-n_end:]}"
@@ -176,7 +165,7 @@ def value_text(value: object) -> str:
         return "null"
     if isinstance(value, bool | np.bool_):
         return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else printable(str(value))
+    return f"{value:g}" if isinstance(value, float) else visible(str(value))
 
 
 def logarithmic_axis(

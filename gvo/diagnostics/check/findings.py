@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from typing import Literal, TypeAlias
 
-from gvo._text import format_table
+from gvo._text import format_table, visible
 from gvo.config import CheckConfig
 
 Verdict: TypeAlias = Literal["ok", "warning", "fault", "info", "unknown"]
@@ -256,7 +256,7 @@ def format_check(result: CheckResult) -> str:
         for row, finding in zip(rows, findings, strict=True)
     ]
     table = format_table(_HEADER, rows, is_text=True, measured=wide)
-    return "".join([*(f"{line}\n" for line in head), table, f"{_sum_up(result)}\n"])
+    return "".join([*(f"{line}\n" for line in head), table, f"{visible(_sum_up(result))}\n"])
 
 
 def _is_info(finding: Finding) -> bool:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gvo._text import visible
 from gvo.errors import OutputError, RunBusyError
 from gvo.io.run_folder.line_file import LineFile, check_folder, replace_text
 from gvo.trajectory.formats import (
@@ -74,7 +75,7 @@ def free_folder(recording: str | Path, what: str = "") -> Path:
     path = Path(recording)
     path = path if path.name not in ("", "..") else path.resolve()
     name = path.name if path.is_dir() else Path(path.name.removesuffix(".zst")).stem
-    first = Path(f"gvo-{name}{what}")
+    first = Path(f"gvo-{visible(name)}{what}")
     numbered = (first.with_name(f"{first.name}-{n}") for n in count(2))
     return next(path for path in chain([first], numbered) if not os.path.lexists(path))
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from dataclasses import asdict
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gvo._text import html_text
 from gvo.diagnostics.explain.motion import has_prior
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.errors import ConfigurationError
@@ -63,7 +63,7 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     except OSError as error:
         raise ConfigurationError(f"{out}: cannot be written: {error.strerror}") from error
     page, title = out / "explanation.html", f"{explanation.recording}: frame {explanation.index}"
-    opening = f"<h1>{escape(title)}</h1>\n<p>{escape(_summary(explanation))}</p>"
+    opening = f"<h1>{html_text(title)}</h1>\n<p>{html_text(_summary(explanation))}</p>"
     write_page(page, title, [opening, *map(_section, pictures)])
     return [*files, page]
 
@@ -93,13 +93,13 @@ def _summary(explanation: FrameExplanation) -> str:
 
 def _section(picture: Picture) -> str:
     """Return a picture, with its caption as text that can be searched and read aloud."""
-    title, image = escape(picture.title), ""
+    title, image = html_text(picture.title), ""
     if picture.panels_png is not None:
         data = b64encode(picture.panels_png).decode()
         style = "display: block; width: 100%; height: auto"
         image = f'<div class="panel"><img src="data:image/png;base64,{data}" alt="{title}" '
         image += f'style="{style}"></div>\n'
-    caption = escape(picture.caption).replace("\n", "<br>")
+    caption = "<br>".join(map(html_text, picture.caption.split("\n")))
     heading = f"{int(picture.name[:2])}. {title}"
     return f"<section>\n<h2>{heading}</h2>\n{image}<p>{caption}</p>\n</section>"
 

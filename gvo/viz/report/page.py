@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from gvo._text import html_text
 from gvo.errors import ConfigurationError
 from gvo.viz.report.paths import Line, World, scene_json
 from gvo.viz.report.sheets import Plot
@@ -42,7 +42,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             # no request for an icon either
             '<link rel="icon" href="data:,">',
-            f"<title>{escape(title)}</title>\n<style>\n{_resource('page.css')}</style>",
+            f"<title>{html_text(title)}</title>\n<style>\n{_resource('page.css')}</style>",
             "</head>\n<body>",
             *body,
             "</body>\n</html>\n",
@@ -73,25 +73,25 @@ def plots_html(
 
 
 def _section(plot: Plot) -> str:
-    text = escape(plot.text)
+    text = html_text(plot.text)
     if plot.figure is None:
         body = f'<p class="absent">{text}</p>'
     else:
         body = f'<p class="note">{text}</p>\n<div class="panel">{plot.svg()}</div>'
-    return f'<section id="{plot.slug}">\n<h2>{escape(plot.title)}</h2>\n{body}\n</section>'
+    return f'<section id="{plot.slug}">\n<h2>{html_text(plot.title)}</h2>\n{body}\n</section>'
 
 
 def _turning(plot: Plot, lines: Sequence[Line], world: World) -> str:
     """Return the view in space: a canvas if scripts run, else the still figure."""
     legend = "".join(_legend_entry(line) for line in lines)
     return f"""<section id="{plot.slug}">
-<h2>{escape(plot.title)}</h2>
-<p class="note">{escape(plot.text)}</p>
+<h2>{html_text(plot.title)}</h2>
+<p class="note">{html_text(plot.text)}</p>
 <div id="turning">
 <p class="note">Drag or use the arrow keys to rotate, + and - or the wheel (after a click) to zoom,
 double-click or Home to reset.</p>
 <div class="panel"><canvas id="scene" tabindex="0" role="img"
-aria-label="{escape(plot.title)}"></canvas>
+aria-label="{html_text(plot.title)}"></canvas>
 <ul class="legend">{legend}</ul></div>
 </div>
 <div id="standing"><div class="panel">{plot.svg()}</div></div>
@@ -106,7 +106,7 @@ def _legend_entry(line: Line) -> str:
     return (
         '<li><svg viewBox="0 0 34 10" aria-hidden="true"><path d="M1 5H33" fill="none" '
         f'stroke="{line.style.color}" stroke-width="2.5" stroke-dasharray="{dash}"/></svg>'
-        f"{escape(line.name)}</li>"
+        f"{html_text(line.name)}</li>"
     )
 
 
@@ -124,13 +124,13 @@ def _row(tag: str, texts: Sequence[str]) -> str:
 
 def _cell(tag: str, text: str, *, is_name: bool) -> str:
     kind = "" if is_name else ' class="number"'
-    return f"<{tag}{kind}>{escape(text)}</{tag}>"
+    return f"<{tag}{kind}>{html_text(text)}</{tag}>"
 
 
 def facts_html(facts: Mapping[str, str]) -> str:
     """Return a table of facts by name, without empty ones."""
     rows = "".join(
-        f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
+        f"<tr><th>{html_text(name)}</th><td>{html_text(text)}</td></tr>"
         for name, text in facts.items()
         if text
     )
@@ -139,10 +139,10 @@ def facts_html(facts: Mapping[str, str]) -> str:
 
 def list_html(title: str, items: Iterable[str], *, kind: str = "") -> str:
     """Return a titled list; empty without items."""
-    entries = "".join(f"<li>{escape(item)}</li>" for item in items)
+    entries = "".join(f"<li>{html_text(item)}</li>" for item in items)
     if not entries:
         return ""
-    return f'<section class="{kind}">\n<h2>{escape(title)}</h2>\n<ul>{entries}</ul>\n</section>'
+    return f'<section class="{kind}">\n<h2>{html_text(title)}</h2>\n<ul>{entries}</ul>\n</section>'
 
 
 def configuration_html(
@@ -170,10 +170,10 @@ def _configuration_section(
         is_changed = key in defaults and defaults[key] != value
         mark = ' class="changed"' if is_changed else ""
         note = f"default {_yaml(defaults[key])}" if is_changed else ""
-        cells = f"<td><code>{escape(key)}</code></td><td>{escape(_yaml(value))}</td>"
-        rows.append(f"<tr{mark}>{cells}<td>{escape(note)}</td></tr>")
+        cells = f"<td><code>{html_text(key)}</code></td><td>{html_text(_yaml(value))}</td>"
+        rows.append(f"<tr{mark}>{cells}<td>{html_text(note)}</td></tr>")
     body = "".join(rows)
-    return f"<section><h3>{escape(name)}</h3><table><tbody>{body}</tbody></table></section>"
+    return f"<section><h3>{html_text(name)}</h3><table><tbody>{body}</tbody></table></section>"
 
 
 def _yaml(value: Any) -> str:  # noqa: ANN401

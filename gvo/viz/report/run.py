@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gvo._text import number_text
+from gvo._text import html_text, number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.frontend.calibration import describe_offsets
@@ -154,7 +153,7 @@ def _first_ns(record: RunRecord) -> int:
 
 def _head(record: RunRecord) -> list[str]:
     summary = record.summary
-    parts = [f"<h1>{escape(record.name)}</h1>"]
+    parts = [f"<h1>{html_text(record.name)}</h1>"]
     if not record.is_finished:
         parts.append(
             '<p class="absent">This run has not ended: it is running or was interrupted. '

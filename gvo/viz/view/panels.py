@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -11,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
+from gvo._text import html_text
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import FloatArray, FrameResult
 from gvo.viz.view.layers import COLOURS
@@ -193,9 +193,9 @@ def numbers_html(rows: Mapping[str, str]) -> str:
         Value by label; a unit in brackets is not part of the name.
     """
     lines = "".join(
-        f'<tr><th style="{_CELL};white-space:nowrap;opacity:0.65">{html.escape(label)}</th>'
-        f'<td style="{_CELL};{_NUMBER}" data-gvo="{html.escape(label.partition(" [")[0])}">'
-        f"{html.escape(value)}</td></tr>"
+        f'<tr><th style="{_CELL};white-space:nowrap;opacity:0.65">{html_text(label)}</th>'
+        f'<td style="{_CELL};{_NUMBER}" data-gvo="{html_text(label.partition(" [")[0])}">'
+        f"{html_text(value)}</td></tr>"
         for label, value in rows.items()
     )
     return (
@@ -211,14 +211,14 @@ def message_html(text: str) -> str:
         f"margin:0 0.75em 0.5em;padding:0.3em 0.6em;font-size:0.85em;border-left:3px solid {colour}"
     )
     shown = style if text else "display:none"
-    return f'<div role="status" data-gvo="message" style="{shown}">{html.escape(text)}</div>'
+    return f'<div role="status" data-gvo="message" style="{shown}">{html_text(text)}</div>'
 
 
 def state_html(text: str) -> str:
     """Return what the player is doing."""
     return (
         '<div style="margin:0 0.75em 0.5em;font-size:0.85em;opacity:0.65" '
-        f'data-gvo="player">{html.escape(text)}</div>'
+        f'data-gvo="player">{html_text(text)}</div>'
     )
 
 
@@ -227,7 +227,7 @@ def legend_html(names: Iterable[str]) -> str:
     entries = "".join(
         '<div style="display:flex;align-items:center;gap:0.6em">'
         f'<span style="flex:none;width:1.4em;border-top:3px {_line(name)} {COLOURS[name]}"></span>'
-        f"<span><b>{name}</b> {html.escape(_MEANINGS[name])}</span></div>"
+        f"<span><b>{name}</b> {html_text(_MEANINGS[name])}</span></div>"
         for name in names
     )
     return (

@@ -180,15 +180,15 @@ def test_texts_of_others_are_escaped(tmp_path: Path) -> None:
     assert not [link for link in page.links if "javascript" in link]
 
 
-def test_what_cannot_be_printed_is_replaced_and_other_scripts_are_kept(tmp_path: Path) -> None:
+def test_what_cannot_be_printed_is_escaped_and_other_scripts_are_kept(tmp_path: Path) -> None:
     rows = [
         replace(row, recording=f"{row.recording} 記録\u202e\x00\udc80", reason="a\nb")
         for row in made_up({}, 3)
     ]
     page = page_of(tmp_path, rows)
     assert page.drawn == ["boxes"]
-    assert page.rows["runs"][1][0] == "drive 2 記録???"
-    assert "記録???" in page.text.split('id="runs"')[0]
+    assert page.rows["runs"][1][0] == r"drive 2 記録\u202e\x00\udc80"
+    assert r"記録\u202e\x00\udc80" in page.text.split('id="runs"')[0]
 
 
 def test_a_name_leads_to_the_report_or_the_folder_or_nowhere(tmp_path: Path) -> None:
