@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,13 +24,17 @@ def _parameter(
     meaning: str,
     unit: str = "",
     *,
+    is_expert: bool = True,
     ge: float | None = None,
     gt: float | None = None,
     le: float | None = None,
 ) -> Any:  # noqa: ANN401 - pydantic types its own Field so
-    return Field(
-        default, ge=ge, gt=gt, le=le, description=meaning, json_schema_extra={"unit": unit}
-    )
+    extra = {"unit": unit, "is_expert": is_expert}
+    return Field(default, ge=ge, gt=gt, le=le, description=meaning, json_schema_extra=extra)
+
+
+# A parameter that matters to many.
+_common = partial(_parameter, is_expert=False)
 
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
@@ -44,13 +49,13 @@ class Section(BaseModel):
 class SyncConfig(Section):
     """Pairing of images into frames."""
 
-    max_difference_ms: float = _parameter(
+    max_difference_ms: float = _common(
         20.0, "maximum difference between the stamps of a colour and a depth image", "ms", ge=0
     )
-    stereo_tolerance_ms: float = _parameter(
+    stereo_tolerance_ms: float = _common(
         0.0, "maximum difference between the stamps of left and right; 0: equal stamps", "ms", ge=0
     )
-    stamps: Literal["header", "recording"] = _parameter(
+    stamps: Literal["header", "recording"] = _common(
         "header", "clock of the stamps of a bag's images; recording: for drivers that set none"
     )
     queue_size: int = _parameter(
@@ -67,10 +72,10 @@ class SyncConfig(Section):
 class ImagesConfig(Section):
     """Grey and colour images of 16 bits, reduced to 8."""
 
-    black: int = _parameter(
+    black: int = _common(
         0, "largest value mapped to black; above 0 for some thermal cameras", ge=0, le=65534
     )
-    white: int = _parameter(
+    white: int = _common(
         65535, "smallest value mapped to white; 4095 for a camera of 12 bits", ge=1, le=65535
     )
 
@@ -78,11 +83,11 @@ class ImagesConfig(Section):
 class DepthConfig(Section):
     """Depth images of RGB-D cameras."""
 
-    scale: float | None = _parameter(
+    scale: float | None = _common(
         None, "counts per metre of integer depth; null: 5000 in TUM folders, else 1000", "1/m", gt=0
     )
-    min_depth_m: float = _parameter(0.3, "minimum valid depth", "m", gt=0)
-    max_depth_m: float = _parameter(8.0, "maximum valid depth", "m", gt=0)
+    min_depth_m: float = _common(0.3, "minimum valid depth", "m", gt=0)
+    max_depth_m: float = _common(8.0, "maximum valid depth", "m", gt=0)
     max_edge_step: float = _parameter(
         0.03, "maximum spread of depth in the window around a keypoint, relative to its depth", ge=0
     )
@@ -99,7 +104,7 @@ class DepthConfig(Section):
 class FrontendConfig(Section):
     """Front-end that registers two frames."""
 
-    kind: Literal["klt", "descriptor"] = _parameter(
+    kind: Literal["klt", "descriptor"] = _common(
         "klt", "corners tracked by Lucas-Kanade, or keypoints matched by descriptors"
     )
 
@@ -107,7 +112,7 @@ class FrontendConfig(Section):
 class KltConfig(Section):
     """Corners tracked by Lucas-Kanade (frontend.kind: klt)."""
 
-    n_corners: int = _parameter(250, "maximum corners per image", ge=50, le=20000)
+    n_corners: int = _common(250, "maximum corners per image", ge=50, le=20000)
     min_eigenvalue: float = _parameter(
         1e-4, "minimum eigenvalue of a corner's gradient covariance, grey in [0, 1]", gt=0
     )
@@ -152,7 +157,7 @@ class FeaturesConfig(Section):
 class CameraConfig(Section):
     """The camera."""
 
-    readout_ms: float | None = _parameter(
+    readout_ms: float | None = _common(
         None,
         "time from the first to the last row of a rolling shutter, 0: global; null: learnt",
         "ms",
@@ -164,8 +169,8 @@ class CameraConfig(Section):
 class StereoConfig(Section):
     """Matching of left and right."""
 
-    min_depth_m: float = _parameter(0.5, "minimum depth of a match", "m", gt=0)
-    max_depth_m: float = _parameter(200.0, "maximum depth of a match", "m", gt=0)
+    min_depth_m: float = _common(0.5, "minimum depth of a match", "m", gt=0)
+    max_depth_m: float = _common(200.0, "maximum depth of a match", "m", gt=0)
     row_tolerance_px: float = _parameter(1.5, "maximum row difference of a match", "px", ge=0)
     max_distance: float = _parameter(
         0.3, "maximum descriptor distance, relative to the largest possible", gt=0, le=1
@@ -241,10 +246,10 @@ class RegistrationConfig(Section):
 class WindowConfig(Section):
     """Sliding-window smoothing."""
 
-    size: int | None = _parameter(
+    size: int | None = _common(
         5, "number of recent frames in the window; null: all frames (full smoothing)", ge=2, le=1000
     )
-    n_keyframes: int = _parameter(20, "maximum number of keyframes kept", ge=0, le=100)
+    n_keyframes: int = _common(20, "maximum number of keyframes kept", ge=0, le=100)
     n_links: int = _parameter(
         3, "maximum registrations per frame, with its predecessor and keyframes", ge=1, le=20
     )
@@ -302,7 +307,7 @@ class WindowConfig(Section):
 class RuntimeConfig(Section):
     """Parallel work."""
 
-    threads: int = _parameter(
+    threads: int = _common(
         2,
         "1: sequential; 2: images decoded ahead; 3: corners detected in parallel too (klt): a "
         "little faster, a little more CPU time",
@@ -450,11 +455,11 @@ def _read_yaml(path: Path) -> dict[str, dict[str, object]]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigurationError(f"{path}: expected sections with keys, see `gvo config`")
+        raise ConfigurationError(f"{path}: expected sections with keys, see `gvo config --all`")
     for section, keys in content.items():
         if not isinstance(keys, dict):
             raise ConfigurationError(
-                f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config`"
+                f"{path}: {cut(str(section), MAX_SHOWN)} must hold keys, see `gvo config --all`"
             )
     return content
 
@@ -484,10 +489,10 @@ def _explain(error: ValidationError) -> str:
     first = error.errors()[0]
     name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
-        return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config`"
+        return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config --all`"
     known = _known_keys() if "." in name else list(sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-    return f"unknown key {name}: did you mean {nearest}? `gvo config` lists all"
+    return f"unknown key {name}: did you mean {nearest}? `gvo config --all` lists all"
 
 
 def _known_keys() -> list[str]:
@@ -505,16 +510,33 @@ def sections() -> dict[str, type[Section]]:
     }
 
 
-def describe_configuration(config: Config) -> str:
-    """Return the configuration as YAML, each key with unit, range and meaning."""
+def describe_configuration(config: Config, *, for_experts: bool = True) -> str:
+    """Return the configuration as YAML, each key with unit, range and meaning.
+
+    Parameters
+    ----------
+    config : Config
+    for_experts : bool
+        All parameters; else those that matter most, and those that differ from their defaults.
+    """
     lines: list[str] = []
     for section, group in sections().items():
-        lines += ["", f"# {group.__doc__}".rstrip("."), f"{section}:"]
         values = getattr(config, section)
-        for key, field in group.model_fields.items():
+        fields = {
+            key: field
+            for key, field in group.model_fields.items()
+            if for_experts or not is_expert(field) or getattr(values, key) != field.default
+        }
+        lines += ["", f"# {group.__doc__}".rstrip("."), f"{section}:"] if fields else []
+        for key, field in fields.items():
             text = yaml.safe_dump(getattr(values, key)).splitlines()[0]
             lines.append(f"  {key}: {text}".ljust(34) + f"  # {describe_field(field)}")
     return "\n".join(lines[1:]) + "\n"
+
+
+def is_expert(field: Any) -> bool:  # noqa: ANN401 - a field of pydantic's
+    """Tell whether a parameter is one that hardly anyone needs."""
+    return bool(field.json_schema_extra["is_expert"])
 
 
 def describe_field(field: Any) -> str:  # noqa: ANN401 - a field of pydantic's

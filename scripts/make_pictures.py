@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,6 +30,7 @@ from gvo.io.run_folder.reader import read_run
 from gvo.odometry.odometry import Odometry
 from gvo.runs.demo import BAG_NAME, write_demo_bags
 from gvo.runs.outputs.options import RunOutputs
+from gvo.types import Frame
 from gvo.viz.explanation.extraction import draw_stereo
 from gvo.viz.overlay import compose_overlay
 from gvo.viz.report import write_run_report
@@ -47,6 +49,8 @@ N_COLOURS = 120
 WINDOW_PX = (1440, 1010)
 FROM_CAM, TO_CAM = np.array([4.0, -4.5, -10.0]), np.array([-0.5, 0.5, 4.0])
 """From where and at what the page looks, metres, in the frame of the camera."""
+N_CORNERS = 60, 250, 1000
+INLIER_BGR = (233, 180, 86)
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -126,6 +130,39 @@ def overlay(task: Task) -> Picture:
     raise RecordingError(f"{task.bag}: no usable frame from {task.frame} on")
 
 
+def corners(task: Task) -> Picture:
+    """Return the inliers of a frame, and the error up to it, at several numbers of corners."""
+    rows = []
+    for n_corners in N_CORNERS:
+        config = gvo.load_configuration(settings=[f"klt.n_corners={n_corners}"])
+        source = gvo.open_recording(task.bag, config=config)
+        odometry, truth = Odometry(source.info.camera, config), source.ground_truth()
+        estimates = []
+        for frame in islice(gvo.frames(source, config), task.frame + 1):
+            if isinstance(frame, gvo.FaultyFrame) or truth is None:
+                raise RecordingError(f"{task.bag}: expected sound frames with a ground truth")
+            result = odometry.track(frame)
+            estimates += result.finished
+        trajectory = gvo.Trajectory.of([*estimates, *odometry.finish()])
+        ate_m = gvo.evaluate(truth, trajectory, name="smoothed").ate_m
+        text = f"klt.n_corners={n_corners}: {result.n_inliers} inliers, ATE {1e3 * ate_m:.1f} mm"
+        rows.append(with_inliers(frame, result, text))
+    return scaled(np.concatenate(rows), 860)
+
+
+def with_inliers(frame: Frame, result: gvo.FrameResult, text: str) -> Picture:
+    """Return the left or colour image with the points that its pose rests on, titled."""
+    grey = frame.left if isinstance(frame, gvo.StereoFrame) else frame.image
+    picture = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    if result.registration is not None:
+        found = result.registration
+        for pixel in np.rint(found.pixels_current[found.inliers]).astype(int):
+            cv2.circle(picture, (int(pixel[0]), int(pixel[1])), 4, INLIER_BGR, -1, cv2.LINE_AA)
+    title = np.full((34, picture.shape[1], 3), 255, dtype=np.uint8)
+    cv2.putText(title, text, (4, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 2, cv2.LINE_AA)
+    return np.concatenate([title, picture])
+
+
 def view(task: Task) -> Picture | None:
     """Return the page in the browser, paused at a frame, parameters unfolded."""
     missing = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
@@ -163,6 +200,7 @@ PICTURES: dict[str, Callable[[Task], Picture | None]] = {
     "explain": explain,
     "report": report,
     "overlay": overlay,
+    "corners": corners,
     "view": view,
 }
 

@@ -172,6 +172,25 @@ def test_the_description_lists_every_key_with_a_meaning() -> None:
     assert not re.search(r"\b(nan|inf|None)\b", text)
 
 
+def test_without_those_for_experts_the_few_and_the_changed_are_listed() -> None:
+    config = load_configuration(settings=["window.gate=7", "klt.n_corners=300"])
+    few = yaml.safe_load(describe_configuration(config, for_experts=False))
+    assert few["window"] == {"size": 5, "n_keyframes": 20, "gate": 7.0}
+    assert few["klt"] == {"n_corners": 300}
+    assert sum(map(len, few.values())) < 20
+    assert Config.model_validate(few) == config
+
+
+def test_the_page_advises_to_turn_what_gvo_config_lists() -> None:
+    page = (Path(__file__).parents[1] / "docs/configuration.md").read_text(encoding="utf-8")
+    advised = page.partition("## Turn these first")[2].partition("## All parameters")[0]
+    named = set(re.findall(r"`([a-z]+\.[a-z_]+)(?:=[^`]*)?`", advised)) - {"config.yaml"}
+    few = yaml.safe_load(describe_configuration(Config(), for_experts=False))
+    listed = {f"{section}.{key}" for section, values in few.items() for key in values}
+    assert 5 <= len(named) <= len(listed)
+    assert named <= listed
+
+
 def test_the_description_tells_unit_range_and_choices() -> None:
     lines = {
         line.split(":")[0].strip(): line for line in describe_configuration(Config()).split("\n")

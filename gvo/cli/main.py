@@ -465,11 +465,20 @@ def convert_(
 
 
 @_command("config")
-def config_(config: ConfigFile = None, set_: Settings = None) -> None:
-    """Print all parameters with units, ranges and meaning."""
+def config_(
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print the parameters for experts too.")
+    ] = False,
+    config: ConfigFile = None,
+    set_: Settings = None,
+) -> None:
+    """Print the parameters that matter most, or all."""
     from gvo.config import describe_configuration
 
-    typer.echo(describe_configuration(load(config, set_)), nl=False)
+    parameters = load(config, set_)
+    typer.echo(describe_configuration(parameters, for_experts=everything), nl=False)
+    if not everything:
+        say("# The others, for experts: gvo config --all")
 
 
 def _parse_lengths(text: str) -> list[float]:

@@ -169,7 +169,8 @@ class RunLoop:
             finished=self._placed(result.finished),
             stage_ms={"read": self._read_ms, **result.stage_ms},
         )
-        _log(placed)
+        text = f"{result.n_matches} matches, {result.n_inliers} inliers, {result.n_links} links"
+        _LOGGER.debug("frame at %d: %s, %s %s", item.stamp_ns, result.status, text, result.reason)
         self.statistics.add_result(placed)
         for output in outputs:
             output.add_frame(item, placed)
@@ -184,17 +185,3 @@ class RunLoop:
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)
-
-
-def _log(result: FrameResult) -> None:
-    _LOGGER.debug(
-        "frame at %d: %s, %d points, %d matches, %d inliers, %d links, %.1f ms%s",
-        result.stamp_ns,
-        result.status.value,
-        result.n_points,
-        result.n_matches,
-        result.n_inliers,
-        result.n_links,
-        sum(result.stage_ms.values()),
-        f": {result.reason}" if result.reason else "",
-    )

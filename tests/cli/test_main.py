@@ -37,11 +37,16 @@ def test_version_is_printed(command: Command) -> None:
     assert command("--version").out == f"gvo {gvo.__version__}\n"
 
 
-def test_config_prints_every_key_and_can_be_read_back(command: Command, tmp_path: Path) -> None:
-    answer = command("config", "--set", "window.n_links=4")
-    assert yaml.safe_load(answer.out)["window"]["n_links"] == 4
-    (tmp_path / "config.yaml").write_text(answer.out)
-    assert command("config", "--config", tmp_path / "config.yaml").out == answer.out
+def test_config_prints_the_few_or_all_and_can_be_read_back(
+    command: Command, tmp_path: Path
+) -> None:
+    for options in ([], ["--all"]):
+        answer = command("config", *options, "--set", "window.n_links=4")
+        assert yaml.safe_load(answer.out)["window"]["n_links"] == 4
+        (tmp_path / "config.yaml").write_text(answer.out)
+        assert command("config", *options, "--config", tmp_path / "config.yaml").out == answer.out
+    assert len(command("config", "--all").out.splitlines()) > 100
+    assert len(command("config").out.splitlines()) < 50
 
 
 def test_run_writes_its_files_and_prints_the_errors(

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.acceptance
 
 ROOT = Path(__file__).parents[2]
 MAX_BYTES = 250_000
-NAMES = {"explain", "report", "overlay", "view"}
+NAMES = {"explain", "report", "overlay", "corners", "view"}
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import combinations, islice, pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -37,6 +37,8 @@ _OF_RUN = "/gvo/"
 # Pieces of one recording follow each other but for what a recorder writes late.
 _MAX_OVERLAP_S = 1.0
 _MAX_GAP_S = 5.0
+# `CameraInfo` that are compared of each, of all topics.
+_N_FIRST = 20
 # The header of a serialised message begins with what changes: of ROS 1 the number, the stamp.
 _N_STAMP_BYTES = 12
 _Numbers: TypeAlias = tuple[object, ...]
@@ -195,20 +197,14 @@ def _image_names(file: BagFile) -> set[str]:
 
 
 def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:
-    """Say which file has another `CameraInfo` than one before; empty where none has."""
-    first: dict[str, tuple[_Numbers, str]] = {}
+    """Say which file begins with another `CameraInfo` than one before; empty where none does."""
+    watch = CameraInfoWatch()
+    names = {topic.name for topic in reader.topics if topic.type == CAMERA_INFO_TYPE}
     for file in files:
-        wanted = {c.name for c, n in file.counts.items() if n > 0 and c.type == CAMERA_INFO_TYPE}
-        for message in reader.messages(frozenset(wanted), files=[file]) if wanted else ():
-            name, numbers = message.topic.name, _numbers_of(message)
-            if numbers is None:
-                continue
-            known, where = first.setdefault(name, (numbers, file.path.name))
-            if known != numbers:
-                return f"{name} of {file.path.name} is not that of {where}"
-            wanted.discard(name)
-            if not wanted:
-                break
+        for message in islice(reader.messages(names, files=[file]), _N_FIRST):
+            watch.take(message)
+        for name in watch.counts:
+            return f"{name} of {file.path.name} is not that of those before"
     return ""
 
 

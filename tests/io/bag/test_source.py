@@ -247,7 +247,9 @@ def test_bags_of_two_cameras_are_not_one_recording(tmp_path: Path, tiny: Any) ->
     other = [(name, type_, ns + 10, message) for name, type_, ns, message in messages]
     other[0] = (*other[0][:3], _info("/s/left/camera_info", wide)[3])
     paths = [write(tmp_path / "a.bag", messages), write(tmp_path / "b.bag", other)]
-    with pytest.raises(RecordingError, match=r"/s/left/camera_info of b.bag is not that of a.bag"):
+    with pytest.raises(
+        RecordingError, match=r"/s/left/camera_info of b.bag is not that of those before"
+    ):
         BagSource(paths)
     other[0] = (*other[0][:3], messages[0][3])
     assert BagSource([paths[0], write(tmp_path / "c.bag", other)]).info.n_images == 6
