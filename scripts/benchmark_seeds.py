@@ -14,12 +14,14 @@ from pathlib import Path
 
 import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
 import benchmark_tables as tables  # type: ignore[import-not-found]
-import consistency  # type: ignore[import-not-found]
 import numpy as np
+from consistency import chain_of  # type: ignore[import-not-found]
 
 import gvo
 from gvo.io.recording import Sensor, Source
-from gvo.types import FloatArray
+from gvo.runs.loop import edge_over, motions_of_window
+from gvo.trajectory.evaluation import Motions, consistency, motions_of_chain
+from gvo.types import Edge, FloatArray
 
 KINDS: dict[str, tuple[str, Sensor]] = {
     "drive": ("driving", "stereo"),
@@ -111,21 +113,21 @@ def figures(source: Source, settings: Sequence[str]) -> FloatArray:
     """
     config = gvo.load_configuration(settings=settings)
     track = passes.Track(source, config)
-    in_window: dict[int, list[consistency.Relative]] = {span: [] for span in SPANS_S}
+    in_window: dict[int, list[tuple[int, Edge]]] = {span: [] for span in SPANS_S}
     for frame in passes.usable_frames(source, config):
         track.add(frame)
-        for span, pairs in in_window.items():
-            pairs += consistency.in_window(
-                track.odometry.window, frame.stamp_ns, span_ns=span * 10**9
-            )
+        for span, edges in in_window.items():
+            edge = edge_over(track.odometry.window, frame.stamp_ns, span * 10**9)
+            if edge is not None:
+                edges.append((frame.stamp_ns, edge))
     evaluations = track.evaluate()
-    chain = track.estimates["raw"]
-    raw = [consistency.chained(chain, span_ns=span * 10**9) for span in SPANS_S]
+    raw = motions_of_chain(chain_of(track.estimates["raw"]))[: len(SPANS_S)]
+    windowed = [motions_of_window(edges, name="window") for edges in in_window.values()]
     truth = source.ground_truth()
     return np.array(
         [
             *errors(evaluations["raw"], evaluations["smoothed"]),
-            *nees([*raw, *in_window.values()], truth),
+            *nees([*raw, *windowed], truth),
         ]
     )
 
@@ -139,15 +141,12 @@ def errors(raw: gvo.Evaluation, smoothed: gvo.Evaluation) -> list[float]:
     return np.array(rows, dtype=np.float64).T.ravel().tolist()
 
 
-def nees(kinds: Iterable[list[consistency.Relative]], truth: gvo.Trajectory | None) -> list[float]:
+def nees(kinds: Iterable[Motions], truth: gvo.Trajectory | None) -> list[float]:
     """Return the mean NEES of rotation and translation of each kind of relative poses."""
     means: list[float] = []
-    for pairs in kinds:
-        compared = [] if truth is None else consistency.compare(pairs, truth)
-        if compared:
-            means += consistency.mean_nees(*map(np.array, zip(*compared, strict=True)))
-        else:
-            means += [np.nan, np.nan]
+    for motions in kinds:
+        compared = None if truth is None else consistency(truth, motions)
+        means += (np.nan, np.nan) if compared is None else compared.mean_nees()
     return means
 
 

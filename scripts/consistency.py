@@ -24,10 +24,11 @@ import numpy as np
 
 import gvo
 from gvo.config import FrontendConfig
-from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.recording import Source
-from gvo.types import FaultyFrame, FloatArray, Frame
+from gvo.runs.loop import edge_over, motions_of_window
+from gvo.trajectory.evaluation import Consistency, Motions, consistency, motions_of_chain
+from gvo.types import Edge, FaultyFrame, Frame
 
 WORLDS = {
     "drive": ("driving", "stereo", 80),
@@ -37,10 +38,6 @@ WORLDS = {
 KINDS = get_args(FrontendConfig.model_fields["kind"].annotation)
 AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
 SPAN_NS = 1_000_000_000
-MOST_OFF_NS = 500_000_000
-
-# A relative pose, with its covariance, and the stamps that it leads from and to.
-Relative = tuple[int, int, FloatArray, FloatArray]
 
 
 def main() -> None:
@@ -79,8 +76,8 @@ def rendered(name: str, seed: int) -> Source:
 
 
 def report(name: str, sources: Iterable[Source], configs: Sequence[gvo.Config]) -> None:
-    """Run odometry over recordings and print the NEES of all their pairs together."""
-    errors: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
+    """Run odometry over recordings and print the NEES of all their motions together."""
+    found: dict[str, list[Consistency]] = {}
     for source in sources:
         truth = source.ground_truth()
         if truth is None:
@@ -88,92 +85,61 @@ def report(name: str, sources: Iterable[Source], configs: Sequence[gvo.Config]) 
         frames = list(gvo.frames(source, configs[0]))  # those of all front-ends
         for config in configs:
             frontend = f"{config.frontend.kind} " if len(configs) > 1 else ""
-            for kind, pairs in relative_poses(source.info.camera, frames, config).items():
-                errors.setdefault(f"{frontend}{kind}", []).extend(compare(pairs, truth))
-    for kind, pairs_of_kind in errors.items():
-        if pairs_of_kind:
-            print_row(f"{name} {kind}", *map(np.array, zip(*pairs_of_kind, strict=True)))
+            for kind, motions in relative_poses(source.info.camera, frames, config).items():
+                compared = consistency(truth, motions)
+                if compared is not None:
+                    found.setdefault(f"{frontend}{kind}", []).append(compared)
+    for kind, parts in found.items():
+        print_row(f"{name} {kind}", joined(parts))
 
 
 def relative_poses(
     camera: StereoCamera | PinholeCamera,
     frames: Iterable[Frame | FaultyFrame],
     config: gvo.Config,
-) -> dict[str, list[Relative]]:
+) -> dict[str, Motions]:
     """Run odometry over frames and return its relative poses over about 1 s."""
     odometry = gvo.Odometry(camera, config)
     raw: list[gvo.Estimate] = []
-    windowed: list[Relative] = []
+    windowed: list[tuple[int, Edge]] = []
     for frame in frames:
         if isinstance(frame, FaultyFrame):
             continue
         raw.append(odometry.track(frame).raw)
-        windowed += in_window(odometry.window, frame.stamp_ns)
-    return {"raw": chained(raw), "window": windowed}
+        edge = edge_over(odometry.window, frame.stamp_ns, SPAN_NS)
+        if edge is not None:
+            windowed.append((frame.stamp_ns, edge))
+    return {
+        "raw": motions_of_chain(chain_of(raw))[0],
+        "window": motions_of_window(windowed, name="window"),
+    }
 
 
-def in_window(
-    window: gvo.SlidingWindow, stamp_ns: int, *, span_ns: int = SPAN_NS
-) -> list[Relative]:
-    """Return the newest pose in one about a span older; nothing where the window holds none."""
-    stamps = {window.stamp_ns(pose): pose for pose in window.poses()}
-    start = nearest(np.array(list(stamps)), stamp_ns - span_ns)
-    if start is None:
-        return []
-    edge = window.relative_pose(stamps[start], stamp_ns)
-    return [(start, stamp_ns, edge.T_reference_frame, edge.covariance)]
+def chain_of(estimates: Sequence[gvo.Estimate]) -> gvo.Trajectory:
+    """Return the poses of a chain with their covariances."""
+    return gvo.Trajectory(
+        stamps_ns=np.array([each.stamp_ns for each in estimates]),
+        T_world_frame=np.array([each.T_world_frame for each in estimates]),
+        covariances=np.array([each.covariance for each in estimates]),
+    )
 
 
-def nearest(stamps_ns: FloatArray, target_ns: int) -> int | None:
-    """Return the stamp nearest to a target, None where all are half a second off."""
-    best = int(stamps_ns[np.argmin(np.abs(stamps_ns - target_ns))])
-    return best if abs(best - target_ns) <= MOST_OFF_NS else None
+def joined(parts: Sequence[Consistency]) -> Consistency:
+    """Return the errors of several recordings together."""
+    arrays = {
+        key: np.concatenate([getattr(part, key) for part in parts])
+        for key in ("start_ns", "end_ns", "errors", "covariances")
+    }
+    return Consistency(name=parts[0].name, **arrays)
 
 
-def chained(estimates: list[gvo.Estimate], *, span_ns: int = SPAN_NS) -> list[Relative]:
-    """Return the relative poses over a span of a chain; only there do covariances subtract."""
-    stamps_ns = np.array([estimate.stamp_ns for estimate in estimates])
-    by_stamp = dict(zip(stamps_ns.tolist(), estimates, strict=True))
-    pairs: list[Relative] = []
-    for b in estimates:
-        start = nearest(stamps_ns, b.stamp_ns - span_ns)
-        if start is None or start >= b.stamp_ns:
-            continue
-        a = by_stamp[start]
-        T_a_b = se3.invert(a.T_world_frame) @ b.T_world_frame
-        Ad = se3.adjoint(se3.invert(T_a_b))
-        pairs.append((start, b.stamp_ns, T_a_b, b.covariance - Ad @ a.covariance @ Ad.T))
-    return pairs
-
-
-def compare(pairs: list[Relative], truth: gvo.Trajectory) -> list[tuple[FloatArray, FloatArray]]:
-    """Return errors (6,) and covariances (6, 6) of the pairs that the ground truth covers."""
-    first, last = truth.stamps_ns[[0, -1]]
-    compared = []
-    for start, end, T_a_b, covariance in pairs:
-        if first <= start and end <= last:
-            T_world_a, T_world_b = truth.interpolate(np.array([start, end])).T_world_frame
-            error = se3.log(se3.invert(T_a_b) @ se3.invert(T_world_a) @ T_world_b)
-            compared.append((error, covariance))
-    return compared
-
-
-def mean_nees(errors: FloatArray, covariances: FloatArray) -> tuple[float, float]:
-    """Return the mean NEES per degree of freedom of rotations and of translations."""
-    means = []
-    for block in (slice(0, 3), slice(3, 6)):
-        solved = np.linalg.solve(covariances[:, block, block], errors[:, block, np.newaxis])
-        means.append(float(np.mean(np.sum(errors[:, block] * solved[..., 0], axis=1))) / 3.0)
-    return means[0], means[1]
-
-
-def print_row(name: str, errors: FloatArray, covariances: FloatArray) -> None:
+def print_row(name: str, found: Consistency) -> None:
     """Print the mean NEES per degree of freedom and the largest bias."""
-    rotation, translation = mean_nees(errors, covariances)
-    bias = np.mean(errors / np.sqrt(np.einsum("nii->ni", covariances)), axis=0)
+    rotation, translation = found.mean_nees()
+    bias = np.mean(found.errors / found.sigmas, axis=0)
     worst = int(np.argmax(np.abs(bias)))
     print(
-        f"{name:<34} {len(errors):>6} {rotation:>9.2f} {translation:>12.2f}"
+        f"{name:<34} {len(found.errors):>6} {rotation:>9.2f} {translation:>12.2f}"
         f"  {bias[worst]:+.2f} sigma in {AXES[worst]}"
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
@@ -90,20 +90,18 @@ def exit_code(is_complete: bool) -> int:
 def report(result: RunResult, out: Path) -> NoReturn:
     """Print the result of a run, and end with its exit code."""
     from gvo.frontend.calibration import describe_offsets
+    from gvo.io.run_folder.reader import verdict
     from gvo.trajectory.evaluation import format_evaluations
 
     for key in ("base_frame", "ground_truth"):
         say(f"{key.replace('_', ' ')}: {result.summary[key]}")
     if result.evaluations:
         say(format_evaluations(result.evaluations), nl=False)
-    frames, tracked = result.summary["frames"], result.summary["tracked"]
     learnt = describe_offsets(result.summary["rig_offsets"])
     if learnt:
         say(f"learnt of the camera: {learnt}")
-    where = out if result.report is None else result.report
-    covered = f"coverage {result.summary['coverage_percent']:.1f} %"
-    segments = _segment_words(result.summary["segments"])
-    say(f"{tracked} of {frames} frames tracked, {covered}{segments}; {where}")
+    say(verdict(result.summary))
+    say(out if result.report is None else result.report)
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))
 
@@ -132,14 +130,6 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
     say(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))
-
-
-def _segment_words(segments: Sequence[Mapping[str, Any]]) -> str:
-    """Return how many segments there are, if more than one."""
-    if len(segments) < 2:
-        return ""
-    n_joined = sum(segment["joined_to"] is not None for segment in segments)
-    return f", {len(segments)} segments, {n_joined} of them joined to another"
 
 
 def warn(warnings: Sequence[str]) -> None:

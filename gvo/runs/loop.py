@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
+import numpy as np
+
+from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError
 from gvo.io.excerpt import Excerpt
@@ -16,9 +19,14 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
+from gvo.trajectory.evaluation import Motions
+from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
 
 _LOGGER = logging.getLogger(__name__)
+
+# Over which the window is asked, once in each, how the camera moved.
+_SPAN_NS = 1_000_000_000
+_MOST_OFF_NS = 500_000_000
 
 
 class Output(Protocol):
@@ -55,6 +63,9 @@ class RunLoop:
     ----------
     statistics : RunStatistics
         Counts so far.
+    edges : list of (int, Edge)
+        About one each second: the stamp of a frame, and its pose in one about 1 s before, by the
+        window as it was then; of the base frame.
     """
 
     def __init__(
@@ -76,6 +87,8 @@ class RunLoop:
         self._items = items
         self._read_ms = 0.0
         self._first_ns: int | None = None
+        self.edges: list[tuple[int, Edge]] = []
+        self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
 
     @property
@@ -172,8 +185,20 @@ class RunLoop:
         text = f"{result.n_matches} matches, {result.n_inliers} inliers, {result.n_links} links"
         _LOGGER.debug("frame at %d: %s, %s %s", item.stamp_ns, result.status, text, result.reason)
         self.statistics.add_result(placed)
+        self._ask_window(item.stamp_ns)
         for output in outputs:
             output.add_frame(item, placed)
+
+    def _ask_window(self, stamp_ns: int) -> None:
+        """Keep the motion over the last second, where the last one kept is as old."""
+        if self._asked_ns is None:
+            self._asked_ns = stamp_ns
+        if stamp_ns - self._asked_ns < _SPAN_NS:
+            return
+        self._asked_ns = stamp_ns
+        edge = edge_over(self._odometry.window, stamp_ns, _SPAN_NS)
+        if edge is not None:
+            self.edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
     def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
@@ -185,3 +210,45 @@ class RunLoop:
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)
+
+
+def edge_over(window: SlidingWindow, stamp_ns: int, span_ns: int) -> Edge | None:
+    """Return the newest pose in one about a span older, with the covariance of both together.
+
+    Parameters
+    ----------
+    window : SlidingWindow
+        Of odometry: stamps name its poses.
+    stamp_ns : int
+        Of the newest pose, nanoseconds.
+    span_ns : int
+        Nanoseconds.
+
+    Returns
+    -------
+    Edge or None
+        None where no pose of the window is so much older, up to half a second.
+    """
+    ages_ns = {pose: stamp_ns - window.stamp_ns(pose) for pose in window.poses()}
+    start = min(ages_ns, key=lambda pose: abs(ages_ns[pose] - span_ns))
+    if abs(ages_ns[start] - span_ns) > _MOST_OFF_NS:
+        return None
+    return window.relative_pose(start, stamp_ns)
+
+
+def motions_of_window(edges: Sequence[tuple[int, Edge]], *, name: str) -> Motions:
+    """Return edges as motions, to compare them with true ones.
+
+    Parameters
+    ----------
+    edges : sequence of (int, Edge)
+        Stamps and edges, as `RunLoop.edges`.
+    name : str
+    """
+    return Motions(
+        name=name,
+        start_ns=np.array([edge.reference_id for _, edge in edges], dtype=np.int64),
+        end_ns=np.array([stamp_ns for stamp_ns, _ in edges], dtype=np.int64),
+        T_start_end=np.array([edge.T_reference_frame for _, edge in edges]).reshape(-1, 4, 4),
+        covariances=np.array([edge.covariance for _, edge in edges]).reshape(-1, 6, 6),
+    )

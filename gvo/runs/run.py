@@ -32,12 +32,12 @@ from gvo.io.run_folder.writer import (
     RunFolder,
     written_alone,
 )
-from gvo.runs.loop import RunLoop
+from gvo.runs.loop import RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
-from gvo.trajectory.evaluation import Evaluation
-from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
+from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
 
@@ -198,6 +198,7 @@ def _conclude(
     is_complete = loop.statistics.is_complete and not faults and bool(compared or not is_asked)
     summary = summarize(loop, compared, warnings)
     summary |= {"is_complete": is_complete, "run": identity}
+    summary |= _measure(folder, loop, compared)
     folder.write_summary(summary)
     return RunResult(
         summary=summary,
@@ -205,6 +206,25 @@ def _conclude(
         is_complete=is_complete,
         warnings=tuple(warnings),
     )
+
+
+def _measure(
+    folder: RunFolder, loop: RunLoop, compared: TruthComparison | Failure
+) -> dict[str, Any]:
+    """Return the path, and how the covariances fit the truth, if there is one."""
+    positions = read_trajectory(folder.path / "smoothed.txt")
+    found: list[Consistency | None] = []
+    if isinstance(compared, TruthComparison):
+        raw = read_trajectory(folder.path / "raw.txt")
+        _, covariances = read_covariances(folder.path / "raw_covariance.csv")
+        chain = motions_of_chain(replace(raw, covariances=covariances))
+        window = motions_of_window(loop.edges, name="window over 1 s")
+        found = [consistency(compared.truth.trajectory, each) for each in (window, *chain)]
+    return {
+        "path_m": float(positions.distances()[-1]),
+        "extent_m": float(np.linalg.norm(np.ptp(positions.positions, axis=0))),
+        "covariances": [each.as_json() for each in found if each is not None],
+    }
 
 
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:

@@ -104,9 +104,8 @@ class RunStatistics:
 
     @property
     def coverage_percent(self) -> float:
-        """Share of the frames that are tracked, or bridge a short gap between tracked ones."""
-        n_bridged = self.n_tracked + self.statuses[Status.COASTING]
-        return round(100.0 * n_bridged / max(self.n_frames, 1), 3)
+        """Share of the frames that are tracked."""
+        return round(100.0 * self.n_tracked / max(self.n_frames, 1), 3)
 
     @property
     def unjoined(self) -> list[Segment]:

@@ -1,4 +1,4 @@
-"""Errors of a trajectory against a reference: ATE, RPE, KITTI segment errors, and their table."""
+"""Errors of a trajectory against a reference: ATE, RPE, segments, covariances, and their table."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from gvo._text import format_table, number_text
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, AlignMode, alignment, pair
+from gvo.trajectory.alignment import MAX_DIFFERENCE_NS, MAX_GAP_NS, AlignMode, alignment, pair
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray, IntArray
+from gvo.types import BoolArray, FloatArray, IntArray
 
 KITTI_SEGMENTS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI odometry benchmark, metres."""
@@ -23,13 +24,15 @@ SHORT_SEGMENTS_M = (20.0, 50.0)
 """Segment lengths for paths shorter than KITTI's longest segment, metres."""
 SHORT_STEP = 1
 """Poses between the starts of those segments."""
+N_DOF = 6
+"""Degrees of freedom of a pose and of an edge."""
 
 _MIN_PATH_M = 1e-6
 _MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 _HEADER = (
     "estimate",
     "poses",
-    "coverage [%]",
+    "of reference [%]",
     "ATE RMSE [m]",
     "ATE max [m]",
     "RPE [m]",
@@ -40,7 +43,7 @@ _HEADER = (
     "path ratio",
 )
 _JSON_NAMES = (
-    *("name", "n", "coverage", "ate_m", "ate_max_m", "rpe_m", "rpe_deg"),
+    *("name", "n", "reference_share", "ate_m", "ate_max_m", "rpe_m", "rpe_deg"),
     *("n_segments", "segments_m", "t_pct", "r_deg_per_100m", "path_ratio"),
 )
 
@@ -49,8 +52,8 @@ _JSON_NAMES = (
 class Evaluation:
     """The errors of one estimate against a reference, over the associated poses.
 
-    Against positions without rotations (GNSS) only position errors, coverage and path ratio are
-    measured.
+    Against positions without rotations (GNSS) only position errors, the share of the reference and
+    the path ratio are measured.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ class Evaluation:
         Segments evaluated.
     segments_m : tuple of float
         Their nominal lengths, metres.
-    coverage : float
+    reference_share : float
         Time from the first to the last associated pose over that of the whole reference, 0 to 1.
     path_ratio : float or None
         Path length of the estimate, before scaling, over that of the reference; None if the
@@ -87,7 +90,7 @@ class Evaluation:
     r_deg_per_100m: float | None
     n_segments: int
     segments_m: tuple[float, ...]
-    coverage: float
+    reference_share: float
     path_ratio: float | None
 
     @property
@@ -183,7 +186,7 @@ def evaluate(
         r_deg_per_100m=_mean(100.0 * np.rad2deg(turns)),
         n_segments=len(shares),
         segments_m=tuple(float(length) for length in segments),
-        coverage=_coverage(reference, ref),
+        reference_share=_reference_share(reference, ref),
         path_ratio=_path_ratio(ref, est),
     )
 
@@ -250,13 +253,23 @@ def segment_errors(
     """
     if step < 1 or not all(0 < length < np.inf for length in lengths_m):
         raise ValueError(f"step and lengths must be positive, got {step} and {lengths_m}")
-    distances = reference.distances()
-    starts, lengths = np.meshgrid(np.arange(0, len(reference), step), np.array(lengths_m, float))
+    if not _have_rotations(reference, estimate):
+        return np.zeros(0), np.zeros(0)
+    first, last, lengths = _segments_of(reference, lengths_m, step)
+    translations, rotations = _pair_errors(reference, estimate, first, last)
+    return translations / lengths, rotations / lengths
+
+
+def _segments_of(
+    path: Trajectory, lengths_m: Sequence[float], step: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the first and last poses of the segments of a path, and their nominal lengths."""
+    distances = path.distances()
+    starts, lengths = np.meshgrid(np.arange(0, len(path), step), np.array(lengths_m, float))
     first, length = starts.ravel(), lengths.ravel()
     last = np.searchsorted(distances, distances[first] + length, side="right")
-    fits = (last < len(reference)) & _have_rotations(reference, estimate)
-    translations, rotations = _pair_errors(reference, estimate, first[fits], last[fits])
-    return translations / length[fits], rotations / length[fits]
+    fits = last < len(path)
+    return first[fits], last[fits], length[fits]
 
 
 def _have_rotations(reference: Trajectory, estimate: Trajectory) -> bool:
@@ -290,11 +303,195 @@ def _path_ratio(reference: Trajectory, estimate: Trajectory) -> float | None:
     return _path_length(estimate) / length if length > _MIN_PATH_M else None
 
 
-def _coverage(reference: Trajectory, associated: Trajectory) -> float:
+def _reference_share(reference: Trajectory, associated: Trajectory) -> float:
     if len(reference) == 1:
         return 1.0
     whole, part = (t.stamps_ns[-1] - t.stamps_ns[0] for t in (reference, associated))
     return float(part / whole)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motions:
+    """Relative poses with their covariances.
+
+    Parameters
+    ----------
+    name : str
+        Whose they are, and over what.
+    start_ns, end_ns : ndarray of int64, shape (n,)
+        Stamps of the two poses, nanoseconds.
+    T_start_end : ndarray of float64, shape (n, 4, 4)
+        Metres.
+    covariances : ndarray of float64, shape (n, 6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbations, at the end.
+    """
+
+    name: str
+    start_ns: IntArray
+    end_ns: IntArray
+    T_start_end: FloatArray
+    covariances: FloatArray
+
+    @classmethod
+    def of_chain(cls, chain: Trajectory, first: IntArray, last: IntArray, *, name: str) -> Motions:
+        """Return the motions between poses of a chain with covariances: only there they subtract.
+
+        Parameters
+        ----------
+        chain : Trajectory
+            Each pose is the one before, moved by an independent measurement.
+        first, last : ndarray of int64, shape (n,)
+            Indices.
+        name : str
+        """
+        T, stamps_ns = chain.T_world_frame, chain.stamps_ns
+        C = np.zeros((len(chain), 6, 6)) if chain.covariances is None else chain.covariances
+        T_start_end = se3.invert(T[first]) @ T[last]
+        Ad = se3.adjoint(se3.invert(T_start_end))
+        covariances = C[last] - Ad @ C[first] @ np.swapaxes(Ad, 1, 2)
+        return cls(
+            name=name,
+            start_ns=stamps_ns[first],
+            end_ns=stamps_ns[last],
+            T_start_end=T_start_end,
+            covariances=covariances,
+        )
+
+
+def motions_of_chain(chain: Trajectory) -> list[Motions]:
+    """Return the motions of a raw chain over 1 s, over 10 s, and over segments of the path."""
+    stamps_ns, found = chain.stamps_ns, []
+    for span_s in (1, 10):
+        span_ns = span_s * 10**9
+        last = np.searchsorted(stamps_ns, stamps_ns + span_ns)
+        first = np.flatnonzero(last < len(chain))
+        first = first[stamps_ns[last[first]] - stamps_ns[first] <= 1.5 * span_ns]
+        found.append(Motions.of_chain(chain, first, last[first], name=f"raw over {span_s} s"))
+    is_long = _path_length(chain) >= KITTI_SEGMENTS_M[-1]
+    lengths = KITTI_SEGMENTS_M if is_long else SHORT_SEGMENTS_M
+    step = KITTI_STEP if is_long else SHORT_STEP
+    first, last, _ = _segments_of(chain, lengths, step)
+    name = f"raw over {lengths[0]:g} to {lengths[-1]:g} m"
+    return [*found, Motions.of_chain(chain, first, last, name=name)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Consistency:
+    """Errors of motions with their stated covariances.
+
+    Parameters
+    ----------
+    name : str
+        That of the motions.
+    start_ns, end_ns : ndarray of int64, shape (n,)
+        Stamps of the two poses, nanoseconds.
+    errors : ndarray of float64, shape (n, 6)
+        (rx, ry, rz, tx, ty, tz), radians and metres: right perturbations of the motions that give
+        the true ones.
+    covariances : ndarray of float64, shape (n, 6, 6)
+        As stated.
+    """
+
+    name: str
+    start_ns: IntArray
+    end_ns: IntArray
+    errors: FloatArray
+    covariances: FloatArray
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Stated standard deviations, shape (n, 6)."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+
+    def mean_nees(self) -> tuple[float, float]:
+        """Return the mean NEES per degree of freedom of rotations and of translations."""
+        rotation, translation = (
+            float(np.mean(se3.mahalanobis(self.errors[:, each], self.covariances[:, each, each])))
+            for each in (slice(0, 3), slice(3, 6))
+        )
+        return rotation / 3.0, translation / 3.0
+
+    def as_json(self) -> dict[str, str | int | float]:
+        """Return what `summary.json` holds of it; NEES are means per degree of freedom.
+
+        `nees_low` and `nees_high` bound 95 % of what chance makes of consistent covariances.
+        """
+        rotation, translation = self.mean_nees()
+        span_ns = np.median(self.end_ns - self.start_ns)
+        # Motions that overlap share their errors.
+        n_apart = max(1, int((self.end_ns.max() - self.start_ns.min()) // span_ns))
+        n_dof = N_DOF * min(n_apart, len(self.errors))
+        return {
+            "motion": self.name,
+            "n": len(self.errors),
+            "error_deg": float(np.rad2deg(np.sqrt(np.mean(self.errors[:, :3] ** 2) * 3))),
+            "error_m": float(np.sqrt(np.mean(self.errors[:, 3:] ** 2) * 3)),
+            "nees_rotation": rotation,
+            "nees_translation": translation,
+            "nees": 0.5 * (rotation + translation),
+            "nees_low": chi2_bound(0.025, n_dof) / n_dof,
+            "nees_high": chi2_bound(0.975, n_dof) / n_dof,
+        }
+
+
+def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
+    """Compare motions with the true ones, interpolated at their stamps.
+
+    Relative motions are compared, since an error of the first true pose would turn all that
+    follows.
+
+    Returns
+    -------
+    Consistency or None
+        None where no motion has both true poses and a covariance, or the truth no rotations.
+    """
+    if not truth.has_rotations:
+        return None
+    true = _interpolated(truth, np.unique([motions.start_ns, motions.end_ns]))
+    are_known = np.isin([motions.start_ns, motions.end_ns], true.stamps_ns).all(axis=0)
+    are_known &= _is_positive(motions.covariances)
+    if not are_known.any():
+        return None
+    start_ns, end_ns = motions.start_ns[are_known], motions.end_ns[are_known]
+    T_a, T_b = (true.T_world_frame[np.searchsorted(true.stamps_ns, s)] for s in (start_ns, end_ns))
+    T_start_end = motions.T_start_end[are_known]
+    return Consistency(
+        name=motions.name,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        errors=se3.log(se3.invert(T_start_end) @ se3.invert(T_a) @ T_b),
+        covariances=motions.covariances[are_known],
+    )
+
+
+def _interpolated(truth: Trajectory, stamps_ns: IntArray) -> Trajectory:
+    """Return the truth at stamps, without those in its gaps."""
+    inside = truth.interpolate(stamps_ns)
+    true_ns = truth.stamps_ns
+    after = np.minimum(np.searchsorted(true_ns, inside.stamps_ns), len(true_ns) - 1)
+    gaps_ns = true_ns[after] - true_ns[np.maximum(after - 1, 0)]
+    return inside.select((true_ns[after] == inside.stamps_ns) | (gaps_ns <= MAX_GAP_NS))
+
+
+def _is_positive(covariances: FloatArray) -> BoolArray:
+    # normalized by the sigmas: metres and radians have different scales
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    scales = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    unit = covariances / (scales[:, :, np.newaxis] * scales[:, np.newaxis])
+    smallest = np.linalg.eigvalsh(unit)[:, 0]
+    return np.asarray(np.all(variances > 0.0, axis=1) & (smallest > 1e-12))
+
+
+def chi2_bound(share: float, n_dof: int = N_DOF) -> float:
+    """Return a quantile of chi-square, by default with 6 degrees of freedom.
+
+    Examples
+    --------
+    >>> round(chi2_bound(0.95), 3)
+    12.592
+    """
+    # scipy.stats takes longer to import than a report to write
+    return 2.0 * float(gammaincinv(0.5 * n_dof, share))
 
 
 def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
@@ -314,7 +511,7 @@ def _cells(evaluation: Evaluation) -> tuple[str, ...]:
     return (
         evaluation.name,
         str(evaluation.n),
-        f"{100.0 * evaluation.coverage:.1f}",
+        f"{100.0 * evaluation.reference_share:.1f}",
         f"{evaluation.ate_m:.4f}",
         f"{evaluation.ate_max_m:.4f}",
         number_text(evaluation.rpe_m, ".4f"),

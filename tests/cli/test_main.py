@@ -55,7 +55,7 @@ def test_run_writes_its_files_and_prints_the_errors(
     answer = command("run", room_bag, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     assert "smoothed" in answer.out
-    assert "20 of 20 frames tracked" in answer.out
+    assert "m in 20 frames, all tracked; " in answer.out
     learnt = json.loads((tmp_path / "out" / "summary.json").read_text())["rig_offsets"]
     assert f"learnt of the camera: {describe_offsets(learnt)}\n" in answer.out
     assert f"rows read out over {learnt['readout_ms']:.1f} ms" in answer.out

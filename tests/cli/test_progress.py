@@ -81,7 +81,7 @@ def test_a_terminal_shows_rate_time_left_and_tracked_share(room_bag: Path, tmp_p
     assert "room" in shown.terminal
     # The bar is gone at the end: what stays is what a pipe would get.
     assert shown.terminal.rstrip().endswith(("\x1b[2K", "\x1b[?25h"))
-    assert "20 of 20 frames tracked" in shown.out
+    assert "m in 20 frames, all tracked; " in shown.out
     assert "\x1b" not in shown.out
 
 

@@ -118,6 +118,19 @@ def test_summary_tells_frames_times_errors_and_configuration(run_dir: Path) -> N
     assert summary["configuration"] == gvo.Config().model_dump()
 
 
+def test_summary_tells_the_path_and_how_the_covariances_fit(run_dir: Path) -> None:
+    summary = json.loads((run_dir / "summary.json").read_text())
+    truth = gvo.read_trajectory(run_dir / "ground_truth.txt")
+    assert summary["path_m"] == pytest.approx(truth.distances()[-1], rel=0.01)
+    assert summary["extent_m"] == pytest.approx(summary["path_m"], rel=0.1)
+    rows = summary["covariances"]
+    assert [row["motion"] for row in rows] == ["window over 1 s", "raw over 1 s"]
+    assert [row["n"] for row in rows] == [1, 10]
+    for row in rows:
+        assert 0.02 < row["nees"] < 5.0
+        assert 0.0 < row["error_m"] < 0.05
+
+
 def test_trajectories_are_close_to_the_exact_truth(run_dir: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     for entry in summary["errors"]:

@@ -87,7 +87,7 @@ def test_segments_are_told_with_their_frames_and_what_they_are_joined_to() -> No
     }
     assert (second["n_frames"], second["n_tracked"]) == (3, 2)
     assert (second["joined_to"], second["joined_at_ns"]) == (0, 50)
-    assert statistics.coverage_percent == pytest.approx(100 * 4 / 6, abs=1e-3)
+    assert statistics.coverage_percent == 50.0
     assert statistics.unjoined == [statistics.segments[0]]
     assert any("joined (1 to 0)" in warning for warning in statistics.warnings())
     assert not statistics.is_complete

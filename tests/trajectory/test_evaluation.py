@@ -146,7 +146,7 @@ def test_a_trajectory_has_no_error_against_itself_wherever_it_lies(seed: int) ->
     T = se3.exp(np.random.default_rng(seed).normal(size=6) * [1, 1, 1, 50, 50, 50])
     evaluation = evaluate(reference, Similarity(T_a_b=T).apply(reference), name="same")
     np.testing.assert_allclose(np.array(measures(evaluation), dtype=float), 0.0, atol=1e-5)
-    assert (evaluation.n, evaluation.coverage) == (80, 1.0)
+    assert (evaluation.n, evaluation.reference_share) == (80, 1.0)
     assert evaluation.path_ratio == pytest.approx(1.0)
 
 
@@ -227,7 +227,11 @@ def test_what_cannot_be_measured_is_none() -> None:
     still = straight(3, 0.0)
     evaluation = evaluate(still, still, name="still", rpe_delta=3)
     assert measures(evaluation) == [0.0, None, None, None, None]
-    assert (evaluation.path_ratio, evaluation.coverage, evaluation.n_segments) == (None, 1.0, 0)
+    assert (evaluation.path_ratio, evaluation.reference_share, evaluation.n_segments) == (
+        None,
+        1.0,
+        0,
+    )
     assert evaluate(straight(20, 1.0), straight(20, 1.0), name="short").t_pct is None
 
 
@@ -239,11 +243,11 @@ def test_fewer_than_three_poses_in_common_measure_nothing(align: AlignMode) -> N
     assert evaluate(straight(30, 1.0), straight(3, 1.0), name="few", align=align).n == 3
 
 
-def test_coverage_is_the_share_of_the_reference_that_the_estimate_reaches() -> None:
+def test_the_share_is_that_of_the_reference_that_the_estimate_reaches() -> None:
     reference = drive(101)
     half = reference.select(slice(25, 76, 2))
     evaluation = evaluate(reference, half, name="half")
-    assert (evaluation.n, evaluation.coverage) == (26, 0.5)
+    assert (evaluation.n, evaluation.reference_share) == (26, 0.5)
     np.testing.assert_array_equal(evaluation.stamps_ns, half.stamps_ns)
 
 
@@ -376,7 +380,7 @@ def test_against_positions_the_place_is_measured_and_no_rotation() -> None:
     for bare in (evaluate(points, estimate, name="e"), evaluate(reference, unturned, name="e")):
         np.testing.assert_allclose(bare.errors_m, full.errors_m, atol=1e-9)
         assert measures(bare) == [pytest.approx(full.ate_m), None, None, None, None]
-        assert (bare.n_segments, bare.coverage, bare.path_ratio) == (0, 1.0, full.path_ratio)
+        assert (bare.n_segments, bare.reference_share, bare.path_ratio) == (0, 1.0, full.path_ratio)
 
 
 def test_a_truth_of_one_fix_a_second_measures_the_drive() -> None:

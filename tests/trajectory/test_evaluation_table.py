@@ -17,7 +17,7 @@ FULL = Evaluation(
     r_deg_per_100m=0.2533,
     n_segments=7,
     segments_m=(100.0, 200.0, 800.0),
-    coverage=0.985,
+    reference_share=0.985,
     path_ratio=1.01,
 )
 BARE = Evaluation(
@@ -30,7 +30,7 @@ BARE = Evaluation(
     r_deg_per_100m=None,
     n_segments=0,
     segments_m=(20.0, 50.0),
-    coverage=1.0,
+    reference_share=1.0,
     path_ratio=None,
 )
 
@@ -65,7 +65,9 @@ def test_a_table_without_evaluations_is_its_header() -> None:
 
 
 def test_the_json_holds_all_columns_of_the_table() -> None:
-    keys = "n coverage ate_m ate_max_m rpe_m rpe_deg n_segments t_pct r_deg_per_100m path_ratio"
+    keys = (
+        "n reference_share ate_m ate_max_m rpe_m rpe_deg n_segments t_pct r_deg_per_100m path_ratio"
+    )
     content = json.loads(json.dumps(evaluations_json([FULL, BARE]), allow_nan=False))
     assert content == {
         "estimates": [

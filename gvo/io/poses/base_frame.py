@@ -21,7 +21,7 @@ from gvo.geometry import se3
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.poses.tf_paths import bare, list_names
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, Failure, FloatArray, IntArray
+from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]
 
@@ -218,6 +218,19 @@ class BaseFrame:
             estimate,
             T_world_frame=T_camera @ se3.invert(T_base_cam),
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
+        )
+
+    def apply_to_edge(self, stamp_ns: int, edge: Edge) -> Edge:
+        """Return an edge between two stamps, the later one given, as one of the base frame."""
+        if self._is_camera:
+            return edge
+        T_a = self.T_base_cam(int(edge.reference_id))  # type: ignore[call-overload]
+        T_b = self.T_base_cam(stamp_ns)
+        Ad = se3.adjoint(T_b)
+        return replace(
+            edge,
+            T_reference_frame=T_a @ edge.T_reference_frame @ se3.invert(T_b),
+            covariance=Ad @ edge.covariance @ Ad.T,
         )
 
     def convert(self, trajectory: Trajectory) -> Trajectory:

@@ -18,7 +18,7 @@ from gvo.viz.report.sheets import settings, write_plots
 _HEADER = (
     "estimate",
     "poses",
-    "coverage [%]",
+    "of reference [%]",
     "ATE RMSE [m]",
     "ATE max [m]",
     "RPE [m]",
@@ -99,7 +99,7 @@ def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
 
 def _row(evaluation: Evaluation) -> list[str]:
     numbers = (
-        100.0 * evaluation.coverage,
+        100.0 * evaluation.reference_share,
         evaluation.ate_m,
         evaluation.ate_max_m,
         evaluation.rpe_m,

@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M
+from gvo.trajectory.evaluation import (
+    KITTI_SEGMENTS_M,
+    SHORT_SEGMENTS_M,
+    Consistency,
+)
 from gvo.types import FloatArray
 from gvo.viz.palette import ESTIMATES, Style, styles_of
 from gvo.viz.plots import plain
 from gvo.viz.report.measures import (
-    N_DOF,
     Comparison,
-    Consistency,
     Drift,
     drift,
     drift_lengths,
-    nees_band,
 )
 from gvo.viz.report.sheets import (
     WIDE,
@@ -30,8 +31,6 @@ from gvo.viz.report.sheets import (
     elapsed,
     kept_of_curve,
     new_figure,
-    plain_decades,
-    time_axes,
 )
 
 if TYPE_CHECKING:
@@ -41,6 +40,7 @@ _ROW_HEIGHT = 2.1
 _N_COLUMNS = 350
 _SIGMAS = 3.0
 _FLOOR = 0.01  # of the logarithmic axis
+_RAW = Style(color=ESTIMATES["raw"], linewidth=1.1, zorder=3.0)
 _ALIGNED = {
     "none": "without alignment",
     "origin": "with the first poses aligned",
@@ -172,86 +172,36 @@ def _draw_drift(panels: Any, name: str, item: Drift, style: Style, *, marker: st
     panels[1].plot(item.lengths_m, item.rotations_deg_per_m, **looks)
 
 
-def covariance_plots(found: Sequence[Consistency], first_ns: int) -> list[Plot]:
-    """Return errors with their 3-sigma bands, and the NEES.
+def covariance_plot(item: Consistency, first_ns: int) -> Plot:
+    """Return errors of motions with their 3-sigma bands.
 
     Parameters
     ----------
-    found : sequence of Consistency
-        Of causal and smoothed poses, at least one.
+    item : Consistency
+        Of the raw chain over a second.
     first_ns : int
         Stamp of elapsed time zero.
     """
-    low, high = nees_band()
-    return [
-        Plot(
-            slug="covariance",
-            text="Pose errors along the axes of each pose, relative to the first pose, with the "
-            "stated 3-sigma bands (filled: smoothed; dashed: causal). The first poses are aligned "
-            "and nothing is fitted, so noise of the first true pose counts as error, the more the "
-            f"longer the path. {_inside(found)} In a consistent run 99.7 % are inside, and the "
-            "errors fill more than a tenth of the band. Errors that leave it within the first "
-            "second and then stay level are those of the first true poses."
-            f"{_late(found, first_ns)}",
-            figure=_bands(found, first_ns),
-        ),
-        Plot(
-            slug="nees",
-            text="Squared error over stated covariance, with six degrees of freedom: mean "
-            f"{N_DOF}, and 95 % between {low:.2f} and {high:.1f} (shaded), where the covariances "
-            "are consistent. Errors of one run are correlated over time, so a single run may lie "
-            "outside for long. Above the band the estimate is overconfident, below it "
-            f"conservative. {_nees_words(found)}",
-            figure=_nees(found, first_ns),
-        ),
-    ]
-
-
-def _late(found: Sequence[Consistency], first_ns: int) -> str:
-    late_s = (min(int(item.stamps_ns[0]) for item in found) - first_ns) / 1e9
-    step_s = float(np.median(np.diff(found[0].stamps_ns))) / 1e9 if len(found[0].nees) > 1 else 0.0
-    if not late_s > 3.0 * step_s > 0.0:
-        return ""
-    return (
-        f" The ground truth begins {late_s:.2g} s after the first pose: the bands include that "
-        "time, the errors do not."
+    inside = 100.0 * np.mean(np.abs(item.errors) <= _SIGMAS * item.sigmas, axis=0)
+    return Plot(
+        slug="covariance",
+        text=f"Errors of the motion, {item.name}, along the axes of its last pose, with the "
+        f"stated 3-sigma bands; nothing is aligned. Inside are {inside[3:].mean():.1f} % of the "
+        f"position and {inside[:3].mean():.1f} % of the rotation errors; 99.7 % where the "
+        "covariances fit and the truth is exact. Noise of the true poses counts as error.",
+        figure=_bands(item, first_ns),
     )
 
 
-def _inside(found: Sequence[Consistency]) -> str:
-    parts = []
-    for item in found:
-        shares = 100.0 * item.share_inside(_SIGMAS)
-        parts.append(
-            f"{item.name}: {shares[3:].mean():.1f} % of the position and {shares[:3].mean():.1f} % "
-            "of the rotation errors"
-        )
-    return f"Inside: {'; '.join(parts)}."
-
-
-def _nees_words(found: Sequence[Consistency]) -> str:
-    parts = []
-    for item in found:
-        below, within, above = (100.0 * share for share in item.share_of_nees())
-        parts.append(
-            f"{item.name}: {within:.1f} % within, {below:.1f} % below, {above:.1f} % above, "
-            f"mean {item.nees.mean():.3g}"
-        )
-    return f"Here: {'; '.join(parts)}."
-
-
-def _bands(found: Sequence[Consistency], first_ns: int) -> Figure:
+def _bands(item: Consistency, first_ns: int) -> Figure:
     figure = new_figure(WIDE, 5.2)
     panels: Any = figure.subplots(2, 3, sharex=True)
+    x = elapsed(item.end_ns, first_ns)
     for panel, (index, letter, unit) in zip(panels.flat, _PANELS, strict=True):
         factor = 1.0 if unit == "m" else float(np.rad2deg(1.0))
-        for item in found:
-            x = elapsed(item.stamps_ns, first_ns)
-            _draw_band(panel, item.name, x, _SIGMAS * factor * item.sigmas[:, index])
-        for item in found:
-            x = elapsed(item.stamps_ns, first_ns)
-            y = factor * item.errors[:, index]
-            draw_curve(panel, x, y, _style(item.name), label=item.name, n_columns=_N_COLUMNS)
+        _draw_band(panel, x, _SIGMAS * factor * item.sigmas[:, index])
+        y = factor * item.errors[:, index]
+        draw_curve(panel, x, y, _RAW, label=item.name, n_columns=_N_COLUMNS)
         kind = "position" if unit == "m" else "rotation"
         panel.set_ylabel(f"{kind} {letter} [{unit}]")
     for panel in panels[-1]:
@@ -262,33 +212,11 @@ def _bands(found: Sequence[Consistency], first_ns: int) -> Figure:
     return figure
 
 
-def _style(name: str) -> Style:
-    return Style(color=ESTIMATES[name], linewidth=1.1, zorder=3.0)
-
-
-def _draw_band(axes: Any, name: str, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
+def _draw_band(axes: Any, x: FloatArray, reach: FloatArray) -> None:  # noqa: ANN401
     kept = kept_of_curve(x, reach, n_columns=_N_COLUMNS)
     x, reach = x[kept], reach[kept]
-    colour, label = ESTIMATES[name], f"\u00b13 sigma {name}"
+    label = "\u00b13 sigma"
     if len(x) == 1:  # a band of one pose has no area
-        axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=colour, marker="_", label=label)
-    elif name == "smoothed":
-        axes.fill_between(x, -reach, reach, color=colour, alpha=0.2, lw=0, label=label)
+        axes.plot([x[0], x[0]], [-reach[0], reach[0]], color=_RAW.color, marker="_", label=label)
     else:
-        axes.plot(x, reach, color=colour, ls="--", lw=1.0, label=label)
-        axes.plot(x, -reach, color=colour, ls="--", lw=1.0)
-
-
-def _nees(found: Sequence[Consistency], first_ns: int) -> Figure:
-    figure, axes = time_axes(3.0, "NEES [-]")
-    axes.axhspan(*nees_band(), color="0.9", lw=0, zorder=0.5, label="95 % band")
-    axes.axhline(N_DOF, color="black", ls=":", lw=1.0, label="expected: 6")
-    for item in found:
-        x = elapsed(item.stamps_ns, first_ns)
-        draw_curve(axes, x, np.maximum(item.nees, _FLOOR), _style(item.name), label=item.name)
-    axes.set_yscale("log")
-    plain_decades(axes.yaxis)
-    low, high = axes.get_ylim()
-    axes.set_ylim(max(min(low, 0.5), 0.7 * _FLOOR), max(high, 120.0))
-    arrange(figure, axes)
-    return figure
+        axes.fill_between(x, -reach, reach, color=_RAW.color, alpha=0.2, lw=0, label=label)

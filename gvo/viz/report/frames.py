@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvo.io.run_folder.reader import EdgeTable, FrameTable, TimingTable
+from gvo.trajectory.evaluation import N_DOF, chi2_bound
 from gvo.types import FloatArray
 from gvo.viz.palette import COUNTS, HATCHES, LINKS, REFUSED, STAGES, STATUSES, Style
-from gvo.viz.report.measures import N_DOF, chi2_bound, chi2_density
+from gvo.viz.report.measures import chi2_density
 from gvo.viz.report.sheets import (
     N_COLUMNS,
     WIDE,

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
-from gvo.trajectory.alignment import MAX_GAP_NS, AlignMode, alignment, pair
-from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, KITTI_STEP, segment_errors
+from gvo.trajectory.alignment import AlignMode, alignment, pair
+from gvo.trajectory.evaluation import (
+    KITTI_SEGMENTS_M,
+    KITTI_STEP,
+    segment_errors,
+)
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import BoolArray, FloatArray, IntArray
-
-N_DOF = 6
-"""Degrees of freedom of a pose and of an edge."""
+from gvo.types import FloatArray, IntArray
 
 _MIN_PATH_M = 0.1
 _MAX_STARTS = 2000
@@ -168,117 +168,6 @@ def drift(comparison: Comparison, lengths_m: Sequence[float]) -> Drift | None:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Consistency:
-    """Errors of poses with their stated covariances.
-
-    Parameters
-    ----------
-    name : str
-    stamps_ns : ndarray of int64, shape (n,)
-    errors : ndarray of float64, shape (n, 6)
-        (rx, ry, rz, tx, ty, tz), radians and metres: right perturbations of the poses that give
-        the true ones.
-    sigmas : ndarray of float64, shape (n, 6)
-        Stated standard deviations.
-    nees : ndarray of float64, shape (n,)
-        Squared Mahalanobis norms of the errors: 6 on average for consistent covariances.
-    """
-
-    name: str
-    stamps_ns: IntArray
-    errors: FloatArray
-    sigmas: FloatArray
-    nees: FloatArray
-
-    def share_inside(self, n_sigmas: float) -> FloatArray:
-        """Return the share of errors within a number of sigmas, shape (6,)."""
-        return np.asarray(np.mean(np.abs(self.errors) <= n_sigmas * self.sigmas, axis=0))
-
-    def share_of_nees(self) -> tuple[float, float, float]:
-        """Return the shares of the NEES below, within and above its 95 % band."""
-        low, high = nees_band()
-        below, above = float(np.mean(self.nees < low)), float(np.mean(self.nees > high))
-        return below, 1.0 - below - above, above
-
-
-def nees_band() -> tuple[float, float]:
-    """Return the central 95 % interval of chi-square with 6 degrees of freedom."""
-    return chi2_bound(0.025), chi2_bound(0.975)
-
-
-def chi2_bound(share: float) -> float:
-    """Return a quantile of chi-square with 6 degrees of freedom.
-
-    Examples
-    --------
-    >>> round(chi2_bound(0.95), 3)
-    12.592
-    """
-    # scipy.stats takes longer to import than the report to write
-    return 2.0 * float(gammaincinv(0.5 * N_DOF, share))
-
-
 def chi2_density(values: FloatArray) -> FloatArray:
     """Return the density of chi-square with 6 degrees of freedom."""
     return np.asarray(values**2 * np.exp(-0.5 * values) / 16.0)
-
-
-def consistency(truth: Trajectory, estimate: Trajectory, *, name: str) -> Consistency | None:
-    """Compare errors with covariances.
-
-    The covariances are those of the motion since the first pose, so the first poses are aligned
-    and nothing is fitted. The truth is interpolated at the stamps of the estimate, lest a
-    difference of milliseconds count as an error.
-
-    Parameters
-    ----------
-    truth : Trajectory
-        With rotations.
-    estimate : Trajectory
-        With covariances.
-    name : str
-
-    Returns
-    -------
-    Consistency or None
-        Without the first pose; None if no pose is left.
-    """
-    if estimate.covariances is None or not truth.has_rotations or not estimate.has_rotations:
-        return None
-    true, est = _at_stamps_of(truth, estimate)
-    if len(true) < 2 or est.covariances is None:
-        return None
-    origin = est.T_world_frame[0] @ se3.invert(true.T_world_frame[0])
-    errors = se3.log(se3.invert(est.T_world_frame) @ origin @ true.T_world_frame)[1:]
-    covariances = est.covariances[1:]
-    is_usable = _is_positive(covariances)
-    errors, covariances = errors[is_usable], covariances[is_usable]
-    if len(errors) == 0:
-        return None
-    return Consistency(
-        name=name,
-        stamps_ns=est.stamps_ns[1:][is_usable],
-        errors=errors,
-        sigmas=np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
-        nees=se3.mahalanobis(errors, covariances),
-    )
-
-
-def _at_stamps_of(truth: Trajectory, estimate: Trajectory) -> tuple[Trajectory, Trajectory]:
-    inside = truth.interpolate(estimate.stamps_ns)
-    true_ns = truth.stamps_ns
-    after = np.minimum(np.searchsorted(true_ns, inside.stamps_ns), len(true_ns) - 1)
-    gaps_ns = true_ns[after] - true_ns[np.maximum(after - 1, 0)]
-    is_near = (true_ns[after] == inside.stamps_ns) | (gaps_ns <= MAX_GAP_NS)
-    inside = inside.select(is_near)
-    return inside, estimate.select(np.isin(estimate.stamps_ns, inside.stamps_ns))
-
-
-def _is_positive(covariances: FloatArray) -> BoolArray:
-    # normalized by the sigmas: metres and radians have different scales
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    scales = np.sqrt(np.where(variances > 0.0, variances, 1.0))
-    unit = covariances / (scales[:, :, np.newaxis] * scales[:, np.newaxis])
-    smallest = np.linalg.eigvalsh(unit)[:, 0]
-    return np.asarray(np.all(variances > 0.0, axis=1) & (smallest > 1e-12))

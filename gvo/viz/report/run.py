@@ -12,12 +12,13 @@ from gvo._text import html_text, number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.frontend.calibration import describe_offsets
-from gvo.io.run_folder.reader import RunRecord
+from gvo.io.run_folder.reader import RunRecord, verdict
+from gvo.trajectory.evaluation import consistency, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.report.comparison import truth_around
-from gvo.viz.report.errors import covariance_plots, drift_plot, error_plots
+from gvo.viz.report.errors import covariance_plot, drift_plot, error_plots
 from gvo.viz.report.frames import count_plot, edge_plots, status_plot, timing_plot
-from gvo.viz.report.measures import Comparison, compare, consistency
+from gvo.viz.report.measures import Comparison, compare
 from gvo.viz.report.page import (
     configuration_html,
     facts_html,
@@ -29,8 +30,7 @@ from gvo.viz.report.page import (
 from gvo.viz.report.paths import Line, World, lines_of, path_plots
 from gvo.viz.report.sheets import Plot, settings, write_plots
 
-_ERROR_PLOTS = ("errors_over_time", "errors_over_distance", "drift")
-_COVARIANCE_PLOTS = ("covariance", "nees")
+_TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
 _ERROR_COLUMNS = {
     "ate_m": "ATE RMSE [m]",
     "rpe_m": "RPE [m]",
@@ -38,6 +38,23 @@ _ERROR_COLUMNS = {
     "t_pct": "t_err [%]",
     "r_deg_per_100m": "r_err [deg/100 m]",
 }
+
+_NEES_COLUMNS = {
+    "motion": "motion",
+    "n": "pairs",
+    "error_m": "error [m]",
+    "error_deg": "error [deg]",
+    "nees_translation": "NEES translation",
+    "nees_rotation": "NEES rotation",
+    "nees": "both",
+    "chance": "by chance",
+}
+_NEES_NOTE = (
+    "Errors of relative motions (RMSE), and their squares over the stated covariances per degree "
+    "of freedom (NEES): one where the covariances fit, four where the sigmas should be twice as "
+    "large. In the last column, 95 % of what chance makes of one. Noise of the true poses counts "
+    "as error."
+)
 
 
 def write_run_report(
@@ -67,7 +84,7 @@ def write_run_report(
         lines, world = _lines(record, estimates, compared)
         sheets = [
             *_path_plots(lines, world),
-            *_truth_plots(record, estimates, compared, reason),
+            *_truth_plots(record, compared, reason),
             status_plot(record.frames),
             count_plot(record.frames),
             timing_plot(record.timings),
@@ -114,36 +131,28 @@ def _path_plots(lines: list[Line], world: World | None) -> list[Plot]:
     return [Plot(slug=slug, text=text) for slug in ("above", "side", "space")]
 
 
-def _truth_plots(
-    record: RunRecord,
-    estimates: Mapping[str, Trajectory],
-    compared: list[Comparison],
-    reason: str,
-) -> list[Plot]:
+def _truth_plots(record: RunRecord, compared: list[Comparison], reason: str) -> list[Plot]:
     if not compared or record.truth is None:
         text = f"Not drawn: errors need ground truth, and {reason.removesuffix('.')}."
-        return [Plot(slug=slug, text=text) for slug in (*_ERROR_PLOTS, *_COVARIANCE_PLOTS)]
+        return [Plot(slug=slug, text=text) for slug in _TRUTH_PLOTS]
     return [
         *error_plots(compared, "se3"),
         drift_plot(compared),
-        *_covariance_plots(record.truth, estimates, _first_ns(record)),
+        _covariance_plot(record, record.truth),
     ]
 
 
-def _covariance_plots(
-    truth: Trajectory, estimates: Mapping[str, Trajectory], first_ns: int
-) -> list[Plot]:
-    names = [name for name in ("causal", "smoothed") if name in estimates]
-    results = [consistency(truth, estimates[name], name=name) for name in names]
-    found = [result for result in results if result is not None]
-    if found:
-        return covariance_plots(found, first_ns)
-    text = (
-        "Not drawn: the ground truth holds no rotations, and covariances are of poses."
+def _covariance_plot(record: RunRecord, truth: Trajectory) -> Plot:
+    raw = record.trajectories["raw"]
+    found = consistency(truth, motions_of_chain(raw)[0]) if len(raw) else None
+    if found is not None:
+        return covariance_plot(found, _first_ns(record))
+    reason = (
+        "the ground truth holds no rotations, and covariances are of poses"
         if not truth.has_rotations
-        else "Not drawn: fewer than two poses have a true pose and a covariance."
+        else "no motion over a second has true poses and a covariance"
     )
-    return [Plot(slug=slug, text=text) for slug in _COVARIANCE_PLOTS]
+    return Plot(slug="covariance", text=f"Not drawn: {reason}.")
 
 
 def _first_ns(record: RunRecord) -> int:
@@ -154,6 +163,8 @@ def _first_ns(record: RunRecord) -> int:
 def _head(record: RunRecord) -> list[str]:
     summary = record.summary
     parts = [f"<h1>{html_text(record.name)}</h1>"]
+    if "frames" in summary:
+        parts.append(f'<p class="verdict">{html_text(verdict(summary))}</p>')
     if not record.is_finished:
         parts.append(
             '<p class="absent">This run has not ended: it is running or was interrupted. '
@@ -164,6 +175,9 @@ def _head(record: RunRecord) -> list[str]:
     if summary.get("errors"):
         header = ("estimate", "poses", *_ERROR_COLUMNS.values())
         parts.append(table_html(header, map(_error_row, summary["errors"])))
+    if summary.get("covariances"):
+        parts.append(table_html([*_NEES_COLUMNS.values()], map(_nees_row, summary["covariances"])))
+        parts.append(f'<p class="note">{_NEES_NOTE}</p>')
     return [part for part in parts if part]
 
 
@@ -178,6 +192,12 @@ def _tail(record: RunRecord) -> list[str]:
 def _error_row(row: Mapping[str, Any]) -> list[str]:
     texts = [number_text(row.get(key)) for key in _ERROR_COLUMNS]
     return [str(row.get("name", "")), str(row.get("n", "")), *texts]
+
+
+def _nees_row(row: Mapping[str, Any]) -> list[str]:
+    chance = f"{number_text(row['nees_low'], '.2f')} to {number_text(row['nees_high'], '.2f')}"
+    cells = [number_text(row[key]) for key in [*_NEES_COLUMNS][1:-1]]
+    return [str(row["motion"]), *cells, chance]
 
 
 def _facts(record: RunRecord) -> dict[str, str]:

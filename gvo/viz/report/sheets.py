@@ -31,7 +31,6 @@ TITLES = {
     "errors_over_distance": "Errors over distance travelled",
     "drift": "Drift by length of segment",
     "covariance": "Errors within their covariances",
-    "nees": "Normalised estimation error squared (NEES)",
     "status": "Status",
     "counts": "Features, matches and inliers",
     "timings": "Milliseconds per frame",

@@ -13,7 +13,7 @@ from gvo.geometry import se3
 from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FloatArray, Status
+from gvo.types import Edge, Estimate, FloatArray, Status
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STAMPS_NS = [1_700_000_000_000_000_000 + n * 100_000_000 for n in range(6)]
@@ -111,6 +111,26 @@ def test_a_mount_that_moves_is_composed_as_by_hand_in_any_order(seed: int) -> No
         out = frame.apply(drive[n]).T_world_frame
         np.testing.assert_allclose(out, expected, rtol=0, atol=1e-9)
     assert frame.n_guessed == 0
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_an_edge_leads_from_base_to_base(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    buffer, _ = mounted(rng, STAMPS_NS)
+    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    first, *_, last = camera_drive(rng)
+    edge = Edge(
+        reference_id=first.stamp_ns,
+        T_reference_frame=se3.invert(first.T_world_frame) @ last.T_world_frame,
+        covariance=last.covariance,
+    )
+    found = frame.apply_to_edge(last.stamp_ns, edge)
+    a, b = apply_all(frame, [first, last])
+    T_a_b = se3.invert(a.T_world_frame) @ b.T_world_frame
+    np.testing.assert_allclose(found.T_reference_frame, T_a_b, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, b.covariance, atol=1e-9)
+    assert BaseFrame("cam").apply_to_edge(last.stamp_ns, edge) is edge
 
 
 @settings(deadline=None)

@@ -124,7 +124,7 @@ def test_a_recorded_chain_has_no_error_against_itself(gvo_data: Path) -> None:
     for text in (f"{path}#tf:odom:base_link", f"{path}#tf:map:base_link"):
         found = evaluate(read_poses(text), read_poses(text), name="same")
         assert measures(found) == pytest.approx([0.0] * 4, abs=1e-5)
-        assert (found.coverage, found.path_ratio) == (1.0, 1.0)
+        assert (found.reference_share, found.path_ratio) == (1.0, 1.0)
 
 
 @pytest.mark.recorded

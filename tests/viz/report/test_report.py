@@ -30,7 +30,6 @@ SECTIONS = [
     "errors_over_distance",
     "drift",
     "covariance",
-    "nees",
     "status",
     "counts",
     "timings",
@@ -42,7 +41,7 @@ SECTIONS = [
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run")
-    run_recording(SyntheticRecording("driving", "stereo", n_frames=8, scale=0.25), path)
+    run_recording(SyntheticRecording("driving", "stereo", n_frames=12, scale=0.25), path)
     return path
 
 
@@ -154,8 +153,8 @@ def test_without_truth_a_sentence_says_why(copy: Path) -> None:
     (copy / "ground_truth.txt").unlink()
     rewrite_summary(copy, ground_truth="none: nobody measured it", errors=[])
     text = page_of(copy)
-    assert text.count("nobody measured it") == 1 + len(SECTIONS[3:8])
-    assert _Page(text).drawn == SECTIONS[:3] + SECTIONS[8:]
+    assert text.count("nobody measured it") == 1 + len(SECTIONS[3:7])
+    assert _Page(text).drawn == SECTIONS[:3] + SECTIONS[7:]
 
 
 def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) -> None:
@@ -167,8 +166,18 @@ def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) 
     table = "\n".join(["stamp_ns,x_m,y_m,z_m", *rows, ""])
     (copy / "ground_truth_positions.csv").write_text(table)
     page = page_of(copy)
-    assert {*SECTIONS} - {*_Page(page).drawn} == {"drift", "covariance", "nees"}
+    assert {*SECTIONS} - {*_Page(page).drawn} == {"drift", "covariance"}
     assert "rotation error [deg]" not in page
+
+
+def test_the_page_begins_with_the_verdict_and_says_whether_the_covariances_fit(copy: Path) -> None:
+    head = page_of(copy).partition("<h2>")[0]
+    assert '<p class="verdict">' in head
+    assert "m in 12 frames, all tracked; " in head
+    for words in ("raw over 1 s", "window over 1 s", "NEES"):
+        assert words in head
+    rewrite_summary(copy, covariances=[])
+    assert "NEES" not in page_of(copy).partition("<h2>")[0]
 
 
 def test_an_interrupted_run_is_shown_as_far_as_it_went(copy: Path) -> None:
@@ -189,7 +198,7 @@ def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
         rows[index] = rows[index].replace(",ok,", f",{status},")
     (copy / "frames.csv").write_text("\n".join([*rows, ""]))
     text = page_of(copy)
-    for label in ("ok: 4", "coasting: 1", "lost: 1", "resumed: 1", "skipped: 1"):
+    for label in ("ok: 8", "coasting: 1", "lost: 1", "resumed: 1", "skipped: 1"):
         assert f">{label}</text>" in text
 
 
@@ -204,7 +213,7 @@ def test_what_differs_from_the_default_is_marked_with_the_default(copy: Path) ->
 
 def test_labels_are_text_and_keep_their_digits(folder: Path) -> None:
     text = page_of(folder)
-    for label in ("x [m]", "z [m]", "position error [m]", "rotation error [deg]", "NEES [-]"):
+    for label in ("x [m]", "z [m]", "position error [m]", "rotation error [deg]"):
         assert f">{label}</text>" in text
     ate_m = json.loads((folder / "summary.json").read_text())["errors"][0]["ate_m"]
     assert f"raw (RMSE {ate_m:.3g} m)" in text
@@ -213,8 +222,8 @@ def test_labels_are_text_and_keep_their_digits(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("n_frames", "missing"),
     [
-        (2, {"drift", "covariance", "errors_over_distance", "errors_over_time", "nees"}),
-        (3, {"drift"}),
+        (2, {"drift", "covariance", "errors_over_distance", "errors_over_time"}),
+        (3, {"drift", "covariance"}),
     ],
 )
 def test_few_frames_are_enough_and_three_for_errors(

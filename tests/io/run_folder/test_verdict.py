@@ -1,0 +1,175 @@
+"""The verdict of a run: how far, how good, what to look at, in plain words."""
+
+import json
+from typing import Any
+
+import pytest
+
+from gvo.io.run_folder.reader import verdict
+
+
+def row(nees: float, *, error_m: float = 0.05, motion: str = "window over 1 s") -> dict[str, Any]:
+    told = {"motion": motion, "n": 40, "error_m": error_m, "error_deg": 0.1}
+    return told | {"nees": nees, "nees_low": 0.6, "nees_high": 1.5}
+
+
+def summary(**changes: Any) -> dict[str, Any]:
+    counts = {"ok": 393, "coasting": 0, "lost": 0, "resumed": 0, "skipped": 0}
+    plain: dict[str, Any] = {
+        "state": "complete",
+        "frames": 393,
+        "tracked": 393,
+        "path_m": 298.4,
+        "extent_m": 120.0,
+        "segments": [{"id": 0, "joined_to": None}],
+        "status_counts": counts,
+        "errors": [
+            {"name": name, "n": 393, "ate_m": ate_m, "rpe_m": 0.004}
+            for name, ate_m in (("raw", 0.52), ("smoothed", 0.304))
+        ],
+        "covariances": [row(1.1), row(7.0, motion="raw over 1 s")],
+        "rig_offsets": None,
+        "warnings": [],
+    }
+    status_counts = counts | changes.pop("status_counts", {})
+    return plain | changes | {"status_counts": status_counts}
+
+
+def without_truth(**changes: Any) -> dict[str, Any]:
+    return summary(errors=[], covariances=[], **changes)
+
+
+LOOK = "frames.csv, which says why frames are not tracked"
+LEARNT = "(learnt and corrected)"
+CASES = [
+    (
+        summary(),
+        "298 m in 393 frames, all tracked; 0.3 m from the truth; covariances fit.",
+    ),
+    (
+        without_truth(),
+        "298 m in 393 frames, all tracked; no truth to compare with.",
+    ),
+    (
+        without_truth(warnings=["not compared with the ground truth: x"]),
+        "298 m in 393 frames, all tracked; not compared with the truth.",
+    ),
+    (
+        without_truth(path_m=0.93, frames=12, tracked=12),
+        "0.93 m in 12 frames, all tracked; no truth to compare with.",
+    ),
+    (
+        without_truth(path_m=12345.6),
+        "12346 m in 393 frames, all tracked; no truth to compare with.",
+    ),
+    # at rest, noise adds up to a path
+    (
+        without_truth(path_m=1.2, extent_m=0.0123),
+        "at rest, within 0.012 m, in 393 frames, all tracked; no truth to compare with.",
+    ),
+    # nothing could be registered: that is no rest
+    (
+        without_truth(path_m=0.0, extent_m=0.0, tracked=0, status_counts={"coasting": 393}),
+        "0 m in 393 frames, none tracked, 393 bridged; no truth to compare with. "
+        f"Worth a look: {LOOK}.",
+    ),
+    # lost, faulty, bridged
+    (
+        without_truth(
+            tracked=371,
+            status_counts={"lost": 12, "coasting": 5, "skipped": 5},
+            segments=[{"joined_to": None}, {"joined_to": 0}, {"joined_to": None}],
+        ),
+        "298 m in 393 frames, 371 tracked, 5 bridged, 12 lost, 5 faulty, in 3 segments, 1 of them "
+        f"joined to another; no truth to compare with. Worth a look: {LOOK}.",
+    ),
+    # a run that is not over
+    (
+        without_truth(state="interrupted", path_m=None, extent_m=None, frames=20, tracked=20),
+        "20 frames so far, all tracked.",
+    ),
+    (
+        without_truth(state="running", path_m=None, frames=0, tracked=0),
+        "0 frames so far, none tracked.",
+    ),
+    # a truth of a part of the frames
+    (
+        summary(errors=[{"name": "smoothed", "n": 64, "ate_m": 0.0039, "rpe_m": None}]),
+        "298 m in 393 frames, all tracked; 0.0039 m from the truth, known of 64 frames; "
+        "covariances fit.",
+    ),
+    # positions without rotations say nothing of covariances
+    (
+        summary(covariances=[]),
+        "298 m in 393 frames, all tracked; 0.3 m from the truth.",
+    ),
+]
+
+
+@pytest.mark.parametrize(("told", "words"), CASES)
+def test_the_verdict_says_how_far_and_how_good(told: dict[str, Any], words: str) -> None:
+    assert verdict(told) == words
+    assert verdict(json.loads(json.dumps(told))) == words
+
+
+FIT = "covariances fit"
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (row(1.0), FIT),
+        (row(3.9), FIT),  # within a factor of two in sigma
+        (row(0.26), FIT),
+        (row(0.04), "covariances too large, 5 times in sigma"),
+        (
+            row(324.0, error_m=0.091),
+            "covariances too small, 18 times in sigma, unless the truth itself is off by 0.091 m "
+            "and 0.1 deg over 1 s",
+        ),
+        # the error over a second is hardly larger than that from one frame to the next
+        (
+            row(25.0, error_m=0.006),
+            "covariances cannot be judged, the truth jumps by 0.004 m between frames",
+        ),
+        # of so few motions chance makes more
+        (row(5.0) | {"nees_high": 6.0}, FIT),
+        (row(0.2) | {"nees_low": 0.1}, FIT),
+    ],
+)
+def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -> None:
+    said = verdict(summary(covariances=[found]))
+    assert said == f"298 m in 393 frames, all tracked; 0.3 m from the truth; {words}."
+
+
+@pytest.mark.parametrize(
+    ("offsets", "looks"),
+    [
+        ({"disparity_px": 0.04, "disparity_sigma_px": 0.001}, []),
+        ({"disparity_px": 0.3, "disparity_sigma_px": 0.2}, []),
+        ({"disparity_px": None, "row_px": None, "readout_ms": None}, []),
+        (
+            {"disparity_px": -0.158, "disparity_sigma_px": 0.022, "row_px": -0.12},
+            ["the calibration, disparities are 0.16 px too small"],
+        ),
+        (
+            {"disparity_px": 0.5, "disparity_sigma_px": None, "row_px": 0.31},
+            [
+                "the calibration, disparities are 0.5 px too large",
+                "the rectification, rows of the right image are off by 0.31 px",
+            ],
+        ),
+        ({"readout_ms": 3.0, "readout_sigma_ms": 0.1}, []),
+        ({"readout_ms": 30.0, "readout_sigma_ms": 0.0}, []),  # as it was given
+        (
+            {"readout_ms": 20.9, "readout_sigma_ms": 1.3},
+            ["a rolling shutter, rows are read out over 21 ms"],
+        ),
+    ],
+)
+def test_the_verdict_names_what_was_learnt_of_the_camera(
+    offsets: dict[str, Any], looks: list[str]
+) -> None:
+    said = verdict(summary(rig_offsets=offsets))
+    text = "; ".join(f"{look} {LEARNT}" for look in looks)
+    assert said.partition(FIT)[2] == (f". Worth a look: {text}." if looks else ".")
