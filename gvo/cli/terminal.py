@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO, TypeVar
 
 import typer
 from typer.core import TyperCommand
 from typer.main import get_command
 
-from gvo._text import visible
+from gvo._text import cut, visible
 
 if TYPE_CHECKING:
     from gvo.runs.run import RunResult
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 ProgressT = TypeVar("ProgressT")
 # Share by which the total of a progress bar may be off.
 _MAX_OFF = 0.02
+_MAX_CHATTER = 1 << 15  # bytes; half of what a pipe holds
 _EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
@@ -63,6 +65,55 @@ class Command(TyperCommand):
         shared = typer.Typer(add_completion=False)
         shared.command()(_every_command)
         self.params += get_command(shared).params
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - Typer's
+        """Run the command; a batch's images are decoded by its workers."""
+        with nullcontext() if self.name == "batch" else chatter_counted():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def chatter_counted() -> Iterator[None]:
+    """Take what libraries write to standard error past Python, and say how much it was.
+
+    It goes into a pipe, which holds some hundred lines; what comes later is dropped.
+    """
+    own = sys.stderr
+    try:
+        number = own.fileno()
+    except (OSError, ValueError):
+        yield  # nothing but Python can write to it
+        return
+    own.flush()
+    kept, (reader, writer) = os.dup(number), os.pipe()
+    for end in (reader, writer):
+        os.set_blocking(end, False)
+    os.dup2(writer, number)
+    with os.fdopen(kept, "w", encoding=own.encoding, errors=own.errors, buffering=1) as stream:
+        _print_errors_to(stream)
+        try:
+            yield
+        finally:
+            os.dup2(kept, number)
+            os.close(writer)
+            _print_errors_to(own)
+            _tell_chatter(reader)
+
+
+def _print_errors_to(stream: TextIO) -> None:
+    sys.stderr = stream
+    for handler in _LOGGER.handlers:
+        if isinstance(handler, logging.StreamHandler):
+            handler.setStream(stream)
+
+
+def _tell_chatter(reader: int) -> None:
+    with os.fdopen(reader, "rb", buffering=0) as pipe:
+        text = pipe.read(_MAX_CHATTER) or b""
+    lines = [line for line in text.decode(errors="replace").splitlines() if line.strip()]
+    if lines:
+        count = f"{'more than ' if len(text) == _MAX_CHATTER else ''}{len(lines)}"
+        warn([f"{count} lines of image libraries, the first: {cut(lines[0], 200)}"])
 
 
 def say(text: object, *, nl: bool = True, err: bool = False) -> None:

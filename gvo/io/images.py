@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import stat
 import struct
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -21,6 +23,12 @@ MAX_PIXELS = 100_000_000
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND"
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the type of colour
+# Of each pass of an interlaced image: the first column and row, the steps of both.
+_PNG_PASSES = (
+    *((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4)),
+    *((0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)),
+)
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _TIFF_MAGICS = {b"II*\0": "<", b"MM\0*": ">"}
 _BMP_MAGIC = b"BM"
@@ -181,6 +189,8 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     is_complete = _COMPLETE.get(header.format)
     if is_complete is not None and not is_complete(data):
         raise RecordingError(f"{where}: the {header.format} image is truncated")
+    if header.format == "PNG":
+        data = _cut_png(data)
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -494,13 +504,58 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
     OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
     """
-    position = len(_PNG_MAGIC)
-    while position < len(data):
-        head = data[position : position + 8].tobytes()
-        position += 12 + int.from_bytes(head[:4], "big")
-        if head[4:] == _PNG_END:
-            break
-    return position <= len(data)
+    return all(end <= len(data) for _, _, end in _png_chunks(data))
+
+
+def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the name of each chunk, and where it and its checksum begin and end."""
+    start, name = len(_PNG_MAGIC), b""
+    while start < len(data) and name != _PNG_END:
+        head = data[start : start + 8].tobytes()
+        name, end = head[4:], start + 12 + int.from_bytes(head[:4], "big")
+        yield name, start, end
+        start = end
+
+
+def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a PNG whose stream ends where its rows do; one that is malformed as it is.
+
+    libpng inflates all that follows, up to a thousand times its bytes. The rows are written
+    uncompressed: they are inflated once.
+    """
+    parts, streams = [_PNG_MAGIC], []
+    for name, start, end in _png_chunks(data):
+        if name == b"IDAT":
+            streams.append(data[start + 8 : end - 4].tobytes())
+        elif name in (b"IHDR", b"PLTE", b"tRNS"):
+            parts.append(data[start:end].tobytes())
+    n_bytes = _n_png_bytes(data[8:33].tobytes())
+    try:
+        rows = zlib.decompressobj().decompress(b"".join(streams), n_bytes) if n_bytes else b""
+    except zlib.error:
+        return data
+    if len(rows) != n_bytes or not rows:
+        return data
+    parts += [_png_chunk(b"IDAT", zlib.compress(rows, 0)), _png_chunk(_PNG_END, b"")]
+    return np.frombuffer(b"".join(parts), dtype=np.uint8)
+
+
+def _n_png_bytes(header: bytes) -> int:
+    """Return the bytes of all rows, each with the byte of its filter; 0 of a wrong header."""
+    if not header.startswith(b"\0\0\0\rIHDR") or header[16] not in (1, 2, 4, 8, 16):
+        return 0
+    width, height, depth, colour, _, _, is_interlaced = struct.unpack(">IIBBBBB", header[8:21])
+    n_bits = depth * _PNG_CHANNELS.get(colour, 0)
+    sizes = (
+        (-(-(width - u) // step_u), -(-(height - v) // step_v))
+        for u, v, step_u, step_v in (_PNG_PASSES if is_interlaced else ((0, 0, 1, 1),))
+    )
+    return sum(h * (1 + (w * n_bits + 7) // 8) for w, h in sizes if min(w, h, n_bits) > 0)
+
+
+def _png_chunk(name: bytes, content: bytes) -> bytes:
+    check = zlib.crc32(content, zlib.crc32(name))
+    return b"".join([struct.pack(">I", len(content)), name, content, struct.pack(">I", check)])
 
 
 _COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -465,3 +466,34 @@ def test_a_signal_ends_a_waiting_pipe_with_complete_files(
     assert errors.count("\n") == 1
     for name in ("raw", "causal", "smoothed"):
         assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 2
+
+
+@pytest.mark.parametrize(
+    ("write", "told"),
+    [
+        ("pass", ""),
+        (
+            "os.write(2, 2 * b'libpng warning: \\x1b[31m\\n')",
+            r"2 lines.*: libpng warning: \\x1b\[31m",
+        ),
+        ("subprocess.run(['sh', '-c', 'yes >&2'])", "more than 16384 lines.*: y"),
+    ],
+    ids=["none", "few", "endless"],
+)
+def test_what_libraries_write_is_counted_and_what_gvo_writes_is_shown(
+    write: str, told: str
+) -> None:
+    program = (
+        "import os, subprocess, sys\n"
+        "from gvo.cli.terminal import chatter_counted\n"
+        "with chatter_counted():\n"
+        f"    {write}\n"
+        "    print('own', file=sys.stderr)\n"
+        "print('after', file=sys.stderr)\n"
+        "os.write(2, b'last')\n"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    words = f"gvo: warning: {told}\n" if told else ""
+    assert re.fullmatch(f"own\n{words}after\nlast", answer.stderr)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -239,6 +240,54 @@ def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
     )
     before, after = (int(line) // 1024 for line in answer.stdout.split())
     assert after - before < 200
+
+
+def png_of(stream: bytes, *fields: int) -> NDArray[np.uint8]:
+    """Return a PNG of width, height, bits, colour, interlacing, and a stream of rows."""
+    width, height, n_bits, colour, interlacing = fields
+    header = struct.pack(">IIBBBBB", width, height, n_bits, colour, 0, 0, interlacing)
+    chunks = [(b"IHDR", header), (b"IDAT", stream[:50]), (b"IDAT", stream[50:]), (b"IEND", b"")]
+    return pixels_of(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+    )
+
+
+def test_of_a_png_nothing_is_inflated_behind_its_last_row(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    decoded: list[NDArray[np.uint8]] = []
+    decode = cv2.imdecode
+
+    def noted(data: NDArray[np.uint8], flags: int) -> Any:
+        decoded.append(data)
+        return decode(data, flags)
+
+    monkeypatch.setattr(cv2, "imdecode", noted)
+    rows = b"".join(b"\0" + bytes(range(k, k + 40)) for k in range(30))
+    expected = np.add.outer(np.arange(30), np.arange(40))
+    bomb = zlib.compress(rows + bytes(1 << 26))
+    np.testing.assert_array_equal(decode_image(png_of(bomb, 40, 30, 8, 0, 0), "bomb"), expected)
+    assert len(decoded[0]) < 2 * len(rows)
+    assert capfd.readouterr().err == ""
+
+
+def test_an_interlaced_png_is_decoded_as_it_is(capfd: pytest.CaptureFixture[str]) -> None:
+    pixels = np.arange(9 * 11, dtype=np.uint8).reshape(9, 11)
+    starts_steps = [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4)]
+    starts_steps += [(0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)]
+    rows = b"".join(
+        b"\0" + row.tobytes()
+        for u, v, step_u, step_v in starts_steps
+        for row in pixels[v::step_v, u::step_u]
+    )
+    for stream in (rows, rows + bytes(1 << 20)):
+        image = decode_image(png_of(zlib.compress(stream), 11, 9, 8, 0, 1), "interlaced")
+        np.testing.assert_array_equal(image, pixels)
+    assert capfd.readouterr().err == ""
 
 
 def test_an_rvl_image_larger_than_any_depth_camera_is_refused() -> None:
