@@ -49,6 +49,8 @@ _READOUT_FACTOR = 5.0
 _VELOCITY = "velocity"
 # Sigma of the newest frame's velocity, relative to the change from the step before to the last one.
 _SIGMA_OF_CHANGE = 1.0
+# Of the row offset of the right image, which is the median of many measurements.
+_ROW_SIGMA_PX = 0.02
 # Stamps nearer to each other than this, in seconds, tell no velocity.
 _MIN_ELAPSED_S = 1e-4
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
@@ -315,19 +317,24 @@ class RigOffsets:
 
 
 def describe_offsets(offsets: Mapping[str, Any] | None) -> str:
-    """Tell in words what was learnt of a camera, as `RigOffsets.as_json` gives it; may be empty."""
+    """Tell in words what was learnt of a camera, as `RigOffsets.as_json` gives it.
+
+    Only what is beyond two sigma is told; the result may be empty.
+    """
     known = {key: value for key, value in (offsets or {}).items() if value is not None}
     words = []
-    if "disparity_px" in known:
-        sigma = known.get("disparity_sigma_px")
-        suffix = "" if sigma is None else f" (sigma {sigma:.3f})"
-        words.append(f"disparities too large by {known['disparity_px']:.3f} px{suffix}")
-    if "row_px" in known:
-        words.append(f"rows of the right image too large by {known['row_px']:.3f} px")
-    if "readout_ms" in known:
-        sigma = known.get("readout_sigma_ms")
-        suffix = f" (sigma {sigma:.1f})" if sigma else ", as given" if sigma == 0 else ""
-        words.append(f"rows read out over {known['readout_ms']:.1f} ms{suffix}")
+    for key, text in (
+        ("disparity", "disparities {size:.3f} px too {side}"),
+        ("row", "rows of the right image {size:.3f} px too {side}"),
+        ("readout", "rows read out over {value:.1f} ms"),
+    ):
+        unit = "ms" if key == "readout" else "px"
+        value, sigma = known.get(f"{key}_{unit}", 0.0), known.get(f"{key}_sigma_{unit}")
+        if abs(value) <= 2.0 * (_ROW_SIGMA_PX if sigma is None else sigma):
+            continue
+        side = "large" if value > 0.0 else "small"
+        suffix = "" if sigma is None else f" (sigma {sigma:.2g})" if sigma else ", as given"
+        words.append(text.format(value=value, size=abs(value), side=side) + suffix)
     return ", ".join(words)
 
 
