@@ -49,8 +49,8 @@ _READOUT_FACTOR = 5.0
 _VELOCITY = "velocity"
 # Sigma of the newest frame's velocity, relative to the change from the step before to the last one.
 _SIGMA_OF_CHANGE = 1.0
-# Of the row offset of the right image, which is the median of many measurements.
-_ROW_SIGMA_PX = 0.02
+# A row offset of the right image, the median of many measurements, that is worth a word.
+_LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
 _MIN_ELAPSED_S = 1e-4
 # An offset of the disparities that is not taken off, as registrations do not tell it from errors
@@ -330,7 +330,7 @@ def describe_offsets(offsets: Mapping[str, Any] | None) -> str:
     ):
         unit = "ms" if key == "readout" else "px"
         value, sigma = known.get(f"{key}_{unit}", 0.0), known.get(f"{key}_sigma_{unit}")
-        if abs(value) <= 2.0 * (_ROW_SIGMA_PX if sigma is None else sigma):
+        if abs(value) <= (_LEAST_ROW_PX if sigma is None else 2.0 * sigma):
             continue
         side = "large" if value > 0.0 else "small"
         suffix = "" if sigma is None else f" (sigma {sigma:.2g})" if sigma else ", as given"
