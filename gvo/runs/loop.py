@@ -66,6 +66,8 @@ class RunLoop:
     edges : list of (int, Edge)
         About one each second: the stamp of a frame, and its pose in one about 1 s before, by the
         window as it was then; of the base frame.
+    output_faults : list of str
+        Why outputs were not written to their end.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class RunLoop:
         self._read_ms = 0.0
         self._first_ns: int | None = None
         self.edges: list[tuple[int, Edge]] = []
+        self.output_faults: list[str] = []
         self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
 
@@ -109,11 +112,12 @@ class RunLoop:
         Parameters
         ----------
         outputs : iterable of Output
-            Get all poses, also those still in the window where the run is interrupted.
+            Get all poses, also those still in the window where the run is interrupted. One that
+            cannot write gets no more, unless it raises `OutputError`, which ends the run.
         on_progress : callable, optional
             Called after each frame.
         """
-        outputs = tuple(outputs)
+        outputs = list(outputs)
         with one_opencv_thread():
             is_writable = True
             try:
@@ -126,8 +130,8 @@ class RunLoop:
                 raise
             finally:
                 finished = self._placed(self._odometry.finish())
-                for output in outputs if is_writable else ():
-                    output.add_smoothed(finished)
+                if is_writable:
+                    self._give(outputs, lambda output: output.add_smoothed(finished))
                 self.count()
 
     def count(self) -> None:
@@ -167,7 +171,7 @@ class RunLoop:
             self._read_ms = 1e3 * (time.perf_counter() - start)
             yield item
 
-    def _take(self, item: Frame | FaultyFrame, outputs: tuple[Output, ...]) -> None:
+    def _take(self, item: Frame | FaultyFrame, outputs: list[Output]) -> None:
         """Count a frame, and give the outputs its poses as those of the base frame."""
         if isinstance(item, FaultyFrame):
             self._take_faulty(item, outputs)
@@ -186,8 +190,17 @@ class RunLoop:
         _LOGGER.debug("frame at %d: %s, %s %s", item.stamp_ns, result.status, text, result.reason)
         self.statistics.add_result(placed)
         self._ask_window(item.stamp_ns)
-        for output in outputs:
-            output.add_frame(item, placed)
+        self._give(outputs, lambda output: output.add_frame(item, placed))
+
+    def _give(self, outputs: list[Output], write: Callable[[Output], None]) -> None:
+        for output in tuple(outputs):
+            try:
+                write(output)
+            except OutputError:
+                raise
+            except RecordingError as error:
+                outputs.remove(output)
+                self.output_faults.append(str(error))
 
     def _ask_window(self, stamp_ns: int) -> None:
         """Keep the motion over the last second, where the last one kept is as old."""
@@ -200,13 +213,13 @@ class RunLoop:
         if edge is not None:
             self.edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
-    def _take_faulty(self, item: FaultyFrame, outputs: tuple[Output, ...]) -> None:
+    def _take_faulty(self, item: FaultyFrame, outputs: list[Output]) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
         _LOGGER.debug("frame at %d: skipped: %s", item.stamp_ns, item.reason)
         self.statistics.add_duration("read", self._read_ms)
         self.statistics.add_faulty(item, is_loss=is_loss)
-        for output in outputs if is_loss else ():
-            output.add_faulty(item)
+        if is_loss:
+            self._give(outputs, lambda output: output.add_faulty(item))
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)

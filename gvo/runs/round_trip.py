@@ -18,7 +18,7 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.run_folder.writer import ROUND_TRIP_PICTURE, TRAJECTORIES, RunFolder, written_alone
 from gvo.runs.loop import RunLoop
-from gvo.runs.summary import summarize
+from gvo.runs.summary import RunningSummary, summarize
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.round_trip import RoundTripError, round_trip_error
 from gvo.trajectory.trajectory import Trajectory
@@ -283,7 +283,9 @@ def run_round_trip(
     base_frame = BaseFrame(source.info.frame_id)
     loop = RunLoop(source, config, base_frame, excerpt=excerpt, items=way)
     with written_alone(Path(out), force=force), RunFolder(Path(out)) as folder:
-        loop.run([folder], None if on_progress is None else _doubled(on_progress))
+        tell = None if on_progress is None else _doubled(on_progress)
+        with RunningSummary(loop, folder, {}, tell) as progress:
+            loop.run([folder], progress)
         if way.turn_ns is None:
             folder.discard()
             reason = loop.statistics.reason()

@@ -137,7 +137,7 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
-            faults = _close(files)
+            faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
         result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
@@ -145,7 +145,7 @@ def run_recording(
 
 
 def _close(files: ExitStack) -> list[str]:
-    """Complete the files; a film that is not whole takes nothing from the run."""
+    """Complete the files; one that is not whole takes nothing from the run."""
     try:
         files.close()
     except RecordingError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from gvo._version import __version__
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
-from gvo.errors import GvoError, RecordingError, TrajectoryError
+from gvo.errors import GvoError, OutputError, RecordingError, TrajectoryError
 from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.lines import (
     CSV_HEADER,
@@ -199,14 +199,11 @@ def smooth_edges(
     notes = SmoothingNotes(decisions=[*source.decisions, *decisions])
     with _opened(Path(out), source, force=force) as (folder, graph_file):
         smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
-        try:
+        with _finished(source.name, folder, smoother, notes):
             for event in _events(source, notes):
                 smoother.take(event)
                 if on_progress is not None:
                     on_progress(_progress(smoother, source.n_poses))
-        finally:
-            # Also where the run is interrupted: what the window holds was computed.
-            smoother.finish()
     notes.warnings += source.faults.warnings()
     truth = _with_stamps(ground_truth, source, folder)
     return conclude(source.name, folder, smoother, config=config, notes=notes, truth=truth)
@@ -226,6 +223,28 @@ def _opened(
             yield folder, graph_file
         finally:
             graph_file.close(source.measurement_lines())
+
+
+@contextmanager
+def _finished(
+    name: str, folder: RunFolder, smoother: Smoother, notes: SmoothingNotes
+) -> Iterator[None]:
+    """Write what the window holds, also where the work ends early, and then how far it came."""
+    folder.write_summary(_summary(name, smoother, notes) | {"state": "running"})
+    try:
+        try:
+            yield
+        finally:
+            smoother.finish()
+    except (OutputError, KeyboardInterrupt) as error:
+        reason = str(error) or "interrupted"
+        summary = _summary(name, smoother, notes) | {"state": "interrupted", "warnings": [reason]}
+        with suppress(OutputError):
+            folder.write_summary(summary)
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        text = f"{error}; {smoother.n_poses} poses stand in {folder.path}"
+        raise OutputError(text, is_partly=smoother.n_poses > 0) from error
 
 
 def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
@@ -379,23 +398,20 @@ def smooth_lines(
         When no line held a pose, or the folder holds an earlier run or cannot be written.
     """
     config = config or Config()
-    faults = InputFaults()
-    broken_off = ""
-    out = Path(out)
+    faults, notes = InputFaults(), SmoothingNotes()
+    out, name = Path(out), "standard input"
     with written_alone(out, force=force), RunFolder(out, columns=POSES_HEADER) as folder:
         smoother = Smoother(folder, config, keyframes=keyframes)
-        try:
-            _answer_all(lines, answer, smoother, faults)
-        except OSError as error:
-            faults.add("answers could not be written", f"the stream ends there: {error.strerror}")
-        except TrajectoryError as error:
-            broken_off = str(error)
-        finally:
-            smoother.finish()
-    notes = SmoothingNotes(warnings=faults.warnings(), broken_off=broken_off)
-    return conclude(
-        "standard input", folder, smoother, config=config, notes=notes, truth=ground_truth
-    )
+        with _finished(name, folder, smoother, notes):
+            try:
+                _answer_all(lines, answer, smoother, faults)
+            except OSError as error:
+                words = f"the stream ends there: {error.strerror}"
+                faults.add("answers could not be written", words)
+            except TrajectoryError as error:
+                notes.broken_off = str(error)
+    notes.warnings += faults.warnings()
+    return conclude(name, folder, smoother, config=config, notes=notes, truth=ground_truth)
 
 
 def _answer_all(

@@ -15,7 +15,11 @@ import pytest
 
 import gvo
 from gvo.errors import OutputError, RunBusyError
+from gvo.io.convert.bag_messages import BagWriter
+from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
+from gvo.runs.round_trip import run_round_trip
+from gvo.runs.smooth import smooth_edges, smooth_lines
 from gvo.types import Progress
 
 N = 12
@@ -174,6 +178,67 @@ def test_a_full_disk_leaves_whole_lines(
     assert summary["state"] == "interrupted"
     assert "No space left" in summary["warnings"][0]
     assert_whole_lines(tmp_path)
+
+
+def test_a_bag_on_a_full_disk_takes_nothing_from_the_run(
+    drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+    write = BagWriter.write
+
+    def write_some(*arguments: Any, **options: Any) -> None:
+        written.append(1)
+        if len(written) > 20:
+            raise OSError(28, "No space left on device")
+        write(*arguments, **options)
+
+    monkeypatch.setattr(BagWriter, "write", write_some)
+    outputs = gvo.RunOutputs(bag=tmp_path / "run.mcap", report=False)
+    result = drive.run(tmp_path / "out", outputs=outputs)
+    assert not result.is_complete
+    assert [line for line in result.warnings if "run.mcap" in line] == [
+        f"{tmp_path / 'run.mcap'}: cannot be written: No space left on device"
+    ]
+    drive.assert_same(tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_round_trip_on_a_full_disk_says_how_far_it_came(
+    drive: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = _FullDisk("raw.txt", (drive.killed / "7" / "raw.txt").stat().st_size - 40)
+    monkeypatch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
+    said = rf"raw\.txt.*No space left.*; 7 frames stand whole in {tmp_path}$"
+    with pytest.raises(OutputError, match=said):
+        run_round_trip(gvo.open_recording(drive.bag), tmp_path)
+    assert summary_of(tmp_path)["state"] == "interrupted"
+    assert_whole_lines(tmp_path)
+
+
+def smooth_file(folder: Path, out: Path) -> None:
+    poses = folder / "poses.txt"
+    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    smooth_edges(open_edges([poses]), out)
+
+
+def smooth_stream(folder: Path, out: Path) -> None:
+    smooth_lines((f"{k},{k}000000000" for k in range(20)), lambda line: None, out)
+
+
+@pytest.mark.parametrize("smooth", [smooth_file, smooth_stream])
+def test_smoothing_on_a_full_disk_says_how_far_it_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, smooth: Callable[[Path, Path], None]
+) -> None:
+    full, out = _FullDisk("causal.txt", 500), tmp_path / "out"
+    monkeypatch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
+    said = rf"causal\.txt.*No space left.*; \d+ poses stand in {out}$"
+    with pytest.raises(OutputError, match=said) as caught:
+        smooth(tmp_path, out)
+    assert caught.value.is_partly
+    assert summary_of(out)["state"] == "interrupted"
+    assert "No space left" in summary_of(out)["warnings"][0]
+    for name in ("raw.txt", "causal.txt", "smoothed.txt", "frames.csv"):
+        assert (out / name).read_bytes()[-1:] in (b"\n", b"")
 
 
 class _FullDisk:
