@@ -20,6 +20,8 @@ from gvo.errors import ConfigurationError
 N_PORTS = 20
 """How many ports are tried, from the one asked for."""
 
+_MAX_PATH = 250  # bytes; the names of the page's files are shorter, no file's name is longer
+
 
 class LocalServer(viser.ViserServer):
     """A server that stays on this machine: it opens no tunnel to a public address."""
@@ -107,12 +109,14 @@ def is_own_page(origin: str | None, host: str, *, is_local: bool) -> bool:
     host : str
         Name and port of the request.
     is_local : bool
-        Accept names of this machine alone: DNS may lead others here.
+        Accept names of this machine alone, also for the page itself: DNS may lead others here.
     """
-    if origin is None:
-        return True
-    page = urlsplit(origin)
-    return page.netloc == host and (not is_local or _is_loopback(page.hostname or ""))
+    try:
+        page = urlsplit(f"//{host}" if origin is None else origin)
+        name = page.hostname or ""
+    except ValueError:  # a bracket without its other one
+        return False
+    return page.netloc == host and (not is_local or _is_loopback(name))
 
 
 def _is_loopback(host: str) -> bool:
@@ -132,6 +136,8 @@ def _refusing_strangers(*, is_local: bool) -> Iterator[None]:
             origin, host = request.headers.get("Origin"), request.headers.get("Host", "")
             if not is_own_page(origin, host, is_local=is_local):
                 return connection.respond(403, "gvo: not from another page\n")
+            if len(request.path.partition("?")[0]) > _MAX_PATH:
+                return connection.respond(414, "gvo: no file of the page has so long a name\n")
             return process_request(connection, request)
 
         return serve(*args, process_request=check, **options)

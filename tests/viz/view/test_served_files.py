@@ -28,6 +28,11 @@ def get(view: ViewServer, path: bytes, method: bytes = b"GET") -> bytes:
     return ask(view, head)
 
 
+def get_as(view: ViewServer, host: bytes, path: bytes = b"/") -> bytes:
+    """Ask for a path by another name of the machine."""
+    return ask(view, b"GET %s HTTP/1.1\r\nHost: %s\r\nConnection: close\r\n\r\n" % (path, host))
+
+
 def status(answer: bytes) -> int:
     return int(answer.split(b" ", 2)[1]) if answer.startswith(b"HTTP/") else 0
 
@@ -43,6 +48,24 @@ def test_the_page_itself_is_served(view: ViewServer) -> None:
     answer = get(view, b"/")
     assert status(answer) == 200
     assert b"<html" in answer.lower()
+
+
+@pytest.mark.parametrize("host", ["example.org", "example.org:8080", "10.0.0.1", "", "[", "a@127"])
+def test_the_page_is_not_served_by_a_name_of_another_machine(view: ViewServer, host: str) -> None:
+    answer = get_as(view, host.encode())
+    assert status(answer) == 403
+    assert b"<html" not in answer.lower()
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1:9", "[::1]:80", "LOCALHOST:8080"])
+def test_the_page_is_served_by_all_names_of_this_machine(view: ViewServer, host: str) -> None:
+    assert status(get_as(view, host.encode())) == 200
+
+
+@pytest.mark.parametrize("n", [251, 300, 7000])
+def test_a_path_that_is_too_long_is_refused(view: ViewServer, n: int) -> None:
+    assert status(get(view, b"/" + b"a" * (n - 1))) == 414
+    assert status(get(view, b"/?" + b"a" * n)) == 200
 
 
 def test_no_path_leads_out_of_the_page(view: ViewServer, secret: Path) -> None:
