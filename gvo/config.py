@@ -29,14 +29,8 @@ def _parameter(
     gt: float | None = None,
     le: float | None = None,
 ) -> Any:  # noqa: ANN401 - pydantic types its own Field so
-    return Field(
-        default,
-        ge=ge,
-        gt=gt,
-        le=le,
-        description=meaning,
-        json_schema_extra={"unit": unit, "is_expert": is_expert},
-    )
+    extra = {"unit": unit, "is_expert": is_expert}
+    return Field(default, ge=ge, gt=gt, le=le, description=meaning, json_schema_extra=extra)
 
 
 # A parameter that matters to many.

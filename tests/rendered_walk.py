@@ -1,6 +1,6 @@
 """A short walk in a rendered room as bags, with its true poses at any time."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -90,11 +90,12 @@ def ate_by_hand(positions: FloatArray, truth: FloatArray) -> float:
     return float(distance / np.sqrt(len(a)))
 
 
-def read_bag(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Return log time and content of all messages by topic, as rosbags reads them."""
+def read_bag(path: Path, topics: Container[str] = ()) -> dict[str, list[tuple[int, Any]]]:
+    """Return log time and content of messages by topic (all without), as rosbags reads them."""
     messages: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
-        for connection, log_time_ns, data in reader.messages():
+        asked = [each for each in reader.connections if not topics or each.topic in topics]
+        for connection, log_time_ns, data in reader.messages(asked):
             content = reader.deserialize(data, connection.msgtype)
             messages.setdefault(connection.topic, []).append((log_time_ns, content))
     return messages

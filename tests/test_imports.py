@@ -4,62 +4,60 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 BATCHES = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
 HEAVY = ("matplotlib", "viser", "rerun", "selenium", *BATCHES)
-# Runs the command as a terminal would, then tells which of the libraries came with it.
+# Does one thing after the other; tells of each how it ended, and which of the libraries came by it.
 _PROGRAM = """
-import json, sys
-code = 0
-try:
-{lines}
-except SystemExit as end:
-    code = end.code
-finally:
-    loaded = sorted({{name.split(".")[0] for name in sys.modules}} & set({heavy!r}))
-    sys.stdout.flush()
-    print("\\n" + json.dumps([code, loaded]))
+import io, json, sys
+from contextlib import redirect_stdout
+
+def command(*arguments):
+    from gvo.cli import main
+    sys.argv = ["gvo", *arguments]
+    main()
+
+def track(path):
+    import itertools
+    import gvo
+    source = gvo.open_recording(path)
+    odometry = gvo.Odometry(source.info.camera)
+    frames = itertools.islice(gvo.frames(source, gvo.Config()), 3)
+    assert [odometry.track(frame).status for frame in frames] == ["ok", "ok", "ok"]
+
+found = []
+for action in sys.argv[1:]:
+    before, code = set(sys.modules), 0
+    with redirect_stdout(io.StringIO()):
+        try:
+            exec(action)
+        except SystemExit as end:
+            code = end.code
+    new = {{name.split(".")[0] for name in set(sys.modules) - before}}
+    found.append([code, sorted(new & set({heavy!r}))])
+print(json.dumps(found))
 """
-_COMMAND = """
-sys.argv = {argv!r}
-from gvo.cli import main
-main()
-"""
-_ODOMETRY = """
-import itertools
-import gvo
-source = gvo.open_recording({path!r})
-odometry = gvo.Odometry(source.info.camera)
-frames = itertools.islice(gvo.frames(source, gvo.Config()), 3)
-results = [odometry.track(frame) for frame in frames]
-assert [result.status for result in results] == ["ok", "ok", "ok"]
-"""
 
 
-class Loaded(NamedTuple):
-    """The exit code, and which of the libraries are loaded at the end."""
-
-    code: int | None
-    modules: list[str]
-
-
-def loaded_after(lines: str) -> Loaded:
-    """Run lines of Python in a process of their own."""
-    indented = "\n".join(f"    {line}" for line in lines.strip().splitlines())
-    program = _PROGRAM.format(lines=indented, heavy=HEAVY)
+def loaded_by(*actions: str) -> list[list[object]]:
+    """Return exit code and libraries loaded of each line of Python, in a process of their own."""
+    program = _PROGRAM.format(heavy=HEAVY)
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", program, *actions],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    return Loaded(*json.loads(done.stdout.splitlines()[-1]))
+    found: list[list[object]] = json.loads(done.stdout)
+    return found
 
 
-def loaded_by(*arguments: object) -> Loaded:
-    """Run the command in a process of its own."""
-    return loaded_after(_COMMAND.format(argv=["gvo", *map(str, arguments)]))
+def command(*arguments: object) -> str:
+    return f"command(*{[*map(str, arguments)]})"
 
 
 @pytest.fixture
@@ -69,43 +67,32 @@ def poses(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_package_and_its_names_load_nothing_that_draws() -> None:
-    assert loaded_after("from gvo import *") == (0, [])
-
-
-def test_batches_are_named_without_being_loaded() -> None:
-    assert loaded_after("import gvo.batch; dir(gvo.batch)") == (0, [])
-    code, loaded = loaded_after("from gvo.batch import Variant, make_variants; make_variants()")
-    assert code == 0
-    assert "matplotlib" not in loaded
-
-
-def test_help_on_batches_loads_nothing() -> None:
-    assert loaded_by("batch", "--help") == (0, [])
-
-
-def test_odometry_over_frames_loads_nothing_that_draws(room_bag: Path) -> None:
-    assert loaded_after(_ODOMETRY.format(path=str(room_bag))) == (0, [])
-
-
-def test_help_loads_nothing_that_draws() -> None:
-    assert loaded_by("--help") == (0, [])
-
-
-def test_a_run_without_a_report_loads_nothing_that_draws(room_bag: Path, tmp_path: Path) -> None:
-    options = ["--out", tmp_path / "out", "--duration", "0.15", "--no-report"]
-    assert loaded_by("run", room_bag, *options) == (0, [])
+def test_nothing_that_draws_or_distributes_is_loaded_before_it_is_needed(
+    room_bag: Path, poses: Path, tmp_path: Path
+) -> None:
+    options = [room_bag, "--duration", "0.15", "--no-report"]
+    film = tmp_path / "film.webm"
+    actions = [
+        "from gvo import *",
+        "import gvo.batch; dir(gvo.batch)",
+        command("--help"),
+        command("batch", "--help"),
+        f"track({str(room_bag)!r})",
+        command("compare", poses, poses),
+        command("run", *options, "--out", tmp_path / "out"),
+        command("run", *options, "--out", tmp_path / "filmed", "--overlay", film),
+    ]
+    found = loaded_by(*actions)
+    assert dict(zip(actions, found, strict=True)) == {action: [0, []] for action in actions}
     assert (tmp_path / "out/summary.json").is_file()
+    assert film.is_file()
 
 
-def test_a_film_needs_no_plots(room_bag: Path, tmp_path: Path) -> None:
-    options = ["--out", tmp_path / "out", "--duration", "0.15", "--no-report"]
-    options += ["--overlay", tmp_path / "film.webm"]
-    assert loaded_by("run", room_bag, *options) == (0, [])
-    assert (tmp_path / "film.webm").is_file()
-
-
-def test_comparing_loads_what_plots_only_for_a_plot(poses: Path, tmp_path: Path) -> None:
-    assert loaded_by("compare", poses, poses) == (0, [])
-    plotted = loaded_by("compare", poses, poses, "--plot", tmp_path / "plot.png")
-    assert plotted == (0, ["matplotlib"])
+def test_batches_and_plots_load_what_they_need_alone(poses: Path, tmp_path: Path) -> None:
+    plot = command("compare", poses, poses, "--plot", tmp_path / "plot.png")
+    make = "from gvo.batch import Variant, make_variants; make_variants()"
+    (code, loaded), plotted = loaded_by(make, plot)
+    assert code == 0
+    assert isinstance(loaded, list)
+    assert "matplotlib" not in loaded
+    assert plotted == [0, ["matplotlib"]]

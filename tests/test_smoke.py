@@ -12,7 +12,7 @@ def test_the_demo_its_comparison_and_its_smoothing(
     command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "gvo-demo"
-    for n_frames in (2, 20):  # into its own folder again
+    for n_frames in (2, 12):  # into its own folder again
         monkeypatch.setattr("gvo.runs.demo.N_FRAMES", n_frames)
         assert command("demo", "--out", out).code == 0
     assert {"drive.mcap", "robot.mcap", "summary.json", "report.html", "trajectories.png"} <= {
@@ -24,4 +24,4 @@ def test_the_demo_its_comparison_and_its_smoothing(
     assert "smoothed" in answer.out
     assert command("smooth", estimates[0], "--out", tmp_path / "again").code == 0
     smoothed = gvo.read_trajectory(tmp_path / "again/smoothed.txt")
-    assert len(smoothed) == 20
+    assert len(smoothed) == 12

@@ -497,10 +497,9 @@ def test_recorded_poses_of_two_topics_are_compared_between_their_stamps(
     answer = command("compare", f"{path}#groundtruth", f"{path}#ORB-SLAM", "--json")
     assert (answer.code, answer.err) == (0, "")
     (entry,) = json.loads(answer.out)["estimates"]
-    messages = read_bag(path)
-    (true_ns, truth), (stamps_ns, estimate) = (
-        positions_of(messages[topic]) for topic in ("groundtruth", "ORB-SLAM")
-    )
+    topics = ("groundtruth", "ORB-SLAM")
+    messages = read_bag(path, topics)
+    (true_ns, truth), (stamps_ns, estimate) = (positions_of(messages[topic]) for topic in topics)
     after = np.clip(np.searchsorted(true_ns, stamps_ns), 1, len(true_ns) - 1)
     is_near = (true_ns[after] - true_ns[after - 1] <= 250_000_000) & (stamps_ns <= true_ns[-1])
     elapsed, known = ((ns - true_ns[0]) / 1e9 for ns in (stamps_ns[is_near], true_ns))
@@ -515,6 +514,7 @@ def positions_of(messages: list[tuple[int, Any]]) -> tuple[IntArray, FloatArray]
 
 
 @pytest.mark.recorded
+@pytest.mark.acceptance
 def test_the_body_of_euroc_has_the_errors_of_its_camera(
     command: Command, gvo_data: Path, tmp_path: Path
 ) -> None:

@@ -209,7 +209,11 @@ def test_errors_are_printed_where_the_page_cannot_be_written(
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["INT", "TERM"]
+    ("number", "code"),
+    [
+        pytest.param(signal.SIGINT, 130, id="INT"),
+        pytest.param(signal.SIGTERM, 143, id="TERM", marks=pytest.mark.acceptance),
+    ],
 )
 def test_a_film_that_is_broken_off_shows_all_frames_until_then(
     drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int

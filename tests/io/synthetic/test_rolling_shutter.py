@@ -106,9 +106,9 @@ def test_one_pose_for_all_rows_gives_the_image_of_one_pose(world: str) -> None:
 def test_each_row_is_that_of_an_image_taken_at_its_stamp(world: Any, sensor: Any) -> None:
     build, move = MOTIONS[world]
     recording = SyntheticRecording(
-        world, sensor, n_frames=12, noise=SensorNoise.none(), scale=0.5, seed=1, readout_ms=30.0
+        world, sensor, n_frames=12, noise=SensorNoise.none(), scale=0.25, readout_ms=30.0
     )
-    camera, scene = recording.info.camera, build(1)
+    camera, scene = recording.info.camera, build(0)
     loaded = [image.load() for image in list(recording.images())[-2:]]
     stamps_ns = recording.ground_truth().stamps_ns
     for row in (0, camera.height // 3, camera.height - 1):

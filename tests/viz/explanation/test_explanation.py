@@ -66,7 +66,10 @@ def assert_without_words(panels: np.ndarray[Any, Any], image: np.ndarray[Any, An
 
 @pytest.mark.parametrize(
     ("explain", "names"),
-    [(explained_descriptors, STEREO), (partial(explained, "rgbd", 2), RGBD)],
+    [
+        pytest.param(explained_descriptors, STEREO, marks=pytest.mark.acceptance),
+        (partial(explained, "rgbd", 2), RGBD),
+    ],
     ids=["descriptors", "tracks"],
 )
 def test_each_step_has_its_picture_in_order(
@@ -94,7 +97,10 @@ def test_a_first_frame_says_in_words_what_was_not_reached(tmp_path: Path) -> Non
     assert "Not reached: this is the first frame" in written[-1].read_text()
 
 
-def test_a_folder_that_is_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_folder_that_is_a_file_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gvo.viz.explanation.write.draw_pictures", lambda _: [])
     (tmp_path / "out").touch()
     with pytest.raises(ConfigurationError, match="cannot be written") as error:
         write_explanation(explained("stereo", 0), tmp_path / "out")
