@@ -29,8 +29,14 @@ def _parameter(
     gt: float | None = None,
     le: float | None = None,
 ) -> Any:  # noqa: ANN401 - pydantic types its own Field so
-    extra = {"unit": unit, "is_expert": is_expert}
-    return Field(default, ge=ge, gt=gt, le=le, description=meaning, json_schema_extra=extra)
+    return Field(
+        default,
+        ge=ge,
+        gt=gt,
+        le=le,
+        description=meaning,
+        json_schema_extra={"unit": unit, "is_expert": is_expert},
+    )
 
 
 # A parameter that matters to many.

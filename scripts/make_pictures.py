@@ -137,16 +137,21 @@ def corners(task: Task) -> Picture:
         config = gvo.load_configuration(settings=[f"klt.n_corners={n_corners}"])
         source = gvo.open_recording(task.bag, config=config)
         odometry, truth = Odometry(source.info.camera, config), source.ground_truth()
-        estimates = []
-        for frame in islice(gvo.frames(source, config), task.frame + 1):
-            if isinstance(frame, gvo.FaultyFrame) or truth is None:
-                raise RecordingError(f"{task.bag}: expected sound frames with a ground truth")
-            result = odometry.track(frame)
-            estimates += result.finished
+        frames = [
+            frame
+            for frame in islice(gvo.frames(source, config), task.frame + 1)
+            if not isinstance(frame, gvo.FaultyFrame)
+        ]
+        if truth is None or not frames:
+            raise RecordingError(f"{task.bag}: expected sound frames with a ground truth")
+        results = [odometry.track(frame) for frame in frames]
+        estimates = [estimate for result in results for estimate in result.finished]
         trajectory = gvo.Trajectory.of([*estimates, *odometry.finish()])
         ate_m = gvo.evaluate(truth, trajectory, name="smoothed").ate_m
-        text = f"klt.n_corners={n_corners}: {result.n_inliers} inliers, ATE {1e3 * ate_m:.1f} mm"
-        rows.append(with_inliers(frame, result, text))
+        text = (
+            f"klt.n_corners={n_corners}: {results[-1].n_inliers} inliers, ATE {1e3 * ate_m:.1f} mm"
+        )
+        rows.append(with_inliers(frames[-1], results[-1], text))
     return scaled(np.concatenate(rows), 860)
 
 

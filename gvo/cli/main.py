@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import os
 import sys
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 from typer.main import get_command
@@ -70,25 +69,9 @@ _command = partial(app.command, cls=Command)
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
-
-class _KeyframePolicy(StrEnum):
-    DISTANCE = "distance"
-    MANUAL = "manual"
-
-
-class _Layout(StrEnum):
-    BAG = "bag"
-    KITTI = "kitti"
-    EUROC = "euroc"
-    TUM = "tum"
-
-
-class _Align(StrEnum):
-    NONE = "none"
-    ORIGIN = "origin"
-    SE3 = "se3"
-    SIM3 = "sim3"
+_KeyframePolicy = Literal["distance", "manual"]
+_Layout = Literal["bag", "kitti", "euroc", "tum"]
+_Align = Literal["none", "origin", "se3", "sim3"]
 
 
 def _print_version(value: bool) -> None:
@@ -283,7 +266,7 @@ def smooth(
     ] = None,
     keyframes: Annotated[
         _KeyframePolicy, typer.Option(help="Which poses stay in the window.")
-    ] = _KeyframePolicy.DISTANCE,
+    ] = "distance",
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
@@ -312,7 +295,7 @@ def smooth(
             source,
             out,
             config=parameters,
-            keyframes=keyframes.value,
+            keyframes=keyframes,
             ground_truth=truth,
             force=force,
             on_progress=both(show, check),
@@ -350,7 +333,7 @@ def _smooth_lines(
             answer,
             out,
             config=config,
-            keyframes=keyframes.value,
+            keyframes=keyframes,
             ground_truth=ground_truth,
             force=force,
         )
@@ -366,7 +349,7 @@ def compare(
         ),
     ],
     estimates: Annotated[list[str], typer.Argument(help="Files of poses, or BAG#..., likewise.")],
-    align: Annotated[_Align, typer.Option(help="How the estimates are aligned.")] = _Align.SE3,
+    align: Annotated[_Align, typer.Option(help="How the estimates are aligned.")] = "se3",
     segments: Annotated[
         str | None,
         typer.Option(metavar="L,...", help="Segment lengths in m; 100,...,800 or 20,50."),
@@ -398,7 +381,7 @@ def compare(
             truth,
             trajectory,
             name=name,
-            align=align.value,
+            align=align,
             segments=lengths,
             segment_step=segment_step,
         )
@@ -411,12 +394,12 @@ def compare(
     if plot is not None:
         from gvo.viz.plots import plot_trajectories
 
-        plot_trajectories(plot, truth, trajectories, align=align.value)
+        plot_trajectories(plot, truth, trajectories, align=align)
     if report_file is not None or plots is not None:
         from gvo.viz.report import write_comparison_report
 
         write_comparison_report(
-            report_file, truth, trajectories, evaluations, align=align.value, plots=plots
+            report_file, truth, trajectories, evaluations, align=align, plots=plots
         )
 
 
@@ -453,7 +436,7 @@ def convert_(
         written = convert(
             source,
             target,
-            layout=None if layout is None else layout.value,
+            layout=layout,
             rectify=rectify,
             compress=png,
             config=settings,
@@ -507,7 +490,7 @@ def _run() -> Any:  # noqa: ANN401 - an exit code, or None
         return group(prog_name="gvo", standalone_mode=False)
     except _UsageError as error:
         refusal: Any = error
-        words = refusal.format_message().rstrip(".")
+        words = refusal.format_message().replace("Value error, ", "").rstrip(".")
         command = refusal.ctx.command_path if refusal.ctx else "gvo"
         message = f"{words[:1].lower()}{words[1:]}; see `{command} --help`"
         raise ConfigurationError(message) from error

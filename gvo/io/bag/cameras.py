@@ -168,10 +168,10 @@ def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
     by_camera_info : bool
         Compare the `CameraInfo`, the first of each file.
     """
-    own = [file.path.name for file in reader.loose_files if _is_of_run(file)]
-    if own:
-        return f"{own[0]} was written by a run"
     parts = [(file, _image_names(file)) for file in reader.loose_files]
+    for file, _ in parts:
+        if any(channel.name.startswith(_OF_RUN) for channel in file.counts):
+            return f"{file.path.name} was written by a run"
     parts = sorted([part for part in parts if part[1]], key=lambda part: part[0].start_time_ns)
     for (before, images), (after, others) in combinations(parts, 2):
         overlap_s = 1e-9 * (min(before.end_time_ns, after.end_time_ns) - after.start_time_ns)
@@ -185,10 +185,6 @@ def find_contradiction(reader: BagReader, *, by_camera_info: bool) -> str:
         if gap_s > _MAX_GAP_S:
             return f"{after.path.name} begins {gap_s:.3g} s after {before.path.name} ends"
     return _other_camera(reader, [file for file, _ in parts]) if by_camera_info else ""
-
-
-def _is_of_run(file: BagFile) -> bool:
-    return any(channel.name.startswith(_OF_RUN) for channel in file.counts)
 
 
 def _image_names(file: BagFile) -> set[str]:

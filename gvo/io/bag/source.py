@@ -256,14 +256,12 @@ class BagSource:
 
 def _describe_parts(paths: Sequence[Path], reader: BagReader, reason: str) -> str:
     """Say that files are not one recording, which they are, and what to type."""
-    files = [file.path for file in reader.loose_files]
-    listed = [str(path) for path in files[:_N_LISTED]]
-    if len(files) > len(listed):
-        listed.append(f"{len(files) - len(listed)} more")
-    each = " ".join(map(str, paths[:_N_LISTED]))
+    names = [str(file.path) for file in reader.loose_files]
+    listed = ", ".join(names[:_N_LISTED]) + (", ..." if len(names) > _N_LISTED else "")
+    given = " ".join(map(str, paths[:_N_LISTED]))
     return (
-        f"{len(files)} bags are not one recording, {reason}: {', '.join(listed)}; give one of "
-        f"them, or those that belong together; `gvo batch {each} --out DIR` runs each"
+        f"{len(names)} bags are not one recording, {reason}: {listed}; give one of them, or those "
+        f"that belong together; `gvo batch {given} --out DIR` runs each"
     )
 
 
