@@ -44,8 +44,12 @@ def commands() -> list[tuple[str, list[str]]]:
         if page == "README.md":  # typed from its first line to its last, see below
             continue
         lines = [line for line in text.splitlines() if line.startswith("gvo ")]
-        # A word in capitals stands for a file of the reader's own.
-        lines = [line for line in lines if not any(word.isupper() for word in shlex.split(line))]
+        # A word in capitals, or a variable of the shell, stands for a file of the reader's own.
+        lines = [
+            line
+            for line in lines
+            if not any(word.isupper() or word.startswith("$") for word in shlex.split(line))
+        ]
         if not any({*lines} <= {*others} for _, others in found):
             found = [each for each in found if not {*each[1]} <= {*lines}] + [(page, lines)]
     return found

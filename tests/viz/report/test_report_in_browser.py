@@ -80,7 +80,8 @@ def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: 
 def test_no_text_of_a_plot_lies_on_another_or_is_cut_off(browser: Browser, report: Path) -> None:
     browser.open_file(report)
     drawings = _drawings(browser)
-    assert len(drawings) >= SECTIONS - 1
+    # The paths in space are a canvas; a run of a second says nothing of its covariances.
+    assert len(drawings) >= SECTIONS - 2
     for svg in drawings:
         name = svg.get_attribute("aria-label")
         assert overlapping_texts(browser, svg) == [], name
