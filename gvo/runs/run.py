@@ -37,7 +37,7 @@ from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
-from gvo.trajectory.formats import read_covariances, read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, Progress
 
@@ -215,11 +215,9 @@ def _measure(
     positions = read_trajectory(folder.path / "smoothed.txt")
     found: list[Consistency | None] = []
     if isinstance(compared, TruthComparison):
-        raw = read_trajectory(folder.path / "raw.txt")
-        _, covariances = read_covariances(folder.path / "raw_covariance.csv")
-        chain = motions_of_chain(replace(raw, covariances=covariances))
         window = motions_of_window(loop.edges, name="window over 1 s")
-        found = [consistency(compared.truth.trajectory, each) for each in (window, *chain)]
+        motions = [window, *motions_of_chain(compared.estimates["raw"])]
+        found = [consistency(compared.truth.trajectory, each) for each in motions]
     return {
         "path_m": float(positions.distances()[-1]),
         "extent_m": float(np.linalg.norm(np.ptp(positions.positions, axis=0))),

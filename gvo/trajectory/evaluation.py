@@ -496,7 +496,14 @@ def chi2_bound(share: float, n_dof: int = N_DOF) -> float:
 
 def format_evaluations(evaluations: Sequence[Evaluation]) -> str:
     """Return a table of text with a row per evaluation; "-" for missing values."""
-    return format_table(_HEADER, [_cells(evaluation) for evaluation in evaluations])
+    return format_table(*evaluation_table(evaluations))
+
+
+def evaluation_table(
+    evaluations: Sequence[Evaluation],
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the header and the rows of that table, as text."""
+    return _HEADER, [_cells(evaluation) for evaluation in evaluations]
 
 
 def evaluations_json(

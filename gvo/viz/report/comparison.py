@@ -5,28 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gvo._text import number_text
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import Evaluation
+from gvo.trajectory.evaluation import Evaluation, evaluation_table
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.report.errors import drift_plot, error_plots
 from gvo.viz.report.measures import compare
 from gvo.viz.report.page import facts_html, plots_html, table_html, write_page
 from gvo.viz.report.paths import World, lines_of, path_plots
 from gvo.viz.report.sheets import settings, write_plots
-
-_HEADER = (
-    "estimate",
-    "poses",
-    "of reference [%]",
-    "ATE RMSE [m]",
-    "ATE max [m]",
-    "RPE [m]",
-    "RPE [deg]",
-    "t_err [%]",
-    "r_err [deg/100 m]",
-    "path ratio",
-)
 
 
 def write_comparison_report(
@@ -86,7 +72,7 @@ def _head(
     names: str, truth: Trajectory, evaluations: Sequence[Evaluation], align: AlignMode
 ) -> list[str]:
     facts = {"Estimates": names, "Poses of the reference": str(len(truth)), "Alignment": align}
-    table = table_html(_HEADER, map(_row, evaluations))
+    table = table_html(*evaluation_table(evaluations))
     return ["<h1>Comparison of trajectories</h1>", facts_html(facts), table]
 
 
@@ -95,17 +81,3 @@ def truth_around(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
     first_ns = min(int(part.stamps_ns[0]) for part in parts)
     last_ns = max(int(part.stamps_ns[-1]) for part in parts)
     return truth.select((truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns))
-
-
-def _row(evaluation: Evaluation) -> list[str]:
-    numbers = (
-        100.0 * evaluation.reference_share,
-        evaluation.ate_m,
-        evaluation.ate_max_m,
-        evaluation.rpe_m,
-        evaluation.rpe_deg,
-        evaluation.t_pct,
-        evaluation.r_deg_per_100m,
-        evaluation.path_ratio,
-    )
-    return [evaluation.name, str(evaluation.n), *map(number_text, numbers)]
