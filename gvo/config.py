@@ -264,7 +264,7 @@ class WindowConfig(Section):
     )
     link_gain: float = _parameter(
         2.0,
-        "minimum number of steps since a keyframe was linked, times its share in view, to link it",
+        "minimum number of steps since a keyframe was asked, times its share in view, to link it",
         gt=0,
     )
     keyframe_overlap: float = _parameter(

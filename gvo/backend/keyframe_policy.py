@@ -57,7 +57,7 @@ def choose_links(
     scores: Mapping[_Id, float],
     config: WindowConfig,
     *,
-    n_unlinked: Mapping[_Id, int],
+    n_unasked: Mapping[_Id, int],
     exclude: Hashable = None,
 ) -> tuple[list[_Id], list[_Id]]:
     """Choose the keyframes to register the current frame against.
@@ -65,6 +65,8 @@ def choose_links(
     A link adds what has become uncertain since the last one: the errors of steps accumulate with
     their number, and what is seen of it grows with the overlap. The product has to be at least
     `link_gain`; the largest come first. What is measured again from the same place adds nothing.
+    One that could not be registered waits its turn like the others: else it would be asked with
+    every frame, and in vain.
 
     Parameters
     ----------
@@ -72,8 +74,8 @@ def choose_links(
         Oldest first.
     config : WindowConfig
         `n_links`, of which one goes to the predecessor, `min_overlap` and `link_gain`.
-    n_unlinked : mapping of frame to int
-        Steps since each was linked last, or since it itself; 0 where the view has not changed
+    n_unasked : mapping of frame to int
+        Steps since each was asked last, or since it itself; 0 where the view has not changed
         since.
     exclude : hashable
         The predecessor.
@@ -88,7 +90,7 @@ def choose_links(
     usable = [
         frame for frame, score in scores.items() if score >= config.min_overlap and frame != exclude
     ]
-    gains = {frame: n_unlinked[frame] * scores[frame] for frame in usable}
+    gains = {frame: n_unasked[frame] * scores[frame] for frame in usable}
     telling = [frame for frame in usable if gains[frame] >= config.link_gain]
     chosen = sorted(telling, key=lambda frame: -gains[frame])[:n]
     rest = [frame for frame in usable if frame not in chosen]

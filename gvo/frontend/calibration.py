@@ -66,8 +66,6 @@ _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
 # Innovations are clipped to so many sigmas.
 _MAX_SURPRISE = 3.0
-# A step is registered again where its own velocity moves what a row shows by more, pixels.
-_MIN_CHANGE_PX = 0.05
 # Moved to the middle of the exposure, points must stay in front of the camera.
 _MIN_DEPTH_M = 0.05
 
@@ -462,25 +460,24 @@ class CalibratedCamera:
             As of `register_correspondences`.
         is_step : bool
             The result tells the velocities of both frames. Where these move what rows show, it is
-            registered once more.
+            registered twice: first as predicted, then with its own.
 
         Returns
         -------
         RelativePose or Failure
         """
-        corrected = self._correspondences(measured)
+        velocities = self._offsets.velocities
+        if is_step and self._offsets.readout_s != 0.0:
+            # What it tells of the constants is not asked for.
+            result = self._register(self._corrected(measured), measured, config, prior)
+            if isinstance(result, Failure):
+                return result
+            velocities.expect(*measured.frames, result.T_reference_current)
+        corrected = self._with_sensitivities(self._corrected(measured), measured)
         result = self._register(corrected, measured, config, prior)
         if isinstance(result, Failure):
             return result
-        if not is_step:
-            return check_rows(result, self._camera)
-        velocities = self._offsets.velocities
-        velocities.expect(*measured.frames, result.T_reference_current)
-        again = self._correspondences(measured)
-        if _largest_change(corrected, again) >= _MIN_CHANGE_PX:
-            result = self._register(again, measured, config, prior)
-            if isinstance(result, Failure):
-                return result
+        if is_step:
             velocities.expect(*measured.frames, result.T_reference_current)
         return check_rows(result, self._camera)
 
@@ -514,12 +511,16 @@ class CalibratedCamera:
             pixels_current=second_pixels,
         )
 
-    def _correspondences(self, measured: Measurements) -> Correspondences:
+    def _corrected(self, measured: Measurements) -> Correspondences:
         reference, current = (
             self.correct(*each) for each in zip(measured.frames, measured.uvd, strict=True)
         )
         note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
-        corrected = Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
+        return Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
+
+    def _with_sensitivities(
+        self, corrected: Correspondences, measured: Measurements
+    ) -> Correspondences:
         sensitivities = {
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
@@ -545,9 +546,3 @@ class CalibratedCamera:
             for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
         ]
         return np.stack(rates)
-
-
-def _largest_change(former: Correspondences, latter: Correspondences) -> float:
-    """Return by how many pixels corrected measurements differ at most."""
-    pairs = (former.source_uvd, latter.source_uvd), (former.target_uvd, latter.target_uvd)
-    return max(float(np.abs(a - b).max(initial=0.0)) for a, b in pairs)

@@ -258,8 +258,9 @@ def _is_simultaneous(frame: RgbdFrame) -> bool:
 
 # Disagreements that are remembered, and those needed to judge.
 _N_REMEMBERED, _N_NEEDED = 40, 10
-# Frames left out between two samples, while links are not judged yet and later.
-_N_SKIPPED_FIRST, _N_SKIPPED = 4, 20
+# Frames from one sample to the next: where depth is believed, while links are not judged yet, and
+# where colour agrees.
+_EVERY, _EVERY_FIRST, _EVERY_AGREEING = 3, 5, 21
 # Median squared disagreement, relative to that of normal errors, at which depth is believed, and
 # below which it no longer is.
 _CONTRADICTS, _AGREES = 16.0, 8.0
@@ -273,7 +274,7 @@ class DepthTrust:
     Motions measured twice, by colour and by depth, differ by as much as the two covariances say.
     If they differ by more over the last frames, one of the two is wrong in a way of its own: then
     those of depth are worth a measurement, with their covariance scaled to the difference, as if
-    depth alone was to blame.
+    both were to blame by as many of their sigmas.
 
     Parameters
     ----------
@@ -284,7 +285,7 @@ class DepthTrust:
         self.mode = mode
         self._is_believed = False
         self._n_unmeasured = 0
-        self._combined, self._alone = _Squares(), _Squares()
+        self._squares: deque[float] = deque(maxlen=_N_REMEMBERED)
 
     @property
     def is_on(self) -> bool:
@@ -294,15 +295,17 @@ class DepthTrust:
     @property
     def disagreement(self) -> float:
         """Squared disagreement, 1 for normal errors; 0 without enough measurements."""
-        return self._combined.level or 0.0
+        squares = self._squares
+        return float(np.median(squares)) / _MEDIAN if len(squares) >= _N_NEEDED else 0.0
 
     def is_due(self) -> bool:
         """Tell, once for each frame, whether its depth is to be aligned."""
         if self.mode == "never":
             return False
         self._n_unmeasured += 1
-        n_skipped = _N_SKIPPED_FIRST if self._combined.level is None else _N_SKIPPED
-        is_due = self.is_on or self._n_unmeasured > n_skipped
+        is_judged = len(self._squares) >= _N_NEEDED
+        every = _EVERY if self.is_on else _EVERY_AGREEING if is_judged else _EVERY_FIRST
+        is_due = self._n_unmeasured >= every
         if is_due:
             self._n_unmeasured = 0
         return is_due
@@ -310,27 +313,12 @@ class DepthTrust:
     def note(self, colour: RelativePose, depth: RelativePose) -> None:
         """Take a motion from a keyframe that was measured by both."""
         difference = se3.log(se3.invert(colour.T_reference_current) @ depth.T_reference_current)
-        self._alone.add(difference, depth.covariance)
-        self._combined.add(difference, colour.covariance + depth.covariance)
+        square = se3.mahalanobis(difference, colour.covariance + depth.covariance)
+        self._squares.append(float(square))
         self._is_believed = self.disagreement > (_AGREES if self._is_believed else _CONTRADICTS)
 
     def widen(self, covariance: FloatArray) -> FloatArray | None:
         """Return the covariance of an edge by depth; None where there is to be none, or not yet."""
-        factor = self._alone.level
-        return None if not self.is_on or factor is None else max(factor, 1.0) * covariance
-
-
-class _Squares:
-    """The last squared lengths of differences, in sigmas."""
-
-    def __init__(self) -> None:
-        self._values: deque[float] = deque(maxlen=_N_REMEMBERED)
-
-    def add(self, difference: FloatArray, covariance: FloatArray) -> None:
-        self._values.append(float(se3.mahalanobis(difference, covariance)))
-
-    @property
-    def level(self) -> float | None:
-        """Their median, relative to that of normal errors; None without enough."""
-        values = self._values
-        return float(np.median(values)) / _MEDIAN if len(values) >= _N_NEEDED else None
+        if not self.is_on or len(self._squares) < _N_NEEDED:
+            return None
+        return max(self.disagreement, 1.0) * covariance

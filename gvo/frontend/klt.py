@@ -47,8 +47,9 @@ _N_TRACK_STEPS = 4
 _N_ALIGN_STEPS = 3
 _N_LINK_STEPS = 4
 _MAX_ALIGN_PX = 2.0
-# Share of the points in view that an alignment from the prediction has to confirm.
-_MIN_SHARE_ALIGNED = 0.2
+# Share of the points in view that an alignment from the prediction has to confirm, times the share
+# of those that came to rest.
+_MIN_SHARE_ALIGNED = 0.1
 # Number of frames whose descriptors are cached.
 _N_DESCRIBED = 3
 # How tracks are found: over more levels of the pyramid; near the predicted pixels; by alignment
@@ -187,18 +188,19 @@ class KltFrontend:
     def _register_keyframe(
         self, prior: MotionPrior, reference: KltObservations, current: KltObservations
     ) -> RelativePose | Failure:
-        """Register by alignment alone, and by tracks too where that finds few points in view.
+        """Register by alignment alone, and by tracks too where that confirms few points in view.
 
         Patches that are aligned where they were expected cannot tell that the prediction is far
-        off.
+        off: then few come to rest, or they disagree.
         """
         aligned = self._register_from(prior, reference, current, "aligned", is_step=False)
-        is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(reference)
-        if not is_sure:
-            _, in_view = self._predict(prior.T_predicted, reference, current)
-            is_sure = aligned.n_inliers >= _MIN_SHARE_ALIGNED * len(in_view)
-        if isinstance(aligned, Contradiction) or (isinstance(aligned, RelativePose) and is_sure):
+        if isinstance(aligned, Contradiction):
             return aligned
+        if isinstance(aligned, RelativePose):
+            _, in_view = self._predict(prior.T_predicted, reference, current)
+            n_sure = aligned.n_inliers**2 / aligned.n_matches
+            if n_sure >= _MIN_SHARE_ALIGNED * len(in_view):
+                return aligned
         tracked = self._register_from(prior, reference, current, "near", is_step=False)
         if isinstance(aligned, Failure):
             return tracked

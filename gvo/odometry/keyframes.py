@@ -63,8 +63,8 @@ class Keyframes(Generic[ObservationsT]):
         self._config = config
         self._kept: dict[int, _Keyframe[ObservationsT]] = {}
         self._attempts: dict[int, _Attempt] = {}
-        # Numbers of steps at which keyframes were linked last, and in view last.
-        self._linked_at: dict[int, int] = {}
+        # Numbers of steps at which keyframes were asked for a link last, and in view last.
+        self._asked_at: dict[int, int] = {}
         self._seen_at: dict[int, int] = {}
 
     @property
@@ -80,10 +80,10 @@ class Keyframes(Generic[ObservationsT]):
         """Return the number of kept frames."""
         return len(self._kept)
 
-    def n_unlinked(
+    def n_unasked(
         self, T_frame_keyframes: Mapping[int, FloatArray], n_steps: int
     ) -> dict[int, int]:
-        """Return the steps since keyframes were linked, or kept; 0 where the view is the same.
+        """Return the steps since keyframes were asked, or kept; 0 where the view is the same.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class Keyframes(Generic[ObservationsT]):
             Of the current frame, since the first one.
         """
         return {
-            ns: n_steps - self._linked_at[ns] if self._is_changed(ns, T) else 0
+            ns: n_steps - self._asked_at[ns] if self._is_changed(ns, T) else 0
             for ns, T in T_frame_keyframes.items()
         }
 
@@ -103,8 +103,7 @@ class Keyframes(Generic[ObservationsT]):
         """Remember from where a keyframe was registered, or could not be."""
         attempt = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
         self._attempts[stamp_ns] = attempt
-        if is_linked:
-            self._linked_at[stamp_ns] = n_steps
+        self._asked_at[stamp_ns] = n_steps
 
     def registrable(self, scores: Mapping[int, float]) -> dict[int, float]:
         """Return the scores without keyframes whose last registration failed."""
@@ -149,16 +148,16 @@ class Keyframes(Generic[ObservationsT]):
             observations=observations,
             points_cam=None if points is None else _sample_points(points),
         )
-        self._linked_at[observations.stamp_ns] = self._seen_at[observations.stamp_ns] = n_steps
+        self._asked_at[observations.stamp_ns] = self._seen_at[observations.stamp_ns] = n_steps
 
     def replace(self, observations: ObservationsT) -> None:
         """Keep other observations of a frame that is kept already."""
-        self.add(observations, n_steps=self._linked_at[observations.stamp_ns])
+        self.add(observations, n_steps=self._asked_at[observations.stamp_ns])
 
     def drop(self, stamp_ns: int) -> None:
         """Forget a kept frame."""
         del self._kept[stamp_ns]
-        del self._linked_at[stamp_ns], self._seen_at[stamp_ns]
+        del self._asked_at[stamp_ns], self._seen_at[stamp_ns]
         self._attempts.pop(stamp_ns, None)
 
     def scores(self, T_current_keyframe: Mapping[int, FloatArray]) -> dict[int, float]:
@@ -208,7 +207,7 @@ def link_keyframes(
     step: RawStep,
     config: WindowConfig,
     *,
-    n_unlinked: Mapping[int, int],
+    n_unasked: Mapping[int, int],
 ) -> list[Edge]:
     """Register a frame against the keyframes that add information to its steps.
 
@@ -227,10 +226,10 @@ def link_keyframes(
     step : RawStep
         Of the frame.
     config : WindowConfig
-    n_unlinked : mapping of int to int
-        See `Keyframes.n_unlinked`.
+    n_unasked : mapping of int to int
+        See `Keyframes.n_unasked`.
     """
-    chosen, spare = choose_links(scores, config, n_unlinked=n_unlinked, exclude=step.reference_ns)
+    chosen, spare = choose_links(scores, config, n_unasked=n_unasked, exclude=step.reference_ns)
     if not chosen and step.is_registered and step.is_steady:
         spare = []
     links: list[Edge] = []

@@ -277,9 +277,9 @@ class Odometry:
         measure = partial(self._register_keyframe, observations, step)
         config = self._config.window
         in_view = {ns: T for ns, T in T_frame_keyframes.items() if scores[ns] >= config.min_overlap}
-        n_unlinked = self._keyframes.n_unlinked(in_view, step.n_steps)
+        n_unasked = self._keyframes.n_unasked(in_view, step.n_steps)
         links = link_keyframes(
-            measure, scores, T_frame_keyframes, step, config, n_unlinked=n_unlinked
+            measure, scores, T_frame_keyframes, step, config, n_unasked=n_unasked
         )
         offered += [("keyframe", edge) for edge in links]
         still = zero_motion_edge(step, config)

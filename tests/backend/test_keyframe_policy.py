@@ -84,7 +84,7 @@ def choose(
     scores: Mapping[Any, float], n_steps: int = 100, *, exclude: Hashable = None, **changes: Any
 ) -> tuple[list[Any], list[Any]]:
     unlinked = dict.fromkeys(scores, n_steps)
-    return choose_links(scores, configure(**changes), n_unlinked=unlinked, exclude=exclude)
+    return choose_links(scores, configure(**changes), n_unasked=unlinked, exclude=exclude)
 
 
 def test_of_keyframes_linked_as_long_ago_those_most_in_view_are_linked() -> None:
@@ -106,12 +106,12 @@ def test_links_go_where_many_unlinked_steps_or_many_points_lie_between() -> None
         (2.6, ([10], [30])),
         (3.3, ([], [30, 20])),
     ):
-        assert choose_links(scores, configure(link_gain=gain), n_unlinked=unlinked) == expected
+        assert choose_links(scores, configure(link_gain=gain), n_unasked=unlinked) == expected
 
 
 def test_what_is_seen_from_the_same_place_again_is_spare() -> None:
     scores = {10: 0.99, 20: 0.5}
-    chosen = choose_links(scores, configure(link_gain=0.1), n_unlinked={10: 0, 20: 1})
+    chosen = choose_links(scores, configure(link_gain=0.1), n_unasked={10: 0, 20: 1})
     assert chosen == ([20], [10])
 
 

@@ -97,14 +97,14 @@ def test_kept_frames_are_known_by_stamp_in_their_order() -> None:
         kept[20]
 
 
-def test_steps_are_counted_from_the_last_link() -> None:
+def test_steps_are_counted_from_the_last_attempt_whether_it_gave_a_link_or_not() -> None:
     kept = keyframes()
     kept.add(observe(7, wall()), n_steps=3)
-    assert kept.n_unlinked({7: shifted(dx=0.2)}, 5) == {7: 2}
+    assert kept.n_unasked({7: shifted(dx=0.2)}, 5) == {7: 2}
     kept.note_attempt(7, shifted(dx=0.2), 5, is_linked=True)
-    assert kept.n_unlinked({7: shifted(dx=0.4)}, 9) == {7: 4}
+    assert kept.n_unasked({7: shifted(dx=0.4)}, 9) == {7: 4}
     kept.note_attempt(7, shifted(dx=0.4), 9, is_linked=False)
-    assert kept.n_unlinked({7: shifted(dx=0.6)}, 10) == {7: 5}
+    assert kept.n_unasked({7: shifted(dx=0.6)}, 10) == {7: 1}
 
 
 @pytest.mark.parametrize("is_linked", [True, False])
@@ -114,7 +114,7 @@ def test_the_same_view_adds_nothing(shift_px: float, is_new: bool, is_linked: bo
     kept.add(observe(7, wall()), n_steps=0)
     kept.note_attempt(7, shifted(dx=0.2), 2, is_linked=is_linked)
     there = shifted(dx=0.2 + shift_px * 4.0 / CAMERA.fx)
-    assert (kept.n_unlinked({7: there}, 8)[7] > 0) == is_new
+    assert (kept.n_unasked({7: there}, 8)[7] > 0) == is_new
 
 
 def test_what_could_not_be_registered_does_not_stand_for_its_view() -> None:

@@ -14,7 +14,7 @@ from gvo.types import Edge, Estimate, FloatArray, RelativePose, Status
 CONFIG = WindowConfig(n_links=3, min_overlap=0.3, link_gain=2.5, gate=10.0)
 # The first is chosen, the other is spare: two steps ago.
 SCORES = {10: 0.4, 80: 0.5}
-N_UNLINKED = {10: 9, 80: 2}
+N_UNASKED = {10: 9, 80: 2}
 SIGMA = 0.01
 
 
@@ -66,7 +66,7 @@ class Registrations:
 def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
     poses = {ns: forward(-0.1 * (100 - ns)) for ns in SCORES}
     config = CONFIG.model_copy(update=changes)
-    links = link_keyframes(measure, SCORES, poses, step, config, n_unlinked=N_UNLINKED)
+    links = link_keyframes(measure, SCORES, poses, step, config, n_unasked=N_UNASKED)
     return [link.reference_id for link in links]
 
 
@@ -103,7 +103,7 @@ def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
     def measure(stamp_ns: int, prior: FloatArray) -> None:
         priors[stamp_ns] = prior
 
-    link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, n_unlinked={10: 9})
+    link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, n_unasked={10: 9})
     np.testing.assert_allclose(priors[10], forward(9.0), atol=1e-12)
 
 
