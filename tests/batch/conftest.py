@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,26 @@ GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 _PATIENCE_S = 60.0
 
 
-def render(seed: int) -> SyntheticRecording:
-    return SyntheticRecording("handheld", "stereo", n_frames=N_FRAMES, scale=0.25, seed=seed)
+class Walk:
+    """Some frames of a walk in a rendered room, those of another number elsewhere."""
+
+    def __init__(self, number: int) -> None:
+        self._first, n_frames = number * N_FRAMES, (number + 1) * N_FRAMES
+        self._source = SyntheticRecording("handheld", "stereo", n_frames=n_frames, scale=0.25)
+        self.info: RecordingInfo = replace(self._source.info, n_images=N_FRAMES)
+
+    def images(self) -> Iterator[StampedImage]:
+        return islice(self._source.images(), 2 * self._first, None)
+
+    def ground_truth(self) -> Trajectory:
+        return self._source.ground_truth().select(slice(self._first, None))
 
 
 class ThereAndBack:
     """A rendered recording, walked to and fro again and again."""
 
     def __init__(self) -> None:
-        source = render(9)
+        source = Walk(0)
         images = list(source.images())
         self._pairs = [images[n : n + 2] for n in range(0, len(images), 2)]
         self._pixels = {id(image): image.load() for image in images}
@@ -70,8 +81,8 @@ class ThereAndBack:
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with three bags: walk0, walk1, walk2."""
     folder = tmp_path_factory.mktemp("bags")
-    for seed in range(3):
-        gvo.convert(render(seed), folder / f"walk{seed}.mcap")
+    for number in range(3):
+        gvo.convert(Walk(number), folder / f"walk{number}.mcap")
     return folder
 
 

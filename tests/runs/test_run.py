@@ -162,7 +162,7 @@ def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, thre
 
 
 def test_a_faulty_frame_is_skipped_and_counted(room: SyntheticRecording, tmp_path: Path) -> None:
-    result = gvo.run_recording(FaultySource(room, faulty={3, 4}), tmp_path)
+    result = gvo.run_recording(FaultySource(room, faulty={3, 4}), tmp_path, outputs=NO_REPORT)
     assert not result.is_complete
     assert result.summary["status_counts"]["skipped"] == 2
     assert len(gvo.read_trajectory(tmp_path / "raw.txt")) == 10
@@ -417,7 +417,12 @@ def test_a_run_that_starts_at_the_truth_lies_on_it_without_alignment(
     base_frame = find_base_frame(source, "base_link")
     truth = read_truth(source, "tf:map:base_link", base_frame=base_frame)
     result = gvo.run_recording(
-        source, tmp_path / "out", ground_truth=truth, base_frame=base_frame, starts_at_truth=True
+        source,
+        tmp_path / "out",
+        outputs=NO_REPORT,
+        ground_truth=truth,
+        base_frame=base_frame,
+        starts_at_truth=True,
     )
     exact = T_map_world @ true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
     for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):

@@ -272,6 +272,7 @@ def test_kitti_00_fused_lies_between_its_inputs_or_below(gvo_data: Path, tmp_pat
 
 
 @pytest.mark.recorded
+@pytest.mark.acceptance
 def test_recorded_odometry_and_fixes_are_fused(gvo_data: Path, tmp_path: Path) -> None:
     path = gvo_data / "bags/good/nav2_turtlebot.mcap"
     source = open_edges([path], topics=["/odom"])

@@ -32,7 +32,7 @@ Result = RelativePose | Failure
 
 @cache
 def recording(sensor: Sensor) -> gvo.SyntheticRecording:
-    return gvo.SyntheticRecording("handheld", sensor, n_frames=3, scale=0.4)
+    return gvo.SyntheticRecording("handheld", sensor, n_frames=3, scale=0.3)
 
 
 @cache

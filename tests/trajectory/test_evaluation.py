@@ -326,6 +326,7 @@ def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.recorded
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     ("reference", "estimate", "kind"),
     [

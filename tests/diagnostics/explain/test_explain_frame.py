@@ -62,7 +62,7 @@ def configuration(kind: str) -> Config:
 
 @cache
 def recording(sensor: Sensor) -> SyntheticRecording:
-    return SyntheticRecording("handheld", sensor, n_frames=LAST + 1, scale=0.5)
+    return SyntheticRecording("handheld", sensor, n_frames=LAST + 1, scale=0.4)
 
 
 def run(source: Source, config: Config) -> list[FrameResult]:
