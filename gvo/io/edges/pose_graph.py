@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 
 from gvo._text import text_lines
-from gvo.errors import RecordingError, TrajectoryError
+from gvo.errors import OutputError, TrajectoryError
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
 from gvo.trajectory.g2o import (
     MEASUREMENT_TAGS,
@@ -347,18 +348,23 @@ class GraphFile:
 
     Raises
     ------
-    RecordingError
+    OutputError
         When the file cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / GRAPH
-        try:
+        with self._refused_on_error():
             folder.mkdir(parents=True, exist_ok=True)
             self._path.unlink(missing_ok=True)
             self._file = self._part.open("w", encoding="utf-8", newline="\n")
+
+    @contextmanager
+    def _refused_on_error(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be written: {error.strerror}") from error
+            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from error
 
     @property
     def _part(self) -> Path:
@@ -366,9 +372,10 @@ class GraphFile:
 
     def add(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses, named by whole numbers, in any order."""
-        for estimate in estimates:
-            vertex = format_vertex(str(estimate.frame_id), estimate.T_world_frame)
-            self._file.write(f"{estimate.stamp_ns} {vertex}\n")
+        with self._refused_on_error():
+            for estimate in estimates:
+                vertex = format_vertex(str(estimate.frame_id), estimate.T_world_frame)
+                self._file.write(f"{estimate.stamp_ns} {vertex}\n")
 
     def close(self, measurement_lines: Iterable[str]) -> None:
         """Sort the vertices by their stamps, and add the measurements.
@@ -378,7 +385,7 @@ class GraphFile:
         measurement_lines : iterable of str
             Without their line ends.
         """
-        try:
+        with self._refused_on_error():
             self._file.close()
             vertices = self._part.read_text(encoding="utf-8").splitlines(keepends=True)
             vertices.sort(key=lambda line: int(line.split(" ", 1)[0]))
@@ -386,5 +393,3 @@ class GraphFile:
                 file.writelines(line.split(" ", 1)[1] for line in vertices)
                 file.writelines(f"{line}\n" for line in measurement_lines)
             self._part.unlink()
-        except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be written: {error.strerror}") from error
