@@ -197,9 +197,11 @@ class KltFrontend:
         if isinstance(aligned, Contradiction):
             return aligned
         if isinstance(aligned, RelativePose):
+            n_confirmed = aligned.n_inliers**2 / (_MIN_SHARE_ALIGNED * aligned.n_matches)
+            if n_confirmed >= len(reference):
+                return aligned
             _, in_view = self._predict(prior.T_predicted, reference, current)
-            n_sure = aligned.n_inliers**2 / aligned.n_matches
-            if n_sure >= _MIN_SHARE_ALIGNED * len(in_view):
+            if n_confirmed >= len(in_view):
                 return aligned
         tracked = self._register_from(prior, reference, current, "near", is_step=False)
         if isinstance(aligned, Failure):

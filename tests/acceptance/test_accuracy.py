@@ -45,7 +45,7 @@ LIMITS = {
     EUROC: Limits(raw_ate_m=0.0046, smoothed_ate_m=0.0042),
     XYZ: Limits(raw_ate_m=0.0098, smoothed_ate_m=0.0050),
     RPY: Limits(raw_ate_m=0.030, smoothed_ate_m=0.0080),
-    ROOM: Limits(raw_ate_m=0.036, smoothed_ate_m=0.026, gain=0.95),
+    ROOM: Limits(raw_ate_m=0.036, smoothed_ate_m=0.024, gain=0.85),
     DRIVE: Limits(raw_ate_m=0.0023, smoothed_ate_m=0.0021, t_pct=0.02, path_error=0.0002),
     HAND: Limits(raw_ate_m=0.0019, smoothed_ate_m=0.00042, gain=0.5),
     HAND_RGBD: Limits(raw_ate_m=0.0022, smoothed_ate_m=0.00046, gain=0.5),
