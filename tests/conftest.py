@@ -1,6 +1,7 @@
 """Fixtures that several test modules share."""
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +29,20 @@ class Answer(NamedTuple):
 
 
 Command = Callable[..., Answer]
+GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+"""The command in a process of its own."""
+TABLES = (
+    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
+    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+    "frames.csv",
+    "edges.csv",
+)
+"""What two runs over the same recording have in common to the bit."""
+
+
+def is_one_line(text: str) -> bool:
+    """Tell whether a command said in one line what is wrong, and nothing else."""
+    return text.startswith("gvo: error: ") and text.count("\n") == 1
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,13 @@
 """Recorded data: the same bytes from every container, and published errors."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import gvo
+from tests.conftest import Command
 
-Command = Callable[..., Any]
 KITTI = "kitti_06_start"
 XYZ = "rgbd_dataset_freiburg1_xyz_start"
 EUROC = "euroc_mh01_start"

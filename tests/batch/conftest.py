@@ -22,18 +22,12 @@ from gvo.batch import BatchOptions
 from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
+from tests.conftest import GVO, TABLES
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.
 N_LONG = 250
 NO_REPORT = BatchOptions(report=False)
-TABLES = (
-    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
-    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
-    "frames.csv",
-    "edges.csv",
-)
-GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 _PATIENCE_S = 60.0
 
 

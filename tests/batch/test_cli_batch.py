@@ -17,7 +17,6 @@ from gvo.batch import BatchProgress
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import (
-    GVO,
     assert_same_run,
     copy_of,
     is_complete,
@@ -25,7 +24,7 @@ from tests.batch.conftest import (
     state_of,
     wait_until,
 )
-from tests.conftest import Answer, Command
+from tests.conftest import GVO, Answer, Command, is_one_line
 
 Batch = Callable[..., Answer]
 
@@ -39,10 +38,6 @@ def batch(near: Client, command: Command) -> Batch:
         return command("batch", *arguments, "--scheduler", address, "--no-report")
 
     return run
-
-
-def is_one_line(text: str) -> bool:
-    return text.startswith("gvo: error: ") and text.count("\n") == 1
 
 
 def test_all_complete_is_0(batch: Batch, bags: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from distributed import Client
 import gvo
 from gvo.batch import BatchProgress, ClusterError, run
 from tests.batch.conftest import (
-    GVO,
     NO_REPORT,
     Cluster,
     assert_same_run,
@@ -21,7 +20,7 @@ from tests.batch.conftest import (
     state_of,
     wait_until,
 )
-from tests.conftest import Command
+from tests.conftest import GVO, Command
 
 NOWHERE = "tcp://127.0.0.1:1"
 

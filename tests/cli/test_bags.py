@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
+from tests.conftest import GVO, Command, is_one_line
 from tests.io.pose_bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
@@ -41,13 +41,6 @@ from tests.rendered_walk import (
     true_poses,
     truth_stamps,
 )
-
-Command = Callable[..., Any]
-GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
-
-
-def is_one_line(text: str) -> bool:
-    return text.startswith("gvo: error: ") and text.count("\n") == 1
 
 
 def poses(folder: Path, name: str) -> FloatArray:

@@ -19,18 +19,11 @@ import numpy as np
 import pytest
 
 import gvo
+from tests.conftest import GVO, TABLES, Command, is_one_line
 
-Command = Callable[..., Any]
-GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
     *("batch", "explain", "view", "round-trip"),
-)
-TABLES = (
-    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
-    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
-    "frames.csv",
-    "edges.csv",
 )
 FILE_STARTS = {".png": b"\x89PNG\r\n\x1a\n", ".pdf": b"%PDF-", ".rrd": b"RRF"}
 # Of rendered recordings.
@@ -38,10 +31,6 @@ FIRST_NS = 1_700_000_000_000_000_000
 WEBM_START = b"\x1a\x45\xdf\xa3"
 # From reading a URL to drawing or fetching it; xmlns names and links in text do not ask for it.
 OUTSIDE = re.compile(r"""(?:src|href)\s*=\s*["']?\s*(?:https?:)?//|url\(\s*["']?https?:|@import""")
-
-
-def is_one_line(text: str) -> bool:
-    return text.startswith("gvo: error: ") and text.count("\n") == 1
 
 
 def starts_rightly(path: Path) -> bool:

@@ -7,9 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -17,13 +15,7 @@ import yaml
 import gvo
 from gvo.frontend.calibration import describe_offsets
 from gvo.io.bag.source import BagSource
-
-Command = Callable[..., Any]
-GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
-
-
-def is_one_line(text: str) -> bool:
-    return text.startswith("gvo: error: ") and text.count("\n") == 1
+from tests.conftest import GVO, Command, is_one_line
 
 
 def test_help_fits_a_screen(command: Command) -> None:

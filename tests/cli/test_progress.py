@@ -7,14 +7,14 @@ import pty
 import re
 import struct
 import subprocess
-import sys
 import termios
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
+from tests.conftest import GVO
+
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 # `12/20  10.5 frames/s,  92% tracked, 0:00:01 left`, however it is spaced.
 _BAR = re.compile(

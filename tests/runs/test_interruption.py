@@ -21,16 +21,11 @@ from gvo.io.run_folder.reader import read_run
 from gvo.runs.round_trip import run_round_trip
 from gvo.runs.smooth import smooth_edges, smooth_lines
 from gvo.types import Progress
+from tests.conftest import TABLES
 
 N = 12
 NO_REPORT = gvo.RunOutputs(report=False)
 # All but the times that things took.
-TABLES = (
-    *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
-    *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
-    "frames.csv",
-    "edges.csv",
-)
 
 
 @dataclass
