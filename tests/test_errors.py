@@ -1,0 +1,34 @@
+"""The line that installs what is missing."""
+
+import importlib.metadata
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import gvo.errors
+from gvo.errors import missing_extra
+
+
+def test_in_a_clone_the_clone_is_installed() -> None:
+    clone = Path(gvo.errors.__file__).parents[1]
+    if not (clone / "pyproject.toml").is_file():
+        pytest.skip("this gvo is installed")
+    assert str(missing_extra("gvo view needs viser", "view")).endswith(f"'{clone}[view]'")
+
+
+@pytest.mark.parametrize("is_local", [True, False])
+def test_an_installed_gvo_is_taken_from_where_it_came_from(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_local: bool
+) -> None:
+    folder = tmp_path / "a clone"
+    folder.mkdir()
+    url = folder.as_uri() if is_local else "https://example.org/gvo.whl"
+    found = SimpleNamespace(read_text=lambda name: json.dumps({"url": url}))
+    monkeypatch.setattr(gvo.errors, "__file__", str(tmp_path / "site-packages/gvo/errors.py"))
+    monkeypatch.setattr(importlib.metadata, "distribution", lambda name: found)
+    wanted = f"{folder}[batch]" if is_local else "gvo[batch]"
+    assert str(missing_extra("batches need pandas", "batch")).endswith(f"pip install '{wanted}'")
+    found.read_text = lambda name: None
+    assert str(missing_extra("batches need pandas", "batch")).endswith("pip install 'gvo[batch]'")
