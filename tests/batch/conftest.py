@@ -216,7 +216,7 @@ class Cluster:
         return process
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def any_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     cluster = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
