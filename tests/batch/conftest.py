@@ -234,7 +234,7 @@ def cluster(any_cluster: Cluster) -> Cluster:
     return any_cluster
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def near() -> Iterator[Client]:
     """Return the client of workers that are threads of this process."""
     with (
