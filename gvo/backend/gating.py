@@ -17,10 +17,9 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from gvo.backend.factors import Measurement
+from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
 from gvo.backend.motion_model import ConstantVelocity
-from gvo.backend.validation import find_faults, prior_fault
-from gvo.backend.window_graph import ORIGIN, NewPose, WindowGraph
+from gvo.backend.window_graph import NewPose, WindowGraph
 from gvo.geometry import se3
 from gvo.types import (
     BoolArray,

@@ -1,11 +1,9 @@
-"""A pose graph by integer keys: in iSAM2 update, marginalize, restore; optimized as a batch.
+"""A pose graph by integer keys in iSAM2: update, marginalize, restore.
 
 References
 ----------
 M. Kaess et al., "iSAM2: Incremental smoothing and mapping using the Bayes tree", IJRR 31(2),
 2012, doi:10.1177/0278364911430419.
-D. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", SIAM J. 11(2),
-1963, doi:10.1137/0111030.
 """
 
 from __future__ import annotations
@@ -13,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import gtsam
@@ -38,9 +35,6 @@ _N_REPLAYED = 16
 _POSES_PER_STEP = 32
 _MIN_EIGENVALUE = 1e-10
 _MAX_ROUNDING = 1e-6
-# Of the batch: iSAM2 alone stays 1 to 2 % above the least error, it relinearizes only what moves.
-_BATCH_TOLERANCE = 1e-10
-_MAX_BATCH_ITERATIONS = 200
 
 
 class PoseGraph:
@@ -316,63 +310,3 @@ def _repaired(symmetric: FloatArray) -> FloatArray:
     clipped = np.maximum(eigenvalues, _MIN_EIGENVALUE)
     repaired = (vectors * clipped) @ vectors.T * scale
     return np.asarray(0.5 * (repaired + repaired.T))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BatchResult:
-    """Errors before and after a batch optimization.
-
-    Parameters
-    ----------
-    error_before, error_after : float
-        Half the sum of the squared whitened residuals (of their kernels' costs), as GTSAM
-        counts it.
-    n_iterations : int
-    """
-
-    error_before: float
-    error_after: float
-    n_iterations: int
-
-    def as_json(self) -> dict[str, float | int]:
-        """Return the values under their names in `summary.json`."""
-        return {
-            "error_isam2": self.error_before,
-            "error": self.error_after,
-            "iterations": self.n_iterations,
-        }
-
-
-def optimize_batch(
-    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> tuple[gtsam.Values, BatchResult]:
-    """Optimize by Levenberg-Marquardt until the error converges.
-
-    Returns
-    -------
-    values : gtsam.Values
-    result : BatchResult
-    """
-    try:
-        return _levenberg_marquardt(factors, values, "MULTIFRONTAL_CHOLESKY")
-    except RuntimeError:
-        # Sigmas too many orders of magnitude apart for Cholesky; QR takes five times as long.
-        return _levenberg_marquardt(factors, values, "MULTIFRONTAL_QR")
-
-
-def _levenberg_marquardt(
-    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, solver: str
-) -> tuple[gtsam.Values, BatchResult]:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(_BATCH_TOLERANCE)
-    parameters.setAbsoluteErrorTol(0.0)
-    parameters.setMaxIterations(_MAX_BATCH_ITERATIONS)
-    parameters.setLinearSolverType(solver)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters)
-    before = optimizer.error()
-    optimized = optimizer.optimize()
-    return optimized, BatchResult(
-        error_before=before,
-        error_after=optimizer.error(),
-        n_iterations=int(optimizer.iterations()),
-    )

@@ -9,12 +9,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from gvo.backend.batch import BatchResult
+from gvo.backend.factors import ORIGIN, find_faults, prior_fault
 from gvo.backend.gating import Admission, WindowCounter, WindowCounts, disagreement
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
 from gvo.backend.motion_model import ConstantVelocity, StatusClock
-from gvo.backend.pose_graph import BatchResult, first_line
-from gvo.backend.validation import find_faults, prior_fault
-from gvo.backend.window_graph import ORIGIN, NewPose, WindowGraph, absence
+from gvo.backend.pose_graph import first_line
+from gvo.backend.window_graph import NewPose, WindowGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3

@@ -11,9 +11,16 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from gvo.backend.factors import Factors, Measurement
-from gvo.backend.pose_graph import BatchResult, PoseGraph, definite, first_line, optimize_batch
-from gvo.backend.validation import place_fault, pose_fault, sane_covariance
+from gvo.backend.batch import BatchResult, optimize_batch
+from gvo.backend.factors import (
+    ORIGIN,
+    Factors,
+    Measurement,
+    place_fault,
+    pose_fault,
+    sane_covariance,
+)
+from gvo.backend.pose_graph import PoseGraph, definite, first_line
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
@@ -31,8 +38,6 @@ from gvo.types import (
 
 _LOGGER = logging.getLogger(__name__)
 
-# Prior of a first pose without one, which defines the world: radians and metres.
-ORIGIN = PosePrior(T_world_frame=np.eye(4), covariance=1e-10 * np.eye(6))
 # Poses that leave at once when the window is made smaller: the cost grows with the cube.
 _MAX_LEAVING = 32
 

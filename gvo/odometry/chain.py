@@ -8,8 +8,8 @@ from typing import Generic
 
 import numpy as np
 
+from gvo.backend.factors import find_faults
 from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, StatusClock, predict_step
-from gvo.backend.validation import find_faults
 from gvo.config import WindowConfig
 from gvo.frontend.protocol import Frontend, ObservationsT
 from gvo.geometry import se3

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gvo.backend.batch import BatchResult
 from gvo.backend.gating import WindowCounts
-from gvo.backend.pose_graph import BatchResult
 from gvo.frontend.calibration import RigOffsets
 from gvo.types import FaultyFrame, FrameResult, Progress, SegmentJoin, Status
 

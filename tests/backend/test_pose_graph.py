@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.backend.pose_graph import PoseGraph, definite, first_line, optimize_batch
+from gvo.backend.batch import optimize_batch
+from gvo.backend.pose_graph import PoseGraph, definite, first_line
 from gvo.errors import SmoothingError
 from gvo.types import FloatArray
 from tests.backend import walks

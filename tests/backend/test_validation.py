@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.backend.validation import (
+from gvo.backend.factors import (
     covariance_fault,
     find_faults,
     place_fault,
