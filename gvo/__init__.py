@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gvo.odometry.odometry import Odometry
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import RunResult, run_recording
-    from gvo.runs.smooth import smooth_edges
+    from gvo.runs.smooth import optimize, smooth_edges
     from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
     from gvo.trajectory.formats import read_trajectory
     from gvo.trajectory.trajectory import Trajectory
@@ -60,7 +60,7 @@ _MODULES = {
     "gvo.io.poses.inputs": ("read_ground_truth",),
     "gvo.runs.outputs.options": ("RunOutputs",),
     "gvo.runs.run": ("RunResult", "run_recording"),
-    "gvo.runs.smooth": ("smooth_edges",),
+    "gvo.runs.smooth": ("optimize", "smooth_edges"),
     "gvo.io.edges.opening": ("open_edges",),
     "gvo.io.excerpt": ("Excerpt",),
     "gvo.io.frames": ("Rig", "frames"),
@@ -128,6 +128,7 @@ __all__ = [
     "load_configuration",
     "open_edges",
     "open_recording",
+    "optimize",
     "plot_trajectories",
     "read_ground_truth",
     "read_trajectory",

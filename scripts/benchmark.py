@@ -14,6 +14,8 @@ benchmark_seeds.py): `--kind drive` (stereo), `hand` (a fast one, RGB-D), `rest`
 hovers, stereo), with a rolling shutter by `--readout`. `--keep DIR` keeps what is rendered.
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
+`--graphs` optimizes whole pose graphs, those named, GTSAM's and generated ones, beside GTSAM used
+by hand (see benchmark_graphs.py).
 
 Example: python scripts/benchmark.py kitti_06_start euroc_mh01_start
 Example: python scripts/benchmark.py --seeds 10 --kind hand --readout 25 --keep rendered
@@ -24,7 +26,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import benchmark_passes as passes  # type: ignore[import-not-found]  # beside this one
+import benchmark_graphs  # type: ignore[import-not-found]  # beside this one
+import benchmark_passes as passes  # type: ignore[import-not-found]
 import benchmark_seeds  # type: ignore[import-not-found]
 import benchmark_tables as tables  # type: ignore[import-not-found]
 import benchmark_window  # type: ignore[import-not-found]
@@ -42,6 +45,8 @@ def main() -> None:
         faults = benchmark_window.soak(arguments.soak, is_timed=not arguments.untimed)
         if faults:
             sys.exit("benchmark: " + "; ".join(faults))
+    if arguments.graphs is not None:
+        benchmark_graphs.measure(arguments.graphs)
     if arguments.seeds:
         benchmark_seeds.measure(recordings_of(arguments), arguments.seeds, arguments.set)
     measure_all(arguments)
@@ -62,12 +67,14 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--soak", type=int, nargs="?", const=1_000_000, metavar="N", help="a life of N poses"
     )
+    parser.add_argument("--graphs", type=Path, nargs="*", metavar="G2O", help="whole pose graphs")
     parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
     add_seeds(parser)
     arguments = parser.parse_args()
     lengths = [n for n in (arguments.window, arguments.soak) if n is not None]
-    if not (arguments.recordings or arguments.seeds or lengths):
-        parser.error("name recordings, or --seeds, --window or --soak")
+    is_graphs = arguments.graphs is not None
+    if not (arguments.recordings or arguments.seeds or lengths or is_graphs):
+        parser.error("name recordings, or --seeds, --window, --soak or --graphs")
     if min(lengths, default=1000) < 1000:
         parser.error("--window and --soak take at least 1000 poses")
     if arguments.rounds < 1:

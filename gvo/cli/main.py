@@ -47,6 +47,7 @@ from gvo.cli.terminal import (
     report,
     report_smoothed,
     say,
+    status,
     told_what_stands,
     told_where_it_stands,
     warn,
@@ -55,6 +56,7 @@ from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
 
 if TYPE_CHECKING:
     from gvo.config import Config
+    from gvo.io.edges.events import EdgeSource
     from gvo.trajectory.trajectory import Trajectory
 
 app = typer.Typer(
@@ -69,6 +71,7 @@ _command = partial(app.command, cls=Command)
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_Robust = Literal["none", "huber", "gnc"]
 _KeyframePolicy = Literal["distance", "manual"]
 _Layout = Literal["bag", "kitti", "euroc", "tum"]
 _Align = Literal["none", "origin", "se3", "sim3"]
@@ -264,28 +267,74 @@ def smooth(
     ground_truth: Annotated[
         Path | None, typer.Option(metavar="FILE", help="True poses: TUM, KITTI, EuRoC.")
     ] = None,
+    robust: Annotated[
+        _Robust | None,
+        typer.Option(help="Against false edges; default: none for a graph, huber for poses."),
+    ] = None,
+    covariances: Annotated[
+        bool, typer.Option("--covariances", help="Of all poses, which takes longer than them.")
+    ] = False,
+    window: Annotated[
+        bool, typer.Option("--window", help="Smooth a file by the window, as a stream of lines.")
+    ] = False,
     keyframes: Annotated[
-        _KeyframePolicy, typer.Option(help="Which poses stay in the window.")
-    ] = "distance",
+        _KeyframePolicy | None, typer.Option(help="Which poses stay in the window.")
+    ] = None,
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
-    """Smooth the edges or poses of any front-end."""
+    """Optimize the edges or poses of any front-end, at once or by the window."""
     from gvo.io.edges.opening import open_edges, parse_sigma
     from gvo.io.poses.inputs import read_ground_truth
-    from gvo.runs.smooth import configuration_for, smooth_edges
 
-    parameters = load(config, set_)
     if "-" in inputs:
         _refuse_with_lines(inputs, topic=topic, sigma=sigma)
+    if window or "-" in inputs:
+        _refuse(
+            "is of a file optimized at once, not of the window",
+            robust=robust,
+            covariances=covariances,
+        )
+    else:
+        _refuse("is of the window; add --window", config=config, set=set_, keyframes=keyframes)
+    parameters = load(config, set_)
+    kept = keyframes or "distance"
     out = new_folder(out, "lines" if "-" in inputs else inputs[0], force=force)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
     if "-" in inputs:
-        _smooth_lines(out, force, config=parameters, keyframes=keyframes, ground_truth=truth)
+        _smooth_lines(out, force, config=parameters, keyframes=kept, ground_truth=truth)
     sigmas = [parse_sigma(text) for text in sigma or []]
     source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
-    for decision in [*source.decisions, *configuration_for(source, parameters)[1]]:
+    for decision in source.decisions:
         say(decision)
+    if window:
+        _smooth_by_window(source, out, force, config=parameters, keyframes=kept, ground_truth=truth)
+    from gvo.runs.smooth import optimize_edges
+
+    with interruptible() as check, told_where_it_stands(out), status(source.name) as show:
+        result = optimize_edges(
+            source,
+            out,
+            robust=robust,
+            covariances=covariances,
+            ground_truth=truth,
+            force=force,
+            on_step=both(show, check),
+        )
+    report_smoothed(result, out)
+
+
+def _smooth_by_window(
+    source: EdgeSource,
+    out: Path,
+    force: bool,
+    *,
+    config: Config,
+    keyframes: _KeyframePolicy,
+    ground_truth: Trajectory | None,
+) -> NoReturn:
+    from gvo.runs.smooth import smooth_edges
+
     with (
         interruptible() as check,
         told_where_it_stands(out),
@@ -294,9 +343,9 @@ def smooth(
         result = smooth_edges(
             source,
             out,
-            config=parameters,
+            config=config,
             keyframes=keyframes,
-            ground_truth=truth,
+            ground_truth=ground_truth,
             force=force,
             on_progress=both(show, check),
         )
@@ -306,9 +355,13 @@ def smooth(
 def _refuse_with_lines(inputs: list[str], **options: object) -> None:
     if len(inputs) > 1:
         raise ConfigurationError("-: standard input does not go with another input")
+    _refuse("does not go with standard input", **options)
+
+
+def _refuse(why: str, **options: object) -> None:
     for name, given in options.items():
         if given:
-            raise ConfigurationError(f"-: standard input does not go with --{name}")
+            raise ConfigurationError(f"--{name}: {why}")
 
 
 def _smooth_lines(

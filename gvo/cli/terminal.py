@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO, TypeVar
@@ -174,13 +174,26 @@ def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = Fal
         say(format_evaluations(result.evaluations), nl=False, err=is_stdout_taken)
     summary = result.summary
     if summary["batch"] is not None:
-        errors = summary["batch"]
-        text = f"error {errors['error_isam2']:.6g} by iSAM2, {errors['error']:.6g} in a batch"
-        say(text, err=is_stdout_taken)
-    counts = f"{summary['frames']} poses, {summary['window']['n_edges']} edges"
+        say(_error_words(summary["batch"]), err=is_stdout_taken)
+    n_edges = summary["edges"] if "edges" in summary else summary["window"]["n_edges"]
+    counts = f"{summary['frames']} poses, {n_edges} edges"
     say(f"{counts}; {out / 'trajectories.png'}", err=is_stdout_taken)
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))
+
+
+def _error_words(batch: Mapping[str, Any]) -> str:
+    """Return the errors of a batch optimization, and what it began at."""
+    if "error_isam2" in batch:
+        return f"error {batch['error_isam2']:.6g} by iSAM2, {batch['error']:.6g} in a batch"
+    starts = batch["errors_of_starts"]
+    others = (f"{name} {error:.6g}" for name, error in starts.items() if name != batch["start"])
+    first = f"{batch['start']} {starts[batch['start']]:.6g}"
+    refused = f", {batch['refused_edges']} edges refused" if batch["refused_edges"] else ""
+    return (
+        f"error {batch['error']:.6g} after {batch['iterations']} iterations{refused}; start: "
+        f"{', '.join([first, *others])}"
+    )
 
 
 def warn(warnings: Sequence[str]) -> None:
@@ -229,6 +242,18 @@ def progress(title: str, unit: str = "frames") -> Iterator[Callable[[Progress], 
             )
 
         yield update
+
+
+@contextmanager
+def status(title: str) -> Iterator[Callable[[str], None]]:
+    """Yield a callback that shows a state in words on a terminal, and nothing in a pipe."""
+    if not is_shown():
+        yield lambda text: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(title) as shown:
+        yield lambda text: shown.update(f"{title}: {text}")
 
 
 def both(

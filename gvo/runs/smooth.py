@@ -1,15 +1,16 @@
-"""Edges of any front-end, smoothed: from a file, or line by line."""
+"""Edges of any front-end: optimized at once, smoothed by the window, or line by line."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from gvo._version import __version__
+from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph
 from gvo.backend.window import Keeping, SlidingWindow
 from gvo.config import Config
 from gvo.errors import GvoError, OutputError, RecordingError, TrajectoryError
@@ -32,7 +33,15 @@ from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, Progress, Rejected, Status
+from gvo.types import (
+    Edge,
+    Estimate,
+    FrameId,
+    PositionPrior,
+    Progress,
+    Rejected,
+    Status,
+)
 from gvo.viz.plots import plot_trajectories
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
@@ -40,44 +49,6 @@ POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reas
 
 _MAX_FOREIGN_LINES = 1000
 """A stream that begins with so many lines that are not understood holds something else."""
-
-# What a pose graph's file says: its noise is stated, its loops reach far back.
-_GRAPH_DEFAULTS: dict[str, tuple[object, str]] = {
-    "size": (None, "loops refer to poses of any age"),
-    "kernel": ("none", "edges are taken at the noise that the file states; 1 where it does not"),
-    "gate": (None, "edges are taken at the noise that the file states; 1 where it does not"),
-}
-
-
-def configuration_for(source: EdgeSource, config: Config) -> tuple[Config, list[str]]:
-    """Return the configuration that fits an input; what the user set stays.
-
-    Parameters
-    ----------
-    source : EdgeSource
-        A pose graph is smoothed as a whole and taken at its word: `window.size: null`,
-        `window.kernel: none` and `window.gate: null`.
-    config : Config
-
-    Returns
-    -------
-    config : Config
-    decisions : list of str
-        What was changed, a line each.
-    """
-    if not isinstance(source, PoseGraphSource):
-        return config, []
-    changes = {
-        key: value
-        for key, (value, _) in _GRAPH_DEFAULTS.items()
-        if key not in config.window.model_fields_set
-    }
-    window = config.window.model_copy(update=changes)
-    decisions = [
-        f"window.{key}: {'null' if value is None else value} ({_GRAPH_DEFAULTS[key][1]})"
-        for key, value in changes.items()
-    ]
-    return config.model_copy(update={"window": window}), decisions
 
 
 @dataclass(slots=True, kw_only=True)
@@ -152,7 +123,8 @@ class Smoother:
     def _add_finished(self, finished: list[Estimate]) -> None:
         self._folder.add_smoothed(finished)
         if self._graph_file is not None:
-            self._graph_file.add(finished)
+            for each in finished:
+                self._graph_file.add(each.stamp_ns, each.frame_id, each.T_world_frame)
         self.chain.forget(estimate.frame_id for estimate in finished)
 
 
@@ -166,7 +138,7 @@ def smooth_edges(
     force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> RunResult:
-    """Smooth the edges of an input and write a run folder.
+    """Smooth the edges of an input by the window, as they come, and write a run folder.
 
     Parameters
     ----------
@@ -176,7 +148,7 @@ def smooth_edges(
         Folder for the trajectories, covariances, table of poses, summary and picture; of a pose
         graph also `smoothed.g2o`.
     config : Config, optional
-        Of which `window` matters; see `configuration_for`.
+        Of which `window` matters.
     keyframes : {"manual", "distance"}
         Which poses stay in the window when they are no longer recent: none, or by distance.
     ground_truth : Trajectory, optional
@@ -195,8 +167,8 @@ def smooth_edges(
     RecordingError
         When the input holds no pose, or the folder holds an earlier run or cannot be written.
     """
-    config, decisions = configuration_for(source, config or Config())
-    notes = SmoothingNotes(decisions=[*source.decisions, *decisions])
+    config = config or Config()
+    notes = SmoothingNotes(decisions=source.decisions)
     with _opened(Path(out), source, force=force) as (folder, graph_file):
         smoother = Smoother(folder, config, keyframes=keyframes, graph_file=graph_file)
         with _finished(source.name, folder, smoother, notes):
@@ -211,10 +183,13 @@ def smooth_edges(
 
 @contextmanager
 def _opened(
-    out: Path, source: EdgeSource, *, force: bool
+    out: Path, source: EdgeSource, *, force: bool, names: Sequence[str] = TRAJECTORIES
 ) -> Iterator[tuple[RunFolder, GraphFile | None]]:
     """Open the files of a run; complete them also where it is interrupted."""
-    with written_alone(out, force=force), RunFolder(out, columns=POSES_HEADER) as folder:
+    with (
+        written_alone(out, force=force),
+        RunFolder(out, columns=POSES_HEADER, names=names) as folder,
+    ):
         if not isinstance(source, PoseGraphSource):
             yield folder, None
             return
@@ -287,27 +262,50 @@ def conclude(
     """Write summary and picture of a finished run, and compare with the truth."""
     if smoother.n_poses == 0:
         folder.discard()
-        reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
-        raise RecordingError(f"{name}: nothing to smooth: {reason}")
+        raise nothing_to_smooth(name, notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
-    evaluations, fault = _compare(truth, estimates)
+    summary = {**_summary(name, smoother, notes), "configuration": config.model_dump()}
+    warnings = [*_broken_off(smoother.n_poses, notes), *_warnings(smoother), *notes.warnings]
     counts = smoother.window.counts
-    is_whole = not (notes.broken_off or notes.warnings or fault)
-    warnings = [*_warnings(smoother, notes), *notes.warnings, *([fault] if fault else [])]
-    summary = {
-        **_summary(name, smoother, notes),
-        "errors": evaluations_json(evaluations)["estimates"],
-        "warnings": warnings,
-        "configuration": config.model_dump(),
-    }
+    is_complete = not (notes.broken_off or notes.warnings or counts.n_coasting or counts.n_rejected)
+    return _concluded(
+        folder, summary, estimates, truth=truth, warnings=warnings, is_complete=is_complete
+    )
+
+
+def nothing_to_smooth(name: str, notes: SmoothingNotes) -> RecordingError:
+    """Return the error of an input that gave no pose."""
+    reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
+    return RecordingError(f"{name}: nothing to smooth: {reason}")
+
+
+def _concluded(
+    folder: RunFolder,
+    summary: dict[str, Any],
+    estimates: dict[str, Trajectory],
+    *,
+    truth: Trajectory | None,
+    warnings: list[str],
+    is_complete: bool,
+) -> RunResult:
+    """Compare with the truth, write summary and picture."""
+    evaluations, fault = _compare(truth, estimates)
+    warnings = [*warnings, *([fault] if fault else [])]
+    summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     folder.write_summary(summary)
     plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
         summary=summary,
         evaluations=evaluations,
-        is_complete=is_whole and not (counts.n_coasting or counts.n_rejected),
+        is_complete=is_complete and not fault,
         warnings=tuple(warnings),
     )
+
+
+def _broken_off(n_poses: int, notes: SmoothingNotes) -> list[str]:
+    if not notes.broken_off:
+        return []
+    return [f"the input broke off after {n_poses} poses: {notes.broken_off}"]
 
 
 def _compare(
@@ -322,11 +320,9 @@ def _compare(
         return (), f"not compared with the ground truth: {error}"
 
 
-def _warnings(smoother: Smoother, notes: SmoothingNotes) -> list[str]:
+def _warnings(smoother: Smoother) -> list[str]:
     counts = smoother.window.counts
     warnings = []
-    if notes.broken_off:
-        warnings.append(f"the input broke off after {smoother.n_poses} poses: {notes.broken_off}")
     if counts.n_rejected:
         warnings.append(
             f"{counts.n_rejected} edges or priors were refused, {counts.n_gated} of them because "
@@ -356,6 +352,200 @@ def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, 
         "batch": None if batch_result is None else batch_result.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
+
+
+def optimize(
+    graph: EdgeSource | Mapping[FrameId, Sequence[Edge]],
+    *,
+    robust: Robust = "none",
+    covariances: bool = False,
+) -> Trajectory:
+    """Optimize a whole pose graph at once, by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    graph : EdgeSource or mapping of hashable to sequence of Edge
+        From `open_edges`; or of each pose by its name the edges that measure it, in any order,
+        the first pose being the world. Invalid edges are left out, and poses that no edge
+        connects with the first.
+    robust : {"none", "huber", "gnc"}
+        Least squares; Huber's kernel on each edge; or graduated non-convexity: edges count fully
+        or not at all, those between a pose and the next always.
+    covariances : bool
+        Compute the marginal covariance of each pose; that takes longer than the optimum.
+
+    Returns
+    -------
+    Trajectory
+        Of a mapping the n-th pose has a stamp of n seconds.
+
+    Raises
+    ------
+    ValueError
+        If `robust` is none of these, or the graph holds no pose, or a position alone as a prior.
+    SmoothingError
+        If GTSAM fails.
+
+    Examples
+    --------
+    >>> import gvo, numpy as np
+    >>> T = np.eye(4)
+    >>> T[0, 3] = 1.0
+    >>> edge = gvo.Edge(reference_id="a", T_reference_frame=T, covariance=1e-4 * np.eye(6))
+    >>> gvo.optimize({"a": [], "b": [edge]}).positions[-1].round(6).tolist()
+    [1.0, 0.0, 0.0]
+    """
+    if robust not in get_args(Robust):
+        raise ValueError(f"robust must be one of {get_args(Robust)}, got {robust!r}")
+    if isinstance(graph, Mapping):
+        whole = WholeGraph()
+        for number, frame_id in enumerate(graph):
+            whole.add_pose(frame_id, number * 1_000_000_000)
+        for frame_id, edges in graph.items():
+            whole.add_edges(frame_id, edges)
+    else:
+        whole = read_graph(graph, SmoothingNotes())
+    if not whole.frame_ids:
+        raise ValueError("the graph holds no pose")
+    optimizer = BatchOptimizer(whole, robust)
+    optimizer.run()
+    return optimizer.trajectory(optimizer.covariances() if covariances else None)
+
+
+def read_graph(source: EdgeSource, notes: SmoothingNotes) -> WholeGraph:
+    """Read all poses and edges of an input; where it breaks off, `notes` say so."""
+    graph = WholeGraph()
+    if isinstance(source, PoseGraphSource):
+        source.vertices = graph.given
+    for event in _events(source, notes):
+        if isinstance(event, PoseEvent):
+            if isinstance(event.prior, PositionPrior):
+                raise ValueError("a position alone as a prior is for the window")
+            graph.add_pose(event.frame_id, event.stamp_ns, event.prior)
+            graph.add_edges(event.frame_id, event.edges)
+        else:
+            graph.add_edges(event.frame_id, [event.edge])
+    return graph
+
+
+def robust_for(source: EdgeSource) -> Robust:
+    """Return "none" for a pose graph, which states its noise, else "huber"."""
+    return "none" if isinstance(source, PoseGraphSource) else "huber"
+
+
+def optimize_edges(
+    source: EdgeSource,
+    out: str | Path,
+    *,
+    robust: Robust | None = None,
+    covariances: bool = False,
+    ground_truth: Trajectory | None = None,
+    force: bool = False,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> RunResult:
+    """Optimize the edges of a complete input at once, and write a run folder.
+
+    Parameters
+    ----------
+    source : EdgeSource
+        From `open_edges`.
+    out : str or Path
+        Folder for raw and smoothed poses, table of poses, summary and picture; of a pose graph
+        also `smoothed.g2o`.
+    robust : {"none", "huber", "gnc"}, optional
+        As of `optimize`; see `robust_for`.
+    covariances : bool
+        As of `optimize`.
+    ground_truth : Trajectory, optional
+        True poses of the same frame.
+    force : bool
+        Replace an earlier run in the folder, complete or not.
+    on_step : callable
+        Called with the state in words after each step. What it raises ends the work; the best
+        poses so far are written first.
+
+    Returns
+    -------
+    RunResult
+
+    Raises
+    ------
+    RecordingError
+        When the input holds no pose, or the folder holds an earlier run or cannot be written.
+    SmoothingError
+        If GTSAM fails.
+    """
+    robust = robust or robust_for(source)
+    notes = SmoothingNotes(decisions=source.decisions)
+    graph = read_graph(source, notes)
+    notes.warnings += source.faults.warnings()
+    if not graph.frame_ids:
+        raise nothing_to_smooth(source.name, notes)
+    optimizer = BatchOptimizer(graph, robust, on_step=on_step)
+    with _opened(Path(out), source, force=force, names=("raw", "smoothed")) as (folder, file):
+        found = None
+        try:
+            optimizer.run()
+            found = optimizer.covariances() if covariances else None
+        finally:
+            # Also where the work is interrupted.
+            smoothed = optimizer.trajectory(found)
+            folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
+            folder.add_trajectory("smoothed", smoothed)
+            folder.add_rows(_rows(graph, optimizer))
+            if file is not None:
+                for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
+                    file.add(graph.stamps_ns[number], graph.frame_ids[number], T)
+    estimates = {"raw": optimizer.trajectory(of=optimizer.raw), "smoothed": smoothed}
+    truth = _with_stamps(ground_truth, source, folder)
+    warnings = [*_broken_off(len(graph.frame_ids), notes), *_left_out(graph, optimizer)]
+    summary = {
+        "gvo_version": __version__,
+        "recording": source.name,
+        "decisions": notes.decisions,
+        "frames": len(graph.frame_ids),
+        "tracked": len(optimizer.numbers),
+        "edges": len(graph.links),
+        "robust": robust,
+        "batch": optimizer.as_json(),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+    }
+    warnings += notes.warnings
+    is_complete = not warnings
+    return _concluded(
+        folder, summary, estimates, truth=truth, warnings=warnings, is_complete=is_complete
+    )
+
+
+def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of the table of poses; each edge counts at both ends."""
+    there = set(optimizer.numbers)
+    ends = Counter(end for link in graph.links for end in (link.reference, link.frame))
+    refused = Counter(end for link in optimizer.refused for end in (link.reference, link.frame))
+    invalid = {rejected.frame_id: str(rejected) for rejected in reversed(graph.rejected)}
+    n_invalid = Counter(rejected.frame_id for rejected in graph.rejected)
+    for number, (frame_id, stamp_ns) in enumerate(
+        zip(graph.frame_ids, graph.stamps_ns, strict=True)
+    ):
+        n_rejected = refused[number] + n_invalid[frame_id]
+        reason = invalid.get(frame_id, "others contradict an edge" if n_rejected else "")
+        status = Status.OK if number in there else Status.SKIPPED
+        yield stamp_ns, frame_id, status, ends[number], n_rejected, reason
+
+
+def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> list[str]:
+    warnings = []
+    if graph.rejected:
+        warnings.append(
+            f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
+        )
+    n_left_out = len(graph.frame_ids) - len(optimizer.numbers)
+    if n_left_out:
+        warnings.append(
+            f"{n_left_out} poses are not connected with the first one and were left out "
+            "(frames.csv: skipped)"
+        )
+    return warnings
 
 
 def smooth_lines(

@@ -1,11 +1,13 @@
 """A signal while a command works: one line says what stands, and how to go on."""
 
+import json
 import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import pytest
 
 import gvo
@@ -81,11 +83,30 @@ def test_a_signal_while_poses_are_smoothed_leaves_those_before(
     poses, out = tmp_path / "poses.txt", tmp_path / "out"
     poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
     interrupt(Smoother, "take", 7, number)
-    answer = command("smooth", poses, "--out", out)
+    answer = command("smooth", poses, "--window", "--out", out)
     assert answer.code == CODES[number]
     assert answer.err == f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
     for name in ("raw", "causal", "smoothed"):
         assert len(gvo.read_trajectory(out / f"{name}.txt")) == 7
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_graph_is_optimized_leaves_the_best_poses(
+    command: Command, interrupt: Callable[..., None], tmp_path: Path, number: signal.Signals
+) -> None:
+    path = gtsam.findExampleDataFile("pose3example-grid.txt")  # type: ignore[no-untyped-call]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert command("smooth", path, "--out", whole).code == 0
+    interrupt(gtsam.LevenbergMarquardtOptimizer, "iterate", 2, number)
+    answer = command("smooth", path, "--out", out)
+    assert answer.code == CODES[number]
+    assert answer.err == f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
+    graph, _ = gtsam.readG2o(path, True)
+    ends = [gtsam.readG2o(str(run / "smoothed.g2o"), True)[1] for run in (whole, out)]
+    starts = json.loads((whole / "summary.json").read_text())["batch"]["errors_of_starts"]
+    assert graph.error(ends[0]) < graph.error(ends[1]) < min(starts.values())
+    for name in ("raw", "smoothed"):
+        assert len(gvo.read_trajectory(out / f"{name}.txt")) == 27
 
 
 def test_a_signal_while_trajectories_are_compared_ends_in_one_line(

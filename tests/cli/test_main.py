@@ -342,9 +342,14 @@ def write_poses(path: Path, n: int = 20) -> Path:
     return path
 
 
-def test_smooth_writes_a_run_folder_and_compares(command: Command, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [["--window", "--keyframes", "manual"], ["--covariances"]])
+def test_smooth_writes_a_run_folder_and_compares(
+    command: Command, tmp_path: Path, options: list[str]
+) -> None:
     poses = write_poses(tmp_path / "poses.txt")
-    options = ["--sigma", "0.1,0.02", "--ground-truth", poses, "--keyframes", "manual"]
+    names_of = ("raw", "causal", "smoothed") if "--window" in options else ("raw", "smoothed")
+    certain = names_of if "--window" in options else ("smoothed",)
+    options = ["--sigma", "0.1,0.02", "--ground-truth", str(poses), *options]
     answer = command("smooth", poses, poses, "--out", tmp_path / "out", *options)
     assert answer.code == 0, answer.err
     assert "20 poses, 38 edges" in answer.out
@@ -352,22 +357,22 @@ def test_smooth_writes_a_run_folder_and_compares(command: Command, tmp_path: Pat
     assert answer.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
-        *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
-        *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+        *(f"{name}.txt" for name in names_of),
+        *(f"{name}_covariance.csv" for name in certain),
         "frames.csv",
         "summary.json",
         "trajectories.png",
     }
 
 
-def test_smooth_tells_what_it_decides_for_a_pose_graph(command: Command, tmp_path: Path) -> None:
+def test_smooth_tells_what_a_pose_graph_began_at(command: Command, tmp_path: Path) -> None:
     edge = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
     path = tmp_path / "graph.g2o"
     path.write_text(edge)
-    answer = command("smooth", path, "--out", tmp_path / "out", "--set", "window.gate=9")
+    answer = command("smooth", path, "--out", tmp_path / "out", "--robust", "gnc")
     assert answer.code == 0, answer.err
-    assert "window.size: null" in answer.out
-    assert "window.gate" not in answer.out
+    assert "error 0 after 1 iterations; start: odometry 0" in answer.out
+    assert "2 poses, 1 edges" in answer.out
     assert (tmp_path / "out/smoothed.g2o").read_text().splitlines()[-1] == edge.strip()
 
 
@@ -383,8 +388,12 @@ def test_smooth_tells_what_it_decides_for_a_pose_graph(command: Command, tmp_pat
         (["graph.g2o", "--sigma", "1,2"], ["--sigma", "graph.g2o"]),
         (["graph.g2o", "poses.txt"], ["graph.g2o", "one input"]),
         (["-", "poses.txt"], ["standard input"]),
-        (["-", "--topic", "/odom"], ["standard input", "--topic"]),
-        (["poses.txt", "--set", "window.siz=3"], ["window.size"]),
+        (["-", "--topic", "/odom"], ["--topic", "standard input"]),
+        (["poses.txt", "--window", "--set", "window.siz=3"], ["window.size"]),
+        (["poses.txt", "--set", "window.size=3"], ["--set", "--window"]),
+        (["poses.txt", "--keyframes", "manual"], ["--keyframes", "--window"]),
+        (["poses.txt", "--window", "--robust", "gnc"], ["--robust", "at once"]),
+        (["-", "--covariances"], ["--covariances", "at once"]),
         (["poses.txt", "--ground-truth", "missing.txt"], ["missing.txt"]),
         (["{room}"], ["holds no poses"]),
     ],

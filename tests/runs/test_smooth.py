@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -16,8 +17,9 @@ from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
 from gvo.io.edges.opening import open_edges
+from gvo.io.run_folder.reader import read_run
 from gvo.runs.run import RunResult
-from gvo.runs.smooth import configuration_for, smooth_edges
+from gvo.runs.smooth import optimize_edges, smooth_edges
 from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
@@ -89,8 +91,8 @@ def least_error(path: Path) -> float:
     return float(optimizer.error())
 
 
-def smooth_file(path: str | Path, out: Path, config: Config | None = None) -> RunResult:
-    return smooth_edges(open_edges([path]), out, config=config)
+def optimize_file(path: str | Path, out: Path, **options: Any) -> RunResult:
+    return optimize_edges(open_edges([path]), out, **options)
 
 
 def test_a_chain_without_redundant_edges_stays_as_it_is(tmp_path: Path) -> None:
@@ -126,14 +128,61 @@ def test_poses_lie_in_the_folder_under_their_own_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["pose3example-grid.txt", "pose3example.txt"])
 def test_a_pose_graph_reaches_the_error_of_batch_optimization(tmp_path: Path, name: str) -> None:
     path = example(name)
-    result = smooth_file(path, tmp_path)
+    result = optimize_file(path, tmp_path)
     assert result.is_complete
     expected = least_error(path)
     reread = errors_by_gtsam(tmp_path / "smoothed.g2o", tmp_path / "smoothed.g2o")
     assert reread == pytest.approx(expected, rel=1e-6)
     assert errors_by_gtsam(tmp_path / "smoothed.g2o", path) == pytest.approx(expected, rel=1e-6)
     assert result.summary["batch"]["error"] == pytest.approx(expected, rel=1e-6)
-    assert result.summary["batch"]["error_isam2"] >= expected * (1 - 1e-9)
+    starts = result.summary["batch"]["errors_of_starts"]
+    assert set(starts) == {"given", "odometry", "chordal"}
+    assert min(starts.values()) >= expected * (1 - 1e-9)
+    assert len(gvo.read_trajectory(tmp_path / "raw.txt")) == result.summary["frames"]
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("raw.txt", "smoothed.txt", "smoothed.g2o", "frames.csv", "summary.json"),
+        "trajectories.png",
+    }
+
+
+def test_covariances_are_those_of_gtsam_and_can_be_read_back(tmp_path: Path) -> None:
+    path = example("pose3example-grid.txt")
+    optimize_file(path, tmp_path, covariances=True)
+    graph, _ = gtsam.readG2o(str(path), True)
+    _, values = gtsam.readG2o(str(tmp_path / "smoothed.g2o"), True)
+    first = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+    graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), first))
+    marginals = gtsam.Marginals(graph, values)
+    expected = [marginals.marginalCovariance(key) for key in range(27)]
+    record = read_run(tmp_path)
+    found = record.trajectories["smoothed"].covariances
+    assert found is not None
+    np.testing.assert_allclose(found, np.array(expected), rtol=1e-3, atol=1e-8)
+    assert record.trajectories["raw"].covariances is None
+    assert len(record.trajectories["causal"]) == 0
+    assert record.frames.statuses == ("ok",) * 27
+
+
+def test_false_edges_are_refused_and_named_in_the_table(tmp_path: Path) -> None:
+    lines = [format_edge(k, k + 1, step(k), 1e-4 * np.eye(6)) for k in range(9)]
+    lines.append(format_edge(0, 9, np.eye(4), 1e-4 * np.eye(6)))
+    path = tmp_path / "graph.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    result = optimize_file(path, tmp_path / "out", robust="gnc")
+    assert result.is_complete
+    assert result.summary["batch"]["refused_edges"] == 1
+    assert result.summary["batch"]["error"] == pytest.approx(0.0, abs=1e-9)
+    with (tmp_path / "out/frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["n_rejected"] for row in rows] == ["1", *"00000000", "1"]
+    assert rows[9]["reason"]
+
+
+def test_an_earlier_runs_files_are_gone(tmp_path: Path) -> None:
+    smooth_edges(ListSource(chain(5)), tmp_path)
+    optimize_edges(ListSource(chain(5)), tmp_path, force=True)
+    assert not list(tmp_path.glob("*covariance*"))
+    assert not (tmp_path / "causal.txt").exists()
 
 
 def test_the_smoothed_graph_keeps_ids_order_and_edges(tmp_path: Path) -> None:
@@ -141,7 +190,7 @@ def test_the_smoothed_graph_keeps_ids_order_and_edges(tmp_path: Path) -> None:
     edges = [format_edge(a, b, step(a), 1e-3 * np.eye(6)) for a, b in [(3, 12), (40, 3), (12, 40)]]
     path = tmp_path / "graph.g2o"
     path.write_text("\n".join([*lines, "FIX 3", *edges]) + "\n")
-    smooth_file(path, tmp_path / "out")
+    optimize_file(path, tmp_path / "out")
     written = (tmp_path / "out/smoothed.g2o").read_text().splitlines()
     assert [line.split()[1] for line in written[:3]] == ["3", "12", "40"]
     assert written[3:] == ["FIX 3", *edges]
@@ -149,23 +198,10 @@ def test_the_smoothed_graph_keeps_ids_order_and_edges(tmp_path: Path) -> None:
     np.testing.assert_allclose(values.atPose3(3).matrix(), se3.exp(np.full(6, 0.3)), atol=1e-9)
 
 
-def test_a_graph_changes_the_windows_defaults_and_settings_win() -> None:
-    source = open_edges([example("pose3example.txt")])
-    config, decisions = configuration_for(source, Config())
-    assert (config.window.size, config.window.kernel, config.window.gate) == (None, "none", None)
-    assert len(decisions) == 3
-    config, decisions = configuration_for(source, Config(window=WindowConfig(size=5, gate=10.0)))
-    assert (config.window.size, config.window.kernel, config.window.gate) == (5, "none", 10.0)
-    assert [line.split(":")[0] for line in decisions] == ["window.kernel"]
-    unchanged, decisions = configuration_for(ListSource([]), Config())
-    assert unchanged == Config()
-    assert decisions == []
-
-
 def test_a_graph_may_be_smoothed_by_a_small_window(tmp_path: Path) -> None:
     path = example("pose3example-grid.txt")
     config = Config(window=WindowConfig(size=3))
-    result = smooth_file(path, tmp_path, config)
+    result = smooth_edges(open_edges([path]), tmp_path, config=config)
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 27
     assert result.summary["batch"] is None
 
@@ -196,10 +232,10 @@ def test_what_was_computed_stays_where_the_input_breaks_off(tmp_path: Path) -> N
 def test_a_graph_that_breaks_off_in_a_line_is_smoothed_up_to_there(tmp_path: Path) -> None:
     path = tmp_path / "broken.g2o"
     path.write_bytes(example("pose3example-grid").read_bytes()[:8300])
-    result = smooth_file(path, tmp_path / "out")
+    result = optimize_file(path, tmp_path / "out")
     assert not result.is_complete
     assert "broken.g2o:70" in result.summary["warnings"][0]
-    assert result.summary["window"]["n_edges"] == 42
+    assert result.summary["edges"] == 42
     lines = (tmp_path / "out/smoothed.g2o").read_text().splitlines()
     edges = [line for line in lines if line.startswith("EDGE")]
     assert len(edges) == 42

@@ -6,7 +6,7 @@ import re
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,15 @@ from gvo.trajectory.g2o import (
     convert_line,
     format_vertex,
     parse_line,
+    parse_lines,
 )
-from gvo.types import Edge, Estimate, FloatArray, PosePrior
+from gvo.types import Edge, FloatArray, FrameId, PosePrior
 
 _SECOND_NS = 1_000_000_000
 _TAG = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)*$")
 GRAPH = "smoothed.g2o"
+# Lines that are parsed together.
+_BLOCK = 512
 
 
 class PoseGraphSource:
@@ -38,13 +41,18 @@ class PoseGraphSource:
     A pose comes with its first edge to a known pose, together with the edges of the lines that
     follow at once. An edge between two poses that are both unknown waits until one of them is
     known. A file has no stamps: the n-th pose gets n seconds. The pose named by `FIX` holds the
-    world, else that of the first vertex, else that of the first edge; of other vertices' poses
-    nothing is used, as the edges tell where they are.
+    world, else that of the first vertex, else that of the first edge; the poses of other vertices
+    are in no event, as the edges tell where they are.
 
     Parameters
     ----------
     path : Path
         Text file.
+
+    Attributes
+    ----------
+    vertices : dict of int to ndarray of float64, shape (4, 4), or None
+        Unless it is None, gets T_world_frame of all vertices as events are read.
 
     Raises
     ------
@@ -57,8 +65,10 @@ class PoseGraphSource:
         self.name = path.stem
         self.faults = InputFaults()
         self.has_made_up_stamps = True
+        self.vertices: dict[FrameId, FloatArray] | None = None
         self._fixed: dict[int, FloatArray] = {}
         self._start_id: int | None = None
+        self._malformed: int | None = None
         self._n_vertices = 0
         self._scan()
         self.n_poses = self._n_vertices
@@ -86,6 +96,8 @@ class PoseGraphSource:
         for line in self._lines():
             if isinstance(line, Measurement):
                 yield from graph.take(line)
+            elif isinstance(line, Vertex) and self.vertices is not None:
+                self.vertices[line.frame_id] = line.T_world_frame
         yield from graph.flush()
         self._report_unconnected(graph)
 
@@ -99,7 +111,9 @@ class PoseGraphSource:
         TrajectoryError
             When the file cannot be read again.
         """
-        for _, text in self._texts():
+        for number, text in self._texts():
+            if number == self._malformed:
+                return
             tag = text.split(maxsplit=1)[0]
             if tag in MEASUREMENT_TAGS or tag == "FIX":
                 try:
@@ -160,15 +174,19 @@ class PoseGraphSource:
         return "".join(f" ({warning})" for warning in self.faults.warnings())
 
     def _lines(self) -> Iterator[Line]:
-        for number, text in self._texts():
-            line = self._parsed(number, text)
-            if line is not None:
-                yield line
+        numbered = self._texts()
+        while block := list(islice(numbered, _BLOCK)):
+            try:
+                lines: Iterable[Line | None] = parse_lines([text for _, text in block])
+            except ValueError:
+                lines = (self._parsed(number, text) for number, text in block)
+            yield from (line for line in lines if line is not None)
 
     def _parsed(self, number: int, text: str) -> Line | None:
         try:
             return parse_line(text)
         except ValueError as error:
+            self._malformed = number
             raise TrajectoryError(f"{self._path}:{number}: {error}") from None
 
     def _texts(self) -> Iterator[tuple[int, str]]:
@@ -370,12 +388,10 @@ class GraphFile:
     def _part(self) -> Path:
         return self._path.with_suffix(".g2o.part")
 
-    def add(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses, named by whole numbers, in any order."""
+    def add(self, stamp_ns: int, frame_id: FrameId, T_world_frame: FloatArray) -> None:
+        """Write a smoothed pose, named by a whole number; they may come in any order."""
         with self._refused_on_error():
-            for estimate in estimates:
-                vertex = format_vertex(str(estimate.frame_id), estimate.T_world_frame)
-                self._file.write(f"{estimate.stamp_ns} {vertex}\n")
+            self._file.write(f"{stamp_ns} {format_vertex(str(frame_id), T_world_frame)}\n")
 
     def close(self, measurement_lines: Iterable[str]) -> None:
         """Sort the vertices by their stamps, and add the measurements.

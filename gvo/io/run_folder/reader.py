@@ -103,7 +103,8 @@ class RunRecord:
     timings : TimingTable or None
         Likewise.
     trajectories : dict of str to Trajectory
-        "raw", "causal" and "smoothed", with covariances; may be empty.
+        "raw", "causal" and "smoothed", with covariances where the run computed them; may be
+        empty, as "causal" where all was optimized at once.
     truth : Trajectory or None
         What the estimates were compared with: poses, or positions of the measured point.
     """
@@ -161,7 +162,7 @@ def read_run(folder: str | Path) -> RunRecord:
         When a file of poses or covariances is damaged.
     """
     folder = Path(folder)
-    needed = ["frames.csv", *(f"{name}.txt" for name in TRAJECTORIES)]
+    needed = ["frames.csv", "raw.txt", "smoothed.txt"]
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing:
         raise RecordingError(f"{folder}: is no run folder: no {missing[0]}; {_EXPECTED}")
@@ -285,8 +286,12 @@ def _read_timings(path: Path) -> TimingTable | None:
 
 def _read_estimate(folder: Path, name: str) -> Trajectory:
     """Read poses and covariances; in the middle of a run either may be a line ahead."""
+    if not (folder / f"{name}.txt").is_file():
+        return Trajectory.of([])
     poses = read_trajectory(folder / f"{name}.txt", is_growing=True)
     path = folder / f"{name}_covariance.csv"
+    if not path.is_file():
+        return replace(poses, covariances=None)
     stamps_ns, covariances = read_covariances(path, is_growing=True)
     _, first, second = np.intersect1d(poses.stamps_ns, stamps_ns, return_indices=True)
     return replace(poses.select(first), covariances=covariances[second])

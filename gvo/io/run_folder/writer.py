@@ -164,6 +164,8 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         summary and picture removed.
     columns : sequence of str
         Of the table of frames; the first is `stamp_ns`.
+    names : sequence of str
+        The trajectories that will be written.
 
     Raises
     ------
@@ -176,22 +178,26 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         path: Path,
         *,
         columns: Sequence[str] = FRAMES_HEADER,
+        names: Sequence[str] = TRAJECTORIES,
     ) -> None:
         self.path = path
         self._is_writable = True
+        self._names = names
         self._files: dict[str, LineFile] = {}
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
-            for name in _OF_EARLIER_RUNS:
+            covariances = (f"{name}_covariance.csv" for name in TRAJECTORIES)
+            for name in (*_RESULTS, *covariances):
                 (path / name).unlink(missing_ok=True)
             stack.callback(self._close_files)
             self._open_all(columns)
             stack.pop_all()
 
     def _open_all(self, columns: Sequence[str]) -> None:
-        for name in TRAJECTORIES:
+        for name in self._names:
             self._open(f"{name}.txt", "")
-            self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
+            if self._names is TRAJECTORIES:
+                self._open_covariances(name)
         self._open("frames.csv", _csv_line(columns))
         if columns is FRAMES_HEADER:
             self._open("edges.csv", _csv_line(EDGES_HEADER))
@@ -207,6 +213,9 @@ class RunFolder(AbstractContextManager["RunFolder"]):
 
     def _open(self, name: str, header: str) -> None:
         self._files[name] = LineFile(self.path / name, header)
+
+    def _open_covariances(self, name: str) -> None:
+        self._open(f"{name}_covariance.csv", f"{COVARIANCE_HEADER}\n")
 
     def _write(self, name: str, lines: str) -> None:
         file = self._files[name]
@@ -236,6 +245,21 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._add_pose("raw", raw)
         self._add_pose("causal", causal)
         self._write("frames.csv", _csv_line(row))
+
+    def add_trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """Write all poses at once, and their covariances, if any."""
+        rows = zip(trajectory.stamps_ns.tolist(), trajectory.T_world_frame, strict=True)
+        self._write(f"{name}.txt", "".join(f"{format_tum_line(*row)}\n" for row in rows))
+        if trajectory.covariances is not None:
+            with self._refused_on_error(self.path):
+                self._open_covariances(name)
+            rows = zip(trajectory.stamps_ns.tolist(), trajectory.covariances, strict=True)
+            lines = (f"{format_covariance_line(*row)}\n" for row in rows)
+            self._write(f"{name}_covariance.csv", "".join(lines))
+
+    def add_rows(self, rows: Iterable[Sequence[object]]) -> None:
+        """Write rows of the table of frames."""
+        self._write("frames.csv", "".join(map(_csv_line, rows)))
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a row for a frame without a pose."""
@@ -292,6 +316,8 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         if not self._is_writable:
             return
         for name, n_header in (("smoothed.txt", 0), ("smoothed_covariance.csv", 1)):
+            if name not in self._files:
+                continue
             with self._refused_on_error(self.path / name):
                 _sort_lines(self.path / name, n_header=n_header)
 

@@ -55,9 +55,15 @@ def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewS
 
 def world_up(record: RunRecord) -> Up:
     """Return which axis points up: -y where the world is the first camera, else +z."""
-    causal = record.trajectories["causal"]
-    is_first = len(causal) == 0 or np.allclose(causal.T_world_frame[0], np.eye(4), atol=1e-6)
+    poses = tracked(record)
+    is_first = len(poses) == 0 or np.allclose(poses.T_world_frame[0], np.eye(4), atol=1e-6)
     return "-y" if is_first and record.summary.get("base_frame", "camera") == "camera" else "+z"
+
+
+def tracked(record: RunRecord) -> Trajectory:
+    """Return the causal poses; where all was optimized at once, which has none, the smoothed."""
+    causal, smoothed = (record.trajectories[name] for name in ("causal", "smoothed"))
+    return causal if len(causal) else smoothed
 
 
 def aligned_truth(record: RunRecord) -> Trajectory | None:
@@ -173,11 +179,11 @@ class FinishedPage:
             rows["reason"] = frames.reasons[index]
         rows |= {name: f"{counts[index]}" for name, counts in frames.counts.items()}
         rows |= self._milliseconds(stamp_ns)
-        causal = self._record.trajectories["causal"]
-        row = int(np.searchsorted(causal.stamps_ns, stamp_ns))
-        if row < len(causal) and causal.stamps_ns[row] == stamp_ns:
-            covariance = None if causal.covariances is None else causal.covariances[row]
-            rows |= pose_rows(causal.T_world_frame[row], covariance)
+        poses = tracked(self._record)
+        row = int(np.searchsorted(poses.stamps_ns, stamp_ns))
+        if row < len(poses) and poses.stamps_ns[row] == stamp_ns:
+            covariance = None if poses.covariances is None else poses.covariances[row]
+            rows |= pose_rows(poses.T_world_frame[row], covariance)
         return rows
 
     def _milliseconds(self, stamp_ns: int) -> dict[str, str]:
@@ -191,10 +197,10 @@ class FinishedPage:
         return {"ms": f"{sum(known.values()):.1f} ({parts})"} if known else {}
 
     def _pose(self, stamp_ns: int) -> FloatArray | None:
-        """Return the last causal pose until a stamp."""
-        causal = self._record.trajectories["causal"]
-        row = int(np.searchsorted(causal.stamps_ns, stamp_ns, side="right")) - 1
-        return causal.T_world_frame[row] if row >= 0 else None
+        """Return the last pose until a stamp."""
+        poses = tracked(self._record)
+        row = int(np.searchsorted(poses.stamps_ns, stamp_ns, side="right")) - 1
+        return poses.T_world_frame[row] if row >= 0 else None
 
     def _draw_ellipsoids(self, stamp_ns: int) -> None:
         """Draw covariances along the smoothed path, of the same poses whatever frame is shown."""

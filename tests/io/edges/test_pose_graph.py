@@ -13,7 +13,7 @@ from gvo.geometry import se3
 from gvo.io.edges.events import EdgeEvent, Event, PoseEvent
 from gvo.io.edges.pose_graph import GRAPH, GraphFile, PoseGraphSource
 from gvo.trajectory.g2o import format_edge, format_vertex
-from gvo.types import Estimate, FloatArray, PosePrior
+from gvo.types import FloatArray, PosePrior
 
 
 def translation(x: float) -> FloatArray:
@@ -207,6 +207,15 @@ def test_what_is_no_graph_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_vertices_are_kept_where_they_are_asked_for(tmp_path: Path) -> None:
+    lines = [format_vertex(n, translation(10.0 + n)) for n in (0, 1)]
+    source = PoseGraphSource(write(tmp_path, *lines, edge_line(0, 1)))
+    assert source.vertices is None
+    source.vertices = {}
+    list(source.events())
+    assert {n: T[0, 3] for n, T in source.vertices.items()} == {0: 10.0, 1: 11.0}
+
+
 def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: Path) -> None:
     source = PoseGraphSource(write(tmp_path, edge_line(0, 1), edge_line(1, 2), "EDGE3 1 2"))
     events = source.events()
@@ -215,16 +224,10 @@ def test_a_malformed_line_further_on_ends_the_stream_with_its_number(tmp_path: P
         list(events)
 
 
-def estimate(number: int, stamp_ns: int) -> Estimate:
-    T = np.eye(4)
-    T[0, 3] = number
-    return Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=np.eye(6), frame_id=number)
-
-
 def test_vertices_come_by_their_stamps_then_the_measurements(tmp_path: Path) -> None:
     graph = GraphFile(tmp_path / "new")
-    graph.add([estimate(7, 300), estimate(5, 20)])
-    graph.add([estimate(6, 100)])
+    for number, stamp_ns in ((7, 300), (5, 20), (6, 100)):
+        graph.add(stamp_ns, number, translation(number))
     graph.close(["EDGE_SE3:QUAT 5 6", "EDGE_SE3:QUAT 6 7"])
     lines = (tmp_path / "new" / GRAPH).read_text().splitlines()
     assert [line.split()[:3] for line in lines[:3]] == [
