@@ -160,8 +160,8 @@ def test_of_chunks_with_a_checksum_none_that_was_changed_is_read(
     assert messages == sorted(set(messages) & set(_ALL))
     n_lost = len(_ALL) - len(messages)
     assert n_lost <= 4 * len(changes)
-    # LZ4 may say the same in other bytes: a copy from elsewhere, of the same content
-    assert n_lost >= 1 or name == "lz4.mcap"
+    # LZ4 may say the same in other bytes, by a copy from elsewhere; bzip2 too, by codes unused
+    assert n_lost >= 1 or name in ("lz4.mcap", "bz2.bag")
     assert ("cannot be read" in damage) == (n_lost >= 1)
 
 
