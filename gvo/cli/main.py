@@ -283,7 +283,7 @@ def smooth(
     config: ConfigFile = None,
     set_: Settings = None,
 ) -> None:
-    """Optimize the edges or poses of any front-end, at once or as they come."""
+    """Optimize edges or poses of any front-end, a graph or a stream."""
     from gvo.io.edges.opening import open_edges, parse_sigma
     from gvo.io.poses.inputs import read_ground_truth
 
