@@ -130,11 +130,13 @@ def test_a_scheduler_that_is_lost_is_a_line_and_the_batch_goes_on_with_another(
     out, asked = tmp_path / "out", [bags / "walk0.mcap", long_bag]
     other = Cluster(folder)
     try:
-        other.add_worker()
+        worker = other.add_worker()
         with batch(*asked, "--out", out, "--scheduler", other.address) as process:
             wait_until(lambda: is_under_way(out / "long"), "the middle of the batch")
-            other.scheduler.kill()
-            said = process.communicate(timeout=120)[1]
+            with other.frozen(worker):  # or it ends the recording
+                other.scheduler.kill()
+                said = process.communicate(timeout=120)[1]
+                other.kill_worker(worker)
     finally:
         other.close()
     assert process.returncode == 2, said
