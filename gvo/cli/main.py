@@ -180,7 +180,7 @@ def run(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
     out = new_folder(out, recordings[0], force=force)
-    outputs.check()
+    outputs.check(force=force)
     options = recording_options(calibration, left, right, color, depth)
     source = open_source(recordings, parameters, options)
     base_frame = find_base_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
@@ -421,11 +421,16 @@ def compare(
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
     from gvo.io.poses.inputs import read_compared
+    from gvo.io.run_folder.line_file import check_new
     from gvo.trajectory.evaluation import evaluate, evaluations_json, format_evaluations
 
+    for path in (plot, report_file, plots):
+        if path is not None and not force:
+            check_new(path, otherwise="--force to replace it")
     truth, trajectories, notes = read_compared(reference, estimates)
     warn(notes)
     lengths = None if segments is None else _parse_lengths(segments)

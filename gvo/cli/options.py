@@ -39,7 +39,7 @@ Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the d
 Out = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result in the folder.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace earlier results.")]
 Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
 Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to read from there.")]
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]

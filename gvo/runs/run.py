@@ -103,7 +103,7 @@ def run_recording(
     outputs : RunOutputs, optional
         What is written besides the folder's tables; the report where omitted.
     force : bool
-        Replace an earlier run in the folder, complete or not.
+        Replace an earlier run in the folder, complete or not, and plots.
     on_progress : callable, optional
         Called after each frame.
 
@@ -124,7 +124,7 @@ def run_recording(
     config = config or Config()
     base_frame = base_frame or BaseFrame(source.info.frame_id)
     outputs = outputs or RunOutputs()
-    outputs.check()
+    outputs.check(force=force)
     truth = _find_truth(source, ground_truth, base_frame)
     _LOGGER.debug("ground truth: %s", truth.decision if isinstance(truth, Truth) else truth.reason)
     first_pose = partial(initial_pose, truth) if starts_at_truth else None

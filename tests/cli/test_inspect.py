@@ -173,7 +173,7 @@ def test_nothing_computed_is_lost_where_a_plot_cannot_be_written(
     (tmp_path / "plots/01_above.png").mkdir(parents=True)
     out = tmp_path / "out"
     options = ["--out", out, "--duration", "0.3", "--plots", tmp_path / "plots"]
-    answer = command("run", drive_bag, *options)
+    answer = command("run", drive_bag, *options, "--force")
     assert answer.code == 3
     assert answer.err.startswith("gvo: warning: ")
     assert answer.err.count("\n") == 1
@@ -190,7 +190,8 @@ def test_errors_are_printed_where_the_page_cannot_be_written(
 ) -> None:
     truth = poses(tmp_path / "truth.txt")
     for options in (["--report", truth / "page.html"], ["--plots", truth]):
-        answer = command("compare", truth, truth, *options)
+        assert command("compare", truth, truth, *options).out == ""
+        answer = command("compare", truth, truth, *options, "--force")
         assert answer.code == 2
         assert is_one_line(answer.err), answer.err
         assert "truth.txt" in answer.err

@@ -90,6 +90,10 @@ def test_a_run_takes_a_new_folder_where_none_is_named(
         ["run", "missing.bag", "--overlay", "taken/summary.json"],
         ["run", "missing.bag", "--rerun", "taken/summary.json"],
         ["run", "missing.bag", "--plots", "taken/summary.json"],
+        ["run", "missing.bag", "--plots", "taken"],
+        ["compare", "missing.txt", "missing.txt", "--plot", "taken/summary.json"],
+        ["compare", "missing.txt", "missing.txt", "--report", "taken/summary.json"],
+        ["compare", "missing.txt", "missing.txt", "--plots", "taken"],
         ["convert", "missing.bag", "taken"],
         ["demo", "--out", "taken"],
     ],
@@ -118,6 +122,20 @@ def test_a_run_is_replaced_where_that_is_asked_for(
     assert (tmp_path / "raw.txt").read_text() == before
     assert command(*run, "0.4", "--force").code == 0
     assert (tmp_path / "raw.txt").read_text() != before
+
+
+def test_a_picture_of_a_comparison_is_replaced_where_that_is_asked_for(
+    command: Command, tmp_path: Path
+) -> None:
+    poses, plot = tmp_path / "poses.txt", tmp_path / "plot.png"
+    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(9)))
+    plot.write_text("mine")
+    words = ["compare", poses, poses, "--plot", plot]
+    said = f"gvo: error: {plot}: exists already; give another path or --force to replace it\n"
+    assert command(*words) == (2, "", said)
+    assert plot.read_text() == "mine"
+    assert command(*words, "--force").code == 0
+    assert plot.read_bytes().startswith(b"\x89PNG")
 
 
 def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:

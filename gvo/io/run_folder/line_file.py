@@ -31,8 +31,14 @@ def check_folder(folder: Path) -> None:
         raise OutputError(f"{folder}: cannot be written: no permission to write to {place}")
 
 
-def check_new(path: Path) -> None:
+def check_new(path: Path, *, otherwise: str = "remove it") -> None:
     """Refuse a path that holds something, or whose folder cannot be written, before any work.
+
+    Parameters
+    ----------
+    path : Path
+    otherwise : str
+        What to do where no other path will do.
 
     Raises
     ------
@@ -42,7 +48,7 @@ def check_new(path: Path) -> None:
     check_folder(path.parent)
     is_empty = path.is_dir() and not any(path.iterdir())
     if os.path.lexists(path) and not is_empty:
-        raise RecordingError(f"{path}: exists already; give another path or remove it")
+        raise RecordingError(f"{path}: exists already; give another path or {otherwise}")
 
 
 def append_whole(file: io.FileIO, data: bytes) -> None:

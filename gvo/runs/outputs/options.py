@@ -46,8 +46,13 @@ class RunOutputs:
         if self.plots is not None and not self.report:
             raise ConfigurationError("--plots are those of the report: not with --no-report")
 
-    def check(self) -> None:
+    def check(self, *, force: bool = False) -> None:
         """Refuse files that exist or cannot be written, before any work; nothing is made.
+
+        Parameters
+        ----------
+        force : bool
+            Let plots be replaced.
 
         Raises
         ------
@@ -59,6 +64,8 @@ class RunOutputs:
                 check_new(path)
         if self.plots is not None:
             check_folder(self.plots)
+            if not force:
+                check_new(self.plots, otherwise="--force to replace its plots")
 
     def open(self, loop: RunLoop, stack: ExitStack) -> tuple[list[Output], list[str]]:
         """Open the files that are written as the run goes.

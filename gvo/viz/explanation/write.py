@@ -26,7 +26,7 @@ from gvo.viz.explanation.extraction import (
 )
 from gvo.viz.explanation.motion import draw_consensus, draw_matches, draw_residuals
 from gvo.viz.explanation.pose import draw_links, draw_pose
-from gvo.viz.explanation.sheet import Picture
+from gvo.viz.explanation.sheet import TITLES, Picture
 from gvo.viz.report.page import write_page
 
 _RELATIVE = "T_reference_current", "covariance", "n_matches", "n_inliers", "flow_px"
@@ -40,7 +40,7 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     ----------
     explanation : FrameExplanation
     out : Path
-        Folder, created if missing.
+        Folder, created if missing; the pictures of an earlier explanation are removed.
 
     Returns
     -------
@@ -58,6 +58,8 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     files[out / "explanation.json"] = numbers.encode()
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for name in TITLES:  # of an earlier explanation, which may have had other steps
+            (out / f"{name}.png").unlink(missing_ok=True)
         for path, content in files.items():
             path.write_bytes(content)
     except OSError as error:

@@ -97,6 +97,13 @@ def test_a_first_frame_says_in_words_what_was_not_reached(tmp_path: Path) -> Non
     assert "Not reached: this is the first frame" in written[-1].read_text()
 
 
+def test_no_picture_of_an_earlier_explanation_is_left(tmp_path: Path) -> None:
+    for name in ("02_depth.png", "09_links.png", "mine.png"):
+        (tmp_path / name).touch()
+    written = write_explanation(explained("stereo", 0), tmp_path)
+    assert {*tmp_path.iterdir()} == {*written, tmp_path / "mine.png"}
+
+
 def test_a_folder_that_is_a_file_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
