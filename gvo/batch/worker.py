@@ -25,11 +25,13 @@ class BatchStoppedError(GvoError):
 
 
 def dask_setup(worker: object) -> None:
-    """Ignore SIGINT in a worker of this machine, which Dask calls when it starts.
+    """Ignore what ends a batch in a worker of this machine, which Dask calls when it starts.
 
-    A terminal sends Ctrl-C to all of its processes; the client ends its workers itself.
+    A terminal sends Ctrl-C to all of its processes, and an end of the session SIGTERM; the client
+    ends its workers itself, and they write the poses so far.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def work(task: Task, options: TaskOptions, topic: str, key: Any) -> BatchRow:  # noqa: ANN401

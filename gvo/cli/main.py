@@ -38,6 +38,7 @@ from gvo.cli.options import (
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
+    WRITTEN,
     Command,
     both,
     ended_by_signals,
@@ -205,6 +206,7 @@ def run(
             outputs=outputs,
             force=force,
             on_progress=both(show, check),
+            on_written=partial(check, WRITTEN),
         )
     report(result, out)
 

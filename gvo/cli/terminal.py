@@ -26,6 +26,7 @@ ProgressT = TypeVar("ProgressT")
 _MAX_OFF = 0.02
 _MAX_CHATTER = 1 << 15  # bytes; half of what a pipe holds
 _EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
+WRITTEN = "all is written"
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
 
@@ -300,18 +301,22 @@ def ended_by_signals() -> Iterator[None]:
 def interruptible() -> Iterator[Callable[[object], None]]:
     """Yield a function that ends the work once a signal has come; call it between frames.
 
-    So a frame is either in all files or in none. A second signal ends at once.
+    So a frame is either in all files or in none. A second signal ends at once, as does the first
+    one after a call with `WRITTEN`.
     """
     received: list[int] = []
+    is_written = False
 
     def receive(number: int, frame: object) -> None:
         received.append(number)
-        if len(received) > 1:
+        if is_written or len(received) > 1:
             raise KeyboardInterrupt
 
-    def check(_: object) -> None:
+    def check(state: object) -> None:
+        nonlocal is_written
         if received:
             raise KeyboardInterrupt
+        is_written = state is WRITTEN
 
     try:
         with _handling(receive):

@@ -81,6 +81,7 @@ def run_recording(
     outputs: RunOutputs | None = None,
     force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
+    on_written: Callable[[], None] | None = None,
 ) -> RunResult:
     """Run odometry over a recording and write a run folder.
 
@@ -106,6 +107,8 @@ def run_recording(
         Replace an earlier run in the folder, complete or not, and plots.
     on_progress : callable, optional
         Called after each frame.
+    on_written : callable, optional
+        Called when all is computed and written; only the report is drawn after it.
 
     Returns
     -------
@@ -141,6 +144,8 @@ def run_recording(
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
         result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
+    if on_written is not None:
+        on_written()
     return _drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
 
 

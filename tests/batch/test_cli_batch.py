@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from distributed import Client
 
+import gvo
 from gvo.batch import BatchProgress
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
@@ -202,11 +203,11 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
     bags: Path, long_bag: Path, tmp_path: Path, batch: Batch, number: signal.Signals
 ) -> None:
-    """As a terminal does it: Ctrl-C goes to all of its processes."""
+    """As a terminal does it, or the end of a session: the signal goes to all processes."""
     out = tmp_path / "out"
     command = [*GVO, "batch", bags / "walk0.mcap", long_bag, "--out", out, "--workers", "2"]
     process = subprocess.Popen(
@@ -219,10 +220,10 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
     group = process.pid
     try:
         wait_until(lambda: is_complete(out / "walk0") and is_under_way(out / "long"), "the middle")
-        if number == signal.SIGINT:
-            os.killpg(group, number)
-        else:
+        if number == signal.SIGKILL:
             process.send_signal(number)
+        else:
+            os.killpg(group, number)
         assert process.stderr is not None
         said = process.stderr.read()
         process.wait(timeout=60)
@@ -233,13 +234,16 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
         process.wait()
         if process.stderr is not None:
             process.stderr.close()
-    codes = {signal.SIGINT: 130, signal.SIGKILL: -9}
+    codes = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
     assert process.returncode == codes[number]
     if number != signal.SIGKILL:
         *rows, last = said.splitlines()
         # The first may have ended before its row was written.
         assert all(row.startswith("[1/2] walk0: complete") for row in rows), said
         assert last == f"gvo: interrupted; the poses so far are in {out}: the same command goes on"
+        names = ("raw", "causal", "smoothed")
+        assert len({len(gvo.read_trajectory(out / f"long/{name}.txt")) for name in names}) == 1
+        assert not (out / "long" / "run.lock").exists()
     before = state_of(out / "walk0")
     answer = batch(bags / "walk0.mcap", long_bag, "--out", out)
     assert answer.code == 0, answer.err

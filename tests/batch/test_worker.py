@@ -16,6 +16,7 @@ import os, signal
 from gvo.batch.worker import dask_setup
 dask_setup(None)
 os.kill(os.getpid(), signal.SIGINT)
+os.kill(os.getpid(), signal.SIGTERM)
 print("goes on")
 """
 
@@ -67,7 +68,7 @@ def test_a_task_that_nobody_wants_any_more_stops(
     assert len(worker.events) == 1
 
 
-def test_a_worker_goes_on_when_ctrl_c_is_pressed() -> None:
+def test_a_worker_goes_on_when_all_processes_are_asked_to_end() -> None:
     command = [sys.executable, "-c", _PROGRAM]
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (answer.returncode, answer.stdout, answer.stderr) == (0, "goes on\n", "")

@@ -15,6 +15,7 @@ from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
 from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
+from gvo.viz.report import run as report
 from tests.conftest import Command
 
 ANEW = "the same command begins anew"
@@ -74,6 +75,24 @@ def test_a_signal_while_a_recording_is_read_ends_in_one_line(
     if "poses" in stands:
         n_poses = {len(gvo.read_trajectory(out / f"{name}.txt")) for name in ("raw", "smoothed")}
         assert len(n_poses) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
+    command: Command,
+    interrupt: Callable[..., None],
+    drive_bag: Path,
+    tmp_path: Path,
+    number: signal.Signals,
+) -> None:
+    interrupt(report, "status_plot", 1, number)
+    answer = command("run", drive_bag, "--out", tmp_path, "--duration", "0.3")
+    said = f"gvo: interrupted; {POSES_STAND.format(out=tmp_path)}\n"
+    assert (answer.code, answer.err) == (CODES[number], said)
+    assert not (tmp_path / "report.html").exists()
+    assert json.loads((tmp_path / "summary.json").read_text())["is_complete"]
+    for name in ("raw", "causal", "smoothed"):
+        assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 3
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
