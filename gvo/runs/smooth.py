@@ -183,11 +183,12 @@ def smooth_edges(
 
 @contextmanager
 def _opened(
-    out: Path, source: EdgeSource, *, force: bool, names: Sequence[str] = TRAJECTORIES
+    out: Path, source: EdgeSource | None, *, force: bool, names: Sequence[str] = TRAJECTORIES
 ) -> Iterator[tuple[RunFolder, GraphFile | None]]:
     """Open the files of a run; complete them also where it is interrupted."""
     with (
         written_alone(out, force=force),
+        _poses_counted(out),
         RunFolder(out, columns=POSES_HEADER, names=names) as folder,
     ):
         if not isinstance(source, PoseGraphSource):
@@ -198,6 +199,18 @@ def _opened(
             yield folder, graph_file
         finally:
             graph_file.close(source.measurement_lines())
+
+
+@contextmanager
+def _poses_counted(out: Path) -> Iterator[None]:
+    """Say, where a file cannot be written, how many poses stand."""
+    try:
+        yield
+    except (OutputError, TrajectoryError) as error:
+        files = [path for name in TRAJECTORIES if (path := out / f"{name}.txt").exists()]
+        n_poses = max((path.read_bytes().count(b"\n") for path in files), default=0)
+        text = f"{error}; {n_poses} poses stand in {out}"
+        raise OutputError(text, is_partly=n_poses > 0) from error
 
 
 @contextmanager
@@ -216,10 +229,7 @@ def _finished(
         summary = _summary(name, smoother, notes) | {"state": "interrupted", "warnings": [reason]}
         with suppress(OutputError):
             folder.write_summary(summary)
-        if isinstance(error, KeyboardInterrupt):
-            raise
-        text = f"{error}; {smoother.n_poses} poses stand in {folder.path}"
-        raise OutputError(text, is_partly=smoother.n_poses > 0) from error
+        raise
 
 
 def _events(source: EdgeSource, notes: SmoothingNotes) -> Iterator[Event]:
@@ -292,8 +302,9 @@ def _concluded(
     evaluations, fault = _compare(truth, estimates)
     warnings = [*warnings, *([fault] if fault else [])]
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
-    folder.write_summary(summary)
-    plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
+    with _poses_counted(folder.path):
+        folder.write_summary(summary)
+        plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
         summary=summary,
         evaluations=evaluations,
@@ -490,8 +501,8 @@ def optimize_edges(
         finally:
             # Also where the work is interrupted.
             smoothed = optimizer.trajectory(found)
-            folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
             folder.add_trajectory("smoothed", smoothed)
+            folder.add_trajectory("raw", optimizer.trajectory(of=optimizer.raw))
             folder.add_rows(_rows(graph, optimizer))
             if file is not None:
                 for number, T in zip(optimizer.numbers, optimizer.poses(), strict=True):
@@ -590,7 +601,7 @@ def smooth_lines(
     config = config or Config()
     faults, notes = InputFaults(), SmoothingNotes()
     out, name = Path(out), "standard input"
-    with written_alone(out, force=force), RunFolder(out, columns=POSES_HEADER) as folder:
+    with _opened(out, None, force=force) as (folder, _):
         smoother = Smoother(folder, config, keyframes=keyframes)
         with _finished(name, folder, smoother, notes):
             try:

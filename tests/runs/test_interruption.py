@@ -11,6 +11,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import pytest
 
 import gvo
@@ -19,7 +20,7 @@ from gvo.io.convert.bag_messages import BagWriter
 from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
 from gvo.runs.round_trip import run_round_trip
-from gvo.runs.smooth import smooth_edges, smooth_lines
+from gvo.runs.smooth import optimize_edges, smooth_edges, smooth_lines
 from gvo.types import Progress
 from tests.conftest import TABLES
 
@@ -234,6 +235,23 @@ def test_smoothing_on_a_full_disk_says_how_far_it_came(
     assert "No space left" in summary_of(out)["warnings"][0]
     for name in ("raw.txt", "causal.txt", "smoothed.txt", "frames.csv"):
         assert (out / name).read_bytes()[-1:] in (b"\n", b"")
+
+
+@pytest.mark.parametrize(
+    ("name", "n_poses"), [("smoothed.txt", 4), ("raw.txt", 27), ("frames", 27), ("summary", 27)]
+)
+def test_a_graph_optimized_onto_a_full_disk_says_how_many_poses_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, n_poses: int
+) -> None:
+    full, out = _FullDisk(name, 500), tmp_path / "out"
+    monkeypatch.setattr("gvo.io.run_folder.line_file.io.FileIO", full.make)
+    graph = gtsam.findExampleDataFile("pose3example-grid.txt")  # type: ignore[no-untyped-call]
+    said = rf"{name}.*No space left.*; {n_poses} poses stand in {out}$"
+    with pytest.raises(OutputError, match=said) as caught:
+        optimize_edges(open_edges([Path(graph)]), out)
+    assert caught.value.is_partly
+    assert len(gvo.read_trajectory(out / "smoothed.txt")) == n_poses
+    assert not list(out.glob("*.new"))
 
 
 class _FullDisk:

@@ -247,15 +247,14 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._write("frames.csv", _csv_line(row))
 
     def add_trajectory(self, name: str, trajectory: Trajectory) -> None:
-        """Write all poses at once, and their covariances, if any."""
-        rows = zip(trajectory.stamps_ns.tolist(), trajectory.T_world_frame, strict=True)
-        self._write(f"{name}.txt", "".join(f"{format_tum_line(*row)}\n" for row in rows))
+        """Write all poses of a trajectory, and their covariances, if any."""
+        for row in zip(trajectory.stamps_ns.tolist(), trajectory.T_world_frame, strict=True):
+            self._write(f"{name}.txt", f"{format_tum_line(*row)}\n")
         if trajectory.covariances is not None:
             with self._refused_on_error(self.path):
                 self._open_covariances(name)
-            rows = zip(trajectory.stamps_ns.tolist(), trajectory.covariances, strict=True)
-            lines = (f"{format_covariance_line(*row)}\n" for row in rows)
-            self._write(f"{name}_covariance.csv", "".join(lines))
+            for row in zip(trajectory.stamps_ns.tolist(), trajectory.covariances, strict=True):
+                self._write(f"{name}_covariance.csv", f"{format_covariance_line(*row)}\n")
 
     def add_rows(self, rows: Iterable[Sequence[object]]) -> None:
         """Write rows of the table of frames."""
@@ -346,8 +345,9 @@ def _sort_lines(path: Path, *, n_header: int) -> None:
     """Sort the lines of a file by their stamp, the number at their start."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     header, body = lines[:n_header], lines[n_header:]
-    body.sort(key=_stamp_digits)
-    replace_text(path, "".join(header + body))
+    ordered = sorted(body, key=_stamp_digits)
+    if ordered != body:
+        replace_text(path, "".join(header + ordered))
 
 
 def _stamp_digits(line: str) -> int:
