@@ -11,7 +11,8 @@ what else it does, ratios less so. Starting up and drawing are left out.
 `--ablation` adds the errors under settings that leave a part of the method out.
 `--seeds N` measures errors and NEES on rendered recordings of N seeds, a line for each (see
 benchmark_seeds.py): `--kind drive` (stereo), `hand` (a fast one, RGB-D), `rest` (a drone that
-hovers, stereo), with a rolling shutter by `--readout`. `--keep DIR` keeps what is rendered.
+hovers, stereo), `block` (a lap and more by car, stereo), `rooms` (alike, RGB-D), with a rolling
+shutter by `--readout`. `--keep DIR` keeps what is rendered.
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 `--graphs` optimizes whole pose graphs, those named, GTSAM's and generated ones, beside GTSAM used
@@ -88,7 +89,7 @@ def add_seeds(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--seeds", type=seeds, metavar="N", help="0 to N - 1, or as in 10-19")
     group.add_argument("--kind", choices=benchmark_seeds.KINDS, default="drive")
     group.add_argument("--sensor", choices=["stereo", "rgbd"], help="default: the kind's")
-    group.add_argument("--frames", type=int, choices=range(2, 100_000), default=300, metavar="N")
+    group.add_argument("--frames", type=int, choices=range(2, 100_000), metavar="N")
     group.add_argument("--readout", type=float, default=0.0, metavar="MS", help="rolling shutter")
     group.add_argument("--keep", type=Path, metavar="DIR", help="of bags, written once, then read")
 
@@ -104,10 +105,11 @@ def seeds(text: str) -> range:
 
 def recordings_of(arguments: argparse.Namespace) -> benchmark_seeds.Recordings:
     """Return what the options of rendered recordings name."""
+    kind = benchmark_seeds.KINDS[arguments.kind]
     return benchmark_seeds.Recordings(
         kind=arguments.kind,
-        sensor=arguments.sensor or benchmark_seeds.KINDS[arguments.kind][1],
-        n_frames=arguments.frames,
+        sensor=arguments.sensor or kind.sensor,
+        n_frames=arguments.frames or kind.n_frames,
         readout_ms=arguments.readout,
         folder=arguments.keep,
     )

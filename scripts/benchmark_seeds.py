@@ -23,10 +23,23 @@ from gvo.runs.loop import edge_over, motions_of_window
 from gvo.trajectory.evaluation import Motions, consistency, motions_of_chain
 from gvo.types import Edge, FloatArray
 
-KINDS: dict[str, tuple[str, Sensor]] = {
-    "drive": ("driving", "stereo"),
-    "hand": ("turning", "rgbd"),
-    "rest": ("hovering", "stereo"),
+
+@dataclass(frozen=True)
+class Kind:
+    """A world, and what is rendered of it where nothing else is asked for."""
+
+    world: str
+    sensor: Sensor
+    n_frames: int = 300
+    scale: float = 1.0
+
+
+KINDS = {
+    "drive": Kind("driving", "stereo"),
+    "hand": Kind("turning", "rgbd"),
+    "rest": Kind("hovering", "stereo"),
+    "block": Kind("block", "stereo", n_frames=600, scale=0.5),
+    "rooms": Kind("rooms", "rgbd", n_frames=1080, scale=0.5),
 }
 SPANS_S = (1, 10)
 # Raw and smoothed of each.
@@ -80,10 +93,11 @@ class Recordings:
         """Return the recording of a seed, rendered while it is read."""
         try:
             return gvo.SyntheticRecording(
-                KINDS[self.kind][0],  # type: ignore[arg-type]
+                KINDS[self.kind].world,  # type: ignore[arg-type]
                 self.sensor,
                 n_frames=self.n_frames,
                 seed=seed,
+                scale=KINDS[self.kind].scale,
                 readout_ms=self.readout_ms,
             )
         except ValueError as error:

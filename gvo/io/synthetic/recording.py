@@ -22,13 +22,15 @@ from gvo.io.synthetic.worlds.deceptive import (
     facade,
     mirror_room,
     ride,
+    rooms,
     traffic,
     traffic_drive,
     turn_away,
+    walk,
 )
-from gvo.io.synthetic.worlds.motion import drive, hover, look_around, turn_fast
+from gvo.io.synthetic.worlds.motion import drive, drive_block, hover, look_around, turn_fast
 from gvo.io.synthetic.worlds.room import room
-from gvo.io.synthetic.worlds.street import street
+from gvo.io.synthetic.worlds.street import block, street
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import BoolArray, DepthArray, FloatArray, ImageArray, IntArray
 
@@ -36,8 +38,9 @@ _EXPOSURE_PERIOD_S = 7.3
 _BLOB_PX = 14
 _STEP_SHARE = 0.03
 WorldName: TypeAlias = Literal[
-    "driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall"
-]
+    "driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall", "block",
+    "rooms",
+]  # fmt: skip
 _START_NS = 1_700_000_000_000_000_000
 
 
@@ -49,7 +52,8 @@ class SyntheticRecording:
 
     Parameters
     ----------
-    world : {"driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall"}
+    world : {"driving", "handheld", "turning", "hovering", "traffic", "facade", "mirror", "wall", \
+             "block", "rooms"}
         `driving`: around a block of houses with KITTI's cameras at 10 Hz. `handheld`: a camera
         held in the hand in a furnished room, 640 x 480 at 30 Hz. `turning`: the same, turned to
         and fro at up to 85 deg/s. `hovering`: a drone there that flies for 2 s to another place,
@@ -60,7 +64,11 @@ class SyntheticRecording:
         the room with a large mirror that swings: what is seen in it moves as one. A stereo camera
         sees the virtual room behind the glass; the depth of an RGB-D camera is that of the glass,
         as of dusty ones, while its image shows what is reflected. `wall`: the hand turns to a
-        wall of one grey, which fills the image from 3.8 to 7.0 s, and turns back.
+        wall of one grey, which fills the image from 3.8 to 7.0 s, and turns back. Two are for
+        loops. `block`: the car closes its lap of 400 m, drives 80 m of it again, turns and comes
+        back in the other lane, 570 m in 60 s; the houses, trees and posts of one side of the block
+        stand again along its opposite side, and look the same to who drives there. `rooms`: the
+        hand walks through three rooms furnished alike, along the corridor between them, in 36 s.
     sensor : {"stereo", "rgbd"}
     n_frames : int
         Length; the drive closes its lap of 400 m after about 480 frames.
@@ -265,6 +273,8 @@ _WORLDS = {
     "facade": _by_car(facade, _always(ride)),
     "mirror": _by_hand(mirror_room, _always(look_around)),
     "wall": _by_hand(blank_room, _always(turn_away)),
+    "block": _by_car(block, _by_seed(drive_block)),
+    "rooms": _by_hand(rooms, _by_seed(walk)),
 }
 
 

@@ -1,4 +1,4 @@
-"""Worlds that deceive: traffic, facade, mirror, blank wall."""
+"""Worlds that deceive: traffic, facade, mirror, blank wall, rooms that look the same."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from gvo.geometry.se3 import exp, make_transform
 from gvo.io.synthetic import textures as paint
@@ -43,6 +44,22 @@ _SWING_S = 4.0
 # The time from turning away to being turned to the blank wall, and how long it is looked at.
 _AWAY_S = (2.0, 2.0)
 _BLANK_S = 2.5
+# Rooms along a corridor: how many, their distance, the corridor's axis; door and wall in metres.
+_N_ROOMS = 3
+_APART_M = 5.0
+_AISLE_M = -2.9
+_DOOR_M = (1.1, 2.1)
+_WALL_M = 0.12
+# A walk from one room to the same place in the next: seconds, x, y, heading in degrees.
+_WALK = np.array(
+    [
+        [0.0, 0.0, -0.9, 0.0], [1.5, 0.15, -0.7, 18.0], [3.5, -0.1, -0.8, -22.0],
+        [6.0, 0.0, -1.4, -140.0], [7.2, 0.0, -2.1, -175.0], [8.6, 0.35, -2.8, -120.0],
+        [9.6, 1.1, -2.9, -92.0], [12.4, 4.2, -2.9, -85.0], [13.8, 4.9, -2.4, -15.0],
+        [15.0, 5.0, -1.5, 0.0],
+    ]
+)  # fmt: skip
+_WALK_S = 16.0
 
 
 def traffic_drive(stamps_s: FloatArray) -> FloatArray:
@@ -267,3 +284,103 @@ def turn_away(stamps_s: FloatArray) -> FloatArray:
 def _smooth(share: FloatArray) -> FloatArray:
     x = np.clip(share, 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
+@lru_cache(maxsize=2)
+def rooms(seed: int) -> Scene:
+    """Build three rooms furnished alike, their doors on one corridor.
+
+    Returns
+    -------
+    Scene
+        Some 800 rectangles, map axes with z up; the first room as `room` has it, the others to
+        the right of it.
+    """
+    return make_scene(rooms_rectangles(), room_textures(seed), LAMP)
+
+
+def rooms_rectangles() -> list[Rectangle]:
+    """Return all that is in the rooms and the corridor, with textures of `room_textures`."""
+    shift = np.array([_APART_M, 0.0, 0.0])
+    alike = [*filter(_leaves_door, room_rectangles()), *_front(), *_aisle()]
+    rectangles = [
+        replace(each, corner=np.asarray(each.corner) + k * shift)
+        for k in range(_N_ROOMS)
+        for each in alike
+    ]
+    far = 0.5 * _APART_M + np.array([-_APART_M, (_N_ROOMS - 1) * _APART_M])
+    for x, inwards in ((far[0], 1.0), (far[1], -1.0)):
+        ends = np.array([x, _AISLE_M - inwards]), np.array([x, _AISLE_M + inwards])
+        rectangles.append(wall(*ends, (0.0, 2.5), plain("wallpaper")))
+    return rectangles
+
+
+def _leaves_door(rectangle: Rectangle) -> bool:
+    """Tell whether a rectangle of the room is not part of its southern wall."""
+    y = np.array([rectangle.corner, rectangle.edge_s, rectangle.edge_t], dtype=np.float64)[:, 1]
+    return bool(y[0] + max(y[1], 0.0) + max(y[2], 0.0) > -1.9)
+
+
+def _front() -> Iterator[Rectangle]:
+    """Yield the wall between a room and the corridor, its door and the door's frame."""
+    width, height = _DOOR_M
+    paper, wood = plain("wallpaper"), plain("wood")
+    middle = -2.0 - 0.5 * _WALL_M
+    beside = 0.5 * (_APART_M - width)
+    for sign in (-1.0, 1.0):
+        center = np.array([sign * 0.5 * (width + beside), middle])
+        yield from box(center, 0.0, (_WALL_M, beside, 2.5), paper)[:4]
+        post = np.array([sign * 0.5 * width, middle])
+        yield from box(post, 0.0, (_WALL_M + 0.06, 0.1, height), wood)[:4]
+    size = (_WALL_M, width, 2.5 - height)
+    yield from box(np.array([0.0, middle]), 0.0, size, paper, bottom=height)[::2]
+    corner = (-0.5 * width, -2.0 - _WALL_M, height)
+    yield replace(wood, corner=corner, edge_s=(width, 0, 0), edge_t=(0, _WALL_M, 0))
+    yield from box(np.array([-0.58, -1.52]), -0.05, (0.95, 0.04, 2.05), wood)
+
+
+def _aisle() -> Iterator[Rectangle]:
+    """Yield the part of the corridor before a room: floor, ceiling, wall, a picture, a carton."""
+    half, near, far = 0.5 * _APART_M, -2.0, 2.0 * _AISLE_M + 2.0
+    ends = np.array([-half, _AISLE_M]), np.array([half, _AISLE_M])
+    yield slab(*ends, near - far, 0.0, plain("planks"))
+    edges = (2 * half, 0, 0), (0, near - far, 0)
+    yield Rectangle(corner=(-half, far, 2.5), edge_s=edges[0], edge_t=edges[1], texture="plaster")
+    south = np.array([half, far]), np.array([-half, far])
+    yield wall(*south, (0.0, 2.5), plain("wallpaper"))
+    yield wall(*south, (0.0, 0.09), plain("wood"))
+    for x, name, width in ((0.3, "landscape", 0.9), (-1.6, "chart", 0.5), (1.9, "abstract", 0.5)):
+        first, *others = box(
+            np.array([x, far + 0.015]), np.pi, (0.03, width, 0.65), plain("wood"), bottom=1.2
+        )
+        yield from (replace(first, texture=name, is_stretched=True), *others)
+    yield from box(np.array([-1.7, far + 0.2]), 0.2, (0.3, 0.4, 0.35), stretched("carton"))
+
+
+def walk(seed: int, stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a camera carried in the hand from room to room.
+
+    It looks around in a room for 4 s, leaves by the door, and is in the next one 16 s later.
+
+    Parameters
+    ----------
+    seed : int
+        Of how the hand sways.
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    onwards = np.array([_WALK_S, _APART_M, 0.0, 0.0])
+    knots = np.vstack([_WALK + k * onwards for k in range(_N_ROOMS)])[
+        : 3 - len(_WALK)
+    ]  # in the last room it stays
+    t = np.minimum(stamps_s, knots[-1, 0])
+    x, y, heading = PchipInterpolator(knots[:, 0], knots[:, 1:])(t).T
+    rng = np.random.default_rng([seed, 13])
+    rates, phases = rng.uniform(1.5, 5.0, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
+    sway = np.sin(rates * stamps_s[:, np.newaxis] + phases)
+    position = np.column_stack([x, y, np.full_like(x, 1.4)]) + 0.012 * sway[:, :3]
+    tilt = exp(np.hstack([0.025 * sway[:, 3:] - [0.1, 0.0, 0.0], np.zeros((len(t), 3))]))
+    zeros = np.zeros_like(x)
+    yaw = exp(np.column_stack([zeros, zeros, np.radians(heading), zeros, zeros, zeros]))
+    level = make_transform(yaw[:, :3, :3] @ R_MAP_LEVEL, position)
+    return np.asarray(level @ tilt)

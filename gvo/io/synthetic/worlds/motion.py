@@ -18,6 +18,15 @@ STRAIGHT_M = 50.0
 TURN_M = 50.0
 LAP_M = 4 * (STRAIGHT_M + TURN_M)
 _START_M = 30.0
+# Where the drive around the block turns back, and its line there: along and right, metres.
+TURN_BACK_M = 525.0
+_TURN_BACK = np.array(
+    [
+        [-12.0, 0.1], [-8.0, 0.7], [-4.0, 1.9], [0.0, 2.75], [3.0, 2.2], [4.9, 0.2],
+        [5.2, -2.2], [3.9, -4.7], [1.3, -6.0], [-2.0, -6.1], [-6.0, -5.0], [-10.0, -3.9],
+        [-14.0, -3.5],
+    ]
+)  # fmt: skip
 _LEG_S, _HOVER_S = 2.0, 3.0
 _N_PLACES = 8
 R_MAP_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -101,14 +110,63 @@ def drive_along(
     shake : float or ndarray of float64, shape (n,)
         Factor on how much the road shakes the car; 0 while it stands.
     """
+    return _by_car(stamps_s, road_point(s), heading(s), shake)
+
+
+def drive_block(seed: int, stamps_s: FloatArray) -> FloatArray:
+    """Return T_map_cam, shape (n, 4, 4), of a car that drives a lap, goes on, turns and comes back.
+
+    From s = 30 m of the road it closes the lap at 430 m, drives over the same road until it turns
+    at 525 m, and back in the other lane to 450 m; at some 10 m/s, and slowly where it turns.
+
+    Parameters
+    ----------
+    seed : int
+        Of its speed, and of where in its lane it drives.
+    stamps_s : ndarray of float64, shape (n,)
+        Seconds since the start.
+    """
+    line, way = _block_line(seed)
+    driven = way(np.minimum(stamps_s, way.x[-1]))
+    along = line(driven, 1)
+    return _by_car(stamps_s, line(driven), np.arctan2(-along[:, 0], along[:, 1]))
+
+
+@lru_cache(maxsize=4)
+def _block_line(seed: int) -> tuple[CubicSpline, CubicSpline]:
+    """Return the driven line by its length in metres, and that length by seconds."""
+    rates = np.random.default_rng([seed, 9]).uniform(0.8, 1.2, 3)
+    there, back = np.arange(_START_M, TURN_BACK_M - 17.0, 5.0), np.arange(0.0, 65.0, 5.0)
+    weave = 0.35 * np.sin(rates[0] * there / 17.0) + 0.15 * np.sin(rates[1] * there / 5.0)
+    table = np.vstack(
+        [
+            np.column_stack([there, weave]),
+            np.add(_TURN_BACK, [TURN_BACK_M, 0.0]),
+            np.column_stack([TURN_BACK_M - 17.0 - back, -3.4 + 0.25 * np.sin(back / 13.0)]),
+        ]
+    )
+    points = road_point(table[:, 0], table[:, 1])
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    line = CubicSpline(lengths, points)
+    fine = np.linspace(0.0, lengths[-1], 4001)
+    from_turn = fine - lengths[len(there) + 6]
+    speeds = 10.8 + 1.4 * np.sin(rates[2] * fine / 14.0)
+    speeds *= 1.0 - 0.73 * np.exp(-((from_turn / 19.0) ** 4))
+    steps = np.diff(fine) * 0.5 * (1.0 / speeds[1:] + 1.0 / speeds[:-1])
+    return line, CubicSpline(np.append(0.0, np.cumsum(steps)), fine)
+
+
+def _by_car(
+    stamps_s: FloatArray, ground: FloatArray, psi: FloatArray, shake: FloatArray | float = 1.0
+) -> FloatArray:
+    """Return the poses of a car on the road at points (n, 2), with headings (n,)."""
     t = stamps_s
-    psi = heading(s)
     zeros, ones = np.zeros_like(psi), np.ones_like(psi)
     right = np.stack([np.cos(psi), np.sin(psi), zeros], axis=-1)
     forward = np.stack([-np.sin(psi), np.cos(psi), zeros], axis=-1)
     R = np.stack([right, np.stack([zeros, zeros, -ones], axis=-1), forward], axis=-1)
     bounce = shake * (0.012 * np.sin(8.1 * t) + 0.008 * np.sin(12.7 * t + 2))
-    position = np.column_stack([road_point(s), CAMERA_HEIGHT_M + bounce])
+    position = np.column_stack([ground, CAMERA_HEIGHT_M + bounce])
     pitch = shake * (0.004 * np.sin(7.3 * t + 1) + 0.003 * np.sin(2.1 * t))
     roll = shake * (0.004 * np.sin(5.9 * t) + 0.004 * np.sin(1.3 * t + 0.5))
     tilt = exp(np.stack([pitch, zeros, roll, zeros, zeros, zeros], axis=-1))

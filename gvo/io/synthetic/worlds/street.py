@@ -17,6 +17,7 @@ from gvo.io.synthetic.worlds.building import box, ground_axes, plain, slab, stre
 from gvo.io.synthetic.worlds.motion import (
     LAP_M,
     STRAIGHT_M,
+    TURN_BACK_M,
     TURN_M,
     curvature,
     heading,
@@ -41,6 +42,11 @@ _SKY_M = 420.0
 DAYLIGHT = Light(
     direction=(0.5, -0.45, 0.8), ambient=0.82, direct=0.5, haze_m=800.0, haze_grey=205.0
 )
+# Rows of houses around the block, the first of which is built twice; where nobody may park.
+_ROWS = ((-10.0, 75.0), (75.0, 190.0), (275.0, 390.0))
+TWIN_M = 0.5 * LAP_M
+_FREE = (TURN_BACK_M % LAP_M - 14.0, TURN_BACK_M % LAP_M + 9.0)
+_OVERCAST = Light(direction=(0.0, 0.0, 1.0), ambient=0.95, direct=0.15, haze_m=600.0, haze_grey=205)
 
 
 @lru_cache(maxsize=2)
@@ -63,6 +69,36 @@ def street_rectangles(seed: int) -> list[Rectangle]:
         rectangles += _houses(rng, side)
         rectangles += _parked_cars(rng, side)
         rectangles += _trees_and_posts(rng, side)
+    return rectangles
+
+
+@lru_cache(maxsize=2)
+def block(seed: int) -> Scene:
+    """Build the street for a drive around the block, with a twin of its first side.
+
+    Houses, trees and posts along the third side of the block are those along its first one: who
+    drives there sees the same, but for parked cars, the age of the paint and the horizon.
+
+    Returns
+    -------
+    Scene
+        Some 2000 rectangles, map axes with z up, the road at height 0, under an overcast sky.
+    """
+    return make_scene(block_rectangles(seed), street_textures(seed), _OVERCAST)
+
+
+def block_rectangles(seed: int) -> list[Rectangle]:
+    """Return all that stands around the block, in the map, with textures of `street_textures`."""
+    rectangles = [*_backdrop(), *_road(), *_markings()]
+    for side in (0, 1):
+        for row, (start, end) in enumerate(_ROWS):
+            for at in (0.0, TWIN_M) if row == 0 else (0.0,):
+                rng = np.random.default_rng([seed, 10, side, row])
+                age = np.random.default_rng([seed, 11, side, row, int(at)])
+                houses = _houses(rng, side, (start + at, end + at))
+                rectangles += (replace(r, gain=r.gain * age.uniform(0.97, 1.03)) for r in houses)
+                rectangles += _trees_and_posts(rng, side, (start + at, end + at))
+        rectangles += _parked_cars(np.random.default_rng([seed, 12, side]), side, _FREE)
     return rectangles
 
 
@@ -136,11 +172,13 @@ def _markings() -> Iterator[Rectangle]:
             yield slab(_point(s, right), _point(s + 3.0, right), 0.55, height + 0.003, bar)
 
 
-def _houses(rng: np.random.Generator, side: int) -> Iterator[Rectangle]:
+def _houses(
+    rng: np.random.Generator, side: int, ends: tuple[float, float] = (0.0, LAP_M)
+) -> Iterator[Rectangle]:
     """Yield a row of houses with a gap now and then."""
     sign = 1.0 if side else -1.0
-    s = 0.0
-    while s < LAP_M:
+    s, end = ends
+    while s < end:
         width = float(rng.choice([9.0, 12.0, 15.0]))
         set_back = _HOUSES[side] + sign * float(rng.uniform(0.0, 1.6))
         # On the inside of a bend the same arc length has less room.
@@ -222,11 +260,13 @@ def _tree(rng: np.random.Generator, foot: FloatArray, height: float) -> Iterator
         yield wall(*ends, (0.3 * height, height), replace(crown, gain=tone * (0.86 + 0.06 * k)))
 
 
-def _trees_and_posts(rng: np.random.Generator, side: int) -> Iterator[Rectangle]:
+def _trees_and_posts(
+    rng: np.random.Generator, side: int, ends: tuple[float, float] = (0.0, LAP_M)
+) -> Iterator[Rectangle]:
     """Yield what stands on the pavement near the kerb."""
     sign = 1.0 if side else -1.0
-    s = float(rng.uniform(4.0, 10.0))
-    while s < LAP_M:
+    s = ends[0] + float(rng.uniform(4.0, 10.0))
+    while s < ends[1]:
         foot = _point(s, _KERBS[side] + sign * float(rng.uniform(0.5, 0.8)))
         if rng.random() < 0.55:
             yield from _tree(rng, foot, float(rng.uniform(5.0, 7.0)))
@@ -244,14 +284,18 @@ def _post(foot: FloatArray, angle: float) -> Iterator[Rectangle]:
     yield wall(*ends, (2.2, 2.86), replace(stretched("sign"), is_lit=False))
 
 
-def _parked_cars(rng: np.random.Generator, side: int) -> Iterator[Rectangle]:
-    """Yield cars at the kerb, with free places between them."""
+def _parked_cars(
+    rng: np.random.Generator, side: int, free: tuple[float, float] = (LAP_M, LAP_M)
+) -> Iterator[Rectangle]:
+    """Yield cars at the kerb, with free places between them, and none between two arc lengths."""
     s = float(rng.uniform(3.0, 8.0))
     while s < LAP_M - 6.0:
         # Whoever parks on the left came the other way.
         angle = _angle(s) + (0.0 if side else np.pi)
         place = _point(s, _PARKING[side] + float(rng.normal(0.0, 0.1)))
-        yield from _car(place, angle, float(rng.choice([0.45, 0.7, 0.95, 1.25])))
+        tone = float(rng.choice([0.45, 0.7, 0.95, 1.25]))
+        if not free[0] < s < free[1]:
+            yield from _car(place, angle, tone)
         s += float(rng.choice([5.6, 6.2, 9.0, 14.0, 21.0]))
 
 
