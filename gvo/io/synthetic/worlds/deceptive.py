@@ -47,16 +47,16 @@ _BLANK_S = 2.5
 # Rooms along a corridor: how many, their distance, the corridor's axis; door and wall in metres.
 _N_ROOMS = 3
 _APART_M = 5.0
-_AISLE_M = -2.9
+_AISLE_M = -3.1
 _DOOR_M = (1.1, 2.1)
 _WALL_M = 0.12
 # A walk from one room to the same place in the next: seconds, x, y, heading in degrees.
 _WALK = np.array(
     [
         [0.0, 0.0, -0.9, 0.0], [1.5, 0.15, -0.7, 18.0], [3.5, -0.1, -0.8, -22.0],
-        [6.0, 0.0, -1.4, -140.0], [7.2, 0.0, -2.1, -175.0], [8.6, 0.35, -2.8, -120.0],
-        [9.6, 1.1, -2.9, -92.0], [12.4, 4.2, -2.9, -85.0], [13.8, 4.9, -2.4, -15.0],
-        [15.0, 5.0, -1.5, 0.0],
+        [6.0, 0.0, -1.4, -140.0], [7.2, 0.0, -2.1, -170.0], [8.6, 0.35, -2.7, -140.0],
+        [9.6, 1.1, -2.8, -125.0], [12.2, 4.3, -2.8, -112.0], [13.3, 4.9, -2.75, -62.0],
+        [14.4, 5.0, -2.1, -8.0], [15.2, 5.0, -1.5, 0.0],
     ]
 )  # fmt: skip
 _WALK_S = 16.0
@@ -309,8 +309,9 @@ def rooms_rectangles() -> list[Rectangle]:
         for each in alike
     ]
     far = 0.5 * _APART_M + np.array([-_APART_M, (_N_ROOMS - 1) * _APART_M])
-    for x, inwards in ((far[0], 1.0), (far[1], -1.0)):
-        ends = np.array([x, _AISLE_M - inwards]), np.array([x, _AISLE_M + inwards])
+    half = -2.0 - _AISLE_M
+    for x, aside in ((far[0], half), (far[1], -half)):
+        ends = np.array([x, _AISLE_M - aside]), np.array([x, _AISLE_M + aside])
         rectangles.append(wall(*ends, (0.0, 2.5), plain("wallpaper")))
     return rectangles
 
