@@ -188,7 +188,7 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     check_density(header, len(data), where)
     is_complete = _COMPLETE.get(header.format)
     if is_complete is not None and not is_complete(data):
-        raise RecordingError(f"{where}: the {header.format} image is truncated")
+        raise RecordingError(f"{where}: the {header.format} image is truncated or damaged")
     if header.format == "PNG":
         data = _cut_png(data)
     try:
@@ -500,11 +500,19 @@ def is_jpeg_complete(data: NDArray[np.uint8]) -> bool:
 
 
 def is_png_complete(data: NDArray[np.uint8]) -> bool:
-    """Tell whether the chunks of a PNG end before it does.
+    """Tell whether the chunks of a PNG end before it does, those of its rows with their checksum.
 
     OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
     """
-    return all(end <= len(data) for _, _, end in _png_chunks(data))
+    chunks = _png_chunks(data)
+    return all(
+        end <= len(data) and _is_png_chunk_sound(data[start:end]) for _, start, end in chunks
+    )
+
+
+def _is_png_chunk_sound(chunk: NDArray[np.uint8]) -> bool:
+    check, name = chunk[-4:].tobytes(), chunk[4:8].tobytes()
+    return name != b"IDAT" or zlib.crc32(chunk[4:-4]) == int.from_bytes(check, "big")
 
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
@@ -523,20 +531,21 @@ def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     libpng inflates all that follows, up to a thousand times its bytes. The rows are written
     uncompressed: they are inflated once.
     """
-    parts, streams = [_PNG_MAGIC], []
+    parts, rows, n_left = [_PNG_MAGIC], list[bytes](), _n_png_bytes(data[8:33].tobytes())
+    inflater, packer = zlib.decompressobj(), zlib.compressobj(0)
     for name, start, end in _png_chunks(data):
-        if name == b"IDAT":
-            streams.append(data[start + 8 : end - 4].tobytes())
-        elif name in (b"IHDR", b"PLTE", b"tRNS"):
+        if name in (b"IHDR", b"PLTE", b"tRNS"):
             parts.append(data[start:end].tobytes())
-    n_bytes = _n_png_bytes(data[8:33].tobytes())
-    try:
-        rows = zlib.decompressobj().decompress(b"".join(streams), n_bytes) if n_bytes else b""
-    except zlib.error:
+        elif name == b"IDAT" and n_left and not inflater.eof:
+            try:
+                row = inflater.decompress(data[start + 8 : end - 4], n_left)
+            except zlib.error:
+                return data
+            n_left -= len(row)
+            rows.append(packer.compress(row))
+    if n_left or not rows:
         return data
-    if len(rows) != n_bytes or not rows:
-        return data
-    parts += [_png_chunk(b"IDAT", zlib.compress(rows, 0)), _png_chunk(_PNG_END, b"")]
+    parts += [*_png_chunk(b"IDAT", [*rows, packer.flush()]), *_png_chunk(_PNG_END, [])]
     return np.frombuffer(b"".join(parts), dtype=np.uint8)
 
 
@@ -553,9 +562,11 @@ def _n_png_bytes(header: bytes) -> int:
     return sum(h * (1 + (w * n_bits + 7) // 8) for w, h in sizes if min(w, h, n_bits) > 0)
 
 
-def _png_chunk(name: bytes, content: bytes) -> bytes:
-    check = zlib.crc32(content, zlib.crc32(name))
-    return b"".join([struct.pack(">I", len(content)), name, content, struct.pack(">I", check)])
+def _png_chunk(name: bytes, contents: list[bytes]) -> list[bytes]:
+    check = zlib.crc32(name)
+    for content in contents:
+        check = zlib.crc32(content, check)
+    return [struct.pack(">I", sum(map(len, contents))), name, *contents, struct.pack(">I", check)]
 
 
 _COMPLETE = {"JPEG": is_jpeg_complete, "PNG": is_png_complete}

@@ -275,6 +275,16 @@ def test_of_a_png_nothing_is_inflated_behind_its_last_row(
     assert capfd.readouterr().err == ""
 
 
+def test_a_png_whose_rows_are_not_those_of_their_checksum_is_refused() -> None:
+    rows = b"".join(b"\0" + bytes(range(k, k + 40)) for k in range(30))
+    sound = png_of(zlib.compress(rows, 0), 40, 30, 8, 0, 0)
+    assert decode_image(sound, "sound").shape == (30, 40)
+    damaged = sound.copy()
+    damaged[sound.tobytes().index(bytes(range(20, 40)))] += 1
+    with pytest.raises(RecordingError, match="damaged"):
+        decode_image(damaged, "damaged")
+
+
 def test_an_interlaced_png_is_decoded_as_it_is(capfd: pytest.CaptureFixture[str]) -> None:
     pixels = np.arange(9 * 11, dtype=np.uint8).reshape(9, 11)
     starts_steps = [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4)]
