@@ -163,8 +163,6 @@ class KltFrontend:
             The second column of `matches` is -1: tracks do not end at observations.
         """
         result = self._register(reference, current, prior)
-        if prior is not None and not prior.is_confirmed:
-            result = check_view(result, reference.points_cam, self.camera)
         if isinstance(result, RelativePose):
             result = self._check_depth(reference, current, result)
         if isinstance(result, RelativePose):
@@ -179,11 +177,14 @@ class KltFrontend:
         if prior is None:
             return self._register_widely(reference, current, None)
         if prior.T_recent is None:
-            return self._register_keyframe(prior, reference, current)
-        result = self._register_from(prior, reference, current, "near", is_step=True)
-        if isinstance(result, RelativePose | Contradiction):
+            result = self._register_keyframe(prior, reference, current)
+        else:
+            result = self._register_from(prior, reference, current, "near", is_step=True)
+            if not isinstance(result, RelativePose | Contradiction):
+                return self._register_widely(reference, current, prior)
+        if prior.is_confirmed:
             return result
-        return self._register_widely(reference, current, prior)
+        return check_view(result, reference.points_cam, self.camera)
 
     def _register_keyframe(
         self, prior: MotionPrior, reference: KltObservations, current: KltObservations

@@ -12,6 +12,7 @@ from gvo.config import Config
 from gvo.frontend.descriptor import DescriptorFrontend
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.klt import KltFrontend, KltObservations
+from gvo.frontend.registration import check_view
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.types import (
@@ -114,6 +115,25 @@ def test_what_follows_a_failure_is_believed_where_enough_of_the_view_is_seen(
     assert isinstance(sure, RelativePose)
     assert isinstance(doubtful, Failure)
     assert "to know a place again" in doubtful.reason
+
+
+@pytest.mark.parametrize("prior", ["none", "true", "far off"])
+def test_the_view_of_what_follows_a_failure_is_checked_once(
+    monkeypatch: pytest.MonkeyPatch, prior: str
+) -> None:
+    checked: list[RelativePose | Failure] = []
+
+    def note(result: RelativePose | Failure, *given: Any) -> RelativePose | Failure:
+        checked.append(check_view(result, *given))
+        return checked[-1]
+
+    monkeypatch.setattr("gvo.frontend.klt.check_view", note)
+    T = true_motion("stereo", 0, 1)
+    T = T if prior == "true" else wrong(T, 0.2)  # near such a prediction nothing is tracked
+    doubtful = MotionPrior(T_predicted=T, T_recent=T, is_confirmed=False)
+    first, second = observations("stereo")[:2]
+    result = frontend("stereo").register(first, second, None if prior == "none" else doubtful)
+    assert [isinstance(each, RelativePose) for each in [*checked, result]] == [True, True]
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
