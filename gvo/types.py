@@ -567,6 +567,42 @@ class FrameLink:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Loop:
+    """A frame that was registered against a place seen long before.
+
+    Parameters
+    ----------
+    stamp_ns, reference_ns : int
+        Of the frame, and of the one that saw the place, nanoseconds.
+    T_reference_frame : ndarray of float64, shape (4, 4)
+        Maps coordinates of the frame to those of the other, metres.
+    covariance : ndarray of float64, shape (6, 6)
+        Of (rx, ry, rz, tx, ty, tz), right perturbation, in the frame.
+    n_matches, n_inliers : int
+        Of the registration.
+    reason : str
+        Why it does not count; empty where it does.
+    """
+
+    stamp_ns: int
+    reference_ns: int
+    T_reference_frame: FloatArray
+    covariance: FloatArray
+    n_matches: int
+    n_inliers: int
+    reason: str = ""
+
+    @property
+    def edge(self) -> Edge:
+        """The measurement for a graph whose frames are named by their stamps."""
+        return Edge(
+            reference_id=self.reference_ns,
+            T_reference_frame=self.T_reference_frame,
+            covariance=self.covariance,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameResult:
     """What one frame gave.
 

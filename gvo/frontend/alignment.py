@@ -130,10 +130,13 @@ class Templates:
     @classmethod
     def of(cls, image: ImageArray, pixels: FloatArray) -> Templates:
         """Cut patches around whole pixels, shape (n, 2), out of an image."""
-        n, size = len(pixels), 2 * RADIUS_PX + 1
-        padded = np.pad(image, RADIUS_PX + 1, mode="edge")
-        u, v = pixels.astype(np.int64).T
-        wide = sliding_window_view(padded, (size + 2, size + 2))[v, u].astype(np.float32)
+        return cls.of_patches(cut_patches(image, pixels))
+
+    @classmethod
+    def of_patches(cls, patches: NDArray[np.uint8]) -> Templates:
+        """Prepare patches as `cut_patches` gives them."""
+        n, size = len(patches), 2 * RADIUS_PX + 1
+        wide = patches.astype(np.float32)
         along = 0.5 * (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2])
         across = 0.5 * (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1])
         gradients = np.stack([along, across], axis=1).reshape(n, 2, size * size)
@@ -187,6 +190,14 @@ class Templates:
         variances = np.einsum("ni,ni->n", self.values, self.values) / n_pixels
         are_alike = left / n_pixels <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
         return pixels, are_alike & (np.hypot(*moves.T) < _MAX_LAST_STEP_PX)
+
+
+def cut_patches(image: ImageArray, pixels: FloatArray) -> NDArray[np.uint8]:
+    """Cut patches and a margin of one pixel around whole pixels (n, 2), shape (n, 11, 11)."""
+    size = 2 * RADIUS_PX + 3
+    padded = np.pad(image, RADIUS_PX + 1, mode="edge")
+    u, v = pixels.astype(np.int64).T
+    return sliding_window_view(padded, (size, size))[v, u]
 
 
 def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.float32]:

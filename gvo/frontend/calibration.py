@@ -156,6 +156,12 @@ class FrameVelocities:
         """Return a twist per second (rad/s, m/s), right of the pose; None where it is unknown."""
         return self._velocities.get(observations)
 
+    def copy(self, observations: Stamped, other: Stamped) -> None:
+        """Let the same frame in another form have the same velocity."""
+        velocity = self.of(observations)
+        if velocity is not None:
+            self._velocities[other] = velocity
+
     def doubt(self, observations: Stamped) -> FloatArray:
         """Return by how much the velocity may be off, one sigma; zero where the next step is known.
 

@@ -6,18 +6,20 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import Literal, Protocol, TypeAlias, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.alignment import Templates, move_slopes, patch_warps
+from gvo.frontend.alignment import Templates, cut_patches, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
+from gvo.frontend.places import describe_pixels
 from gvo.frontend.registration import check_view, relocalize_observations
-from gvo.frontend.rgbd import check_depths, sample_depth
+from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
 from gvo.frontend.stereo.corners import CornerDisparities, measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
@@ -82,8 +84,8 @@ class KltFrontend:
         rig_offsets: RigOffsets | None = None,
     ) -> None:
         self.camera = as_stereo(camera, config)
-        is_stereo = isinstance(camera, StereoCamera)
-        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=is_stereo)
+        self._is_stereo = isinstance(camera, StereoCamera)
+        self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
         self._descriptors = DescriptorFrontend(camera, config)
@@ -255,14 +257,77 @@ class KltFrontend:
             return self._depths.align(first, second, T_reference_current)
         return Failure(reason="a stereo camera has no depth images")
 
+    def describe(self, observations: KltObservations) -> KltPlace:
+        """Return a frame as a place: small, but for its image all that `recognize` needs."""
+        frame, corners = observations.frame, observations.find_corners()
+        chosen, descriptors = describe_pixels(observations.image, corners.keypoints)
+        depth_points = None
+        if isinstance(frame, RgbdFrame):
+            points = grid_points(frame.depth, self.camera, self._config.depth)
+            depth_points = points.astype(np.float32)
+        place = KltPlace(
+            stamp_ns=observations.stamp_ns,
+            uvd=observations.uvd[chosen].astype(np.float32),
+            points=corners.points_cam[chosen].astype(np.float32),
+            slopes=corners.slopes[chosen].astype(np.float32),
+            patches=cut_patches(observations.image, corners.keypoints[chosen]),
+            descriptors=descriptors,
+            depth_points=depth_points,
+        )
+        self.rig_offsets.velocities.copy(observations, place)
+        return place
+
+    def recognize(
+        self, reference: KltPlace, current: KltPlace, observations: KltObservations
+    ) -> RelativePose | Failure:
+        """Estimate the motion from a place to a frame: by descriptors, then by its patches.
+
+        Parameters
+        ----------
+        reference, current : KltPlace
+        observations : KltObservations
+            Of the current frame.
+
+        Returns
+        -------
+        RelativePose or Failure
+        """
+        offset_px = self._offsets_px()[0]
+        first, second = (self._as_observations(place) for place in (reference, current))
+        rough = relocalize_observations(
+            first, second, self.camera, self._config, offset_px=offset_px
+        )
+        if isinstance(rough, Failure):
+            return rough
+        prior = MotionPrior(T_predicted=rough.T_reference_current)
+        result = self._register_from(prior, reference, observations, "aligned", is_step=False)
+        result = check_view(result, reference.points_cam, self.camera)
+        points, frame = reference.depth_points, observations.frame
+        if isinstance(result, Failure) or points is None or not isinstance(frame, RgbdFrame):
+            return result
+        return check_depths(
+            result, points.astype(np.float64), frame.depth, self.camera, self._config.depth
+        )
+
+    def _as_observations(self, place: KltPlace) -> Observations:
+        sigmas = np.ones((len(place.uvd), 3)) * [1.0, 1.0, self._sigmas(1)[0][0, 2]]
+        return Observations(
+            stamp_ns=place.stamp_ns,
+            keypoints=place.keypoints,
+            disparities=place.uvd[:, 2].astype(np.float64),
+            points_cam=place.points_cam,
+            sigmas=sigmas,
+            descriptors_left=place.descriptors,
+        )
+
     def _check_depth(
         self, reference: KltObservations, current: KltObservations, result: RelativePose
     ) -> RelativePose | Failure:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
         first, second = reference.frame, current.frame
         if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
-            depths = first.depth, second.depth
-            return check_depths(result, depths, self.camera, self._config.depth)
+            points = grid_points(first.depth, self.camera, self._config.depth)
+            return check_depths(result, points, second.depth, self.camera, self._config.depth)
         return result
 
     def _register_descriptors(
@@ -286,7 +351,7 @@ class KltFrontend:
     def _register_from(
         self,
         prior: MotionPrior | None,
-        reference: KltObservations,
+        reference: _Reference,
         current: KltObservations,
         search: _Search,
         *,
@@ -302,7 +367,7 @@ class KltFrontend:
             Measurements(
                 frames=(reference, current),
                 uvd=(source_uvd, target_uvd),
-                sigmas=self._sigmas(len(indices), is_stereo=isinstance(current.frame, StereoFrame)),
+                sigmas=self._sigmas(len(indices)),
                 matches=np.column_stack([indices, np.full_like(indices, -1)]),
                 sigma_factor=self._config.klt.sigma_factor,
             ),
@@ -311,10 +376,10 @@ class KltFrontend:
             is_step=is_step,
         )
 
-    def _sigmas(self, n: int, *, is_stereo: bool) -> tuple[FloatArray, FloatArray]:
+    def _sigmas(self, n: int) -> tuple[FloatArray, FloatArray]:
         """Return the sigmas of (u, v, disparity) of corners and of their tracks."""
         klt = self._config.klt
-        disparity = klt.disparity_sigma_px if is_stereo else self._config.depth.sigma_px
+        disparity = klt.disparity_sigma_px if self._is_stereo else self._config.depth.sigma_px
         # A corner is where it was cut out: only the track into the current frame is noisy.
         corner = [0.0, 0.0, disparity]
         track = [klt.pixel_sigma_px, klt.pixel_sigma_px, disparity]
@@ -323,7 +388,7 @@ class KltFrontend:
     def _track(
         self,
         T_reference_current: FloatArray,
-        reference: KltObservations,
+        reference: _Reference,
         current: KltObservations,
         search: _Search,
     ) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -359,7 +424,7 @@ class KltFrontend:
     def _predict(
         self,
         T_reference_current: FloatArray,
-        reference: KltObservations,
+        reference: _Reference,
         current: KltObservations,
     ) -> tuple[FloatArray, IntArray]:
         """Return (u, v, disparity), as measured, of the points in view of the current camera."""
@@ -372,20 +437,20 @@ class KltFrontend:
         return seen[is_in_view], in_front[is_in_view]
 
     def _predict_patches(
-        self, T_reference_current: FloatArray, reference: KltObservations, indices: IntArray
+        self, T_reference_current: FloatArray, reference: _Reference, indices: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the warps of patches by a motion; of stereo, slopes of disparities after it."""
         offset = np.array([0.0, 0.0, self.rig_offsets.disparity_px])
         uvd, slopes = reference.uvd[indices] - offset, reference.find_corners().slopes[indices]
         T_current_reference = se3.invert(T_reference_current)
         warps = patch_warps(uvd, slopes, T_current_reference, self.camera)
-        if not isinstance(reference.frame, StereoFrame):
+        if not self._is_stereo:
             return warps, None
         return warps, move_slopes(uvd, slopes, T_current_reference, self.camera)
 
     def _find_tracks(
         self,
-        frames: tuple[KltObservations, KltObservations],
+        frames: tuple[_Reference, KltObservations],
         indices: IntArray,
         start: FloatArray,
         warps: FloatArray | None,
@@ -402,7 +467,7 @@ class KltFrontend:
             return self._align(frames, indices, start, warps, n_steps=_N_LINK_STEPS)
         klt, is_wide = self._config.klt, warps is None
         pixels, is_tracked = track_pixels(
-            (reference.image, current.image),
+            (cast(KltObservations, reference).image, current.image),  # a place is only aligned
             reference.keypoints[indices],
             start,
             klt,
@@ -420,7 +485,7 @@ class KltFrontend:
 
     def _align(
         self,
-        frames: tuple[KltObservations, KltObservations],
+        frames: tuple[_Reference, KltObservations],
         indices: IntArray,
         start: FloatArray,
         warps: FloatArray,
@@ -503,6 +568,21 @@ class KltCorners:
     row_shift_px: float | None = None
 
 
+class _Reference(Protocol):
+    """Corners that are tracked: those of a frame, or of a place."""
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def keypoints(self) -> FloatArray: ...
+
+    @property
+    def uvd(self) -> FloatArray: ...
+
+    def find_corners(self) -> KltCorners: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class KltObservations:
     """A frame to track corners into, and its own corners.
@@ -556,6 +636,56 @@ class KltObservations:
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.keypoints)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
+class KltPlace:
+    """A frame kept small: its corners with their descriptors and patches.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Stamp of the frame, nanoseconds.
+    uvd : ndarray of float32, shape (n, 3)
+        Pixels and disparities as measured.
+    points : ndarray of float32, shape (n, 3)
+        In the `cam` frame, metres.
+    slopes : ndarray of float32, shape (n, 2)
+        Of the disparities.
+    patches : ndarray of uint8, shape (n, 11, 11)
+    descriptors : ndarray of uint8, shape (n, 32)
+    depth_points : ndarray of float32, shape (m, 3), or None
+        A grid of the depth image as points, metres.
+    """
+
+    stamp_ns: int
+    uvd: NDArray[np.float32]
+    points: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+    patches: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8]
+    depth_points: NDArray[np.float32] | None = None
+
+    @property
+    def keypoints(self) -> FloatArray:
+        """Pixels (u, v) of the corners, shape (n, 2)."""
+        return self.uvd[:, :2].astype(np.float64)
+
+    @property
+    def points_cam(self) -> FloatArray:
+        """The corners as points in the `cam` frame, metres, shape (n, 3)."""
+        return self.points.astype(np.float64)
+
+    def find_corners(self) -> KltCorners:
+        """Return the corners."""
+        return KltCorners(
+            keypoints=self.keypoints,
+            disparities=self.uvd[:, 2].astype(np.float64),
+            slopes=self.slopes.astype(np.float64),
+            points_cam=self.points_cam,
+            templates=Templates.of_patches(self.patches),
+            n_keypoints=len(self.uvd),
+        )
 
 
 def image_of(frame: Frame) -> ImageArray:

@@ -129,7 +129,8 @@ def _fit_planes(
 
 def check_depths(
     result: RelativePose,
-    depths: tuple[DepthArray, DepthArray],
+    points: FloatArray,
+    depth: DepthArray,
     camera: StereoCamera,
     config: DepthConfig,
 ) -> RelativePose | Failure:
@@ -139,8 +140,10 @@ def check_depths(
     ----------
     result : RelativePose
         From the reference to the current frame.
-    depths : tuple of two ndarrays of float32, shape (height, width)
-        Of the reference and of the current frame, metres, NaN where unknown.
+    points : ndarray of float64, shape (n, 3)
+        Of the reference's depth image, see `grid_points`.
+    depth : ndarray of float32, shape (height, width)
+        Of the current frame, metres, NaN where unknown.
     camera : StereoCamera
         The depth camera with its virtual baseline.
     config : DepthConfig
@@ -150,7 +153,7 @@ def check_depths(
     -------
     RelativePose or Failure
     """
-    differences = compare_depths(depths, result.T_reference_current, camera, config)
+    differences = compare_depths(points, depth, result.T_reference_current, camera, config)
     n_agreeing = int(np.count_nonzero(np.abs(differences) <= _GATE))
     # Nearer than expected is hidden, and says nothing; farther is seen through.
     n_pierced = int(np.count_nonzero(differences < -_GATE))
@@ -167,7 +170,8 @@ def check_depths(
 
 
 def compare_depths(
-    depths: tuple[DepthArray, DepthArray],
+    points: FloatArray,
+    depth: DepthArray,
     T_reference_current: FloatArray,
     camera: StereoCamera,
     config: DepthConfig,
@@ -176,8 +180,10 @@ def compare_depths(
 
     Parameters
     ----------
-    depths : tuple of two ndarrays of float32, shape (height, width)
-        Of the reference and of the current frame, metres, NaN where unknown.
+    points : ndarray of float64, shape (n, 3)
+        Of the reference's depth image, see `grid_points`.
+    depth : ndarray of float32, shape (height, width)
+        Of the current frame, metres, NaN where unknown.
     T_reference_current : ndarray of float64, shape (4, 4)
         The motion in question.
     camera : StereoCamera
@@ -191,22 +197,21 @@ def compare_depths(
         Disparity measured less disparity expected, in sigmas, of the n points that both frames
         measure; negative where the current frame sees farther.
     """
-    points = _grid_points(depths[0], camera, config)
     points = se3.transform_points(se3.invert(T_reference_current), points)
     points = points[points[:, 2] > config.min_depth_m]
     expected = camera.project_stereo(points)
-    height, width = depths[0].shape
+    height, width = depth.shape
     seen = np.rint(expected[:, :2]).astype(np.int64)
     is_inside = np.all((seen >= 0) & (seen < [width, height]), axis=1)
-    measured = depths[1][seen[is_inside, 1], seen[is_inside, 0]].astype(np.float64)
+    measured = depth[seen[is_inside, 1], seen[is_inside, 0]].astype(np.float64)
     is_known = (measured >= config.min_depth_m) & (measured <= config.max_depth_m)
     disparities = camera.depth_to_disparity(measured[is_known])
     sigma = np.sqrt(2.0) * config.sigma_px
     return np.asarray((disparities - expected[is_inside, 2][is_known]) / sigma)
 
 
-def _grid_points(depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> FloatArray:
-    """Return the points of a grid of pixels, metres, shape (n, 3)."""
+def grid_points(depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> FloatArray:
+    """Return the points of a grid of a depth image's pixels, metres, shape (n, 3)."""
     height, width = depth.shape
     rows = np.linspace(0.0, height - 1.0, _N_GRID).astype(np.int64)
     columns = np.linspace(0.0, width - 1.0, _N_GRID).astype(np.int64)

@@ -1,0 +1,188 @@
+"""Loops: a keyframe sees a place that has left the window, and is registered against it."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from gvo.config import Config
+from gvo.frontend.factory import make_frontend
+from gvo.frontend.places import PlaceIndex
+from gvo.geometry import se3
+from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.types import Edge, Failure, FloatArray, Frame, Loop, RelativePose
+
+# Places that are never searched: the latest ones.
+_N_RECENT = 10
+# Places that a view is registered against: those of the best scores, if they stand out.
+_N_CANDIDATES = 3
+_NOISE_QUANTILE = 0.95
+_ABOVE_NOISE = 1.5
+_SURE_SCORE = 0.06
+# Places within which a second loop has to confirm one, the sigmas by which both may differ, and by
+# how much odometry may be wrong between them: per metre, and per radian.
+_N_WAITING = 5
+_AGREEMENT = 5.0
+_DRIFT = 0.02
+
+
+class Recognizer(Protocol):
+    """A front-end that finds frames again that it keeps small."""
+
+    def describe(self, observations: Any, /) -> Any:  # noqa: ANN401 - of the front-end's own kind
+        """Return a place: `stamp_ns`, `descriptors` (n, m) of uint8, what `recognize` needs."""
+
+    def recognize(
+        self,
+        reference: Any,  # noqa: ANN401
+        current: Any,  # noqa: ANN401
+        observations: Any,  # noqa: ANN401
+        /,
+    ) -> RelativePose | Failure:
+        """Estimate the motion from a place to a frame and its own place; rather fail."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Visit:
+    """A place, and where odometry was when it was seen."""
+
+    place: Any
+    T_world_frame: FloatArray
+
+
+class LoopDetector:
+    """Finds places again, and registers frames against them.
+
+    Candidates come by appearance, the latest places apart. What is registered has to be seen in
+    most of the view. It is a loop when another one confirms it: two loops of neighbouring frames
+    and the odometry between them agree.
+
+    Parameters
+    ----------
+    camera : StereoCamera or PinholeCamera, optional
+        Needed without a front-end.
+    config : Config, optional
+    frontend : Recognizer, optional
+        In place of the one that the configuration names.
+
+    Attributes
+    ----------
+    loops : list of Loop
+        All that were registered; those without a reason against them are confirmed.
+    """
+
+    def __init__(
+        self,
+        camera: StereoCamera | PinholeCamera | None = None,
+        config: Config | None = None,
+        *,
+        frontend: Any = None,  # noqa: ANN401
+    ) -> None:
+        if frontend is None:
+            if camera is None:
+                raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
+            frontend = make_frontend(camera, config)
+        self._frontend = frontend
+        self._index = PlaceIndex()
+        self._visits: list[_Visit] = []
+        self._waiting: list[tuple[int, Loop]] = []
+        self._numbers: dict[int, int] = {}
+        self.loops: list[Loop] = []
+
+    def __len__(self) -> int:
+        """Return the number of places."""
+        return len(self._visits)
+
+    def detect(self, frame: Frame, T_world_frame: FloatArray) -> tuple[Loop, ...]:
+        """Look for the place that a frame shows, and keep it as another one.
+
+        Parameters
+        ----------
+        frame : StereoFrame or RgbdFrame
+        T_world_frame : ndarray of float64, shape (4, 4)
+            By odometry, which may drift, metres.
+
+        Returns
+        -------
+        tuple of Loop
+            Those that are confirmed with this frame.
+        """
+        return self.look(self._frontend.extract(frame), T_world_frame)
+
+    def look(
+        self, observations: Any, T_world_frame: FloatArray, *, near: Container[int] = ()  # noqa: ANN401
+    ) -> tuple[Loop, ...]:
+        """Detect, by what a front-end extracted; places whose stamps are `near` are no loops."""
+        place = self._frontend.describe(observations)
+        found: list[Loop] = []
+        for number in self._candidates(place.descriptors, near):
+            reference = self._visits[number].place
+            result = self._frontend.recognize(reference, place, observations)
+            if isinstance(result, RelativePose):
+                found.append(_loop(reference.stamp_ns, place.stamp_ns, result))
+                break
+        self._numbers[place.stamp_ns] = len(self._visits)
+        self._visits.append(_Visit(place=place, T_world_frame=T_world_frame))
+        self._index.add(place.descriptors)
+        confirmed = [each for loop in found for each in self._confirm(loop)]
+        return tuple(confirmed)
+
+    def _candidates(self, descriptors: Any, near: Container[int]) -> list[int]:  # noqa: ANN401
+        scores = self._index.scores(descriptors)[:-_N_RECENT]
+        if len(scores) == 0:
+            return []
+        limit = min(_ABOVE_NOISE * float(np.quantile(scores, _NOISE_QUANTILE)), _SURE_SCORE)
+        best = np.argsort(-scores)[: 4 * _N_CANDIDATES].tolist()
+        chosen = [k for k in best if scores[k] >= limit and self._visits[k].place.stamp_ns not in near]
+        return chosen[:_N_CANDIDATES]
+
+    def _confirm(self, loop: Loop) -> list[Loop]:
+        """Return the loops that are confirmed with a new one, this one among them."""
+        newest = len(self._visits) - 1
+        self._waiting = [each for each in self._waiting if newest - each[0] <= _N_WAITING]
+        agreeing = [k for k, (_, other) in enumerate(self._waiting) if self._agree(other, loop)]
+        confirmed = []
+        for k in agreeing:
+            number, other = self._waiting[k]
+            if other.reason:
+                self._waiting[k] = number, replace(other, reason="")
+                confirmed.append(self._waiting[k][1])
+                self.loops[self.loops.index(other)] = self._waiting[k][1]
+        if agreeing:
+            confirmed.append(loop := replace(loop, reason=""))
+        self._waiting.append((newest, loop))
+        self.loops.append(loop)
+        return confirmed
+
+    def _agree(self, first: Loop, second: Loop) -> bool:
+        """Tell whether two loops and the odometry between their ends agree."""
+        T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
+        T_references, other_drift = self._way(first.reference_ns, second.reference_ns)
+        T_expected = se3.invert(T_references) @ first.T_reference_frame @ T_first_second
+        difference = se3.log(se3.invert(T_expected) @ second.T_reference_frame)
+        Ad = se3.adjoint(se3.invert(T_first_second))
+        covariance = Ad @ first.covariance @ Ad.T + second.covariance + np.diag(drift + other_drift)
+        return bool(se3.mahalanobis(difference, covariance) <= _AGREEMENT**2)
+
+    def _way(self, first_ns: int, second_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the motion between two places by odometry, and variances of its drift (6,)."""
+        first, second = (self._visits[self._numbers[ns]] for ns in (first_ns, second_ns))
+        T = se3.invert(first.T_world_frame) @ second.T_world_frame
+        length, angle = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
+        turn = (_DRIFT * angle) ** 2 + (_DRIFT * 0.1 * length) ** 2
+        return T, np.repeat([turn, (_DRIFT * length) ** 2], 3)
+
+
+def _loop(reference_ns: int, stamp_ns: int, result: RelativePose) -> Loop:
+    return Loop(
+        stamp_ns=stamp_ns,
+        reference_ns=reference_ns,
+        T_reference_frame=result.T_reference_current,
+        covariance=result.covariance,
+        n_matches=result.n_matches,
+        n_inliers=result.n_inliers,
+        reason="no other loop confirms it",
+    )
