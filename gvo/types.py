@@ -630,6 +630,8 @@ class FrameResult:
         Counted from 0; another one begins when the camera is lost.
     joins : tuple of SegmentJoin
         Segments that found their place among earlier ones with this frame.
+    loops : tuple of Loop
+        Those that are confirmed with this frame; of this frame, and of one shortly before.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -649,6 +651,7 @@ class FrameResult:
     keyframes_ns: tuple[int, ...] = ()
     segment: int = 0
     joins: tuple[SegmentJoin, ...] = ()
+    loops: tuple[Loop, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -159,6 +159,7 @@ class WholeGraph:
         self.given: dict[FrameId, FloatArray] = {}
         self.rejected: list[Rejected] = []
         self._numbers: dict[FrameId, int] = {}
+        self._trusted: list[int] = []
 
     def add_pose(self, frame_id: FrameId, stamp_ns: int, prior: PosePrior | None = None) -> None:
         """Add a pose, and where it is in the world, if that was measured."""
@@ -172,8 +173,13 @@ class WholeGraph:
         else:
             self.priors[self._numbers[frame_id]] = prior
 
-    def add_edges(self, frame_id: FrameId, edges: Sequence[Edge]) -> None:
-        """Add edges that measure a pose; their references are there already."""
+    def add_edges(
+        self, frame_id: FrameId, edges: Sequence[Edge], *, is_trusted: bool = False
+    ) -> None:
+        """Add edges that measure a pose; their references are there already.
+
+        Those that are said to be trusted are never refused.
+        """
         frame = self._numbers[frame_id]
         for edge, fault in zip(edges, find_faults(edges), strict=True):
             reference = self._numbers.get(edge.reference_id)
@@ -191,6 +197,8 @@ class WholeGraph:
                     )
                 )
             else:
+                if is_trusted:
+                    self._trusted.append(len(self.links))
                 self.links.append(Link(reference, frame, edge))
 
     def anchors(self) -> dict[int, PosePrior]:
@@ -198,10 +206,13 @@ class WholeGraph:
         return self.priors or {0: ORIGIN}
 
     def trusted(self) -> list[int]:
-        """Return the indices of the links of odometry: the first between a pose and the next.
+        """Return the indices of the links that are trusted.
 
-        Poses follow each other by their ids where these are integers, else as they were added.
+        If none was said to be, those of odometry: the first between a pose and the next. Poses
+        follow each other by their ids where these are integers, else as they were added.
         """
+        if self._trusted:
+            return self._trusted
         ids, n = self.frame_ids, len(self.frame_ids)
         is_numbered = all(isinstance(frame_id, int) for frame_id in ids)
         order = sorted(range(n), key=lambda k: ids[k] if is_numbered else k)  # type: ignore[arg-type, return-value]

@@ -78,7 +78,7 @@ class Factors:
     """
 
     def __init__(self, config: WindowConfig) -> None:
-        self._default = config.kernel
+        self.default = config.kernel
         self._estimators = {
             kernel: create(
                 config.kernel_threshold
@@ -93,7 +93,7 @@ class Factors:
     ) -> gtsam.NonlinearFactor:
         """Return the between-factor of an edge."""
         edge, T_reference_frame, gaussian = measurement
-        noise = self._robust(gaussian, edge.kernel or self._default)
+        noise = self._robust(gaussian, edge.kernel or self.default)
         return gtsam.BetweenFactorPose3(reference_key, key, T_reference_frame, noise)
 
     def prior(self, key: int, prior: Prior) -> gtsam.NonlinearFactor:
@@ -121,7 +121,7 @@ class Factors:
             T_reference_frame=edge.T_reference_frame,
             covariance=edge.covariance,
             residual=residual,
-            weight=self._weight(residual, edge.kernel or self._default),
+            weight=self._weight(residual, edge.kernel or self.default),
         )
 
     def residual_of_prior(

@@ -24,6 +24,8 @@ from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes
+from gvo.odometry.graph import RunGraph
+from gvo.odometry.loops import LoopDetector
 from gvo.odometry.segments import Segments
 from gvo.types import (
     Edge,
@@ -32,6 +34,7 @@ from gvo.types import (
     FloatArray,
     FrameResult,
     LinkKind,
+    Loop,
     MotionPrior,
     RelativePose,
     RgbdFrame,
@@ -86,6 +89,8 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
         self._anchor_ns: int | None = None
+        self.graph = RunGraph(self._config.window)
+        self._loops = LoopDetector(frontend=frontend)
         self._trust = DepthTrust(self._config.depth.icp)
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
@@ -174,8 +179,11 @@ class Odometry:
             joins = self._join_segments(step, causal)
             self._select_keyframes(observations, step, scores, causal)
             self._keep_anchor()
+        with watch.stage("loops"):
+            loops = self._close_loops(observations, causal)
         self._keep_frame(frame)
-        return self._result(observations, step, offered, causal, joins, watch.stage_ms)
+        result = self._result(observations, step, offered, causal, joins, watch.stage_ms)
+        return replace(result, loops=loops)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
@@ -400,6 +408,19 @@ class Odometry:
         for stamp_ns in self._keyframes.stamps_ns:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
+
+    def _close_loops(self, observations: _Observations, causal: Estimate) -> tuple[Loop, ...]:
+        """Add a frame to the graph of the run, and the loops of a keyframe."""
+        stamp_ns = causal.stamp_ns
+        kept_ns = self._keyframes.stamps_ns
+        is_keyframe = stamp_ns in kept_ns
+        self.graph.add_frame(causal, self._window.edges(stamp_ns), is_keyframe=is_keyframe)
+        if self._loops is None or not is_keyframe:
+            return ()
+        loops = self._loops.look(observations, causal.T_world_frame, near=kept_ns)
+        for loop in loops:
+            self.graph.loops.append(loop)
+        return loops
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
