@@ -176,7 +176,7 @@ class Keyframes(Generic[ObservationsT]):
         points = self._kept[stamp_ns].points_cam
         if points is None or self._camera is None:
             return proximity(T_current_keyframe, self._config)
-        return _overlap(points, T_current_keyframe, self._camera)
+        return view_overlap(points, T_current_keyframe, self._camera)
 
 
 def _sample_points(points_cam: FloatArray) -> FloatArray:
@@ -186,10 +186,10 @@ def _sample_points(points_cam: FloatArray) -> FloatArray:
     return points_cam[chosen.astype(np.int64)]
 
 
-def _overlap(
+def view_overlap(
     points_keyframe: FloatArray, T_current_keyframe: FloatArray, camera: StereoCamera
 ) -> float:
-    """Return the share of points in view of another camera, at about the same distance."""
+    """Return the share of points (n, 3) in view of another camera, at about the same distance."""
     if len(points_keyframe) == 0:
         return 0.0
     T = T_current_keyframe

@@ -13,8 +13,11 @@ from gvo.frontend.factory import make_frontend
 from gvo.frontend.places import PlaceIndex
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.types import Edge, Failure, FloatArray, Frame, Loop, RelativePose
+from gvo.odometry.keyframes import view_overlap
+from gvo.types import Failure, FloatArray, Frame, Loop, RelativePose
 
+# A frame that shows less than so much of the latest place is another one.
+_MAX_OVERLAP = 0.75
 # Places that are never searched: the latest ones.
 _N_RECENT = 10
 # Places that a view is registered against: those of the best scores, if they stand out.
@@ -115,7 +118,12 @@ class LoopDetector:
     def look(
         self, observations: Any, T_world_frame: FloatArray, *, near: Container[int] = ()  # noqa: ANN401
     ) -> tuple[Loop, ...]:
-        """Detect, by what a front-end extracted; places whose stamps are `near` are no loops."""
+        """Detect, by what a front-end extracted; places whose stamps are `near` are no loops.
+
+        A frame that shows most of the latest place is none of its own, and nothing is looked for.
+        """
+        if self._shows_latest(T_world_frame):
+            return ()
         place = self._frontend.describe(observations)
         found: list[Loop] = []
         for number in self._candidates(place.descriptors, near):
@@ -129,6 +137,14 @@ class LoopDetector:
         self._index.add(place.descriptors)
         confirmed = [each for loop in found for each in self._confirm(loop)]
         return tuple(confirmed)
+
+    def _shows_latest(self, T_world_frame: FloatArray) -> bool:
+        if not self._visits:
+            return False
+        latest = self._visits[-1]
+        T = se3.invert(T_world_frame) @ latest.T_world_frame
+        points, camera = latest.place.points_cam, self._frontend.camera
+        return view_overlap(points, T, camera) > _MAX_OVERLAP
 
     def _candidates(self, descriptors: Any, near: Container[int]) -> list[int]:  # noqa: ANN401
         scores = self._index.scores(descriptors)[:-_N_RECENT]
