@@ -310,6 +310,12 @@ class WindowConfig(Section):
     )
 
 
+class LoopsConfig(Section):
+    """Places seen again, and the global poses."""
+
+    enabled: bool = _common(True, "look for loops, and write the global poses")
+
+
 class RuntimeConfig(Section):
     """Parallel work."""
 
@@ -408,6 +414,7 @@ class Config(Section):
     ransac: RansacConfig = RansacConfig()
     registration: RegistrationConfig = RegistrationConfig()
     window: WindowConfig = WindowConfig()
+    loops: LoopsConfig = LoopsConfig()
     runtime: RuntimeConfig = RuntimeConfig()
     check: CheckConfig = CheckConfig()
 

@@ -41,6 +41,8 @@ _INLIER_CHI2 = 16.812
 _SHARPENING = 1.4
 _MAX_SHARPENINGS = 200
 _STEPS_EACH = 2
+# Steps of a small graph, whose start is good.
+_N_LOCAL_STEPS = 5
 # Covariances between two reports of progress.
 _REPORTED = 20
 
@@ -244,6 +246,75 @@ class WholeGraph:
                     add = queue.appendleft if is_first else queue.append
                     add((other, T_world_key.compose(T_key_other)))
         return poses
+
+
+class LocalGraph:
+    """A few poses around one of them, which is the origin.
+
+    Parameters
+    ----------
+    origin : hashable
+        The name of that pose.
+    factors : Factors
+        With the kernel of the edges.
+    """
+
+    def __init__(self, origin: FrameId, factors: Factors) -> None:
+        self._origin, self._make = origin, factors
+        self._graph = gtsam.NonlinearFactorGraph()
+        # Along the first edges: T_origin_frame and its covariance.
+        self._poses = {origin: (np.eye(4), np.zeros((6, 6)))}
+        self._keys: dict[FrameId, int] = {}
+
+    def __contains__(self, frame_id: object) -> bool:
+        """Tell whether a pose is there."""
+        return frame_id in self._poses
+
+    def add(self, frame_id: FrameId, edge: Edge) -> None:
+        """Add an edge; one of its poses is there already."""
+        reference_id, T = edge.reference_id, edge.T_reference_frame
+        if frame_id not in self._poses and reference_id in self._poses:
+            T_reference, covariance = self._poses[reference_id]
+            moved = se3.compose_covariance(covariance, T, edge.covariance)
+            self._poses[frame_id] = T_reference @ T, moved
+        elif reference_id not in self._poses:
+            T_frame, covariance = self._poses[frame_id]
+            Ad, T = se3.adjoint(T), se3.invert(T)
+            moved = se3.compose_covariance(covariance, T, Ad @ edge.covariance @ Ad.T)
+            self._poses[reference_id] = T_frame @ T, moved
+        if reference_id == self._origin:
+            prior = PosePrior(
+                T_world_frame=edge.T_reference_frame,
+                covariance=edge.covariance,
+                kernel=edge.kernel or self._make.default,
+            )
+            self._graph.add(self._make.prior(self._key(frame_id), prior))
+        else:
+            keys = self._key(reference_id), self._key(frame_id)
+            self._graph.add(self._make.between(*keys, Measurement.of(edge)))
+
+    def _key(self, frame_id: FrameId) -> int:
+        return self._keys.setdefault(frame_id, len(self._keys))
+
+    def solve(self) -> dict[FrameId, tuple[FloatArray, FloatArray]]:
+        """Return the poses in the origin, and their covariances (6, 6), by name."""
+        found = {frame_id: self._poses[frame_id] for frame_id in self._keys}
+        if self._graph.size() == len(found):  # a tree
+            return found
+        values = gtsam.Values()
+        for frame_id, key in self._keys.items():
+            values.insert(key, gtsam.Pose3(found[frame_id][0]))
+        try:
+            for values, _ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B007, B020
+                pass
+            marginals = gtsam.Marginals(self._graph, values)
+            poses = as_transforms(values)
+            return {
+                frame_id: (poses[key], definite(marginals.marginalCovariance(key)))
+                for frame_id, key in self._keys.items()
+            }
+        except RuntimeError:
+            return found
 
 
 class BatchOptimizer:

@@ -197,7 +197,7 @@ def cut_patches(image: ImageArray, pixels: FloatArray) -> NDArray[np.uint8]:
     size = 2 * RADIUS_PX + 3
     padded = np.pad(image, RADIUS_PX + 1, mode="edge")
     u, v = pixels.astype(np.int64).T
-    return sliding_window_view(padded, (size, size))[v, u]
+    return np.asarray(sliding_window_view(padded, (size, size))[v, u])
 
 
 def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.float32]:

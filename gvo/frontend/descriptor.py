@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from gvo.config import Config
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.matching import match_temporal, predict_pixels
+from gvo.frontend.places import thin
 from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
@@ -168,6 +170,25 @@ class DescriptorFrontend:
         if isinstance(rough, Failure):
             return rough
         return self._check_view(reference, current, rough)
+
+    def describe(self, observations: Observations) -> Observations:
+        """Return a frame as a place: fewer points, without what only neighbours need."""
+        chosen = thin(len(observations))
+        return replace(
+            observations,
+            keypoints=observations.keypoints[chosen],
+            disparities=observations.disparities[chosen],
+            points_cam=observations.points_cam[chosen],
+            sigmas=observations.sigmas[chosen],
+            descriptors_left=observations.descriptors_left[chosen],
+            descriptors_right=None,
+        )
+
+    def recognize(
+        self, reference: Observations, current: Observations, observations: Observations
+    ) -> RelativePose | Failure:
+        """Estimate the motion from a place to a frame, given with its own place."""
+        return self.relocalize(reference, observations)
 
     def _check_view(
         self, reference: Observations, current: Observations, rough: RelativePose

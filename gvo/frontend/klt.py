@@ -267,11 +267,11 @@ class KltFrontend:
             depth_points = points.astype(np.float32)
         place = KltPlace(
             stamp_ns=observations.stamp_ns,
-            uvd=observations.uvd[chosen].astype(np.float32),
+            pixels=observations.uvd[chosen].astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
             slopes=corners.slopes[chosen].astype(np.float32),
             patches=cut_patches(observations.image, corners.keypoints[chosen]),
-            descriptors=descriptors,
+            descriptors_left=descriptors,
             depth_points=depth_points,
         )
         self.rig_offsets.velocities.copy(observations, place)
@@ -314,10 +314,10 @@ class KltFrontend:
         return Observations(
             stamp_ns=place.stamp_ns,
             keypoints=place.keypoints,
-            disparities=place.uvd[:, 2].astype(np.float64),
+            disparities=place.uvd[:, 2],
             points_cam=place.points_cam,
             sigmas=sigmas,
-            descriptors_left=place.descriptors,
+            descriptors_left=place.descriptors_left,
         )
 
     def _check_depth(
@@ -646,30 +646,35 @@ class KltPlace:
     ----------
     stamp_ns : int
         Stamp of the frame, nanoseconds.
-    uvd : ndarray of float32, shape (n, 3)
+    pixels : ndarray of float32, shape (n, 3)
         Pixels and disparities as measured.
     points : ndarray of float32, shape (n, 3)
         In the `cam` frame, metres.
     slopes : ndarray of float32, shape (n, 2)
         Of the disparities.
     patches : ndarray of uint8, shape (n, 11, 11)
-    descriptors : ndarray of uint8, shape (n, 32)
+    descriptors_left : ndarray of uint8, shape (n, 32)
     depth_points : ndarray of float32, shape (m, 3), or None
         A grid of the depth image as points, metres.
     """
 
     stamp_ns: int
-    uvd: NDArray[np.float32]
+    pixels: NDArray[np.float32]
     points: NDArray[np.float32]
     slopes: NDArray[np.float32]
     patches: NDArray[np.uint8]
-    descriptors: NDArray[np.uint8]
+    descriptors_left: NDArray[np.uint8]
     depth_points: NDArray[np.float32] | None = None
+
+    @property
+    def uvd(self) -> FloatArray:
+        """Pixels and disparities of the corners as measured, shape (n, 3)."""
+        return self.pixels.astype(np.float64)
 
     @property
     def keypoints(self) -> FloatArray:
         """Pixels (u, v) of the corners, shape (n, 2)."""
-        return self.uvd[:, :2].astype(np.float64)
+        return self.uvd[:, :2]
 
     @property
     def points_cam(self) -> FloatArray:
@@ -680,7 +685,7 @@ class KltPlace:
         """Return the corners."""
         return KltCorners(
             keypoints=self.keypoints,
-            disparities=self.uvd[:, 2].astype(np.float64),
+            disparities=self.uvd[:, 2],
             slopes=self.slopes.astype(np.float64),
             points_cam=self.points_cam,
             templates=Templates.of_patches(self.patches),

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvo.frontend.features import Descriptors
 from gvo.types import FloatArray, ImageArray, IntArray
 
 # Points of a place, spread over those of its frame.
@@ -33,9 +34,7 @@ _COMMON_SHARE = 0.1
 _N_ALWAYS = 10
 
 
-def describe_pixels(
-    image: ImageArray, pixels: FloatArray
-) -> tuple[IntArray, NDArray[np.uint8]]:
+def describe_pixels(image: ImageArray, pixels: FloatArray) -> tuple[IntArray, NDArray[np.uint8]]:
     """Describe pixels by ORB, upright and of one size.
 
     Parameters
@@ -58,7 +57,7 @@ def describe_pixels(
     inside = np.all(pixels >= _BORDER_PX, axis=1)
     inside &= np.all(pixels < [width - _BORDER_PX, height - _BORDER_PX], axis=1)
     chosen = np.flatnonzero(inside)
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _MAX_POINTS)).astype(int)]
+    chosen = chosen[thin(len(chosen))]
     points = [
         cv2.KeyPoint(u, v, float(_PATCH_PX), 0.0, 0.0, 0, index)
         for index, (u, v) in zip(chosen.tolist(), pixels[chosen].tolist(), strict=True)
@@ -68,6 +67,11 @@ def describe_pixels(
     if descriptors is None:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 32), dtype=np.uint8)
     return np.array([point.class_id for point in found], dtype=np.int64), descriptors
+
+
+def thin(n: int) -> IntArray:
+    """Return which of n points a place keeps."""
+    return np.linspace(0, n - 1, min(n, _MAX_POINTS)).astype(np.int64)
 
 
 class PlaceIndex:
@@ -87,11 +91,12 @@ class PlaceIndex:
         """Return the number of places."""
         return self._n_places
 
-    def add(self, descriptors: NDArray[np.uint8]) -> None:
+    def add(self, descriptors: Descriptors) -> None:
         """Add a place, numbered in the order of adding."""
         words = _words(descriptors)
         if len(self._latest) == 0:
-            self._latest = np.full(descriptors.shape[1] // 2 * _N_VALUES, -1, dtype=np.int32)
+            n_bytes = descriptors.shape[1] // (1 if descriptors.dtype == np.uint8 else 8)
+            self._latest = np.full(n_bytes // 2 * _N_VALUES, -1, dtype=np.int32)
             self._counts = np.zeros_like(self._latest)
         entries = np.arange(self._n_entries, self._n_entries + len(words), dtype=np.int32)
         self._n_entries += len(words)
@@ -104,7 +109,7 @@ class PlaceIndex:
         self._counts[words] += 1
         self._n_places += 1
 
-    def scores(self, descriptors: NDArray[np.uint8]) -> FloatArray:
+    def scores(self, descriptors: Descriptors) -> FloatArray:
         """Return how much of a view's words each place has, the rare ones counting more.
 
         Returns
@@ -128,7 +133,9 @@ class PlaceIndex:
         return np.asarray(scores / max(float(weights[is_rare].sum()), 1e-9))
 
 
-def _words(descriptors: NDArray[np.uint8]) -> IntArray:
+def _words(descriptors: Descriptors) -> IntArray:
     """Return the different words of descriptors, with their places in the descriptor."""
+    if descriptors.dtype != np.uint8:
+        descriptors = np.packbits(descriptors > descriptors.mean(axis=1, keepdims=True), axis=1)
     words = np.ascontiguousarray(descriptors).view(np.uint16).astype(np.int64)
     return np.unique(words + np.arange(words.shape[1]) * _N_VALUES)

@@ -105,6 +105,29 @@ class LearnsRig(Protocol):
         """The present estimates."""
 
 
+class Recognizer(Protocol):
+    """A front-end that knows frames again that it keeps small: loops need one.
+
+    A place has `stamp_ns`, `points_cam` (n, 3) and `descriptors_left` (n, m); what else
+    `recognize` needs is the front-end's own affair.
+    """
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The camera that the points are seen by; of RGB-D, with a virtual baseline."""
+
+    def extract(self, frame: _Own, /) -> _Own:
+        """Return what is needed of a frame."""
+
+    def describe(self, observations: _Own, /) -> _Own:
+        """Return a frame as a place, at less than 100 kB."""
+
+    def recognize(
+        self, reference: _Own, current: _Own, observations: _Own, /
+    ) -> RelativePose | Failure:
+        """Estimate the motion from a place to a frame, given with its own place; rather fail."""
+
+
 @runtime_checkable
 class HasPoints(Protocol):
     """Observations whose points tell the view overlap."""
@@ -129,6 +152,11 @@ class CheckedFrontend(Generic[ObservationsT]):
     Parameters
     ----------
     frontend : Frontend
+
+    Attributes
+    ----------
+    recognizer : Recognizer or None
+        The front-end, where it is one.
     """
 
     def __init__(self, frontend: Frontend[ObservationsT]) -> None:
@@ -137,6 +165,7 @@ class CheckedFrontend(Generic[ObservationsT]):
         self._reconfigurable: Reconfigurable | None = _capability(frontend, "reconfigure")
         self._learner: LearnsRig | None = _capability(frontend, "rig_offsets")
         self._aligner: AlignsDepth | None = _capability(frontend, "align_depth")
+        self.recognizer: Recognizer | None = _capability(frontend, "recognize")
         self._camera_holder: HasCamera | None = _capability(frontend, "camera")
 
     @property

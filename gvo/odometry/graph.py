@@ -14,16 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
-import gtsam
 import numpy as np
 
-from gvo.backend.batch import BatchOptimizer, WholeGraph, as_transforms, descend
-from gvo.backend.factors import ORIGIN, Factors, Measurement
-from gvo.backend.pose_graph import definite
+from gvo.backend.batch import BatchOptimizer, LocalGraph, WholeGraph
+from gvo.backend.factors import ORIGIN, Factors
 from gvo.config import WindowConfig
 from gvo.geometry import se3
-from gvo.types import Edge, Estimate, FloatArray, Loop, PosePrior, Status
+from gvo.types import Edge, Estimate, FloatArray, Loop, Optimum, PosePrior, Status
 
 # Sigmas of a step of a camera that is lost: rad and m.
 _LOST_SIGMA = 100.0
@@ -31,7 +30,6 @@ _LOST_SIGMA = 100.0
 # per metre.
 _DRIFT = 0.01
 _TURN_PER_M = 0.0005
-_N_LOCAL_STEPS = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,31 +56,6 @@ class _Frame:
     status: Status
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Optimum:
-    """The poses of a run that fit all that was measured best.
-
-    Parameters
-    ----------
-    estimates : tuple of Estimate
-        Of all frames, by stamp, with marginal covariances where they were asked for.
-    loops : tuple of Loop
-        All that were confirmed; those that contradict the rest have a reason.
-    residuals : ndarray of float64, shape (n,)
-        Norms of the loops' whitened residuals, about 2.4 where the covariances are right.
-    error_before, error : float
-        Half the sum of the squared whitened residuals, of the poses along odometry and of these.
-    n_iterations : int
-    """
-
-    estimates: tuple[Estimate, ...]
-    loops: tuple[Loop, ...]
-    residuals: FloatArray
-    error_before: float
-    error: float
-    n_iterations: int
-
-
 class RunGraph:
     """The keyframes of a run with the edges between them; the frames between hang on them.
 
@@ -95,8 +68,8 @@ class RunGraph:
 
     Attributes
     ----------
-    loops : list of Loop
-        Those that are confirmed.
+    loops : sequence of Loop
+        Those with a reason against them do not count.
     """
 
     def __init__(self, config: WindowConfig) -> None:
@@ -108,7 +81,7 @@ class RunGraph:
         self._frames: dict[int, _Frame] = {}
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
-        self.loops: list[Loop] = []
+        self.loops: Sequence[Loop] = ()
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -158,8 +131,8 @@ class RunGraph:
     def _condense(self, *, is_closed: bool) -> None:
         """Solve what came since the last keyframe; the newest frame becomes one if it is closed."""
         arrivals, self._arrivals = self._arrivals, []
-        origin_ns, local = next(reversed(self._keyframes)), _Local(self._factors)
-        local.start(origin_ns)
+        origin_ns = next(reversed(self._keyframes))
+        local = LocalGraph(origin_ns, self._factors)
         for index, (estimate, edges) in enumerate(arrivals):
             is_closing = is_closed and index == len(arrivals) - 1
             for edge in map(self._from_keyframe, edges):
@@ -183,7 +156,7 @@ class RunGraph:
             )
         for stamp_ns, (T, covariance) in solved.items():
             edge = Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)
-            self._edges.append((stamp_ns, edge))
+            self._edges.append((int(stamp_ns), edge))  # type: ignore[call-overload]
 
     def _from_keyframe(self, edge: Edge) -> Edge:
         """Return an edge from a frame that hangs on a keyframe as one from the keyframe."""
@@ -203,11 +176,22 @@ class RunGraph:
     ) -> Optimum:
         """Return the poses that fit all measurements best, loops that contradict the rest apart.
 
+        Parameters
+        ----------
+        covariances : bool
+            Else they are the identity.
+        on_step : callable
+            Called with the state in words.
+
         Raises
         ------
         SmoothingError
             If GTSAM fails.
+        ValueError
+            If the graph is empty.
         """
+        if not self._keyframes:
+            raise ValueError("the graph of the run is empty: no frame has come")
         if self._arrivals:
             self._condense(is_closed=False)
         loops = self._judged(on_step)
@@ -220,6 +204,8 @@ class RunGraph:
         by_keyframe = dict(zip(self._keyframes, found, strict=True))
         return Optimum(
             estimates=self._place(poses, by_keyframe),
+            keyframes_ns=tuple(self._keyframes),
+            edges=tuple(self._edges),
             loops=loops,
             residuals=np.array([_residual(loop.edge, loop.stamp_ns, poses) for loop in loops]),
             error_before=before,
@@ -229,16 +215,19 @@ class RunGraph:
 
     def _judged(self, on_step: Callable[[str], None]) -> tuple[Loop, ...]:
         """Return the loops, those with a reason that contradict odometry and the other ones."""
-        if not self.loops:
-            return ()
-        graph = self._whole(self.loops, drift=_DRIFT * np.sqrt(len(self._edges)))
+        confirmed = [loop for loop in self.loops if not loop.reason]
+        if not confirmed:
+            return tuple(self.loops)
+        graph = self._whole(confirmed, drift=_DRIFT * np.sqrt(len(self._edges)))
         optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
         optimizer.run()
         keyframes = list(self._keyframes)
         refused = {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
         reason = "contradicts odometry or the other loops"
         return tuple(
-            replace(loop, reason=reason) if (loop.reference_ns, loop.stamp_ns) in refused else loop
+            replace(loop, reason=loop.reason or reason)
+            if (loop.reference_ns, loop.stamp_ns) in refused
+            else loop
             for loop in self.loops
         )
 
@@ -260,8 +249,10 @@ class RunGraph:
     ) -> tuple[Estimate, ...]:
         """Return all frames; those between two keyframes are bent so that both ends fit."""
         stamps_ns = list(self._keyframes)
-        following = dict(zip(stamps_ns, stamps_ns[1:], strict=False))
-        steps = {(edge.reference_id, ns): edge.T_reference_frame for ns, edge in self._edges}
+        following = dict(pairwise(stamps_ns))
+        steps: dict[tuple[object, int | None], FloatArray] = {
+            (edge.reference_id, ns): edge.T_reference_frame for ns, edge in self._edges
+        }
         estimates = [
             replace(each, T_world_frame=poses[ns], covariance=covariances[ns], rejected=())
             for ns, each in self._keyframes.items()
@@ -286,73 +277,6 @@ class RunGraph:
                 )
             )
         return tuple(sorted(estimates, key=lambda estimate: estimate.stamp_ns))
-
-
-class _Local:
-    """What was measured since a keyframe, which is the origin."""
-
-    def __init__(self, factors: Factors) -> None:
-        self._make = factors
-        self._graph = gtsam.NonlinearFactorGraph()
-        # Along the first edges: T_origin_frame and its covariance.
-        self._poses: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self._keys: dict[int, int] = {}
-
-    def start(self, origin_ns: int) -> None:
-        """Begin at a keyframe."""
-        self._origin_ns = origin_ns
-        self._poses[origin_ns] = np.eye(4), np.zeros((6, 6))
-
-    def __contains__(self, stamp_ns: object) -> bool:
-        """Tell whether a frame is there."""
-        return stamp_ns in self._poses
-
-    def add(self, stamp_ns: int, edge: Edge) -> None:
-        """Add an edge; one of its frames is there already."""
-        reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
-        T = edge.T_reference_frame
-        if stamp_ns not in self._poses and reference_ns in self._poses:
-            T_reference, covariance = self._poses[reference_ns]
-            moved = se3.compose_covariance(covariance, T, edge.covariance)
-            self._poses[stamp_ns] = T_reference @ T, moved
-        elif reference_ns not in self._poses:
-            T_frame, covariance = self._poses[stamp_ns]
-            Ad, T = se3.adjoint(T), se3.invert(T)
-            moved = se3.compose_covariance(covariance, T, Ad @ edge.covariance @ Ad.T)
-            self._poses[reference_ns] = T_frame @ T, moved
-        if reference_ns == self._origin_ns:
-            prior = PosePrior(
-                T_world_frame=edge.T_reference_frame,
-                covariance=edge.covariance,
-                kernel=edge.kernel or self._make.default,
-            )
-            self._graph.add(self._make.prior(self._key(stamp_ns), prior))
-        else:
-            keys = self._key(reference_ns), self._key(stamp_ns)
-            self._graph.add(self._make.between(*keys, Measurement.of(edge)))
-
-    def _key(self, stamp_ns: int) -> int:
-        return self._keys.setdefault(stamp_ns, len(self._keys))
-
-    def solve(self) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Return the frames' poses in the origin and their covariances (6, 6), by stamp."""
-        found = {ns: self._poses[ns] for ns in self._keys}
-        if self._graph.size() == len(found):  # a tree
-            return found
-        values = gtsam.Values()
-        for stamp_ns, key in self._keys.items():
-            values.insert(key, gtsam.Pose3(found[stamp_ns][0]))
-        try:
-            for values, _ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B020
-                pass
-            marginals = gtsam.Marginals(self._graph, values)
-            poses = as_transforms(values)
-            return {
-                ns: (poses[key], definite(marginals.marginalCovariance(key)))
-                for ns, key in self._keys.items()
-            }
-        except RuntimeError:
-            return found
 
 
 def _drifting(edge: Edge, drift: float) -> Edge:

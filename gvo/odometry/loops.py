@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.factory import make_frontend
 from gvo.frontend.places import PlaceIndex
+from gvo.frontend.protocol import Recognizer
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.keyframes import view_overlap
-from gvo.types import Failure, FloatArray, Frame, Loop, RelativePose
+from gvo.types import FloatArray, Frame, Loop, RelativePose
 
 # A frame that shows less than so much of the latest place is another one.
 _MAX_OVERLAP = 0.75
@@ -30,22 +31,6 @@ _SURE_SCORE = 0.06
 _N_WAITING = 5
 _AGREEMENT = 5.0
 _DRIFT = 0.02
-
-
-class Recognizer(Protocol):
-    """A front-end that finds frames again that it keeps small."""
-
-    def describe(self, observations: Any, /) -> Any:  # noqa: ANN401 - of the front-end's own kind
-        """Return a place: `stamp_ns`, `descriptors` (n, m) of uint8, what `recognize` needs."""
-
-    def recognize(
-        self,
-        reference: Any,  # noqa: ANN401
-        current: Any,  # noqa: ANN401
-        observations: Any,  # noqa: ANN401
-        /,
-    ) -> RelativePose | Failure:
-        """Estimate the motion from a place to a frame and its own place; rather fail."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,13 +67,11 @@ class LoopDetector:
         camera: StereoCamera | PinholeCamera | None = None,
         config: Config | None = None,
         *,
-        frontend: Any = None,  # noqa: ANN401
+        frontend: Recognizer | None = None,
     ) -> None:
-        if frontend is None:
-            if camera is None:
-                raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
-            frontend = make_frontend(camera, config)
-        self._frontend = frontend
+        if frontend is None and camera is None:
+            raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
+        self._frontend: Recognizer = frontend or make_frontend(camera, config)  # type: ignore[arg-type]
         self._index = PlaceIndex()
         self._visits: list[_Visit] = []
         self._waiting: list[tuple[int, Loop]] = []
@@ -116,7 +99,11 @@ class LoopDetector:
         return self.look(self._frontend.extract(frame), T_world_frame)
 
     def look(
-        self, observations: Any, T_world_frame: FloatArray, *, near: Container[int] = ()  # noqa: ANN401
+        self,
+        observations: Any,  # noqa: ANN401 - of the front-end's own kind
+        T_world_frame: FloatArray,
+        *,
+        near: Container[int] = (),
     ) -> tuple[Loop, ...]:
         """Detect, by what a front-end extracted; places whose stamps are `near` are no loops.
 
@@ -126,7 +113,7 @@ class LoopDetector:
             return ()
         place = self._frontend.describe(observations)
         found: list[Loop] = []
-        for number in self._candidates(place.descriptors, near):
+        for number in self._candidates(place.descriptors_left, near):
             reference = self._visits[number].place
             result = self._frontend.recognize(reference, place, observations)
             if isinstance(result, RelativePose):
@@ -134,7 +121,7 @@ class LoopDetector:
                 break
         self._numbers[place.stamp_ns] = len(self._visits)
         self._visits.append(_Visit(place=place, T_world_frame=T_world_frame))
-        self._index.add(place.descriptors)
+        self._index.add(place.descriptors_left)
         confirmed = [each for loop in found for each in self._confirm(loop)]
         return tuple(confirmed)
 
@@ -152,7 +139,9 @@ class LoopDetector:
             return []
         limit = min(_ABOVE_NOISE * float(np.quantile(scores, _NOISE_QUANTILE)), _SURE_SCORE)
         best = np.argsort(-scores)[: 4 * _N_CANDIDATES].tolist()
-        chosen = [k for k in best if scores[k] >= limit and self._visits[k].place.stamp_ns not in near]
+        chosen = [
+            k for k in best if scores[k] >= limit and self._visits[k].place.stamp_ns not in near
+        ]
         return chosen[:_N_CANDIDATES]
 
     def _confirm(self, loop: Loop) -> list[Loop]:

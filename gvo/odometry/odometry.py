@@ -23,8 +23,8 @@ from gvo.frontend.protocol import CheckedFrontend, Frontend, count_points
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
-from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes
 from gvo.odometry.graph import RunGraph
+from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes
 from gvo.odometry.loops import LoopDetector
 from gvo.odometry.segments import Segments
 from gvo.types import (
@@ -36,6 +36,7 @@ from gvo.types import (
     LinkKind,
     Loop,
     MotionPrior,
+    Optimum,
     RelativePose,
     RgbdFrame,
     SegmentJoin,
@@ -89,8 +90,8 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
         self._anchor_ns: int | None = None
-        self.graph = RunGraph(self._config.window)
-        self._loops = LoopDetector(frontend=frontend)
+        self._graph = RunGraph(self._config.window)
+        self._loops = self._make_detector()
         self._trust = DepthTrust(self._config.depth.icp)
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
@@ -104,6 +105,11 @@ class Odometry:
     def window(self) -> SlidingWindow:
         """The sliding window: its poses by stamp, covariances, edges and counts."""
         return self._window
+
+    @property
+    def graph(self) -> RunGraph:
+        """The graph of all keyframes so far, and its loops."""
+        return self._graph
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
@@ -189,6 +195,21 @@ class Odometry:
         """Return the smoothed poses of the frames still in the window."""
         return tuple(self._window.finish())
 
+    def optimize(self) -> Optimum:
+        """Return the poses of all frames so far that fit all that was measured best.
+
+        Loops are closed; without any, it is the batch optimum of the same edges that the window
+        has smoothed.
+
+        Raises
+        ------
+        SmoothingError
+            When GTSAM fails.
+        ValueError
+            Before the first frame.
+        """
+        return self._graph.optimize()
+
     def _result(
         self,
         observations: _Observations,
@@ -218,6 +239,13 @@ class Odometry:
             joins=joins,
             stage_ms=stage_ms,
         )
+
+    def _make_detector(self) -> LoopDetector | None:
+        """Return a detector where the front-end can find places again, and it is asked for."""
+        frontend = self._frontend.recognizer
+        if frontend is None or not self._config.loops.enabled:
+            return None
+        return LoopDetector(frontend=frontend)
 
     def _view(self) -> StereoCamera | None:
         """Return the camera of the view overlap."""
@@ -414,13 +442,11 @@ class Odometry:
         stamp_ns = causal.stamp_ns
         kept_ns = self._keyframes.stamps_ns
         is_keyframe = stamp_ns in kept_ns
-        self.graph.add_frame(causal, self._window.edges(stamp_ns), is_keyframe=is_keyframe)
+        self._graph.add_frame(causal, self._window.edges(stamp_ns), is_keyframe=is_keyframe)
         if self._loops is None or not is_keyframe:
             return ()
-        loops = self._loops.look(observations, causal.T_world_frame, near=kept_ns)
-        for loop in loops:
-            self.graph.loops.append(loop)
-        return loops
+        self._graph.loops = self._loops.loops
+        return self._loops.look(observations, causal.T_world_frame, near=kept_ns)
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""

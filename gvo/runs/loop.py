@@ -12,7 +12,7 @@ import numpy as np
 
 from gvo.backend.window import SlidingWindow
 from gvo.config import Config
-from gvo.errors import OutputError, RecordingError
+from gvo.errors import OutputError, RecordingError, SmoothingError
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import BaseFrame
@@ -20,7 +20,7 @@ from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
 from gvo.trajectory.evaluation import Motions
-from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
+from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -133,6 +133,30 @@ class RunLoop:
                 if is_writable:
                     self._give(outputs, lambda output: output.add_smoothed(finished))
                 self.count()
+
+    def optimize(self) -> Optimum | None:
+        """Return the optimum of all measurements, of the base frame; None if it is not asked for.
+
+        Where GTSAM fails, `output_faults` says so.
+        """
+        if not self.config.loops.enabled or self.statistics.n_with_pose == 0:
+            return None
+        try:
+            optimum = self._odometry.optimize()
+        except SmoothingError as error:
+            self.output_faults.append(f"no global poses: {error}")
+            return None
+        place = self.base_frame.apply_to_edge
+        loops = [(loop, place(loop.stamp_ns, loop.edge)) for loop in optimum.loops]
+        return replace(
+            optimum,
+            estimates=self._placed(optimum.estimates),
+            edges=tuple((stamp_ns, place(stamp_ns, edge)) for stamp_ns, edge in optimum.edges),
+            loops=tuple(
+                replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
+                for loop, edge in loops
+            ),
+        )
 
     def count(self) -> None:
         """Copy the counts of window, front-end and base frame into the statistics."""

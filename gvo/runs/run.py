@@ -26,6 +26,7 @@ from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run
 from gvo.io.run_folder.writer import (
+    GLOBAL,
     PICTURE,
     REPORT,
     TRAJECTORIES,
@@ -140,6 +141,9 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
+            optimum = loop.optimize()
+            if optimum is not None:
+                folder.write_optimum(optimum)
             faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
@@ -233,7 +237,8 @@ def _measure(
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:
     if isinstance(truth, Failure):
         return truth
-    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
+    names = [*TRAJECTORIES, *([GLOBAL] if (folder.path / f"{GLOBAL}.txt").is_file() else [])]
+    estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in names}
     try:
         return TruthComparison.of(_within(truth, folder, loop), estimates)
     except GvoError as error:

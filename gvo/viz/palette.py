@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 # Okabe and Ito's colours; black is the reference's
-ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73"}
+ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73", "global": "#CC79A7"}
 """Of the three trajectories of a run."""
 OTHERS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
 """Of other estimates, in turn."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from gvo.config import Config, DepthConfig
 from gvo.frontend.descriptor import as_stereo
-from gvo.frontend.rgbd import check_depths, compare_depths, sample_depth
+from gvo.frontend.rgbd import check_depths, compare_depths, grid_points, sample_depth
 from gvo.geometry import se3
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.types import Contradiction, DepthArray, FloatArray, RelativePose
@@ -199,6 +199,10 @@ def depth(index: int) -> DepthArray:
     return IMAGES[2 * index + 1].load()
 
 
+def compared(reference: DepthArray, current: DepthArray) -> tuple[FloatArray, DepthArray]:
+    return grid_points(reference, CAMERA, CONFIG), current
+
+
 def moved(last: int) -> FloatArray:
     return np.asarray(se3.invert(T_WORLD_CAM[0]) @ T_WORLD_CAM[last])
 
@@ -216,15 +220,15 @@ def result_of(T_reference_current: FloatArray) -> RelativePose:
 def test_the_true_motion_passes(last: int) -> None:
     depths = depth(0), depth(last)
     result = result_of(moved(last))
-    assert check_depths(result, depths, CAMERA, CONFIG) is result
-    differences = compare_depths(depths, moved(last), CAMERA, CONFIG)
+    assert check_depths(result, *compared(*depths), CAMERA, CONFIG) is result
+    differences = compare_depths(*compared(*depths), moved(last), CAMERA, CONFIG)
     assert np.mean(differences < -3.0) < 0.1
 
 
 @pytest.mark.parametrize("metres", [1.0, 1.3])
 def test_a_motion_through_free_space_is_refused_with_its_numbers(metres: float) -> None:
     wrong = moved(1) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, metres]))
-    refused = check_depths(result_of(wrong), (depth(0), depth(1)), CAMERA, CONFIG)
+    refused = check_depths(result_of(wrong), *compared(depth(0), depth(1)), CAMERA, CONFIG)
     assert isinstance(refused, Contradiction)
     assert "free space" in refused.reason
     assert refused.n_matches == 50
@@ -233,11 +237,11 @@ def test_a_motion_through_free_space_is_refused_with_its_numbers(metres: float) 
 def test_what_is_hidden_now_does_not_count() -> None:
     near = np.full_like(depth(1), 0.5)
     result = result_of(moved(1))
-    assert check_depths(result, (depth(0), near), CAMERA, CONFIG) is result
+    assert check_depths(result, *compared(depth(0), near), CAMERA, CONFIG) is result
 
 
 def test_without_depth_nothing_is_refused() -> None:
     unknown = np.full_like(depth(1), np.nan)
     result = result_of(np.eye(4))
     for depths in ((unknown, depth(1)), (depth(0), unknown)):
-        assert check_depths(result, depths, CAMERA, CONFIG) is result
+        assert check_depths(result, *compared(*depths), CAMERA, CONFIG) is result

@@ -194,7 +194,7 @@ def test_what_a_frame_gave_is_counted() -> None:
         assert result.raw.status == result.causal.status == result.status
         assert result.raw.frame_id == result.causal.frame_id == result.stamp_ns
         assert result.n_keypoints >= result.n_points > 50
-        assert set(result.stage_ms) == {"extract", "register", "links", "window"}
+        assert set(result.stage_ms) == {"extract", "register", "links", "window", "loops"}
         assert not result.reason
     assert all(12 <= r.n_inliers <= r.n_matches <= r.n_points for r in results[1:])
     assert all(1 <= r.n_links <= 3 for r in results[1:])

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from gvo._text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.writer import TRAJECTORIES, TRUE_POSITIONS, TRUTH
+from gvo.io.run_folder.writer import GLOBAL, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.formats import MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
@@ -104,7 +104,7 @@ class RunRecord:
         Likewise.
     trajectories : dict of str to Trajectory
         "raw", "causal" and "smoothed", with covariances where the run computed them; may be
-        empty, as "causal" where all was optimized at once.
+        empty, as "causal" where all was optimized at once. "global" where there is one.
     truth : Trajectory or None
         What the estimates were compared with: poses, or positions of the measured point.
     """
@@ -167,7 +167,8 @@ def read_run(folder: str | Path) -> RunRecord:
     if missing:
         raise RecordingError(f"{folder}: is no run folder: no {missing[0]}; {_EXPECTED}")
     summary = _read_summary(folder / "summary.json")
-    trajectories = {name: _read_estimate(folder, name) for name in TRAJECTORIES}
+    names = [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
+    trajectories = {name: _read_estimate(folder, name) for name in names}
     return RunRecord(
         folder=folder,
         summary=summary,

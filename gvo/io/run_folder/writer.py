@@ -17,6 +17,7 @@ import numpy as np
 
 from gvo._text import visible
 from gvo.errors import OutputError, RunBusyError
+from gvo.geometry import se3
 from gvo.io.run_folder.line_file import LineFile, check_folder, replace_text
 from gvo.trajectory.formats import (
     COVARIANCE_HEADER,
@@ -24,8 +25,9 @@ from gvo.trajectory.formats import (
     format_tum_line,
     write_tum,
 )
+from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Status
+from gvo.types import Estimate, FaultyFrame, FrameResult, IntArray, Optimum, Status
 
 SUMMARY = "summary.json"
 LOCK = "run.lock"
@@ -36,6 +38,21 @@ TRUTH = "ground_truth.txt"
 TRUE_POSITIONS = "ground_truth_positions.csv"
 POSITIONS_HEADER = ("stamp_ns", "x_m", "y_m", "z_m")
 TRAJECTORIES = ("raw", "causal", "smoothed")
+"""Those that are written as the run goes."""
+GLOBAL = "global"
+"""The one that comes at its end."""
+GRAPH = "graph.g2o"
+LOOPS = "loops.csv"
+LOOPS_HEADER = (
+    "stamp_ns",
+    "reference_ns",
+    "n_matches",
+    "n_inliers",
+    *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+    "residual",
+    "weight",
+    "reason",
+)
 FRAMES_HEADER = (
     "stamp_ns",
     "status",
@@ -48,7 +65,15 @@ FRAMES_HEADER = (
     "reason",
 )
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
-TIMINGS_HEADER = ("stamp_ns", "read_ms", "extract_ms", "register_ms", "links_ms", "window_ms")
+TIMINGS_HEADER = (
+    "stamp_ns",
+    "read_ms",
+    "extract_ms",
+    "register_ms",
+    "links_ms",
+    "window_ms",
+    "loops_ms",
+)
 
 _OF_EARLIER_RUNS = (
     SUMMARY,
@@ -59,6 +84,9 @@ _OF_EARLIER_RUNS = (
     ROUND_TRIP_PICTURE,
     TRUTH,
     TRUE_POSITIONS,
+    GRAPH,
+    LOOPS,
+    f"{GLOBAL}.txt",
 )
 
 
@@ -186,7 +214,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._files: dict[str, LineFile] = {}
         with ExitStack() as stack, self._refused_on_error(path):
             path.mkdir(parents=True, exist_ok=True)
-            covariances = (f"{name}_covariance.csv" for name in TRAJECTORIES)
+            covariances = (f"{name}_covariance.csv" for name in (*TRAJECTORIES, GLOBAL))
             for name in (*_RESULTS, *covariances):
                 (path / name).unlink(missing_ok=True)
             stack.callback(self._close_files)
@@ -245,6 +273,17 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._add_pose("raw", raw)
         self._add_pose("causal", causal)
         self._write("frames.csv", _csv_line(row))
+
+    def write_optimum(self, optimum: Optimum) -> None:
+        """Write the global poses, the graph that they are the optimum of, and its loops."""
+        self._open(f"{GLOBAL}.txt", "")
+        self._open_covariances(GLOBAL)
+        for estimate in optimum.estimates:
+            self._add_pose(GLOBAL, estimate)
+        self._open(GRAPH, "")
+        self._write(GRAPH, "".join(f"{line}\n" for line in _graph_lines(optimum)))
+        self._open(LOOPS, _csv_line(LOOPS_HEADER))
+        self._write(LOOPS, "".join(map(_csv_line, _loop_rows(optimum))))
 
     def add_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write all poses of a trajectory, and their covariances, if any."""
@@ -333,6 +372,30 @@ def _link_rows(result: FrameResult) -> Iterator[Sequence[object]]:
     for link in result.links:
         chi2 = "" if link.chi2 is None else f"{link.chi2:.6g}"
         yield result.stamp_ns, link.reference_ns, link.kind, int(link.is_accepted), chi2
+
+
+def _graph_lines(optimum: Optimum) -> Iterator[str]:
+    """Yield the keyframes, numbered, with their stamps as comments, and the edges between them."""
+    numbers = {stamp_ns: number for number, stamp_ns in enumerate(optimum.keyframes_ns)}
+    for estimate in optimum.estimates:
+        number = numbers.get(estimate.stamp_ns)
+        if number is not None:
+            yield f"{format_vertex(number, estimate.T_world_frame)}  # {estimate.stamp_ns}"
+    loops = ((loop.stamp_ns, loop.edge) for loop in optimum.loops if not loop.reason)
+    for stamp_ns, edge in chain(optimum.edges, loops):
+        ends = numbers[int(edge.reference_id)], numbers[stamp_ns]  # type: ignore[call-overload]
+        yield format_edge(*ends, edge.T_reference_frame, edge.covariance)
+
+
+def _loop_rows(optimum: Optimum) -> Iterator[Sequence[object]]:
+    for loop, residual in zip(optimum.loops, optimum.residuals.tolist(), strict=True):
+        T = loop.T_reference_frame
+        pose = (*T[:3, 3].tolist(), *se3.quaternions(T[:3, :3]).tolist())
+        yield (
+            *(loop.stamp_ns, loop.reference_ns, loop.n_matches, loop.n_inliers),
+            *(f"{value:.9g}" for value in pose),
+            *(f"{residual:.4g}", 0 if loop.reason else 1, loop.reason),
+        )
 
 
 def _times(result: FrameResult) -> Iterator[str]:
