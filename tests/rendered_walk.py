@@ -22,6 +22,7 @@ N_FRAMES = 16
 CAMERA = "camera_left_optical"
 LEFT, RIGHT = "/stereo/left/image_rect", "/stereo/right/image_rect"
 TRAJECTORIES = ("raw", "causal", "smoothed")
+GLOBAL = "global"
 _EVERY = 3  # of the frames that are rendered, so that the camera moves between two of them
 _RENDERED = SyntheticRecording("handheld", "stereo", n_frames=_EVERY * N_FRAMES, scale=0.4)
 STAMPS_NS: IntArray = _RENDERED.ground_truth().stamps_ns[::_EVERY]

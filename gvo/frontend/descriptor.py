@@ -10,9 +10,8 @@ import numpy as np
 from gvo._trace import note
 from gvo.config import Config
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
-from gvo.frontend.features import FeatureExtractor, Features
+from gvo.frontend.features import FeatureExtractor, Features, thin
 from gvo.frontend.matching import match_temporal, predict_pixels
-from gvo.frontend.places import thin
 from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities

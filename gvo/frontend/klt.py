@@ -17,7 +17,7 @@ from gvo.frontend.alignment import Templates, cut_patches, move_slopes, patch_wa
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.places import describe_pixels
+from gvo.frontend.features import describe_pixels
 from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
 from gvo.frontend.stereo.corners import CornerDisparities, measure_corners

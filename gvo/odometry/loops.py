@@ -10,7 +10,7 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.frontend.factory import make_frontend
-from gvo.frontend.places import PlaceIndex
+from gvo.frontend.features import PlaceIndex
 from gvo.frontend.protocol import Recognizer
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -77,6 +77,12 @@ class LoopDetector:
         self._waiting: list[tuple[int, Loop]] = []
         self._numbers: dict[int, int] = {}
         self.loops: list[Loop] = []
+
+    def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
+        """Go on with another front-end; places of another kind are not searched any more."""
+        self._frontend = frontend
+        if not keeps_places:
+            self._index, self._visits, self._waiting = PlaceIndex(), [], []
 
     def __len__(self) -> int:
         """Return the number of places."""

@@ -132,7 +132,7 @@ class Odometry:
           `features` (descriptor): then KLT keyframes, which hold their images, are extracted
           again, and those of descriptors are released.
         - `camera`, `stereo`: what was learnt of the camera is estimated anew.
-        - `runtime`: with the next frame.
+        - `loops`, `runtime`: with the next frame.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 
         A front-end of one's own is told at once where it is `Reconfigurable`.
@@ -241,11 +241,9 @@ class Odometry:
         )
 
     def _make_detector(self) -> LoopDetector | None:
-        """Return a detector where the front-end can find places again, and it is asked for."""
+        """Return a detector where the front-end can find places again."""
         frontend = self._frontend.recognizer
-        if frontend is None or not self._config.loops.enabled:
-            return None
-        return LoopDetector(frontend=frontend)
+        return None if frontend is None else LoopDetector(frontend=frontend)
 
     def _view(self) -> StereoCamera | None:
         """Return the camera of the view overlap."""
@@ -273,6 +271,9 @@ class Odometry:
             offsets = None if change.is_of_rig else self._frontend.rig_offsets
             frontend = make_frontend(camera, self._config, rig_offsets=offsets)
             self._frontend = CheckedFrontend(frontend)
+            if self._loops is not None and self._frontend.recognizer is not None:
+                keeps_places = not change.is_of_kind
+                self._loops.reconfigure(self._frontend.recognizer, keeps_places=keeps_places)
         extracted = {}
         if change.is_of_extraction:
             frames = sorted(self._frames.items())
@@ -443,7 +444,7 @@ class Odometry:
         kept_ns = self._keyframes.stamps_ns
         is_keyframe = stamp_ns in kept_ns
         self._graph.add_frame(causal, self._window.edges(stamp_ns), is_keyframe=is_keyframe)
-        if self._loops is None or not is_keyframe:
+        if self._loops is None or not is_keyframe or not self._config.loops.enabled:
             return ()
         self._graph.loops = self._loops.loops
         return self._loops.look(observations, causal.T_world_frame, near=kept_ns)

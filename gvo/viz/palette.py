@@ -35,8 +35,9 @@ STAGES = {
     "read": "#00224E",
     "extract": "#35456C",
     "register": "#7C7B78",
-    "links": "#BCAE6B",
-    "window": "#FDEA45",
+    "links": "#A69D75",
+    "window": "#D2C060",
+    "loops": "#FDEA45",
 }
 """Of the stages of a frame, from dark to light: distinct in grey print too."""
 COUNTS = {"keypoints": "#999999", "points": "#0072B2", "matches": "#CC79A7", "inliers": INLIERS}

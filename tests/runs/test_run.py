@@ -23,6 +23,7 @@ from tests.conftest import Command
 from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
+    GLOBAL,
     N_FRAMES,
     STAMPS_NS,
     START_NS,
@@ -114,7 +115,7 @@ def test_summary_tells_frames_times_errors_and_configuration(run_dir: Path) -> N
     assert summary["coverage_percent"] == 100.0
     assert summary["status_counts"]["ok"] == 20
     assert {"read", "extract", "register", "links", "window"} <= set(summary["median_ms"])
-    assert [entry["name"] for entry in summary["errors"]] == list(TRAJECTORIES)
+    assert [entry["name"] for entry in summary["errors"]] == [*TRAJECTORIES, GLOBAL]
     assert summary["configuration"] == gvo.Config().model_dump()
 
 
@@ -155,8 +156,8 @@ def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, thre
     for out in (tmp_path / "a", tmp_path / "b"):
         gvo.run_recording(gvo.open_recording(room_bag), out, outputs=NO_REPORT, config=config)
         config = gvo.Config()
-    names = {path.name for path in (tmp_path / "a").glob("*.[tc][xs][tv]")} - {"timings.csv"}
-    assert len(names) == 9
+    names = {path.name for path in (tmp_path / "a").glob("*.[tcg][xs2][tvo]")} - {"timings.csv"}
+    assert len(names) == 13
     for path in sorted(tmp_path / "a" / name for name in names):
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 
@@ -425,7 +426,7 @@ def test_a_run_that_starts_at_the_truth_lies_on_it_without_alignment(
         starts_at_truth=True,
     )
     exact = T_map_world @ true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
-    for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):
+    for name, evaluation in zip([*TRAJECTORIES, GLOBAL], result.evaluations, strict=True):
         poses = _poses(tmp_path / "out", name)
         np.testing.assert_allclose(poses[0], exact[0], atol=1e-4)
         np.testing.assert_allclose(poses[:, :3, 3], exact[:, :3, 3], atol=0.02)
@@ -451,7 +452,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
     assert result.warnings == ()
     exact = true_poses(STAMPS_NS)
     points = exact[:, :3, :3] @ p_cam + exact[:, :3, 3]
-    for name, evaluation in zip(TRAJECTORIES, result.evaluations, strict=True):
+    for name, evaluation in zip([*TRAJECTORIES, GLOBAL], result.evaluations, strict=True):
         poses = _poses(walk_run, name)
         found = poses[:, :3, :3] @ p_cam + poses[:, :3, 3]
         # interpolation over 20 ms leaves a tenth of a millimetre

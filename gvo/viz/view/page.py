@@ -135,7 +135,7 @@ class Page:
             self._message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
             start = {"frame": f"the first of {self._player.n_frames} is coming"}
             self._numbers = gui.add_html(numbers_html(start))
-            hidden = {"standstill"} if self._truth is not None else {"standstill", "truth"}
+            hidden = {"standstill", "global"} | (set() if self._truth is not None else {"truth"})
             gui.add_html(legend_html(name for name in COLOURS if name not in hidden))
 
     def _add_main_panel(self) -> None:

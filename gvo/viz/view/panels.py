@@ -30,6 +30,7 @@ _MEANINGS = {
     "raw": "chain of frame-to-frame registrations",
     "causal": "pose when the frame arrived; the camera",
     "smoothed": "pose when the frame left the window",
+    "global": "optimum of all that was measured, loops closed",
     "truth": "ground truth (dashed)",
     "keyframes": "keyframes of the window",
     "step": "link to the frame before",

@@ -37,4 +37,4 @@ def test_plots_without_a_report_are_refused() -> None:
 def test_without_a_report_nothing_is_drawn(tmp_path: Path) -> None:
     gvo.run_recording(Walk(), tmp_path, outputs=gvo.RunOutputs(report=False))
     suffixes = {path.suffix for path in tmp_path.iterdir()}
-    assert suffixes == {".txt", ".csv", ".json"}
+    assert suffixes == {".txt", ".csv", ".json", ".g2o"}
