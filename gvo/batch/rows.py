@@ -41,7 +41,7 @@ class BatchRow:
         Share of the frames with a pose.
     segments : int
         Segments of the trajectory; one if the camera was never lost.
-    ate_raw_m, ate_causal_m, ate_smoothed_m : float
+    ate_raw_m, ate_causal_m, ate_smoothed_m, ate_global_m : float
         Absolute trajectory errors, metres.
     rpe_smoothed_m, rpe_smoothed_deg : float
         Relative pose errors from frame to frame.
@@ -73,6 +73,7 @@ class BatchRow:
     ate_raw_m: float | None = None
     ate_causal_m: float | None = None
     ate_smoothed_m: float | None = None
+    ate_global_m: float | None = None
     rpe_smoothed_m: float | None = None
     rpe_smoothed_deg: float | None = None
     t_smoothed_percent: float | None = None

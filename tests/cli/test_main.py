@@ -56,8 +56,10 @@ def test_run_writes_its_files_and_prints_the_errors(
     assert answer.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
-        *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
-        *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
+        *(f"{name}.txt" for name in ("raw", "causal", "smoothed", "global")),
+        *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed", "global")),
+        "graph.g2o",
+        "loops.csv",
         "frames.csv",
         "edges.csv",
         "timings.csv",
