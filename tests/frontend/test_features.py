@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from gvo.config import FeaturesConfig
-from gvo.frontend.features import FeatureExtractor, Features, rank_in_group
+from gvo.frontend.features import (
+    Descriptors,
+    FeatureExtractor,
+    Features,
+    PlaceIndex,
+    describe_pixels,
+    rank_in_group,
+)
 from gvo.frontend.matching import descriptor_distances
 from gvo.types import ImageArray
 
@@ -139,3 +147,71 @@ def test_ranks_count_within_each_group(groups: list[int]) -> None:
     ordered = sorted(groups)
     expected = [ordered[:i].count(group) for i, group in enumerate(ordered)]
     assert rank_in_group(np.array(ordered, dtype=np.int64)).tolist() == expected
+
+
+def flipped(descriptors: Descriptors, n_bits: int, seed: int) -> Descriptors:
+    """Change so many bits of each descriptor."""
+    rng = np.random.default_rng(seed)
+    bits = np.unpackbits(descriptors, axis=1)
+    for row in bits:
+        row[rng.choice(len(row), n_bits, replace=False)] ^= 1
+    return np.packbits(bits, axis=1)
+
+
+def made_up(seed: int, n: int = 200) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (n, 32), dtype=np.uint8)
+
+
+def test_a_place_is_found_among_others_by_what_is_left_of_its_descriptors() -> None:
+    index = PlaceIndex()
+    for seed in range(60):
+        index.add(made_up(seed))
+    assert len(index) == 60
+    # A third of the points is seen again, an eighth of their bits has changed.
+    seen = np.concatenate([flipped(made_up(17)[:66], 32, 0), made_up(1000, 134)])
+    scores = index.scores(seen)
+    assert scores.shape == (60,)
+    assert scores.argmax() == 17
+    assert scores[17] > 3.0 * np.delete(scores, 17).max()
+    assert index.scores(made_up(17))[17] == pytest.approx(1.0)
+
+
+def test_what_all_places_show_tells_none_of_them() -> None:
+    index, common = PlaceIndex(), made_up(0, 100)
+    for seed in range(40):
+        index.add(np.concatenate([common, made_up(seed + 1, 100)]))
+    scores = index.scores(np.concatenate([common, made_up(5, 100)]))
+    assert scores.argmax() == 4
+    assert np.delete(scores, 4).max() < 0.1
+
+
+def test_a_view_without_points_and_an_empty_index_have_no_scores() -> None:
+    index, nothing = PlaceIndex(), np.zeros((0, 32), dtype=np.uint8)
+    assert index.scores(made_up(0)).shape == (0,)
+    index.add(nothing)
+    index.add(made_up(0))
+    assert index.scores(nothing).tolist() == [0.0, 0.0]
+    assert index.scores(made_up(0)).tolist() == pytest.approx([0.0, 1.0])
+
+
+def test_places_of_sift_are_found_too() -> None:
+    index = PlaceIndex()
+    images = [blobs(seed) for seed in range(12)]
+    for image in images:
+        index.add(extract(image, "sift").descriptors)
+    noise = np.random.default_rng(0).normal(0.0, 2.0, images[3].shape)
+    again = np.clip(images[3] + noise, 0, 255).astype(np.uint8)
+    assert index.scores(extract(again, "sift").descriptors).argmax() == 3
+
+
+def test_pixels_near_the_border_are_not_described() -> None:
+    pixels = np.array(
+        [[5.0, 100.0], [100.0, 100.0], [160.5, 120.0], [310.0, 100.0], [100.0, 235.0]]
+    )
+    chosen, descriptors = describe_pixels(blobs(), pixels)
+    assert chosen.tolist() == [1, 2]
+    assert descriptors.shape == (2, 32)
+    many = np.random.default_rng(0).uniform([30, 30], [290, 210], (1000, 2))
+    chosen, descriptors = describe_pixels(blobs(), many)
+    assert len(chosen) == len(descriptors) == 400
+    assert np.all(np.diff(chosen) > 0)

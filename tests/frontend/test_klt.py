@@ -290,3 +290,49 @@ def test_a_drive_at_a_low_rate_begins_without_a_prediction() -> None:
         se3.invert(result.T_reference_current) @ np.asarray(se3.invert(poses[0]) @ poses[4])
     )
     assert np.linalg.norm(error[3:]) < 0.05
+
+
+@pytest.mark.parametrize("kind", ["klt", "descriptor"])
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_place_is_small_and_recognized(sensor: Sensor, kind: str) -> None:
+    config = Config.model_validate({"frontend": {"kind": kind}})
+    finder = make_frontend(recording(sensor).info.camera, config)
+    seen = [finder.extract(frame) for frame in frames(sensor)]  # type: ignore[arg-type]
+    first, last = (finder.describe(each) for each in (seen[0], seen[-1]))  # type: ignore[arg-type]
+    assert len(first.points_cam) == len(first.descriptors_left) <= 400
+    arrays = [getattr(first, name, None) for name in first.__dataclass_fields__]
+    assert sum(each.nbytes for each in arrays if isinstance(each, np.ndarray)) < 100_000
+    result = finder.recognize(first, last, seen[-1])  # type: ignore[arg-type]
+    assert isinstance(result, RelativePose)
+    true = true_motion(sensor, 0, N_FRAMES - 1)
+    error = se3.log(se3.invert(true) @ result.T_reference_current)
+    assert np.linalg.norm(error[3:]) < 0.01
+    assert se3.mahalanobis(error, result.covariance) < 40.0
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_another_place_is_not_recognized(sensor: Sensor) -> None:
+    klt, frame = frontend(sensor), frames(sensor)[-1]
+    if isinstance(frame, StereoFrame):
+        turned = replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
+    else:
+        turned = replace(frame, image=frame.image[::-1].copy(), depth=frame.depth[::-1].copy())
+    other, nothing = klt.extract(turned), klt.extract(blank(sensor))
+    here = observations(sensor)[0]
+    for first, second in ((here, other), (other, here), (here, nothing), (nothing, here)):
+        result = klt.recognize(klt.describe(first), klt.describe(second), second)
+        assert isinstance(result, Failure)
+
+
+def test_depth_that_contradicts_a_place_is_no_place() -> None:
+    klt, (first, *_, last) = frontend("rgbd"), observations("rgbd")
+    assert isinstance(last.frame, RgbdFrame)
+    # The corners stay where they were; what lies between them is seen through.
+    depth = np.full_like(last.frame.depth, 0.9 * Config().depth.max_depth_m)
+    for u, v in np.rint(last.keypoints).astype(int):
+        around = slice(v - 4, v + 5), slice(u - 4, u + 5)
+        depth[around] = last.frame.depth[around]
+    pierced = klt.extract(replace(last.frame, depth=depth))
+    result = klt.recognize(klt.describe(first), klt.describe(pierced), pierced)
+    assert isinstance(result, Failure)
+    assert "free space" in result.reason
