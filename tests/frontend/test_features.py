@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from gvo.config import FeaturesConfig
 from gvo.frontend.features import (
-    Descriptors,
     FeatureExtractor,
     Features,
     PlaceIndex,
@@ -149,7 +148,7 @@ def test_ranks_count_within_each_group(groups: list[int]) -> None:
     assert rank_in_group(np.array(ordered, dtype=np.int64)).tolist() == expected
 
 
-def flipped(descriptors: Descriptors, n_bits: int, seed: int) -> Descriptors:
+def flipped(descriptors: NDArray[np.uint8], n_bits: int, seed: int) -> NDArray[np.uint8]:
     """Change so many bits of each descriptor."""
     rng = np.random.default_rng(seed)
     bits = np.unpackbits(descriptors, axis=1)

@@ -297,7 +297,7 @@ def test_a_drive_at_a_low_rate_begins_without_a_prediction() -> None:
 def test_a_place_is_small_and_recognized(sensor: Sensor, kind: str) -> None:
     config = Config.model_validate({"frontend": {"kind": kind}})
     finder = make_frontend(recording(sensor).info.camera, config)
-    seen = [finder.extract(frame) for frame in frames(sensor)]  # type: ignore[arg-type]
+    seen = [finder.extract(frame) for frame in frames(sensor)]
     first, last = (finder.describe(each) for each in (seen[0], seen[-1]))  # type: ignore[arg-type]
     assert len(first.points_cam) == len(first.descriptors_left) <= 400
     arrays = [getattr(first, name, None) for name in first.__dataclass_fields__]
@@ -313,10 +313,11 @@ def test_a_place_is_small_and_recognized(sensor: Sensor, kind: str) -> None:
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_another_place_is_not_recognized(sensor: Sensor) -> None:
     klt, frame = frontend(sensor), frames(sensor)[-1]
-    if isinstance(frame, StereoFrame):
-        turned = replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
-    else:
-        turned = replace(frame, image=frame.image[::-1].copy(), depth=frame.depth[::-1].copy())
+    turned: Frame = (
+        replace(frame, left=frame.left[::-1].copy(), right=frame.right[::-1].copy())
+        if isinstance(frame, StereoFrame)
+        else replace(frame, image=frame.image[::-1].copy(), depth=frame.depth[::-1].copy())
+    )
     other, nothing = klt.extract(turned), klt.extract(blank(sensor))
     here = observations(sensor)[0]
     for first, second in ((here, other), (other, here), (here, nothing), (nothing, here)):
