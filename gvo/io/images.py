@@ -512,7 +512,7 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
 def _is_png_chunk_sound(chunk: NDArray[np.uint8]) -> bool:
     check, name = chunk[-4:].tobytes(), chunk[4:8].tobytes()
-    return name != b"IDAT" or zlib.crc32(memoryview(chunk[4:-4])) == int.from_bytes(check, "big")
+    return name != b"IDAT" or zlib.crc32(chunk[4:-4].data) == int.from_bytes(check, "big")
 
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
@@ -538,7 +538,7 @@ def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
             parts.append(data[start:end].tobytes())
         elif name == b"IDAT" and n_left and not inflater.eof:
             try:
-                row = inflater.decompress(memoryview(data[start + 8 : end - 4]), n_left)
+                row = inflater.decompress(data[start + 8 : end - 4].data, n_left)
             except zlib.error:
                 return data
             n_left -= len(row)
