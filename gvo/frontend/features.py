@@ -2,9 +2,10 @@
 
 A descriptor is cut into words of 16 bits. Of two that differ in an eighth of their 256 bits, nine
 of ten pairs share a word or more; so a table of words names the places that a view may be, without
-a vocabulary that would have to be learnt. Of 1,000 places with 200 descriptors each it answers in
-2 ms, and a place is added in 0.5 ms. FLANN's LSH takes 37 ms for an answer as complete, and is
-built anew whenever something is added.
+a vocabulary that would have to be learnt. Of 720 places of rendered drives with 150 descriptors
+each it names the right one first for 98 % of the views, in 1.2 ms; a place is added in 0.3 ms.
+FLANN's LSH is as complete and as quick, but cannot be added to: to build it anew takes 160 ms.
+faiss's takes 3.2 ms, and a package of 65 MB (`scripts/benchmark_index.py`).
 
 References
 ----------

@@ -135,7 +135,9 @@ class RunGraph:
         local = LocalGraph(origin_ns, self._factors)
         for index, (estimate, edges) in enumerate(arrivals):
             is_closing = is_closed and index == len(arrivals) - 1
-            for edge in map(self._from_keyframe, edges):
+            tied = [self._from_keyframe(edge) for edge in edges]
+            # those that tie the frame to what is there already come first
+            for edge in sorted(tied, key=lambda edge: edge.reference_id not in local):
                 if is_closing and edge.reference_id not in local:
                     self._edges.append((estimate.stamp_ns, edge))  # as it is
                 else:
