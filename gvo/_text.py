@@ -24,6 +24,9 @@ MAX_TEXT_BYTES = 1 << 28
 MAX_LINE = 1 << 20
 """Characters of a line; an edge with its covariance has a thousandth."""
 
+MAX_LINES = 3_000_000
+"""Lines of a table, as many: rows of a few bytes take more memory than their text."""
+
 MAX_SHOWN = 80
 """Largest length of a value in a message, characters."""
 
@@ -127,21 +130,36 @@ def exists(path: Path) -> bool:
     return not access_fault(path)
 
 
-def text_lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file, one at a time.
+def text_lines(
+    path: Path, fault: type[Exception], *, is_held: bool = False
+) -> Iterator[tuple[int, str]]:
+    """Yield numbers, from one, and lines of a text file, one at a time.
 
-    Raises
-    ------
-    OSError
-        If it cannot be read, or a line has more than `MAX_LINE` characters; `strerror` says so.
-    UnicodeDecodeError
-        If it is no text.
+    Parameters
+    ----------
+    path : Path
+        File, pipe or device.
+    fault : type
+        Raised if it cannot be read, is no text, or a line has more than `MAX_LINE` characters.
+    is_held : bool
+        All is held in memory: no more than `MAX_LINES` and `MAX_TEXT_BYTES` then.
     """
-    with path.open(encoding="utf-8-sig") as file:
-        for line in iter(partial(file.readline, MAX_LINE + 1), ""):
-            if len(line) > MAX_LINE:
-                raise OSError(errno.EFBIG, f"a line has more than {MAX_LINE} characters")
-            yield line
+    n_left = MAX_TEXT_BYTES
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            lines = iter(partial(file.readline, MAX_LINE + 1), "")
+            for number, line in enumerate(lines, start=1):
+                n_left -= len(line)
+                if len(line) > MAX_LINE:
+                    raise fault(f"{path}: a line has more than {MAX_LINE} characters")
+                if is_held and (n_left < 0 or number > MAX_LINES):
+                    limits = f"{MAX_TEXT_BYTES} bytes or {MAX_LINES} lines"
+                    raise fault(f"{path}: holds more than {limits}")
+                yield number, line
+    except OSError as error:
+        raise fault(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise fault(f"{path}: is no text file") from error
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gvo._text import cut, exists, plain_number, read_text
+from gvo._text import cut, exists, plain_number, text_lines
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
@@ -71,23 +74,27 @@ def read_trajectory(path: str | Path, *, is_growing: bool = False) -> Trajectory
         If the file is missing, empty or malformed; names file and line.
     """
     path = Path(path)
-    header, rows = read_rows(path, of="poses", is_growing=is_growing)
-    if is_growing:
-        return _read_growing(rows)
-    if not rows:
+    rows = read_rows(path, is_growing=is_growing)
+    first = next(rows, None)
+    if first is None and is_growing:
+        return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
+    if first is None:
         raise TrajectoryError(f"{path}: holds no poses; expected rows of {_FORMATS}")
-    return _with_covariances(_parse(path, header, rows), path)
+    rows = chain([first], rows)
+    if is_growing:
+        return _read_tum(path, rows, is_sorted=False)
+    return _with_covariances(_parse(path, first, rows), path)
 
 
-def _parse(path: Path, header: str, rows: list[Row]) -> Trajectory:
-    n_columns = len(rows[0].fields)
-    if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(header[:_MAX_HEADER])):
-        return _read_euroc(rows)
+def _parse(path: Path, first: Row, rows: Iterable[Row]) -> Trajectory:
+    n_columns = len(first.fields)
+    if n_columns == 17 or (n_columns >= 8 and _SCALAR_FIRST.search(first.header[:_MAX_HEADER])):
+        return _read_euroc(path, rows, n_columns)
     if n_columns == 12:
         return _read_kitti(path, rows)
     if n_columns == 8:
-        return _read_tum(rows)
-    raise rows[0].error(f"expected {_FORMATS}, got {n_columns}")
+        return _read_tum(path, rows)
+    raise first.error(f"expected {_FORMATS}, got {n_columns}")
 
 
 def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
@@ -121,13 +128,14 @@ def read_covariances(path: str | Path, *, is_growing: bool = False) -> tuple[Int
         If the file is missing or malformed.
     """
     path = Path(path)
-    _, rows = read_rows(path, of="covariances", is_growing=is_growing)
-    if is_growing and not rows:
+    rows = read_rows(path, is_growing=is_growing)
+    first = next(rows, None)
+    if is_growing and first is None:
         return np.empty(0, dtype=np.int64), np.empty((0, 6, 6))
-    if not rows or rows[0].fields != COVARIANCE_HEADER.split(","):
+    if first is None or first.fields != COVARIANCE_HEADER.split(","):
         raise TrajectoryError(f"{path}:1: expected the header {COVARIANCE_HEADER[:32]}...")
-    values = read_numbers(rows[1:], slice(1, None), n_columns=22, limit=math.inf)
-    return read_stamps(rows[1:], unit_ns=1), from_upper_triangle(values)
+    table = read_table(path, rows, slice(1, 22), n_columns=22, unit_ns=1, limit=math.inf)
+    return table.stamps_ns, from_upper_triangle(table.values)
 
 
 def upper_triangle(matrix: FloatArray) -> FloatArray:
@@ -296,43 +304,36 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
         raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _read_growing(rows: list[Row]) -> Trajectory:
-    if not rows:
-        return Trajectory(stamps_ns=np.empty(0, dtype=np.int64), T_world_frame=np.empty((0, 4, 4)))
-    return _read_tum(rows, is_sorted=False)
-
-
-def _read_tum(rows: list[Row], *, is_sorted: bool = True) -> Trajectory:
-    values = read_numbers(rows, slice(1, 8), n_columns=8)
-    stamps_ns = read_stamps(rows, unit_ns=1_000_000_000)
+def _read_tum(path: Path, rows: Iterable[Row], *, is_sorted: bool = True) -> Trajectory:
+    table = read_table(path, rows, slice(1, 8), n_columns=8, unit_ns=1_000_000_000)
     if not is_sorted:
-        order = np.argsort(stamps_ns, kind="stable")
-        rows, values, stamps_ns = [rows[n] for n in order], values[order], stamps_ns[order]
+        table = table.take(np.argsort(table.stamps_ns, kind="stable"))
     # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
-    is_last = np.diff(stamps_ns, append=stamps_ns[-1] + 1) != 0
-    rows = [row for row, is_kept in zip(rows, is_last, strict=True) if is_kept]
-    values = values[is_last]
-    R = _rotations_of_quaternions(rows, values[:, 3:])
+    is_last = np.diff(table.stamps_ns, append=table.stamps_ns[-1] + 1) != 0
+    table = table.take(is_last)
+    R = _rotations_of_quaternions(table, table.values[:, 3:])
     return Trajectory(
-        stamps_ns=check_increasing(rows, stamps_ns[is_last]),
-        T_world_frame=se3.make_transform(R, values[:, :3]),
+        stamps_ns=check_increasing(table),
+        T_world_frame=se3.make_transform(R, table.values[:, :3]),
         n_repeated=int(np.count_nonzero(~is_last)),
     )
 
 
-def _read_euroc(rows: list[Row]) -> Trajectory:
-    values = read_numbers(rows, slice(1, 8), n_columns=len(rows[0].fields))
-    stamps_ns = check_increasing(rows, read_stamps(rows, unit_ns=1))
-    R = _rotations_of_quaternions(rows, values[:, [4, 5, 6, 3]])
-    return Trajectory(stamps_ns=stamps_ns, T_world_frame=se3.make_transform(R, values[:, :3]))
+def _read_euroc(path: Path, rows: Iterable[Row], n_columns: int) -> Trajectory:
+    table = read_table(path, rows, slice(1, 8), n_columns=n_columns, unit_ns=1)
+    stamps_ns = check_increasing(table)
+    R = _rotations_of_quaternions(table, table.values[:, [4, 5, 6, 3]])
+    T_world_frame = se3.make_transform(R, table.values[:, :3])
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_frame)
 
 
-def _read_kitti(path: Path, rows: list[Row]) -> Trajectory:
-    P = read_numbers(rows, slice(0, 12), n_columns=12).reshape(-1, 3, 4)
+def _read_kitti(path: Path, rows: Iterable[Row]) -> Trajectory:
+    table = read_table(path, rows, slice(0, 12), n_columns=12)
+    P = table.values.reshape(-1, 3, 4)
     M = P[:, :, :3]
     is_wrong = ~se3.is_rotation(M, tolerance=_ROUNDING)
-    refuse(rows, is_wrong, "the first three columns of the pose are no rotation")
-    stamps_ns, stamps_from = _kitti_stamps(path, len(rows))
+    table.refuse(is_wrong, "the first three columns of the pose are no rotation")
+    stamps_ns, stamps_from = _kitti_stamps(path, len(P))
     return Trajectory(
         stamps_ns=stamps_ns,
         T_world_frame=se3.make_transform(se3.nearest_rotation(M), P[:, :, 3]),
@@ -345,15 +346,15 @@ def _kitti_stamps(path: Path, n_rows: int) -> tuple[IntArray, StampsFrom]:
     official = path.parent.parent / "sequences" / path.stem / "times.txt"
     for times in (beside, official):
         if times.is_file():
-            _, rows = read_rows(times, of="stamps")
-            if len(rows) == n_rows:
-                return check_increasing(rows, read_stamps(rows, unit_ns=1_000_000_000)), "times"
+            table = read_table(times, read_rows(times), slice(0), unit_ns=1_000_000_000)
+            if len(table.stamps_ns) == n_rows:
+                return check_increasing(table), "times"
     return np.arange(n_rows, dtype=np.int64) * 1_000_000_000, "rows"
 
 
-def _rotations_of_quaternions(rows: list[Row], quaternions_xyzw: FloatArray) -> FloatArray:
+def _rotations_of_quaternions(table: Table, quaternions_xyzw: FloatArray) -> FloatArray:
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
-    refuse(rows, np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
+    table.refuse(np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
     return np.asarray(Rotation.from_quat(quaternions_xyzw).as_matrix())
 
 
@@ -369,34 +370,33 @@ class Row:
         Line number, from one.
     fields : list of str
         At least one.
+    header : str
+        The comments since the row before.
     """
 
     path: Path
     number: int
     fields: list[str]
+    header: str
 
     def error(self, text: str) -> TrajectoryError:
         """Return an error with this text that names file and line."""
         return TrajectoryError(f"{self.path}:{self.number}: {cut(text, _MAX_REASON)}")
 
 
-def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, list[Row]]:
-    """Read the fields of a text file, separated by blanks or commas; comments start with #.
+def read_rows(path: Path, *, is_growing: bool = False) -> Iterator[Row]:
+    """Yield the rows of a text file, separated by blanks or commas; comments start with #.
 
     Parameters
     ----------
     path : Path
         Text file.
-    of : str
-        What its rows hold, in the plural, for messages.
     is_growing : bool
         It may be missing, and an incomplete last line is ignored.
 
-    Returns
-    -------
-    header : str
-        The comments before the first row.
-    rows : list of Row
+    Yields
+    ------
+    Row
         Lines with at least one field.
 
     Raises
@@ -405,114 +405,114 @@ def read_rows(path: Path, *, of: str, is_growing: bool = False) -> tuple[str, li
         If the file cannot be read.
     """
     if is_growing and not exists(path):
-        return "", []
-    try:
-        content = read_text(path, encoding="utf-8-sig")
-    except OSError as error:
-        raise TrajectoryError(
-            f"{path}: cannot be read: {error.strerror}; give a file of {of}"
-        ) from error
-    except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: is no text; expected rows of {of}") from error
-    if is_growing:
-        content = content[: content.rfind("\n") + 1]
+        return
     header: list[str] = []
-    rows: list[Row] = []
-    for number, line in enumerate(content.splitlines(), start=1):
-        text, mark, comment = line.partition("#")
+    for number, line in text_lines(path, TrajectoryError, is_held=True):
+        text, mark, comment = line.rstrip("\n").partition("#")
         fields = text.replace(",", " ").split()
-        if mark and not rows:
+        if mark:
             header.append(comment)
-        if fields:
-            rows.append(Row(path=path, number=number, fields=fields))
-    return " ".join(header), rows
+        if fields and not (is_growing and line[-1] != "\n"):
+            yield Row(path=path, number=number, fields=fields, header=" ".join(header))
+            header = []
 
 
-def read_numbers(
-    rows: list[Row], columns: slice, *, n_columns: int, limit: float = MAX_POSITION_M
-) -> FloatArray:
-    """Return some columns of rows as numbers.
+class Table(NamedTuple):
+    """Rows of a text file as numbers, which take a few times their text.
 
     Parameters
     ----------
-    rows : list of Row
-        Of one file.
+    path : Path
+        The file.
+    numbers : ndarray of int64, shape (n,)
+        Line numbers, from one.
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the first column; zero where it holds none.
+    values : ndarray of float64, shape (n, k)
+        Finite numbers of some columns.
+    """
+
+    path: Path
+    numbers: IntArray
+    stamps_ns: IntArray
+    values: FloatArray
+
+    def take(self, rows: IntArray | BoolArray) -> Table:
+        """Return some of the rows."""
+        return Table(self.path, self.numbers[rows], self.stamps_ns[rows], self.values[rows])
+
+    def refuse(self, is_wrong: BoolArray, text: str) -> None:
+        """Raise `TrajectoryError` for the first row of a mask, shape (n,), if any."""
+        if np.any(is_wrong):
+            raise TrajectoryError(f"{self.path}:{self.numbers[np.argmax(is_wrong)]}: {text}")
+
+
+def read_table(
+    path: Path,
+    rows: Iterable[Row],
+    columns: slice,
+    *,
+    n_columns: int | None = None,
+    unit_ns: int | None = None,
+    limit: float = MAX_POSITION_M,
+) -> Table:
+    """Return rows as numbers.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    rows : iterable of Row
     columns : slice
-        Which to return.
-    n_columns : int
+        Which are the values; from start to stop.
+    n_columns : int, optional
         Required in each row.
+    unit_ns : int, optional
+        Nanoseconds of a unit of the first column, 1_000_000_000 for seconds; it is converted
+        without loss (decimal arithmetic).
     limit : float
         Of the absolute values.
-
-    Returns
-    -------
-    ndarray of float64, shape (len(rows), k)
-        Finite numbers.
 
     Raises
     ------
     TrajectoryError
-        If a row has more or fewer columns, or a number is not finite; names the line.
+        If a row has more or fewer columns, a number is not finite, or a stamp is no number or out
+        of range; names the line.
     """
-    values = []
+    numbers, stamps_ns, values = array("q"), array("q"), array("d")
     for row in rows:
-        if len(row.fields) != n_columns:
+        if n_columns not in (None, len(row.fields)):
             raise row.error(
                 f"expected {n_columns} columns, got {len(row.fields)}; remove or complete the row"
             )
         try:
-            values.append([float(plain_number(field)) for field in row.fields[columns]])
+            values.extend([float(plain_number(field)) for field in row.fields[columns]])
+            stamps_ns.append(parse_stamp(row.fields[0], unit_ns=unit_ns) if unit_ns else 0)
         except ValueError as error:
-            raise row.error(f"{error}; expected {n_columns} numbers") from None
-    array = np.array(values).reshape(len(rows), len(range(n_columns)[columns]))
-    refuse(rows, ~np.isfinite(array).all(axis=1), "a number is not finite; remove the row")
-    is_absurd = (np.abs(array) > limit).any(axis=1)
-    refuse(rows, is_absurd, f"a number is beyond {limit:g}; remove the row")
-    return array
+            raise row.error(f"{error}; expected {len(row.fields)} numbers") from None
+        numbers.append(row.number)
+    table = Table(
+        path,
+        np.frombuffer(numbers, dtype=np.int64),
+        np.frombuffer(stamps_ns, dtype=np.int64),
+        np.frombuffer(values).reshape(len(numbers), len(range(columns.stop)[columns])),
+    )
+    is_broken = np.any(~np.isfinite(table.values), axis=1)
+    table.refuse(is_broken, "a number is not finite; remove the row")
+    is_absurd = np.any((table.values > limit) | (table.values < -limit), axis=1)
+    table.refuse(is_absurd, f"a number is beyond {limit:g}; remove the row")
+    return table
 
 
-def read_stamps(rows: list[Row], *, unit_ns: int) -> IntArray:
-    """Return the first column in nanoseconds, without loss (decimal arithmetic).
-
-    Parameters
-    ----------
-    rows : list of Row
-        Of one file.
-    unit_ns : int
-        Nanoseconds of a unit: 1_000_000_000 for seconds, 1 for nanoseconds.
-
-    Returns
-    -------
-    ndarray of int64, shape (len(rows),)
-
-    Raises
-    ------
-    TrajectoryError
-        If a stamp is no number or out of range; names the line.
-    """
-    return np.array([_stamp(row, unit_ns) for row in rows], dtype=np.int64)
-
-
-def _stamp(row: Row, unit_ns: int) -> int:
-    try:
-        return parse_stamp(row.fields[0], unit_ns=unit_ns)
-    except ValueError as error:
-        raise row.error(str(error)) from None
-
-
-def check_increasing(rows: list[Row], stamps_ns: IntArray) -> IntArray:
+def check_increasing(table: Table) -> IntArray:
     """Return the stamps; raise `TrajectoryError` if they do not increase strictly."""
-    falls = np.flatnonzero(np.diff(stamps_ns) <= 0)
-    if len(falls) > 0:
-        before, row = rows[falls[0]], rows[falls[0] + 1]
-        raise row.error(
-            f"the stamp {row.fields[0]} is not after {before.fields[0]} of line {before.number}; "
-            "sort the rows and remove repeated ones"
+    is_fall = np.append(False, np.diff(table.stamps_ns) <= 0)
+    if np.any(is_fall):
+        n = int(np.argmax(is_fall))
+        before, stamp = (format_stamp(each) for each in table.stamps_ns[n - 1 : n + 1].tolist())
+        table.refuse(
+            is_fall,
+            f"the stamp {stamp} is not after {before} of line {table.numbers[n - 1]}; sort the "
+            "rows and remove repeated ones",
         )
-    return stamps_ns
-
-
-def refuse(rows: list[Row], is_wrong: BoolArray, text: str) -> None:
-    """Raise `TrajectoryError` for the first row of a mask, shape (len(rows),), if any."""
-    if np.any(is_wrong):
-        raise rows[int(np.argmax(is_wrong))].error(text)
+    return table.stamps_ns

@@ -4,6 +4,7 @@ import json
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,18 +22,25 @@ from rosbags.rosbag1 import Writer
 
 from gvo._text import MAX_LINE, MAX_VALUES, cut, read_text
 from gvo.config import load_configuration
-from gvo.errors import CalibrationError, ConfigurationError, GvoError, RecordingError
+from gvo.errors import (
+    CalibrationError,
+    ConfigurationError,
+    GvoError,
+    RecordingError,
+    TrajectoryError,
+)
 from gvo.io.bag.image_encodings import decode_rvl
 from gvo.io.bag.messages import decode_compressed, transform_of
 from gvo.io.bag.reader import BagReader, typestore
 from gvo.io.bag.recovery import inflate
 from gvo.io.bag.recovery.mcap import MAGIC
 from gvo.io.calibration.files import read_cameras
+from gvo.io.datasets.files import read_stamped_rows
 from gvo.io.edges.lines import parse_line, read_lines
 from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
 from gvo.io.poses.ground_truth import parse_truth
 from gvo.io.run_folder.reader import read_run
-from gvo.trajectory.formats import read_trajectory
+from gvo.trajectory.formats import read_rows, read_table, read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.types import Failure
@@ -240,6 +248,34 @@ def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
     )
     before, after = (int(line) // 1024 for line in answer.stdout.split())
     assert after - before < 200
+
+
+def test_a_table_of_tiny_rows_takes_a_few_times_its_text(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("0 0 0 0 0 0 0 1\n" * 20_000)
+    tracemalloc.start()
+    try:
+        table = read_table(path, read_rows(path), slice(1, 8), n_columns=8, unit_ns=1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert table.values.shape == (20_000, 7)
+    assert peak < 8 * path.stat().st_size
+
+
+@pytest.mark.parametrize(("name", "limit"), [("MAX_LINES", 9), ("MAX_TEXT_BYTES", 150)])
+def test_a_table_that_is_too_long_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, limit: int
+) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(9)))
+    monkeypatch.setattr(f"gvo._text.{name}", limit)
+    assert len(read_trajectory(path)) == len(read_stamped_rows(path, unit_ns=1)) == 9
+    path.write_text(path.read_text() + "9 0 0 0 0 0 0 1\n")
+    with pytest.raises(TrajectoryError, match="holds more than"):
+        read_trajectory(path)
+    with pytest.raises(RecordingError, match="holds more than"):
+        read_stamped_rows(path, unit_ns=1)
 
 
 def png_of(stream: bytes, *fields: int) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gvo._text import cut, read_text
+from gvo._text import cut, text_lines
 from gvo.errors import RecordingError
 from gvo.io.calibration.files import CameraSet
 from gvo.io.images import FULL_RANGE, GreyRange, read_image
@@ -19,7 +19,6 @@ from gvo.trajectory.trajectory import parse_stamp
 
 StampedPath = tuple[int, Path]
 _MAX_REASON = 300  # characters
-_Row = tuple[int, list[str]]
 
 
 class FolderSource:
@@ -119,8 +118,10 @@ def read_stamped_rows(
     return rows
 
 
-def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> list[_Row]:
-    """Read the rows of a table, without comments and empty lines.
+def read_rows(
+    path: Path, *, n_fields: int, separator: str | None = None
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a table, without comments and empty lines.
 
     Parameters
     ----------
@@ -131,9 +132,9 @@ def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> lis
     separator : str, optional
         Between the fields; white space when None.
 
-    Returns
-    -------
-    list of (int, list of str)
+    Yields
+    ------
+    int, list of str
         Line number, counted from one, and fields.
 
     Raises
@@ -141,28 +142,17 @@ def read_rows(path: Path, *, n_fields: int, separator: str | None = None) -> lis
     RecordingError
         When the file cannot be read, holds no row, or a row is too short.
     """
-    rows = []
-    for number, line in enumerate(_read_lines(path), start=1):
+    is_empty = True
+    for number, line in text_lines(path, RecordingError, is_held=True):
         text = line.strip()
         if not text or text.startswith("#"):
             continue
+        is_empty = False
         fields = [field.strip() for field in text.split(separator)]
         if len(fields) < n_fields:
             raise RecordingError(
                 f"{path}, line {number}: expected {n_fields} fields, got {len(fields)}"
             )
-        rows.append((number, fields))
-    if not rows:
+        yield number, fields
+    if is_empty:
         raise RecordingError(f"{path}: holds no rows")
-    return rows
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return read_text(path, encoding="utf-8-sig").splitlines()
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: the file is missing") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: is no text file") from error
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error

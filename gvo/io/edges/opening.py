@@ -112,10 +112,10 @@ def _is_pose_graph(path: Path) -> bool:
     A pipe can be read once only, a pose graph is read more often.
     """
     try:
-        for line in text_lines(path) if path.is_file() else ():
+        for _, line in text_lines(path, TrajectoryError) if path.is_file() else ():
             text = line.partition("#")[0].strip()
             if text:
                 return text[0].isupper()
-    except (OSError, UnicodeDecodeError):
+    except TrajectoryError:
         return False
     return False

@@ -191,15 +191,10 @@ class PoseGraphSource:
 
     def _texts(self) -> Iterator[tuple[int, str]]:
         """Yield line numbers and lines that hold anything."""
-        try:
-            for number, line in enumerate(text_lines(self._path), start=1):
-                text = line.partition("#")[0].strip()
-                if text:
-                    yield number, text
-        except OSError as error:
-            raise TrajectoryError(f"{self._path}: cannot be read: {error.strerror}") from error
-        except UnicodeDecodeError as error:
-            raise TrajectoryError(f"{self._path}: is no text file") from error
+        for number, line in text_lines(self._path, TrajectoryError):
+            text = line.partition("#")[0].strip()
+            if text:
+                yield number, text
 
     def _report_unconnected(self, graph: _Connector) -> None:
         if graph.n_waiting:
