@@ -13,6 +13,8 @@ what else it does, ratios less so. Starting up and drawing are left out.
 benchmark_seeds.py): `--kind drive` (stereo), `hand` (a fast one, RGB-D), `rest` (a drone that
 hovers, stereo), `block` (a lap and more by car, stereo), `rooms` (alike, RGB-D), with a rolling
 shutter by `--readout`. `--keep DIR` keeps what is rendered.
+`--loops` judges loop closure on recordings with ground truth, named or of seeds, also with
+`--drift` or with the light going out (`--dark`; see benchmark_loops.py).
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 `--graphs` optimizes whole pose graphs, those named, GTSAM's and generated ones, beside GTSAM used
@@ -24,10 +26,11 @@ Example: python scripts/benchmark.py --seeds 10 --kind hand --readout 25 --keep 
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import benchmark_graphs  # type: ignore[import-not-found]  # beside this one
+import benchmark_loops  # type: ignore[import-not-found]
 import benchmark_passes as passes  # type: ignore[import-not-found]
 import benchmark_seeds  # type: ignore[import-not-found]
 import benchmark_tables as tables  # type: ignore[import-not-found]
@@ -35,6 +38,7 @@ import benchmark_window  # type: ignore[import-not-found]
 import numpy as np
 
 import gvo
+from gvo.io.recording import Source
 
 
 def main() -> None:
@@ -48,6 +52,10 @@ def main() -> None:
             sys.exit("benchmark: " + "; ".join(faults))
     if arguments.graphs is not None:
         benchmark_graphs.measure(arguments.graphs)
+    if arguments.loops:
+        spoiling = benchmark_loops.Spoiling(dark_s=arguments.dark, drift=arguments.drift)
+        benchmark_loops.measure(sources_of(arguments), arguments.set, spoiling)
+        return
     if arguments.seeds:
         benchmark_seeds.measure(recordings_of(arguments), arguments.seeds, arguments.set)
     measure_all(arguments)
@@ -70,6 +78,9 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--graphs", type=Path, nargs="*", metavar="G2O", help="whole pose graphs")
     parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
+    parser.add_argument("--loops", action="store_true", help="judge loop closure")
+    parser.add_argument("--drift", type=float, default=0.0, metavar="PERCENT", help="of a lap")
+    parser.add_argument("--dark", type=span, metavar="A-B", help="seconds without light")
     add_seeds(parser)
     arguments = parser.parse_args()
     lengths = [n for n in (arguments.window, arguments.soak) if n is not None]
@@ -80,6 +91,10 @@ def parse() -> argparse.Namespace:
         parser.error("--window and --soak take at least 1000 poses")
     if arguments.rounds < 1:
         parser.error("--rounds takes at least 1")
+    if (arguments.drift or arguments.dark) and not arguments.loops:
+        parser.error("--drift and --dark go with --loops")
+    if not 0.0 <= arguments.drift <= 5.0:
+        parser.error("--drift takes 0 to 5")
     return arguments
 
 
@@ -101,6 +116,21 @@ def seeds(text: str) -> range:
     if not found:
         raise ValueError(text)
     return found
+
+
+def span(text: str) -> tuple[float, float]:
+    """Return from when to when, seconds."""
+    first, end = map(float, text.split("-"))
+    return first, end
+
+
+def sources_of(arguments: argparse.Namespace) -> Iterator[Source]:
+    """Yield the recordings that are named, then those of the seeds."""
+    config = gvo.load_configuration(settings=arguments.set)
+    for path in arguments.recordings:
+        yield gvo.open_recording(path, config=config)
+    for seed in arguments.seeds or ():
+        yield recordings_of(arguments).of(seed)
 
 
 def recordings_of(arguments: argparse.Namespace) -> benchmark_seeds.Recordings:

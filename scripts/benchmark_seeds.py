@@ -38,6 +38,8 @@ KINDS = {
     "drive": Kind("driving", "stereo"),
     "hand": Kind("turning", "rgbd"),
     "rest": Kind("hovering", "stereo"),
+    "lap": Kind("driving", "stereo", n_frames=560, scale=0.5),
+    "room": Kind("handheld", "rgbd", n_frames=600, scale=0.5),
     "block": Kind("block", "stereo", n_frames=600, scale=0.5),
     "rooms": Kind("rooms", "rgbd", n_frames=1080, scale=0.5),
 }
