@@ -4,7 +4,7 @@ import json
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
@@ -65,15 +65,30 @@ class TrajectoryError(GvoError):
 
 
 @contextmanager
-def named_faults(kind: type[GvoError], where: object) -> Iterator[None]:
-    """Raise errors of the operating system as a `GvoError` that names the file."""
+def named_faults(kind: type[GvoError], where: object, what: str = "") -> Iterator[None]:
+    """Raise errors of the operating system as a `GvoError`.
+
+    Parameters
+    ----------
+    kind : type
+    where : object
+        Named in the message; of what the error itself names the file, if `what` is omitted.
+    what : str
+        Could not be done, as in "cannot be written".
+    """
     try:
         yield
-    except BrokenPipeError:
-        raise
     except OSError as error:
-        name = where if error.filename is None else error.filename
-        raise kind(f"{name}: {error.strerror or error}") from error
+        if isinstance(error, BrokenPipeError) and not what:
+            raise
+        name = where if what or error.filename is None else error.filename
+        reason = f"{what}: {error.strerror or error}" if what else error.strerror or error
+        raise kind(f"{name}: {reason}") from error
+
+
+def write_faults(kind: type[GvoError], where: object) -> AbstractContextManager[None]:
+    """Raise errors of the operating system as a `GvoError`: a file or folder cannot be written."""
+    return named_faults(kind, where, "cannot be written")
 
 
 def missing_extra(what: str, extra: str) -> ConfigurationError:

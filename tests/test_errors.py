@@ -1,4 +1,4 @@
-"""The line that installs what is missing."""
+"""The line that installs what is missing; faults of the system by name."""
 
 import importlib.metadata
 import json
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 import gvo.errors
-from gvo.errors import missing_extra
+from gvo.errors import GvoError, OutputError, missing_extra, named_faults, write_faults
 
 
 def test_in_a_clone_the_clone_is_installed() -> None:
@@ -32,3 +32,17 @@ def test_an_installed_gvo_is_taken_from_where_it_came_from(
     assert str(missing_extra("batches need pandas", "batch")).endswith(f"pip install '{wanted}'")
     found.read_text = lambda name: None
     assert str(missing_extra("batches need pandas", "batch")).endswith("pip install 'gvo[batch]'")
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space")])
+def test_what_cannot_be_written_is_named(error: OSError) -> None:
+    said = rf"^a: cannot be written: {error.strerror}$"
+    with pytest.raises(OutputError, match=said), write_faults(OutputError, "a"):
+        raise error
+
+
+def test_a_pipe_that_nobody_reads_ends_what_is_not_written_to_a_file() -> None:
+    with pytest.raises(BrokenPipeError), named_faults(GvoError, "gvo"):
+        raise BrokenPipeError
+    with pytest.raises(GvoError, match=r"^b: No such file"), named_faults(GvoError, "a"):
+        raise FileNotFoundError(2, "No such file", "b")

@@ -17,7 +17,7 @@ from gvo.backend.motion_model import ConstantVelocity, StatusClock
 from gvo.backend.pose_graph import first_line
 from gvo.backend.window_graph import NewPose, WindowGraph, absence
 from gvo.config import WindowConfig
-from gvo.errors import SmoothingError
+from gvo.errors import SmoothingError, write_faults
 from gvo.geometry import se3
 from gvo.trajectory.g2o import g2o_lines
 from gvo.types import (
@@ -327,10 +327,8 @@ class SlidingWindow:
             If the file cannot be written.
         """
         text = "".join(f"{line}\n" for line in g2o_lines(self.poses(), self.graph()))
-        try:
+        with write_faults(SmoothingError, path):
             Path(path).write_text(text, encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise SmoothingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def pop_finished(self) -> list[Estimate]:
         """Return the smoothed estimates of the poses that left since the last call."""

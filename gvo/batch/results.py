@@ -12,7 +12,7 @@ import pandas as pd
 import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
 
 from gvo.batch.rows import BatchRow, RunStatus, Value
-from gvo.errors import OutputError
+from gvo.errors import OutputError, write_faults
 from gvo.io.run_folder.line_file import replace_bytes
 
 CSV = "results.csv"
@@ -62,10 +62,8 @@ def write_results(frame: pd.DataFrame, folder: Path) -> None:
         PARQUET: frame.to_parquet(index=False),
     }
     for name, content in contents.items():
-        try:
+        with write_faults(OutputError, folder / name):
             replace_bytes(folder / name, content)
-        except OSError as error:
-            raise OutputError(f"{folder / name}: cannot be written: {error.strerror}") from error
 
 
 def _text(value: Value) -> Value:

@@ -22,7 +22,7 @@ from gvo.batch.storage import is_url, store
 from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions
 from gvo.batch.variants import Variant, differences, name_variants
 from gvo.config import Config
-from gvo.errors import OutputError
+from gvo.errors import OutputError, write_faults
 from gvo.io.run_folder.line_file import replace_text
 from gvo.io.run_folder.writer import REPORT
 
@@ -177,11 +177,9 @@ class _Table:
 
     def _mark(self, folder: Path) -> None:
         content = {"mark": self.mark, "gvo_version": __version__, "n_runs": len(self._places)}
-        try:
+        with write_faults(OutputError, folder):
             folder.mkdir(parents=True, exist_ok=True)
             replace_text(folder / MARK, json.dumps(content) + "\n")
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
 
     def _draw(self, folder: Path) -> None:
         from gvo.batch.report.report import write_batch_report

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gvo.config import Config
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, write_faults
 from gvo.io.convert.bag_messages import BagWriter, FramePose, write_transforms
 from gvo.io.convert.bag_writer import write_bag
 from gvo.io.opening import open_recording
@@ -46,13 +46,11 @@ def write_demo_bags(folder: Path, *, progress: Callable[[int], None] | None = No
         When a file cannot be written.
     """
     drive = SyntheticRecording(world="driving", sensor="stereo", n_frames=N_FRAMES)
-    try:
+    with write_faults(RecordingError, folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (BAG_NAME, ROBOT_NAME):
             (folder / name).unlink(missing_ok=True)
         write_robot_bag(drive.ground_truth(), folder / ROBOT_NAME)
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot be written: {error.strerror}") from error
     write_bag(drive, folder / BAG_NAME, progress=progress)
 
 

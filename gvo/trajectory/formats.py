@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvo._text import cut, exists, plain_number, text_lines
-from gvo.errors import TrajectoryError
+from gvo.errors import TrajectoryError, write_faults
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import StampsFrom, Trajectory, format_stamp, parse_stamp
 from gvo.types import BoolArray, FloatArray, IntArray
@@ -297,11 +297,11 @@ def _check_rotations(trajectory: Trajectory) -> None:
 
 
 def _write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    try:
-        with Path(path).open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(f"{line}\n" for line in lines)
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
+    with (
+        write_faults(TrajectoryError, path),
+        Path(path).open("w", encoding="utf-8", newline="\n") as file,
+    ):
+        file.writelines(f"{line}\n" for line in lines)
 
 
 def _read_tum(path: Path, rows: Iterable[Row], *, is_sorted: bool = True) -> Trajectory:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvo._text import visible
-from gvo.errors import ConfigurationError, TrajectoryError
+from gvo.errors import ConfigurationError, TrajectoryError, write_faults
 from gvo.trajectory.alignment import AlignMode, alignment, pair
 from gvo.trajectory.round_trip import RoundTripError
 from gvo.trajectory.trajectory import Trajectory
@@ -285,13 +285,13 @@ def save_figure(figure: Figure, path: Path) -> None:
     from matplotlib import rc_context
 
     suffix = path.suffix.lower()
-    try:
+    # the salt of the ids in SVG is random by default; the setting ends with the block
+    with (
+        write_faults(TrajectoryError, path),
+        rc_context({"svg.hashsalt": "gvo"}),
+    ):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # the salt of the ids in SVG is random by default; the setting ends with the block
-        with rc_context({"svg.hashsalt": "gvo"}):
-            figure.savefig(path, format=suffix[1:], dpi=150, metadata=METADATA[suffix])
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be written: {error.strerror}") from error
+        figure.savefig(path, format=suffix[1:], dpi=150, metadata=METADATA[suffix])
 
 
 def _new_figure(size_inches: tuple[float, float]) -> Figure:

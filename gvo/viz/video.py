@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from PIL import Image, features
 
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import ConfigurationError, RecordingError, write_faults
 from gvo.io.images import encode_image
 from gvo.types import ImageArray
 
@@ -102,7 +102,7 @@ class Film:
         self._stamps_ns: list[int] = []
         self._writer: cv2.VideoWriter | None = None
         self._n, self._size = 0, (0, 0)
-        with _refused_on_error(path):
+        with write_faults(RecordingError, path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = tempfile.TemporaryDirectory(dir=path.parent, prefix=".gvo-film-")
         self._is_vp8 = path.suffix.lower() == ".webm"
@@ -147,7 +147,7 @@ class Film:
         RecordingError
             When it cannot be written, or was not written whole.
         """
-        with self._folder, _refused_on_error(self.path):
+        with self._folder, write_faults(RecordingError, self.path):
             if self._waiting:
                 self._begin()
             if self._writer is None:
@@ -223,7 +223,7 @@ class PngFolder:
         self.path = path
         self.decisions = decisions
         self._n = 0
-        with _refused_on_error(path):
+        with write_faults(RecordingError, path):
             path.mkdir(parents=True, exist_ok=True)
             is_empty = next(path.iterdir(), None) is None
         if not is_empty:
@@ -237,14 +237,14 @@ class PngFolder:
         RecordingError
             When it cannot be written.
         """
-        with _refused_on_error(self.path):
+        with write_faults(RecordingError, self.path):
             (self.path / f"{self._n:06d}.png").write_bytes(encode_image(picture, ".png"))
         self._n += 1
 
     def close(self) -> None:
         """Remove the folder where it is empty."""
         if self._n == 0:
-            with _refused_on_error(self.path):
+            with write_faults(RecordingError, self.path):
                 self.path.rmdir()
 
 
@@ -292,12 +292,3 @@ def _quiet_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(level)
-
-
-@contextmanager
-def _refused_on_error(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        detail = error.strerror or error
-        raise RecordingError(f"{path}: cannot be written: {detail}") from error

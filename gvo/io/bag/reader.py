@@ -322,8 +322,6 @@ def unpack(path: Path, folder: Path) -> tuple[Path, str]:
         When it cannot be read or the folder cannot be written.
     """
     target = folder / path.name.removesuffix(_COMPRESSED)
-    try:
+    with named_faults(RecordingError, path, f"cannot be decompressed to {folder}"):
         reason = inflate_file(path, target)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be decompressed to {folder}: {error}") from error
     return target, f"{path}: is cut or damaged ({reason}); copy it anew" if reason else ""

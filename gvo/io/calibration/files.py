@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from gvo._text import MAX_CHARACTERS, YamlError, load_yaml, read_text, shortened
-from gvo.errors import CalibrationError
+from gvo.errors import CalibrationError, named_faults
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import (
@@ -434,11 +434,8 @@ def read_yaml(path: Path) -> dict[Any, Any]:
         When it is missing, malformed or holds no keys.
     """
     try:
-        text = read_text(path, max_bytes=MAX_CHARACTERS)
-    except OSError as error:
-        raise CalibrationError(
-            f"{path}: the calibration cannot be read: {error.strerror}"
-        ) from error
+        with named_faults(CalibrationError, path, "the calibration cannot be read"):
+            text = read_text(path, max_bytes=MAX_CHARACTERS)
     except UnicodeDecodeError as error:
         raise CalibrationError(f"{path}: the calibration is no text") from error
     if text.startswith(_OPENCV_HEADER):

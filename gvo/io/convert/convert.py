@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from gvo.config import Config
-from gvo.errors import RecordingError
+from gvo.errors import RecordingError, write_faults
 from gvo.io.bag.source import BagSource
 from gvo.io.convert.bag_writer import write_bag
 from gvo.io.convert.common import (
@@ -127,20 +127,20 @@ def write_folder(
     path = Path(path)
     check_new(path)
     layout = _choose(source.info, layout, rectify=rectify)
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as parent:
-            folder = Path(parent) / path.name
-            left_out = LeftOut()
-            writer: FolderStreams
-            if layout == "kitti":
-                writer = KittiFolder(folder, source, left_out, (config or Config()).sync)
-            else:
-                make = EurocFolder if layout == "euroc" else TumFolder
-                writer = make(folder, source, left_out, rectify=rectify)
-            n_images, n_poses = _write(writer, source, progress)
-            folder.rename(path)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+    with (
+        write_faults(RecordingError, path),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as parent,
+    ):
+        folder = Path(parent) / path.name
+        left_out = LeftOut()
+        writer: FolderStreams
+        if layout == "kitti":
+            writer = KittiFolder(folder, source, left_out, (config or Config()).sync)
+        else:
+            make = EurocFolder if layout == "euroc" else TumFolder
+            writer = make(folder, source, left_out, rectify=rectify)
+        n_images, n_poses = _write(writer, source, progress)
+        folder.rename(path)
     return Conversion(path=path, n_images=n_images, n_poses=n_poses, skipped=left_out.lines())
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 
 from gvo._text import text_lines
-from gvo.errors import OutputError, TrajectoryError
+from gvo.errors import OutputError, TrajectoryError, write_faults
 from gvo.io.edges.events import EdgeEvent, Event, InputFaults, PoseEvent, anchor, inverted
 from gvo.trajectory.g2o import (
     MEASUREMENT_TAGS,
@@ -372,12 +372,8 @@ class GraphFile:
             self._path.unlink(missing_ok=True)
             self._file = self._part.open("w", encoding="utf-8", newline="\n")
 
-    @contextmanager
-    def _refused_on_error(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from error
+    def _refused_on_error(self) -> AbstractContextManager[None]:
+        return write_faults(OutputError, self._path)
 
     @property
     def _part(self) -> Path:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gvo.errors import OutputError, RecordingError
+from gvo.errors import OutputError, RecordingError, write_faults
 
 
 def check_folder(folder: Path) -> None:
@@ -20,11 +20,9 @@ def check_folder(folder: Path) -> None:
     OutputError
         With the reason.
     """
-    try:
+    with write_faults(OutputError, folder):
         place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         is_folder = place.is_dir()
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     if not is_folder:
         raise OutputError(f"{folder}: cannot be written: {place} is no folder")
     if not os.access(place, os.W_OK | os.X_OK):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gvo._text import visible
-from gvo.errors import OutputError, RunBusyError
+from gvo.errors import OutputError, RunBusyError, write_faults
 from gvo.geometry import se3
 from gvo.io.run_folder.line_file import LineFile, check_folder, replace_text
 from gvo.trajectory.formats import (
@@ -150,11 +150,9 @@ def written_alone(folder: Path, *, force: bool = False) -> Iterator[None]:
     """
     path = folder / LOCK
     is_new = not folder.exists()
-    try:
+    with write_faults(OutputError, folder):
         folder.mkdir(parents=True, exist_ok=True)
         file = io.FileIO(path, "ab", opener=_open_no_link)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import ConfigurationError, RecordingError, write_faults
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.io.run_folder.line_file import check_folder, check_new
@@ -93,7 +93,8 @@ class RunOutputs:
         outputs: list[Output] = []
         warnings: list[str] = []
         if self.plots is not None:
-            _make_folder(self.plots)
+            with write_faults(RecordingError, self.plots):
+                self.plots.mkdir(parents=True, exist_ok=True)
         if self.bag is not None or self.rerun is not None:
             names = name_frames(
                 loop.source, loop.base_frame, is_placed=loop.is_placed, world=self.world
@@ -114,14 +115,6 @@ class RunOutputs:
             rerun = RunRerun(self.rerun, loop.source.info.camera, names, config=loop.config)
             outputs.append(stack.enter_context(rerun))
         return outputs, warnings
-
-
-def _make_folder(path: Path) -> None:
-    """Make a folder, so that a failure comes before the work."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str) -> RunFrames:

@@ -13,7 +13,7 @@ import numpy as np
 from gvo._text import html_text
 from gvo.diagnostics.explain.motion import has_prior
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, write_faults
 from gvo.types import ConstantError, StereoFrame
 from gvo.viz.explanation.extraction import (
     budget_of,
@@ -56,14 +56,12 @@ def write_explanation(explanation: FrameExplanation, out: Path) -> list[Path]:
     files = {out / f"{each.name}.png": each.png for each in pictures if each.png is not None}
     numbers = json.dumps(explanation_json(explanation), indent=2, allow_nan=False, default=_plain)
     files[out / "explanation.json"] = numbers.encode()
-    try:
+    with write_faults(ConfigurationError, out):
         out.mkdir(parents=True, exist_ok=True)
         for name in TITLES:  # of an earlier explanation, which may have had other steps
             (out / f"{name}.png").unlink(missing_ok=True)
         for path, content in files.items():
             path.write_bytes(content)
-    except OSError as error:
-        raise ConfigurationError(f"{out}: cannot be written: {error.strerror}") from error
     page, title = out / "explanation.html", f"{explanation.recording}: frame {explanation.index}"
     opening = f"<h1>{html_text(title)}</h1>\n<p>{html_text(_summary(explanation))}</p>"
     write_page(page, title, [opening, *map(_section, pictures)])

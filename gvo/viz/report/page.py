@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gvo._text import html_text
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, write_faults
 from gvo.viz.report.paths import Line, World, scene_json
 from gvo.viz.report.sheets import Plot
 
@@ -48,11 +48,9 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
             "</body>\n</html>\n",
         ]
     )
-    try:
+    with write_faults(ConfigurationError, path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(page, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def plots_html(

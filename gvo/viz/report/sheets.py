@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvo.errors import ConfigurationError
+from gvo.errors import ConfigurationError, named_faults
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.palette import Style
@@ -141,12 +141,8 @@ def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:
     TrajectoryError
         When a file cannot be written.
     """
-    try:
+    with named_faults(ConfigurationError, f"--plots {folder}", "cannot be made"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(
-            f"--plots {folder}: cannot be made: {error.strerror}; give a folder to write into"
-        ) from error
     paths = []
     for number, plot in enumerate(plots, start=1):
         if plot.figure is None:
