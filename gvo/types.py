@@ -663,6 +663,9 @@ class FrameResult:
         Segments that found their place among earlier ones with this frame.
     loops : tuple of Loop
         Those that are confirmed with this frame; of this frame, and of one shortly before.
+    T_previous_frame : ndarray of float64, shape (4, 4), or None
+        The pose in the frame before, both as the window has them after this one: a correction of
+        the past is no motion. None for the first frame.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -683,6 +686,7 @@ class FrameResult:
     segment: int = 0
     joins: tuple[SegmentJoin, ...] = ()
     loops: tuple[Loop, ...] = ()
+    T_previous_frame: FloatArray | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -90,6 +90,7 @@ class Odometry:
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
         self._anchor_ns: int | None = None
+        self._previous: Estimate | None = None  # by the raw chain
         self._graph = RunGraph(self._config.window)
         self._loops = self._make_detector()
         self._trust = DepthTrust(self._config.depth.icp)
@@ -182,6 +183,7 @@ class Odometry:
             offered += self._align_depths(observations, offered)
         with watch.stage("window"):
             causal = self._add_to_window(step, offered, is_resumed=bool(relocalized))
+            T_previous_frame = self._last_step(step.estimate, causal)
             joins = self._join_segments(step, causal)
             self._select_keyframes(observations, step, scores, causal)
             self._keep_anchor()
@@ -189,7 +191,7 @@ class Odometry:
             loops = self._close_loops(observations, causal)
         self._keep_frame(frame)
         result = self._result(observations, step, offered, causal, joins, watch.stage_ms)
-        return replace(result, loops=loops)
+        return replace(result, loops=loops, T_previous_frame=T_previous_frame)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
@@ -399,6 +401,16 @@ class Odometry:
         edges = [edge for _, edge in offered]
         status = Status.RESUMED if is_resumed else None
         return self._window.add_pose(stamp_ns, stamp_ns, edges, status=status)
+
+    def _last_step(self, raw: Estimate, causal: Estimate) -> FloatArray | None:
+        """Return T_previous_frame, of one state of the window; by the raw chain without one."""
+        previous, self._previous = self._previous, raw
+        if previous is None:
+            return None
+        if previous.stamp_ns in self._window:
+            T_world_previous = self._window.pose(previous.stamp_ns)
+            return np.asarray(se3.invert(T_world_previous) @ causal.T_world_frame)
+        return np.asarray(se3.invert(previous.T_world_frame) @ raw.T_world_frame)
 
     def _join_segments(self, step: RawStep, causal: Estimate) -> tuple[SegmentJoin, ...]:
         """Return the segments that the accepted edges of a frame join."""

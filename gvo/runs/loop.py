@@ -20,7 +20,17 @@ from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
 from gvo.trajectory.evaluation import Motions
-from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
+from gvo.types import (
+    Edge,
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    FrameResult,
+    Loop,
+    Optimum,
+    Progress,
+)
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -40,6 +50,9 @@ class Output(Protocol):
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses that are final."""
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Write, at the end, the poses that fit all measurements best, and the loops."""
 
 
 class RunLoop:
@@ -89,6 +102,8 @@ class RunLoop:
         self._items = items
         self._read_ms = 0.0
         self._first_ns: int | None = None
+        self._previous_ns: int | None = None
+        self._outputs: list[Output] = []
         self.edges: list[tuple[int, Edge]] = []
         self.output_faults: list[str] = []
         self._asked_ns: int | None = None
@@ -117,12 +132,12 @@ class RunLoop:
         on_progress : callable, optional
             Called after each frame.
         """
-        outputs = list(outputs)
+        self._outputs = list(outputs)
         with one_opencv_thread():
             is_writable = True
             try:
                 for item in self._read():
-                    self._take(item, outputs)
+                    self._take(item)
                     if on_progress is not None:
                         on_progress(self.statistics.progress(self._n_expected(item.stamp_ns)))
             except OutputError:
@@ -131,13 +146,16 @@ class RunLoop:
             finally:
                 finished = self._placed(self._odometry.finish())
                 if is_writable:
-                    self._give(outputs, lambda output: output.add_smoothed(finished))
+                    self._give(lambda output: output.add_smoothed(finished))
                 self.count()
 
     def optimize(self) -> Optimum | None:
-        """Return the optimum of all measurements, of the base frame; None if it is not asked for.
+        """Give the outputs of the run the optimum of all measurements, of the base frame.
 
-        Where GTSAM fails, `output_faults` says so.
+        Returns
+        -------
+        Optimum or None
+            None if it is not asked for, and where GTSAM fails: `output_faults` says so.
         """
         if not self.config.loops.enabled or self.statistics.n_with_pose == 0:
             return None
@@ -147,16 +165,14 @@ class RunLoop:
             self.output_faults.append(f"no global poses: {error}")
             return None
         place = self.base_frame.apply_to_edge
-        loops = [(loop, place(loop.stamp_ns, loop.edge)) for loop in optimum.loops]
-        return replace(
+        placed = replace(
             optimum,
             estimates=self._placed(optimum.estimates),
             edges=tuple((stamp_ns, place(stamp_ns, edge)) for stamp_ns, edge in optimum.edges),
-            loops=tuple(
-                replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
-                for loop, edge in loops
-            ),
+            loops=self._placed_loops(optimum.loops),
         )
+        self._give(lambda output: output.add_optimum(placed))
+        return placed
 
     def count(self) -> None:
         """Copy the counts of window, front-end and base frame into the statistics."""
@@ -195,35 +211,29 @@ class RunLoop:
             self._read_ms = 1e3 * (time.perf_counter() - start)
             yield item
 
-    def _take(self, item: Frame | FaultyFrame, outputs: list[Output]) -> None:
+    def _take(self, item: Frame | FaultyFrame) -> None:
         """Count a frame, and give the outputs its poses as those of the base frame."""
         if isinstance(item, FaultyFrame):
-            self._take_faulty(item, outputs)
+            self._take_faulty(item)
             return
         if self._first_pose is not None and self.base_frame.first_stamp_ns is None:
             self.base_frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
         result = self._odometry.track(item)
-        placed = replace(
-            result,
-            raw=self.base_frame.apply(result.raw),
-            causal=self.base_frame.apply(result.causal),
-            finished=self._placed(result.finished),
-            stage_ms={"read": self._read_ms, **result.stage_ms},
-        )
+        placed = self._placed_result(result)
         text = f"{result.n_matches} matches, {result.n_inliers} inliers, {result.n_links} links"
         _LOGGER.debug("frame at %d: %s, %s %s", item.stamp_ns, result.status, text, result.reason)
         self.statistics.add_result(placed)
         self._ask_window(item.stamp_ns)
-        self._give(outputs, lambda output: output.add_frame(item, placed))
+        self._give(lambda output: output.add_frame(item, placed))
 
-    def _give(self, outputs: list[Output], write: Callable[[Output], None]) -> None:
-        for output in tuple(outputs):
+    def _give(self, write: Callable[[Output], None]) -> None:
+        for output in tuple(self._outputs):
             try:
                 write(output)
             except OutputError:
                 raise
             except RecordingError as error:
-                outputs.remove(output)
+                self._outputs.remove(output)
                 self.output_faults.append(str(error))
 
     def _ask_window(self, stamp_ns: int) -> None:
@@ -237,13 +247,36 @@ class RunLoop:
         if edge is not None:
             self.edges.append((stamp_ns, self.base_frame.apply_to_edge(stamp_ns, edge)))
 
-    def _take_faulty(self, item: FaultyFrame, outputs: list[Output]) -> None:
+    def _take_faulty(self, item: FaultyFrame) -> None:
         is_loss = is_lost(item, self.source.info.sensor)
         _LOGGER.debug("frame at %d: skipped: %s", item.stamp_ns, item.reason)
         self.statistics.add_duration("read", self._read_ms)
         self.statistics.add_faulty(item, is_loss=is_loss)
         if is_loss:
-            self._give(outputs, lambda output: output.add_faulty(item))
+            self._give(lambda output: output.add_faulty(item))
+
+    def _placed_result(self, result: FrameResult) -> FrameResult:
+        """Return a result as one of the base frame."""
+        step, start_ns = result.T_previous_frame, self._previous_ns
+        if step is not None and start_ns is not None:
+            step = self.base_frame.apply_to_step(start_ns, result.stamp_ns, step)
+        self._previous_ns = result.stamp_ns
+        return replace(
+            result,
+            raw=self.base_frame.apply(result.raw),
+            causal=self.base_frame.apply(result.causal),
+            finished=self._placed(result.finished),
+            loops=self._placed_loops(result.loops),
+            T_previous_frame=step,
+            stage_ms={"read": self._read_ms, **result.stage_ms},
+        )
+
+    def _placed_loops(self, loops: tuple[Loop, ...]) -> tuple[Loop, ...]:
+        edges = [self.base_frame.apply_to_edge(loop.stamp_ns, loop.edge) for loop in loops]
+        return tuple(
+            replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
+            for loop, edge in zip(loops, edges, strict=True)
+        )
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         return tuple(self.base_frame.apply(estimate) for estimate in estimates)

@@ -141,9 +141,7 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
-            optimum = loop.optimize()
-            if optimum is not None:
-                folder.write_optimum(optimum)
+            loop.optimize()
             faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None

@@ -42,10 +42,11 @@ from gvo.viz.canvas import (
     write_lines,
 )
 from gvo.viz.canvas import HEIGHT_PX as FOOTER_PX
-from gvo.viz.palette import INLIERS, OUTLIERS, STATUSES
+from gvo.viz.palette import ESTIMATES, INLIERS, OUTLIERS, STATUSES
 
 INLIER_COLOUR: Final = bgr(INLIERS)
 OUTLIER_COLOUR: Final = bgr(OUTLIERS)
+LOOP_COLOUR: Final = bgr(ESTIMATES["global"])
 HEADER_PX: Final = 44
 MIN_WIDTH_PX: Final = 640
 """Of a picture, for its text."""
@@ -320,6 +321,8 @@ def _write_header(
     _write_row(canvas, [(text, WHITE) for text in texts], (start, upper))
     if isinstance(result, FrameResult):
         _write_row(canvas, _counts(result), (_MARGIN_PX, lower))
+        loop = loop_text(result)
+        write(canvas, loop, (layout.size[0] - text_width(loop) - _MARGIN_PX, upper), LOOP_COLOUR)
         rate = _rate_text(result, rate_hz)
         write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
 
@@ -330,6 +333,15 @@ def _write_row(
     u, v = corner
     for text, colour in texts:
         u = write(canvas, text, (u, v), colour)[0] + _GAP_PX
+
+
+def loop_text(result: FrameResult) -> str:
+    """Say to what the newest loop of a frame leads; nothing where there is none."""
+    if not result.loops:
+        return ""
+    loop = result.loops[-1]
+    ago_s = 1e-9 * (loop.stamp_ns - loop.reference_ns)
+    return f"loop to {ago_s:.1f} s before, {loop.n_inliers} inliers"
 
 
 def _counts(result: FrameResult) -> list[tuple[str, Colour]]:

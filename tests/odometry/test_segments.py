@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from gvo.backend.window_graph import NewPose, WindowGraph
 from gvo.config import Config
+from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.odometry.odometry import Odometry
 from gvo.odometry.segments import Segments
@@ -99,6 +102,21 @@ def run(frontend: Beacon, places: list[Place], **window: object) -> list[FrameRe
     return [odometry.track(place) for place in places]
 
 
+def steps_of_the_window(
+    odometry: Odometry, places: list[Place]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the step of each frame but the first: as it is told, and as the window has it then."""
+    told = [odometry.track(places[0]).T_previous_frame]
+    assert told[0] is None
+    pairs = []
+    for previous, place in pairwise(places):
+        step, window = odometry.track(place).T_previous_frame, odometry.window
+        assert step is not None
+        known = se3.invert(window.pose(previous.stamp_ns)) @ window.pose(place.stamp_ns)
+        pairs.append((step, np.asarray(known)))
+    return pairs
+
+
 def errors(results: list[FrameResult], places: list[Place]) -> list[float]:
     return [
         float(np.linalg.norm((result.causal.T_world_frame - place.T_world_frame)[:3]))
@@ -146,6 +164,42 @@ def test_a_keyframe_that_is_seen_twice_joins_the_segments() -> None:
     assert sigma[joined - 1] > 0.5
     assert max(sigma[joined:]) < 0.2
     assert {result.segment for result in results[joined:]} == {1}
+
+
+def test_a_join_is_no_step_and_each_step_is_of_one_state_of_the_window() -> None:
+    places = walk(away=AWAY)
+    settings = {"lost_after_s": 0.35, "keyframe_distance_m": 0.3, "n_keyframes": 4}
+    odometry = Odometry(config=Config.model_validate({"window": settings}), frontend=Beacon())
+    pairs = steps_of_the_window(odometry, places)
+    for step, known in pairs:
+        np.testing.assert_allclose(step, known, atol=1e-9)
+    results = run(Beacon(), places)
+    poses = [result.causal.T_world_frame for result in results]
+    jumps = [float(np.linalg.norm((b - a)[:3, 3])) for a, b in pairwise(poses)]
+    lengths = [float(np.linalg.norm(step[:3, 3])) for step, _ in pairs]
+    assert max(jumps) > 1.0
+    assert max(lengths) < 0.15
+    told = [result.T_previous_frame for result in results[1:]]
+    np.testing.assert_array_equal(told, [step for step, _ in pairs])
+
+
+def test_after_a_frame_that_no_window_took_the_step_is_that_of_the_raw_chain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    places = walk(n_dark=0, n_after=0, away=np.eye(4))
+    insert = WindowGraph.insert
+
+    def fail_once(graph: WindowGraph, pose: NewPose) -> tuple[FloatArray, FloatArray]:
+        if pose.stamp_ns == places[5].stamp_ns:
+            raise SmoothingError("no")
+        return insert(graph, pose)
+
+    monkeypatch.setattr(WindowGraph, "insert", fail_once)
+    results = run(Beacon(), places)
+    before, after = results[5].raw.T_world_frame, results[6].raw.T_world_frame
+    step = results[6].T_previous_frame
+    assert step is not None
+    np.testing.assert_allclose(step, se3.invert(before) @ after, atol=1e-12)
 
 
 def test_nobody_looks_where_that_is_switched_off() -> None:

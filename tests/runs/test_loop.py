@@ -18,7 +18,7 @@ from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.loop import RunLoop
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Progress
+from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
 _N_FRAMES = 7
@@ -31,6 +31,7 @@ class Kept:
     frames: list[FrameResult] = field(default_factory=list)
     faulty: list[FaultyFrame] = field(default_factory=list)
     smoothed: list[Estimate] = field(default_factory=list)
+    optima: list[Optimum] = field(default_factory=list)
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         assert frame.stamp_ns == result.stamp_ns
@@ -42,6 +43,9 @@ class Kept:
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         self.smoothed += estimates
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        self.optima.append(optimum)
 
     def poses(self) -> dict[str, FloatArray]:
         smoothed = sorted(self.smoothed, key=lambda estimate: estimate.stamp_ns)
@@ -114,6 +118,47 @@ def test_all_poses_are_of_the_frame_asked_for(walk: Rendered) -> None:
         expected = moved_by_hand(poses, T_BASE_CAM)
         np.testing.assert_allclose(base[name], expected, atol=1e-12)
         np.testing.assert_allclose(placed[name], T_initial @ expected, atol=1e-12)
+
+
+def test_steps_are_of_the_frame_asked_for(walk: Rendered) -> None:
+    camera = run(walk)[0].frames
+    base = run(walk, BaseFrame("base_link", T_BASE_CAM))[0].frames
+    assert camera[0].T_previous_frame is base[0].T_previous_frame is None
+    for ours, theirs in zip(base[1:], camera[1:], strict=True):
+        assert theirs.T_previous_frame is not None
+        assert ours.T_previous_frame is not None
+        expected = T_BASE_CAM @ theirs.T_previous_frame @ np.linalg.inv(T_BASE_CAM)
+        np.testing.assert_allclose(ours.T_previous_frame, expected, atol=1e-12)
+
+
+class Torn(Kept):
+    """An output that cannot be written from the second frame on, or at the end."""
+
+    def __init__(self, *, is_at_end: bool) -> None:
+        super().__init__()
+        self.is_at_end = is_at_end
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        super().add_frame(frame, result)
+        if len(self.frames) == 2 and not self.is_at_end:
+            raise RecordingError("torn")
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        super().add_optimum(optimum)
+        raise RecordingError("torn at the end")
+
+
+def test_all_outputs_but_those_that_cannot_write_are_given_the_optimum(walk: Rendered) -> None:
+    first, early, late, last = Kept(), Torn(is_at_end=False), Torn(is_at_end=True), Kept()
+    loop = loop_over(walk, BaseFrame("base_link", T_BASE_CAM))
+    loop.run([first, early, late, last], None)
+    optimum = loop.optimize()
+    assert optimum is not None
+    assert first.optima == last.optima == late.optima == [optimum]
+    assert early.optima == []
+    assert loop.output_faults == ["torn", "torn at the end"]
+    poses = np.array([estimate.T_world_frame for estimate in optimum.estimates])
+    np.testing.assert_allclose(poses, last.poses()["smoothed"], atol=0.05)
 
 
 def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(

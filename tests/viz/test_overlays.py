@@ -1,5 +1,7 @@
 """Matches drawn over images."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from gvo.types import (
     Estimate,
     FaultyFrame,
     FrameResult,
+    Loop,
     RelativePose,
     RgbdFrame,
     Status,
@@ -25,6 +28,7 @@ from gvo.viz.overlay import (
     compose_faulty,
     compose_overlay,
     draw_matches,
+    loop_text,
 )
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
@@ -225,6 +229,29 @@ def test_each_status_has_a_badge_of_its_own() -> None:
     ]
     badges.append(compose_faulty(FaultyFrame(stamp_ns=1, reason=""), _STEREO)[:24, :110].tobytes())
     assert len(set(badges)) == 5
+
+
+def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_readable() -> None:
+    loop = Loop(
+        stamp_ns=10**18,
+        reference_ns=10**18 - 98_765_400_000_000,
+        T_reference_frame=np.eye(4),
+        covariance=np.eye(6),
+        n_matches=90,
+        n_inliers=87,
+    )
+    plain = _result([], [], status=Status.RESUMED)
+    marked = replace(plain, loops=(loop,))
+    assert loop_text(plain) == ""
+    assert loop_text(marked) == "loop to 98765.4 s before, 87 inliers"
+    before, after = (
+        compose_overlay(_pair(), each, _STEREO, index=99_999, max_width=640).astype(int)
+        for each in (plain, marked)
+    )
+    rows, columns = np.nonzero(np.abs(after - before).sum(axis=2))
+    assert rows.max() < 24
+    assert columns.max() >= 620
+    assert not before[:24, columns.min() - 4 :].any()
 
 
 def test_images_of_another_size_and_a_pair_without_a_baseline_are_refused() -> None:

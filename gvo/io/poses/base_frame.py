@@ -220,16 +220,22 @@ class BaseFrame:
             covariance=0.5 * (covariance + covariance.T),  # symmetric in spite of rounding
         )
 
+    def apply_to_step(self, start_ns: int, stamp_ns: int, T_start_end: FloatArray) -> FloatArray:
+        """Return a motion of the camera between two stamps, (4, 4), as one of the base frame."""
+        if self._is_camera:
+            return T_start_end
+        T_end = se3.invert(self.T_base_cam(stamp_ns))
+        return np.asarray(self.T_base_cam(start_ns) @ T_start_end @ T_end)
+
     def apply_to_edge(self, stamp_ns: int, edge: Edge) -> Edge:
         """Return an edge between two stamps, the later one given, as one of the base frame."""
         if self._is_camera:
             return edge
-        T_a = self.T_base_cam(int(edge.reference_id))  # type: ignore[call-overload]
-        T_b = self.T_base_cam(stamp_ns)
-        Ad = se3.adjoint(T_b)
+        start_ns = int(edge.reference_id)  # type: ignore[call-overload]
+        Ad = se3.adjoint(self.T_base_cam(stamp_ns))
         return replace(
             edge,
-            T_reference_frame=T_a @ edge.T_reference_frame @ se3.invert(T_b),
+            T_reference_frame=self.apply_to_step(start_ns, stamp_ns, edge.T_reference_frame),
             covariance=Ad @ edge.covariance @ Ad.T,
         )
 

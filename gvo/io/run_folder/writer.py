@@ -272,7 +272,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
         self._add_pose("causal", causal)
         self._write("frames.csv", _csv_line(row))
 
-    def write_optimum(self, optimum: Optimum) -> None:
+    def add_optimum(self, optimum: Optimum) -> None:
         """Write the global poses, the graph that they are the optimum of, and its loops."""
         self._open(f"{GLOBAL}.txt", "")
         self._open_covariances(GLOBAL)

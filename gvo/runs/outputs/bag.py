@@ -4,8 +4,9 @@ Topics (frames: see `RunFrames`)
 
 ===========================  ==============================  ======================================
 `/tf`, `/tf_static`          `tf2_msgs/TFMessage`            the frames and their poses
-`/gvo/NAME/odometry`         `nav_msgs/Odometry`             NAME: raw, causal, smoothed
-`/gvo/NAME/path`             `nav_msgs/Path`                 NAME: raw, smoothed
+`/gvo/NAME/odometry`         `nav_msgs/Odometry`             NAME: raw, causal, smoothed, global
+`/gvo/NAME/path`             `nav_msgs/Path`                 NAME: raw, smoothed, global
+`/gvo/loops`                 `visualization_msgs/Marker`     a line for each loop, by namespace
 `/gvo/points`                `sensor_msgs/PointCloud2`       matched points in `gvo/causal/CAMERA`
 `/gvo/matches/compressed`    `sensor_msgs/CompressedImage`   matches drawn over the image
 `/diagnostics`               `diagnostic_msgs/...Array`      status, counts, milliseconds
@@ -15,6 +16,15 @@ All stamps are those of the frames. The log time is the stamp of the newest fram
 smoothed pose appears when it was known, with its own, earlier stamp. Raw and causal poses,
 points, pictures and diagnostics come once a frame; a frame without a registration has an empty
 cloud and a picture without lines.
+
+The frames of REP 105 stand beside those of the estimates: from the world, its `map`, to `gvo/odom`
+to the base frame. The pose in `gvo/odom` is the product of the steps from frame to frame, each as
+the window has it when the frame comes: it drifts and never jumps. Corrections move `gvo/odom`; both
+together are the causal pose.
+
+Global poses come at the end, with their own stamps. Loops are drawn when they are confirmed,
+between the causal poses of their frames (namespace `causal`); at the end all that count, between
+the global ones (`global`).
 
 The velocity of an `Odometry` is that from the pose before, as far as it was known, to this one; 0
 where none was. Its covariance is known for the raw poses alone, from the registration between the
@@ -47,11 +57,12 @@ from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.bag_messages import (
     write_diagnostics,
+    write_lines,
     write_odometry,
     write_path,
     write_points,
 )
-from gvo.runs.outputs.frames import RunFrames, StampedPose, Track, twist_between
+from gvo.runs.outputs.frames import GLOBAL, RunFrames, StampedPose, Track, twist_between
 from gvo.types import (
     BoolArray,
     Estimate,
@@ -60,11 +71,13 @@ from gvo.types import (
     Frame,
     FrameResult,
     ImageArray,
+    Loop,
+    Optimum,
     RelativePose,
     Status,
     StereoFrame,
 )
-from gvo.viz.overlay import draw_matches
+from gvo.viz.overlay import draw_matches, loop_text
 
 SUFFIXES: Final = (".mcap", ".bag")
 N_SHOWN_POSES: Final = 500
@@ -95,7 +108,10 @@ class RunBag(AbstractContextManager["RunBag"]):
     def __init__(self, path: str | Path, frames: RunFrames | None = None) -> None:
         self.path = Path(path)
         self._frames = frames or RunFrames()
-        self._tracks = {"raw": Track(), "smoothed": Track()}
+        self._tracks = {name: Track() for name in ("raw", "smoothed", GLOBAL)}
+        self._causal = Track()
+        self._n_markers = 0
+        self._T_odom_base = np.eye(4)
         self._last: dict[str, Estimate] = {}
         self._first_ns: int | None = None
         self._newest_ns = 0
@@ -129,12 +145,15 @@ class RunBag(AbstractContextManager["RunBag"]):
         with self._file.refused_on_error():
             self._begin(frame.stamp_ns)
             self._write_tf([("raw", raw), ("causal", causal)])
+            self._write_odom(result)
             covariance = self._step_covariance(result, raw)
             self._write_odometry("raw", raw, self._previous("raw"), covariance)
             self._write_odometry("causal", causal, self._previous("causal"))
             self._tracks["raw"].add(raw)
+            self._causal.add(causal)
             self._last.update(raw=raw, causal=causal)
             self._write_matches(frame, result)
+            self._write_loops("causal", self._causal, result.loops)
             self._write_paths_of_second(frame.stamp_ns)
         self.add_smoothed(result.finished)
 
@@ -146,12 +165,27 @@ class RunBag(AbstractContextManager["RunBag"]):
         RecordingError
             When the file cannot be written.
         """
-        estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
-        track = self._tracks["smoothed"]
+        self._add_late("smoothed", estimates)
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Write the global poses of the base frame, and the loops that count.
+
+        Raises
+        ------
+        RecordingError
+            When the file cannot be written.
+        """
+        self._add_late(GLOBAL, optimum.estimates)
         with self._file.refused_on_error():
-            self._write_tf([("smoothed", estimate) for estimate in estimates])
+            self._write_loops(GLOBAL, self._tracks[GLOBAL], optimum.loops)
+
+    def _add_late(self, name: str, estimates: Iterable[Estimate]) -> None:
+        estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
+        track = self._tracks[name]
+        with self._file.refused_on_error():
+            self._write_tf([(name, estimate) for estimate in estimates])
             for estimate in estimates:
-                self._write_odometry("smoothed", estimate, track.before(estimate.stamp_ns))
+                self._write_odometry(name, estimate, track.before(estimate.stamp_ns))
                 track.add(estimate)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
@@ -197,6 +231,20 @@ class RunBag(AbstractContextManager["RunBag"]):
     def _write_tf(self, named: Iterable[tuple[str, Estimate]]) -> None:
         poses = [self._frames.moving(name, estimate) for name, estimate in named]
         write_transforms(self._bag, "/tf", chain.from_iterable(poses))
+
+    def _write_odom(self, result: FrameResult) -> None:
+        """Go on by the step of a frame, and write where that leads and what corrects it."""
+        if result.T_previous_frame is not None:
+            self._T_odom_base = se3.normalize(self._T_odom_base @ result.T_previous_frame)
+        poses = self._frames.corrected(result.causal, self._T_odom_base)
+        write_transforms(self._bag, "/tf", poses)
+
+    def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:
+        segments = track.segments(loops)
+        if len(segments) > 0:
+            header, number = Header(self._newest_ns, self._frames.world), self._n_markers
+            self._n_markers += 1
+            write_lines(self._bag, "/gvo/loops", header, segments, name=name, number=number)
 
     def _previous(self, name: str) -> StampedPose | None:
         last = self._last.get(name)
@@ -283,7 +331,7 @@ def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:
 def _caption(result: FrameResult) -> list[str]:
     counts = f"{result.n_inliers} of {result.n_matches} matches are inliers, {result.n_links} links"
     lines = [f"{result.status}: {counts}"]
-    return [*lines, result.reason] if result.reason else lines
+    return [*lines, *(text for text in (result.reason, loop_text(result)) if text)]
 
 
 def _numbers(result: FrameResult) -> dict[str, object]:
@@ -297,6 +345,7 @@ def _numbers(result: FrameResult) -> dict[str, object]:
         "inliers": result.n_inliers,
         "links": result.n_links,
         "refused edges": len(result.causal.rejected),
+        "loops": len(result.loops),
     }
     stages = {f"{stage} [ms]": f"{ms:.3f}" for stage, ms in result.stage_ms.items()}
     return {**numbers, **stages}

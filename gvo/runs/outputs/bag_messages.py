@@ -8,14 +8,20 @@ from typing import Any, Final
 import numpy as np
 
 from gvo.geometry import se3
+from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import BagWriter, Header, pose_numbers
 from gvo.runs.outputs.frames import Twist
 from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
+from gvo.viz.palette import ESTIMATES
 
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
 PATH_TYPE: Final = "nav_msgs/msg/Path"
 CLOUD_TYPE: Final = "sensor_msgs/msg/PointCloud2"
+MARKER_TYPE: Final = "visualization_msgs/msg/Marker"
 DIAGNOSTICS_TYPE: Final = "diagnostic_msgs/msg/DiagnosticArray"
+
+_LINE_LIST, _ADD = 5, 0  # of visualization_msgs/Marker
+_LINE_WIDTH_M = 0.03
 
 # Three bytes of padding: four-byte fields that start at multiples of four are read anywhere.
 _POINT: Final = np.dtype(
@@ -119,6 +125,62 @@ def write_path(
     ]
     message = bag.make(PATH_TYPE, header=bag.header(header), poses=stamped)
     bag.write(topic, PATH_TYPE, message, header.stamp_ns)
+
+
+def write_lines(
+    bag: BagWriter, topic: str, header: Header, segments: FloatArray, *, name: str, number: int
+) -> None:
+    """Write lines as a `visualization_msgs/Marker`, in the colour of loops.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Open.
+    topic : str
+        Where to.
+    header : Header
+        Stamp, and the frame of the lines.
+    segments : ndarray of float64, shape (n, 2, 3)
+        Where each begins and ends, metres.
+    name, number : str, int
+        Namespace and id: another marker of both replaces this one.
+    """
+    red, green, blue = (value / 255 for value in bytes.fromhex(ESTIMATES["global"][1:]))
+    message = bag.make(
+        MARKER_TYPE,
+        header=bag.header(header),
+        ns=name,
+        id=number,
+        type=_LINE_LIST,
+        action=_ADD,
+        pose=_pose(bag, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+        scale=bag.make("geometry_msgs/msg/Vector3", x=_LINE_WIDTH_M, y=0.0, z=0.0),
+        color=bag.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        lifetime=bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        frame_locked=False,
+        points=[
+            bag.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+            for x, y, z in segments.reshape(-1, 3).tolist()
+        ],
+        colors=[],
+        text="",
+        mesh_resource="",
+        mesh_use_embedded_materials=False,
+        **({} if bag.is_ros1 else _untextured(bag)),
+    )
+    bag.write(topic, MARKER_TYPE, message, header.stamp_ns)
+
+
+def _untextured(bag: BagWriter) -> dict[str, object]:
+    """Return what the markers of ROS 2 hold besides."""
+    nothing = np.zeros(0, dtype=np.uint8)
+    header = bag.header(Header(0, ""))
+    return {
+        "texture_resource": "",
+        "texture": bag.make(COMPRESSED_TYPE, header=header, format="", data=nothing),
+        "uv_coordinates": [],
+        "mesh_file": bag.make("visualization_msgs/msg/MeshFile", filename="", data=nothing),
+    }
 
 
 def write_points(

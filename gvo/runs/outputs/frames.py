@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -14,9 +14,13 @@ from scipy.spatial.transform import Rotation
 from gvo.geometry import se3
 from gvo.io.convert.bag_messages import FramePose, pose_numbers
 from gvo.io.poses.tf_paths import bare
-from gvo.types import Estimate, FloatArray, IntArray
+from gvo.types import Estimate, FloatArray, IntArray, Loop
 
 ESTIMATES: Final = ("raw", "causal", "smoothed")
+GLOBAL: Final = "global"
+"""The estimate that comes at the end of a run."""
+ODOM: Final = "odom"
+"""The frame of REP 105 in which the base frame never jumps."""
 
 # x forward, y left, z up, from the optical x right, y down, z forward (REP 103).
 _T_FLU_OPTICAL: Final = se3.make_transform(
@@ -85,17 +89,27 @@ class RunFrames:
         return self.T_base_cam(stamp_ns) if callable(self.T_base_cam) else self.T_base_cam
 
     def base_by(self, name: str) -> str:
-        """Return the base frame as one of `ESTIMATES` places it."""
+        """Return the base frame as an estimate places it, or `ODOM`."""
         return f"gvo/{name}/{self.base}"
 
     def camera_by(self, name: str) -> str:
-        """Return the camera's optical frame as one of `ESTIMATES` places it."""
+        """Return the camera's optical frame as an estimate places it, or `ODOM`."""
         return f"gvo/{name}/{self.camera}"
 
     def moving(self, name: str, estimate: Estimate) -> Iterator[FramePose]:
         """Yield the moving transforms of a pose."""
-        stamp_ns = estimate.stamp_ns
-        yield FramePose(stamp_ns, self.world, self.base_by(name), estimate.T_world_frame)
+        return self._moving(name, self.world, estimate.stamp_ns, estimate.T_world_frame)
+
+    def corrected(self, estimate: Estimate, T_odom_base: FloatArray) -> Iterator[FramePose]:
+        """Yield those of REP 105: a pose that never jumps, and what corrects it to an estimate."""
+        odom, T_world_odom = f"gvo/{ODOM}", estimate.T_world_frame @ se3.invert(T_odom_base)
+        yield FramePose(estimate.stamp_ns, self.world, odom, T_world_odom)
+        yield from self._moving(ODOM, odom, estimate.stamp_ns, T_odom_base)
+
+    def _moving(
+        self, name: str, parent: str, stamp_ns: int, T_parent_base: FloatArray
+    ) -> Iterator[FramePose]:
+        yield FramePose(stamp_ns, parent, self.base_by(name), T_parent_base)
         if callable(self.T_base_cam) and not self.is_camera:
             yield self._mounted(stamp_ns, name)
 
@@ -104,7 +118,7 @@ class RunFrames:
         if self.is_world_optical:
             yield FramePose(stamp_ns, f"{self.world}_flu", self.world, _T_FLU_OPTICAL)
         if not callable(self.T_base_cam) and not self.is_camera:
-            for name in ESTIMATES:
+            for name in (*ESTIMATES, GLOBAL, ODOM):
                 yield self._mounted(stamp_ns, name)
 
     def _mounted(self, stamp_ns: int, name: str) -> FramePose:
@@ -158,6 +172,22 @@ class Track:
         numbers = np.array(self._poses[_N_NUMBERS * index : _N_NUMBERS * (index + 1)])
         R = np.asarray(Rotation.from_quat(numbers[3:]).as_matrix())
         return StampedPose(self._stamps_ns[index], se3.make_transform(R, numbers[:3]))
+
+    def at(self, stamp_ns: int) -> FloatArray | None:
+        """Return the pose (4, 4) at a stamp, if there is one."""
+        pose = self.before(stamp_ns + 1)
+        return pose.T_world_frame if pose is not None and pose.stamp_ns == stamp_ns else None
+
+    def segments(self, loops: Iterable[Loop]) -> FloatArray:
+        """Return lines (n, 2, 3) from frame to reference of those loops that count."""
+        counting = [loop for loop in loops if not loop.reason]
+        ends = [(self.at(loop.stamp_ns), self.at(loop.reference_ns)) for loop in counting]
+        known = [
+            [T[:3, 3], T_reference[:3, 3]]
+            for T, T_reference in ends
+            if T is not None and T_reference is not None
+        ]
+        return np.array(known).reshape(-1, 2, 3)
 
     def poses(self, n_most: int | None = None) -> tuple[IntArray, FloatArray]:
         """Return stamps (n,) and positions with quaternions (n, 7).

@@ -4,7 +4,7 @@ Entities
 
 ===========================================  ======================================================
 `world`                                      x right, y down, z forward, or x forward, z up
-`world/NAME/frame`                           poses; NAME: raw, causal, smoothed
+`world/NAME/frame`                           poses; NAME: raw, causal, smoothed, global
 `world/NAME/path`, `world/NAME/recent`       where it was up to the last full second, and since
 `world/NAME/covariance`                      3-sigma ellipsoid of the position; NAME: raw, causal
 `world/causal/frame/camera`                  how the camera sits in the frame
@@ -12,6 +12,8 @@ Entities
 `world/causal/frame/camera/points`           matched points: inliers blue, outliers orange
 `world/keyframes`, `.../covariance`          the kept frames as they were placed when they came
 `world/links`                                the edges that came with the frame
+`world/loops`                                lines between causal poses, when confirmed
+`world/global/loops`                         lines between global poses, at the end
 `world/cloud`                                points of each keyframe, placed when it came
 `overlay`                                    matches drawn over the image
 `counts/...`, `milliseconds/...`             matches, inliers, points; time by stage
@@ -42,7 +44,7 @@ from gvo.errors import ConfigurationError, RecordingError, missing_extra
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.frames import RunFrames
-from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Status
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Optimum, Status
 
 if TYPE_CHECKING:
     from gvo.runs.outputs.rerun_writer import RerunWriter
@@ -136,6 +138,10 @@ class RunRerun(AbstractContextManager["RunRerun"]):
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Write smoothed poses of the base frame that are final, in any order."""
         self._writer.add_smoothed(estimates)
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Write the global poses of the base frame, and the loops that count."""
+        self._writer.add_optimum(optimum)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a frame without a pose to the log."""

@@ -71,6 +71,7 @@ class FilePipe:
 
 
 CLOUD: Final = "world/cloud"
+LOOPS: Final = "world/loops"
 OVERLAY: Final = "overlay"
 COUNTS: Final = "counts"
 MILLISECONDS: Final = "milliseconds"
@@ -107,7 +108,7 @@ def make_layout() -> rrb.Blueprint:
 
 
 def _scene() -> rrb.Spatial3DView:
-    """Return the view of the world; of the keyframes' points, all that came so far are shown."""
+    """Return the view of the world; points of keyframes and loops are those that came so far."""
     so_far = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(
@@ -118,7 +119,7 @@ def _scene() -> rrb.Spatial3DView:
             for timeline in (STAMP, FRAME)
         ]
     )
-    return rrb.Spatial3DView(origin="world", name="Scene", overrides={CLOUD: so_far})
+    return rrb.Spatial3DView(origin="world", name="Scene", overrides={CLOUD: so_far, LOOPS: so_far})
 
 
 APPLICATION: Final = "gvo"

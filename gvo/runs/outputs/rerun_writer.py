@@ -16,7 +16,7 @@ from gvo.geometry.camera import PinholeCamera
 from gvo.io.convert.bag_messages import pose_numbers
 from gvo.io.images import encode_image
 from gvo.runs.outputs import rerun_stream as place
-from gvo.runs.outputs.frames import ESTIMATES, RunFrames, Track
+from gvo.runs.outputs.frames import ESTIMATES, GLOBAL, RunFrames, Track
 from gvo.runs.outputs.rerun_stream import RerunStream
 from gvo.types import (
     Estimate,
@@ -25,6 +25,7 @@ from gvo.types import (
     FrameLink,
     FrameResult,
     ImageArray,
+    Optimum,
     RelativePose,
     Status,
     StereoFrame,
@@ -99,11 +100,21 @@ class RerunWriter:
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Log poses at their own stamps."""
+        self._add_late("smoothed", estimates)
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Log the global poses at their own stamps, and the loops between them at the end."""
+        track = self._tracks.setdefault(GLOBAL, Track())
+        self.stream.log(f"world/{GLOBAL}/frame", make_marker(GLOBAL), is_static=True)
+        self._add_late(GLOBAL, optimum.estimates)
+        self._set_frame(self._stamps_ns[-1])
+        self.stream.log(f"world/{GLOBAL}/loops", make_loops(track.segments(optimum.loops)))
+
+    def _add_late(self, name: str, estimates: Iterable[Estimate]) -> None:
         for estimate in estimates:
             self._set_frame(estimate.stamp_ns)
-            transform = make_transform(estimate.T_world_frame)
-            self.stream.log("world/smoothed/frame", transform)
-            self._tracks["smoothed"].add(estimate)
+            self.stream.log(f"world/{name}/frame", make_transform(estimate.T_world_frame))
+            self._tracks[name].add(estimate)
 
     def add_paths(self, n_most: int | None = None) -> None:
         """Log the paths up to now, of at most `n_most` poses, at the newest frame."""
@@ -165,17 +176,13 @@ class RerunWriter:
         ellipsoids = make_ellipsoids(KEYFRAMES, kept)
         self.stream.log("world/keyframes/covariance", ellipsoids)
         here = result.causal.T_world_frame[:3, 3]
-        ends = [(link, self._position(link.reference_ns)) for link in result.links]
-        placed = [(link, np.stack([end, here])) for link, end in ends if end is not None]
+        track = self._tracks["causal"]
+        ends = [(link, track.at(link.reference_ns)) for link in result.links]
+        placed = [(link, np.stack([T[:3, 3], here])) for link, T in ends if T is not None]
         segments = np.array([segment for _, segment in placed]).reshape(-1, 2, 3)
         self.stream.log("world/links", make_links([link for link, _ in placed], segments))
-
-    def _position(self, stamp_ns: int) -> FloatArray | None:
-        """Return where a frame was placed when it came, shape (3,)."""
-        pose = self._tracks["causal"].before(stamp_ns + 1)
-        if pose is None or pose.stamp_ns != stamp_ns:
-            return None
-        return np.asarray(pose.T_world_frame[:3, 3])
+        if result.loops:
+            self.stream.log(place.LOOPS, make_loops(track.segments(result.loops)))
 
     def _add_numbers(self, result: FrameResult) -> None:
         counts = (result.n_matches, result.n_inliers, result.n_points)
@@ -295,6 +302,11 @@ def make_links(links: Sequence[FrameLink], segments: FloatArray) -> rr.LineStrip
     codes = [palette.LINKS[link.kind] if link.is_accepted else palette.REFUSED for link in links]
     colours = [colour_of(code) for code in codes]
     return rr.LineStrips3D(list(segments), colors=colours or None, radii=_THIN_LINE)
+
+
+def make_loops(segments: FloatArray) -> rr.LineStrips3D:
+    """Return loops as lines; where each begins and ends, shape (n, 2, 3)."""
+    return rr.LineStrips3D(list(segments), colors=COLOURS[GLOBAL], radii=_LINE)
 
 
 def make_ellipsoids(name: str, estimates: Sequence[Estimate]) -> rr.Ellipsoids3D:

@@ -6,16 +6,19 @@ from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, TypeAlias
 
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import Estimate, FaultyFrame, Frame, FrameResult
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, Loop, Optimum
 from gvo.viz.overlay import MIN_WIDTH_PX, Layout, compose_faulty, compose_overlay
 from gvo.viz.video import open_sink
 
 _MAX_WIDTH_PX: Final = 960
 _MAX_PIXELS: Final = 300_000  # of which each costs, at every frame
+
+_SHOWN_NS: Final = 1_000_000_000  # how long a loop is
 
 _N_WAITING = 4  # frames; each holds its images
 _Item: TypeAlias = tuple[Frame, FrameResult] | FaultyFrame
@@ -57,6 +60,7 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
         self.decisions = self._sink.decisions
         self._n = 0
         self._is_open = True
+        self._loops: tuple[Loop, ...] = ()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="overlay")
         self._waiting: deque[Future[None]] = deque()
 
@@ -82,6 +86,9 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Take smoothed poses, which the film does not show."""
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Take the global poses, which the film does not show."""
 
     def close(self) -> None:
         """Write what waits and finish the film; a second call does nothing.
@@ -118,6 +125,9 @@ class RunOverlay(AbstractContextManager["RunOverlay"]):
             self._sink.add(picture, item.stamp_ns)
             return
         frame, result = item
+        self._loops = result.loops or self._loops
+        if self._loops and result.stamp_ns - self._loops[-1].stamp_ns <= _SHOWN_NS:
+            result = replace(result, loops=self._loops)
         picture = compose_overlay(frame, result, self._camera, index=index, max_width=width)
         self._sink.add(picture, frame.stamp_ns)
 

@@ -33,6 +33,8 @@ from gvo.types import (
     FloatArray,
     Frame,
     FrameResult,
+    Loop,
+    Optimum,
     RelativePose,
     RgbdFrame,
     Status,
@@ -273,6 +275,8 @@ def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: 
     expected = stereo_run.estimates(names.mount(0))
     found: dict[str, set[int]] = defaultdict(set)
     for parent, child, stamp_ns, T in _transforms(_read(tmp_path / name)):
+        if "gvo/odom" in (parent, child):
+            continue
         gvo, kind, tracked = child.split("/")
         assert (parent, gvo, tracked) == ("world", "gvo", names.base)
         np.testing.assert_allclose(T, expected[kind][stamp_ns].T_world_frame, atol=1e-12)
@@ -324,7 +328,94 @@ def test_above_the_world_of_a_camera_stands_one_with_z_up(tmp_path: Path, stereo
     T_flu_world = _lookup(buffer, "odom_flu", "odom", stereo_run.frames[-1].stamp_ns)
     ahead, left, up = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]]) @ T_flu_world.T
     np.testing.assert_array_equal([ahead, left, up], np.eye(3, 4))
-    assert all(parent == "odom" for parent, *_ in _transforms(_read(tmp_path / "run.mcap")))
+    parents = {parent for parent, *_ in _transforms(_read(tmp_path / "run.mcap"))}
+    assert parents == {"odom", "gvo/odom"}
+
+
+@_KINDS
+@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_causal_pose(
+    tmp_path: Path, name: str, names: RunFrames
+) -> None:
+    stamps = [_START_NS + k * _SECOND_NS for k in range(5)]
+    rng = np.random.default_rng(1)
+    steps = [np.eye(4), *(np.asarray(expm(_hat(rng.normal(0.0, 0.1, 6)))) for _ in stamps[1:])]
+    with RunBag(tmp_path / name, names) as bag:
+        for stamp_ns, step in zip(stamps, steps, strict=True):
+            frame, result = _made_up(stamp_ns)  # ten metres from frame to frame
+            first = stamp_ns == stamps[0]
+            bag.add_frame(frame, replace(result, T_previous_frame=None if first else step))
+    buffer = _buffer(_read(tmp_path / name))
+    T_odom_base = np.eye(4)
+    for stamp_ns, step in zip(stamps, steps, strict=True):
+        T_odom_base = T_odom_base @ step
+        found = _lookup(buffer, "gvo/odom", f"gvo/odom/{names.base}", stamp_ns)
+        np.testing.assert_allclose(found, T_odom_base, atol=1e-12)
+        T_world_base = _made_up(stamp_ns)[1].causal.T_world_frame
+        found = _lookup(buffer, "world", f"gvo/odom/{names.camera}", stamp_ns)
+        np.testing.assert_allclose(found, T_world_base @ names.mount(stamp_ns), atol=1e-12)
+
+
+def _loop(stamp_ns: int, reference_ns: int, reason: str = "") -> Loop:
+    return Loop(
+        stamp_ns=stamp_ns,
+        reference_ns=reference_ns,
+        T_reference_frame=np.eye(4),
+        covariance=np.eye(6),
+        n_matches=90,
+        n_inliers=87,
+        reason=reason,
+    )
+
+
+def _optimum(estimates: list[Estimate], *loops: Loop) -> Optimum:
+    return Optimum(
+        estimates=tuple(estimates),
+        keyframes_ns=(),
+        edges=(),
+        loops=loops,
+        residuals=np.zeros(len(loops)),
+        error_before=1.0,
+        error=0.5,
+        n_iterations=3,
+    )
+
+
+@_KINDS
+def test_loops_are_drawn_when_they_are_confirmed_and_at_the_end_between_global_poses(
+    tmp_path: Path, name: str
+) -> None:
+    stamps = [_START_NS + k * _SECOND_NS for k in range(4)]
+    loop = _loop(stamps[2], stamps[0])
+    aside = np.eye(4)
+    aside[0, 3] = 1.0
+    with RunBag(tmp_path / name) as bag:
+        poses = []
+        for stamp_ns in stamps:
+            frame, result = _made_up(stamp_ns)
+            loops = (loop,) if stamp_ns == stamps[2] else ()
+            bag.add_frame(frame, replace(result, loops=loops))
+            poses.append(replace(result.causal, T_world_frame=aside @ result.causal.T_world_frame))
+        bag.add_optimum(_optimum(poses[::-1], loop, _loop(stamps[3], stamps[0], "contradicts")))
+    messages = _read(tmp_path / name)
+    causal, last = messages["/gvo/loops"]
+    assert [(m.stamp_ns, m.content.ns) for m in (causal, last)] == [
+        (stamps[2], "causal"),
+        (stamps[3], "global"),
+    ]
+    assert causal.content.id != last.content.id
+    for message, x in ((causal, 0.0), (last, 1.0)):
+        assert (message.content.header.frame_id, message.content.type) == ("world", 5)
+        assert [(p.x, p.y, p.z) for p in message.content.points] == [(x, 0, 20), (x, 0, 0)]
+        assert message.content.pose.orientation.w == 1
+    path = messages["/gvo/global/path"][-1].content
+    assert [_stamp_ns(p.header) for p in path.poses] == stamps
+    assert {p.pose.position.x for p in path.poses} == {1.0}
+    assert [m.stamp_ns for m in messages["/gvo/global/odometry"]] == stamps
+    T = _lookup(_buffer(messages), "world", "gvo/global/camera_optical", stamps[1])
+    np.testing.assert_allclose(T, poses[1].T_world_frame, atol=1e-12)
+    told = messages["/diagnostics"][2].content.status[0]
+    assert "loop to 2.0 s before, 87 inliers" in told.message
 
 
 @_KINDS

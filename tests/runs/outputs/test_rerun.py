@@ -43,6 +43,8 @@ from gvo.types import (
     FloatArray,
     FrameLink,
     FrameResult,
+    Loop,
+    Optimum,
     RelativePose,
     Status,
     StereoFrame,
@@ -50,7 +52,7 @@ from gvo.types import (
 from gvo.viz.palette import COUNTS, LINKS, STAGES
 
 _N_FRAMES = 12
-_ESTIMATES = ("raw", "causal", "smoothed")
+_ESTIMATES = ("raw", "causal", "smoothed", "global")
 _CAMERA_ENTITY = "/world/causal/frame/camera"
 _SECOND_NS = 10**9
 _UNIX_NS = 1_403_636_584_763_555_584
@@ -161,6 +163,9 @@ class _Kept:
     def add_smoothed(self, estimates: object) -> None:
         """Nothing is kept."""
 
+    def add_optimum(self, optimum: object) -> None:
+        """Nothing is kept."""
+
 
 def _run(folder: Path, source: SyntheticRecording, names: RunFrames) -> _Run:
     frame = BaseFrame() if names.is_camera else BaseFrame("base_link", names.mount(0))
@@ -171,6 +176,7 @@ def _run(folder: Path, source: SyntheticRecording, names: RunFrames) -> _Run:
         RunRerun(path, source.info.camera, names, config=Config()) as file,
     ):
         loop.run([tables, file, kept], None)
+        assert loop.optimize() is not None
     return _Run(folder=folder, read=_Read(path), results=kept.results, frames=names)
 
 
@@ -474,6 +480,51 @@ def test_a_pose_that_cannot_be_tied_to_a_known_frame_has_no_link(tmp_path: Path)
     drawn = read.latest("/world/links", 1)
     assert len(drawn["LineStrips3D:strips"]) == 2
     assert len(set(drawn["LineStrips3D:colors"])) == 2  # refused ones stand out
+
+
+def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(
+    tmp_path: Path,
+) -> None:
+    def at(x: float) -> FloatArray:
+        return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+
+    def loop(stamp_ns: int, reference_ns: int, reason: str = "") -> Loop:
+        return Loop(
+            stamp_ns=stamp_ns,
+            reference_ns=reference_ns,
+            T_reference_frame=np.eye(4),
+            covariance=np.eye(6),
+            n_matches=9,
+            n_inliers=8,
+            reason=reason,
+        )
+
+    results = [_made(10, at(1.0)), _made(20, at(2.0)), _made(30, at(3.0))]
+    # The place of the second is not known.
+    results[2] = replace(results[2], loops=(loop(30, 10), loop(30, 15)))
+    moved = [replace(each.causal, T_world_frame=at(0.5 * k)) for k, each in enumerate(results)]
+    optimum = Optimum(
+        estimates=tuple(moved),
+        keyframes_ns=(10, 20, 30),
+        edges=(),
+        loops=(loop(30, 10), loop(30, 20, "contradicts the others")),
+        residuals=np.zeros(2),
+        error_before=1.0,
+        error=0.5,
+        n_iterations=3,
+    )
+    path = tmp_path / "made.rrd"
+    with RunRerun(path, _CAMERA) as file:
+        for result in results:
+            file.add_frame(_frame(result.stamp_ns), result)
+        file.add_optimum(optimum)
+    read = _Read(path)
+    for entity, ends in (("/world/loops", (3.0, 1.0)), ("/world/global/loops", (1.0, 0.0))):
+        (row,) = read.rows[entity]
+        assert row.stamp_ns == 30
+        (strip,) = row.values["LineStrips3D:strips"]
+        assert [point[0] for point in strip] == list(ends)
+    assert [point[0] for point in _strip(read.latest("/world/global/path", 2))] == [0.0, 0.5, 1.0]
 
 
 def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:

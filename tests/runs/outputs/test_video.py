@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.video import RunOverlay, film_width
-from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
+from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray, Loop
 from gvo.viz.overlay import compose_faulty, compose_overlay
 
 _N_FRAMES = 11
@@ -132,6 +133,37 @@ def test_frames_become_numbered_files_where_a_folder_is_named(room: _Run, tmp_pa
     width = film_width(camera)
     expected = compose_overlay(frame, result, camera, index=_N_FRAMES - 1, max_width=width)
     np.testing.assert_array_equal(cv2.imread(str(files[-1])), expected)
+
+
+def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
+    recording, pairs = drive
+    camera = recording.info.camera
+    loop = Loop(
+        stamp_ns=pairs[2][0].stamp_ns,
+        reference_ns=pairs[0][0].stamp_ns,
+        T_reference_frame=np.eye(4),
+        covariance=np.eye(6),
+        n_matches=90,
+        n_inliers=87,
+    )
+    ends_ns = loop.stamp_ns + 1_000_000_000
+    late = [(_shifted(frame, ends_ns + n), result) for n, (frame, result) in enumerate(pairs[5:7])]
+    shown = [*pairs[:4], *late]
+    with RunOverlay(tmp_path / "frames", camera) as output:
+        for n, (frame, result) in enumerate(shown):
+            raw = replace(result.raw, stamp_ns=frame.stamp_ns)
+            shown[n] = frame, replace(result, raw=raw)
+            output.add_frame(frame, replace(shown[n][1], loops=(loop,) if n == 2 else ()))
+    files = sorted((tmp_path / "frames").iterdir())
+    is_marked = []
+    for n, (file, (frame, result)) in enumerate(zip(files, shown, strict=True)):
+        plain = compose_overlay(frame, result, camera, index=n, max_width=film_width(camera))
+        is_marked.append(not np.array_equal(cv2.imread(str(file)), plain))
+    assert is_marked == [False, False, True, True, True, False]
+
+
+def _shifted(frame: Frame, stamp_ns: int) -> Frame:
+    return replace(frame, stamp_ns=stamp_ns)
 
 
 def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) -> None:
