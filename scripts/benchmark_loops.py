@@ -13,7 +13,7 @@ seconds after the first. Errors are then those of the frames that are tracked in
 recording, beside the global ones of the unbroken one.
 
 Example: python scripts/benchmark.py --loops --seeds 10 --kind block --drift 1 --keep rendered
-Example: python scripts/benchmark.py --loops --dark 2-4 rgbd_dataset_freiburg1_xyz_start
+Example: python scripts/benchmark.py --loops --dark 1-2 rgbd_dataset_freiburg1_rpy_part
 """
 
 import csv
