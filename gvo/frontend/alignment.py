@@ -195,7 +195,7 @@ class Templates:
 def cut_patches(image: ImageArray, pixels: FloatArray) -> NDArray[np.uint8]:
     """Cut patches and a margin of one pixel around whole pixels (n, 2), shape (n, 11, 11)."""
     size = 2 * RADIUS_PX + 3
-    padded = np.pad(image, RADIUS_PX + 1, mode="edge")
+    padded = cv2.copyMakeBorder(image, *(RADIUS_PX + 1,) * 4, cv2.BORDER_REPLICATE)
     u, v = pixels.astype(np.int64).T
     return np.asarray(sliding_window_view(padded, (size, size))[v, u])
 

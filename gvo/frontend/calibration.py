@@ -25,7 +25,7 @@ import numpy as np
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.registration import check_rows, register_correspondences
+from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -162,12 +162,12 @@ class FrameVelocities:
         if velocity is not None:
             self._velocities[other] = velocity
 
-    def doubt(self, observations: Stamped) -> FloatArray:
-        """Return by how much the velocity may be off, one sigma; zero where the next step is known.
+    def doubt(self, observations: Stamped) -> FloatArray | None:
+        """Return by how much the velocity may be off, one sigma; None where the next step is known.
 
         The newest frame's is extrapolated: the camera may go on changing its velocity, or not.
         """
-        return self._doubts.get(observations, np.zeros(6))
+        return self._doubts.get(observations)
 
 
 class RigOffsets:
@@ -466,25 +466,27 @@ class CalibratedCamera:
             As of `register_correspondences`.
         is_step : bool
             The result tells the velocities of both frames. Where these move what rows show, it is
-            registered twice: first as predicted, then with its own.
+            estimated twice: roughly, with those predicted, then with its own.
 
         Returns
         -------
         RelativePose or Failure
         """
         velocities = self._offsets.velocities
+        first, second = measured.frames
+        hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
         if is_step and self._offsets.readout_s != 0.0:
-            # What it tells of the constants is not asked for.
-            result = self._register(self._corrected(measured), measured, config, prior)
-            if isinstance(result, Failure):
-                return result
-            velocities.expect(*measured.frames, result.T_reference_current)
+            rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
+            # What fails is tried again as a whole, to tell why.
+            if not isinstance(rough, Failure):
+                hints["T_start"] = rough
+                velocities.expect(first, second, se3.invert(rough))
         corrected = self._with_sensitivities(self._corrected(measured), measured)
-        result = self._register(corrected, measured, config, prior)
+        result = self._register(corrected, measured, config, hints)
         if isinstance(result, Failure):
             return result
         if is_step:
-            velocities.expect(*measured.frames, result.T_reference_current)
+            velocities.expect(first, second, result.T_reference_current)
         return check_rows(result, self._camera)
 
     def _register(
@@ -492,12 +494,10 @@ class CalibratedCamera:
         corrected: Correspondences,
         measured: Measurements,
         config: Config,
-        prior: MotionPrior | None,
+        hints: Mapping[str, Any],
     ) -> RelativePose | Failure:
-        first, second = measured.frames
-        stamps_ns = first.stamp_ns, second.stamp_ns
         result = register_correspondences(
-            corrected, measured.matches, self._camera, config, stamps_ns=stamps_ns, prior=prior
+            corrected, measured.matches, self._camera, config, **hints
         )
         if isinstance(result, Failure):
             return result

@@ -44,9 +44,9 @@ _MAX_BEND = 0.03
 _STRIDE = 3
 # Noise of a depth camera: so many metres, and so many per metre squared.
 _SIGMA_M, _SIGMA_PER_M = 0.003, 0.003
-_N_ITERATIONS = 6
-# Largest residuals in sigmas, in the first rounds and later.
-_GATES = (4.0, 4.0, 2.5)
+# Largest residuals in sigmas, and one in how many points is enough: in the first
+# rounds, in later ones, and in the last, to which what is at rest goes at once.
+_ROUNDS = (*((4.0, 4),) * 2, *((2.5, 4),) * 3, (2.5, 1))
 _HUBER = 1.5
 # Squared length of a step, in sigmas, that no longer matters.
 _CONVERGED = 1e-2
@@ -150,16 +150,18 @@ def align_depth_maps(
         variance.
     """
     T = se3.invert(T_reference_current)
-    for index in range(_N_ITERATIONS):
-        system = _linearize(T, reference, current, gate=_GATES[min(index, len(_GATES) - 1)])
+    is_settled = False
+    for gate, every in _ROUNDS:
+        if is_settled and every > 1:
+            continue
+        system = _linearize(T, reference, current, gate=gate, every=every)
         if isinstance(system, Failure):
             return system
         H, g, scale = system
         inverse, open_inverse = _invert(H, reference)
         step = inverse @ g
         T = se3.exp(step) @ T
-        if step @ g < _CONVERGED:
-            break
+        is_settled = bool(step @ g < _CONVERGED)
     covariance = _N_CORRELATED * scale**2 * (inverse + open_inverse)
     return RelativePose(
         T_reference_current=se3.normalize(se3.invert(T)),
@@ -168,12 +170,12 @@ def align_depth_maps(
 
 
 def _linearize(
-    T: FloatArray, reference: DepthMap, current: DepthMap, *, gate: float
+    T: FloatArray, reference: DepthMap, current: DepthMap, *, gate: float, every: int
 ) -> tuple[FloatArray, FloatArray, float] | Failure:
     """Return the normal equations of a left perturbation of T, and the scale of the residuals."""
     fx, fy, cx, cy = current.camera
-    points = T[:3, :3] @ reference.points + T[:3, 3:]
-    normals = T[:3, :3] @ reference.normals
+    points = T[:3, :3] @ reference.points[:, ::every] + T[:3, 3:]
+    normals = T[:3, :3] @ reference.normals[:, ::every]
     z = np.maximum(points[2], 1e-3)
     u, v = (f * row / z + c for f, row, c in ((fx, points[0], cx), (fy, points[1], cy)))
     seen = _look_up(current.inverse_depths, u, v)
@@ -183,7 +185,7 @@ def _linearize(
     # Of grazing views: what is measured lies on another surface, however small the residual.
     is_near = (np.abs(residuals) < gate) & (np.abs(stretch) * z < 10.0 * sigmas + 0.03 * z)
     chosen = np.flatnonzero(is_near)
-    if len(chosen) < _MIN_POINTS:
+    if len(chosen) * every < _MIN_POINTS:
         return Failure(reason=f"{len(chosen)} points of two depth images fit each other")
     r, points, normals = residuals[chosen], points[:, chosen], normals[:, chosen]
     J = np.concatenate([np.cross(points, normals, axis=0), normals]) / sigmas[chosen]

@@ -17,7 +17,8 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.geometry.ransac import Consensus, find_inliers, ransac_rigid
-from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
+from gvo.geometry.refinement import Refinement, descend, fit_covariance, refine_pose
+from gvo.geometry.residuals import StereoResiduals
 from gvo.types import (
     BoolArray,
     Failure,
@@ -30,6 +31,8 @@ from gvo.types import (
 
 # From such a share of inliers on RANSAC would find the same motion again.
 _MIN_KNOWN_SHARE = 0.7
+# Gauss-Newton steps of a rough estimate.
+_N_ROUGH_ITERATIONS = 2
 # Best over second best distance of a match (D. Lowe, 2004, doi:10.1023/B:VISI.0000029664.99615.94).
 _MAX_RATIO = 0.8
 # More RANSAC hypotheses: more matches are wrong than between neighbouring frames.
@@ -56,6 +59,7 @@ def register_correspondences(
     *,
     stamps_ns: tuple[int, int],
     prior: MotionPrior | None = None,
+    T_start: FloatArray | None = None,
 ) -> RelativePose | Failure:
     """Estimate the motion between two frames from 3D-3D correspondences.
 
@@ -75,6 +79,8 @@ def register_correspondences(
         Where most matches agree with its prediction, RANSAC is skipped: the refinement starts
         from it, and chooses its inliers anew (not with `registration.refine` none, where the fit
         to the consensus is the result).
+    T_start : ndarray of float64, shape (4, 4), optional
+        T_target_source that is used so in place of the prediction.
 
     Returns
     -------
@@ -82,7 +88,9 @@ def register_correspondences(
     """
     given = {"correspondences": correspondences, "matches": matches, "stamps_ns": stamps_ns}
     note("registration.begin", **given)
-    known = _known_consensus(prior, correspondences, camera, config)
+    if prior is not None and T_start is None:
+        T_start = se3.invert(prior.T_predicted)
+    known = _known_consensus(T_start, correspondences, camera, config)
     consensus = known or search_consensus(correspondences, camera, config, stamps_ns)
     note("registration.consensus", consensus=consensus, is_known=known is not None)
     if isinstance(consensus, Failure):
@@ -98,16 +106,32 @@ def register_correspondences(
     return _conclude(refined, consensus, correspondences, matches, config.ransac.min_inliers)
 
 
-def _known_consensus(
-    prior: MotionPrior | None,
+def estimate_roughly(
     correspondences: Correspondences,
     camera: StereoCamera,
     config: Config,
+    *,
+    stamps_ns: tuple[int, int],
+    prior: MotionPrior | None,
+) -> FloatArray | Failure:
+    """Return T_target_source after a few steps, not verified; as `register_correspondences`."""
+    T = None if prior is None else se3.invert(prior.T_predicted)
+    known = _known_consensus(T, correspondences, camera, config)
+    found = known or search_consensus(correspondences, camera, config, stamps_ns)
+    if isinstance(found, Failure):
+        return found
+    T, huber = found.T_target_source, config.registration.huber
+    residuals = StereoResiduals.of(T, correspondences, camera, huber=huber)
+    refined = descend(T, residuals.select(found.inliers), n_iterations=_N_ROUGH_ITERATIONS)
+    return T if refined is None else refined
+
+
+def _known_consensus(
+    T: FloatArray | None, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Consensus | None:
-    """Return the inliers of the prediction, if they are most of the matches."""
-    if prior is None or config.registration.refine == "none":
+    """Return the inliers of the start value, if they are most of the matches."""
+    if T is None or config.registration.refine == "none":
         return None
-    T = se3.invert(prior.T_predicted)
     inliers = find_inliers(T[np.newaxis], correspondences, camera, config.ransac)[0]
     n_needed = max(config.ransac.min_inliers, _MIN_KNOWN_SHARE * len(correspondences))
     note("registration.known", inliers=inliers, n_needed=n_needed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from gvo._trace import note
@@ -77,6 +79,7 @@ def sample_depth(
     return depths, is_valid
 
 
+@lru_cache(maxsize=8)
 def _offsets(radius: int) -> IntArray:
     """List (u, v) of the pixels of a window from its centre, shape ((2 * radius + 1)^2, 2)."""
     rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
@@ -213,9 +216,8 @@ def compare_depths(
 def grid_points(depth: DepthArray, camera: StereoCamera, config: DepthConfig) -> FloatArray:
     """Return the points of a grid of a depth image's pixels, metres, shape (n, 3)."""
     height, width = depth.shape
-    rows = np.linspace(0.0, height - 1.0, _N_GRID).astype(np.int64)
-    columns = np.linspace(0.0, width - 1.0, _N_GRID).astype(np.int64)
-    grid = depth[np.ix_(rows, columns)].astype(np.float64)
+    rows, columns = (np.arange(_N_GRID) * (n - 1) // (_N_GRID - 1) for n in (height, width))
+    grid = depth[rows[:, np.newaxis], columns].astype(np.float64)
     v, u = np.nonzero((grid >= config.min_depth_m) & (grid <= config.max_depth_m))
     pixels = np.column_stack([columns[u], rows[v]]).astype(np.float64)
     return camera.unproject_stereo(pixels, camera.depth_to_disparity(grid[v, u]))

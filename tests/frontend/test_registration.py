@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.config import Config
 from gvo.frontend import registration
-from gvo.frontend.registration import check_rows, register_correspondences
+from gvo.frontend.registration import check_rows, estimate_roughly, register_correspondences
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
@@ -234,6 +234,38 @@ def test_a_prediction_that_few_matches_confirm_changes_nothing(error: float) -> 
     assert isinstance(searched, RelativePose)
     assert isinstance(result, RelativePose)
     np.testing.assert_array_equal(result.T_reference_current, searched.T_reference_current)
+
+
+@pytest.mark.parametrize("is_predicted", [True, False])
+def test_a_rough_estimate_is_near_the_motion_and_starts_the_next_without_samples(
+    is_predicted: bool,
+) -> None:
+    T, reference, current, matches = two_frames(7, n_outliers=20)
+    start = T @ se3.exp(np.repeat([0.002, 0.02], 3))
+    given = Correspondences.of(reference, current, matches), matches, CAMERA, configure()
+    found = register_correspondences(*given, stamps_ns=(10, 20))
+    prior = MotionPrior(T_predicted=start) if is_predicted else None
+    rough = estimate_roughly(given[0], *given[2:], stamps_ns=(10, 20), prior=prior)
+    assert isinstance(found, RelativePose)
+    assert not isinstance(rough, Failure)
+    # Not as good: its inliers are those of the prediction or of a sample.
+    difference = se3.log(rough @ found.T_reference_current)
+    assert difference @ np.linalg.solve(found.covariance, difference) / 6 < 5.0
+    assert np.linalg.norm(difference) < 0.5 * np.linalg.norm(se3.log(np.linalg.inv(T) @ start))
+    with pytest.MonkeyPatch.context() as patch:
+        forbid_search(patch)
+        again = register_correspondences(*given, stamps_ns=(10, 20), T_start=rough)
+    assert isinstance(again, RelativePose)
+    difference = se3.log(np.linalg.inv(found.T_reference_current) @ again.T_reference_current)
+    assert difference @ np.linalg.solve(found.covariance, difference) / 6 < 0.5
+
+
+def test_a_rough_estimate_of_too_few_matches_is_a_failure() -> None:
+    _, reference, current, matches = two_frames(6, n_outliers=0)
+    given = Correspondences.of(reference, current, matches[:11]), CAMERA, configure()
+    rough = estimate_roughly(*given, stamps_ns=(10, 20), prior=None)
+    assert isinstance(rough, Failure)
+    assert rough.n_matches == 11
 
 
 @pytest.mark.parametrize(("n_outliers", "is_known"), [(30, True), (45, False)])
