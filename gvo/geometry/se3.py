@@ -211,10 +211,12 @@ def normalize(T: FloatArray) -> FloatArray:
 def compose_covariance(
     covariance_a_b: FloatArray, T_b_c: FloatArray, covariance_b_c: FloatArray
 ) -> FloatArray:
-    """Return the covariance (6, 6) of T_a_b @ T_b_c, independent errors, first order."""
+    """Return the covariances (..., 6, 6) of T_a_b @ T_b_c, independent errors, first order."""
     Ad = adjoint(invert(T_b_c))
-    moved = Ad @ covariance_a_b @ Ad.T
-    return np.asarray(0.5 * (moved + moved.T) + covariance_b_c)  # symmetric in spite of rounding
+    moved = Ad @ covariance_a_b @ np.swapaxes(Ad, -1, -2)
+    return np.asarray(
+        0.5 * (moved + np.swapaxes(moved, -1, -2)) + covariance_b_c
+    )  # symmetric in spite of rounding
 
 
 def covariance_from_ros(covariance_ros: FloatArray, R_parent_frame: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ _DRIFT = 0.02
 class _Visit:
     """A place, and where odometry was when it was seen."""
 
+    number: int
     place: Any
     T_world_frame: FloatArray
 
@@ -73,20 +75,27 @@ class LoopDetector:
             raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
         self._frontend: Recognizer = frontend or make_frontend(camera, config)  # type: ignore[arg-type]
         self._index = PlaceIndex()
-        self._visits: list[_Visit] = []
+        # By their stamps; those of the index in its order; the latest ones, which it has not.
+        self._visits: dict[int, _Visit] = {}
+        self._indexed: list[_Visit] = []
+        self._recent: list[_Visit] = []
         self._waiting: list[tuple[int, Loop]] = []
-        self._numbers: dict[int, int] = {}
         self.loops: list[Loop] = []
 
     def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
         """Go on with another front-end; places of another kind are not searched any more."""
         self._frontend = frontend
         if not keeps_places:
-            self._index, self._visits, self._waiting = PlaceIndex(), [], []
+            self._index, self._visits = PlaceIndex(), {}
+            self._indexed, self._recent, self._waiting = [], [], []
 
     def __len__(self) -> int:
         """Return the number of places."""
         return len(self._visits)
+
+    def __contains__(self, stamp_ns: object) -> bool:
+        """Tell whether the place of a frame is known by it."""
+        return stamp_ns in self._visits
 
     def detect(self, frame: Frame, T_world_frame: FloatArray) -> tuple[Loop, ...]:
         """Look for the place that a frame shows, and keep it as another one.
@@ -120,39 +129,55 @@ class LoopDetector:
         place = self._frontend.describe(observations)
         found: list[Loop] = []
         for number in self._candidates(place.descriptors_left, near):
-            reference = self._visits[number].place
+            reference = self._indexed[number].place
             result = self._frontend.recognize(reference, place, observations)
             if isinstance(result, RelativePose):
                 found.append(_loop(reference.stamp_ns, place.stamp_ns, result))
                 break
-        self._numbers[place.stamp_ns] = len(self._visits)
-        self._visits.append(_Visit(place=place, T_world_frame=T_world_frame))
-        self._index.add(place.descriptors_left)
+        number = self._recent[-1].number + 1 if self._recent else 0
+        visit = _Visit(number=number, place=place, T_world_frame=T_world_frame)
+        self._visits[place.stamp_ns] = visit
+        self._recent.append(visit)
         confirmed = [each for loop in found for each in self._confirm(loop)]
+        self._keep_oldest_recent()
         return tuple(confirmed)
 
+    def _keep_oldest_recent(self) -> None:
+        """Add the latest place but some to the index, unless it is known by another frame."""
+        if len(self._recent) <= _N_RECENT:
+            return
+        visit = self._recent.pop(0)
+        stamp_ns = visit.place.stamp_ns
+        newest = reversed(self.loops)
+        newest = takewhile(lambda loop: loop.stamp_ns >= stamp_ns, newest)
+        if any(loop.stamp_ns == stamp_ns and not loop.reason for loop in newest):
+            del self._visits[stamp_ns]
+        else:
+            self._index.add(visit.place.descriptors_left)
+            self._indexed.append(visit)
+
     def _shows_latest(self, T_world_frame: FloatArray) -> bool:
-        if not self._visits:
+        if not self._recent:
             return False
-        latest = self._visits[-1]
+        latest = self._recent[-1]
         T = se3.invert(T_world_frame) @ latest.T_world_frame
         points, camera = latest.place.points_cam, self._frontend.camera
         return view_overlap(points, T, camera) > _MAX_OVERLAP
 
     def _candidates(self, descriptors: Any, near: Container[int]) -> list[int]:  # noqa: ANN401
-        scores = self._index.scores(descriptors)[:-_N_RECENT]
+        scores = self._index.scores(descriptors)
         if len(scores) == 0:
             return []
         limit = min(_ABOVE_NOISE * float(np.quantile(scores, _NOISE_QUANTILE)), _SURE_SCORE)
         best = np.argsort(-scores)[: 4 * _N_CANDIDATES].tolist()
         chosen = [
-            k for k in best if scores[k] >= limit and self._visits[k].place.stamp_ns not in near
+            k for k in best if scores[k] >= limit and self._indexed[k].place.stamp_ns not in near
         ]
         return chosen[:_N_CANDIDATES]
 
     def _confirm(self, loop: Loop) -> list[Loop]:
         """Return the loops that are confirmed with a new one, this one among them."""
-        newest = len(self._visits) - 1
+        newest = self._recent[-1].number
         self._waiting = [each for each in self._waiting if newest - each[0] <= _N_WAITING]
         agreeing = [k for k, (_, other) in enumerate(self._waiting) if self._agree(other, loop)]
         confirmed = []
@@ -180,7 +205,7 @@ class LoopDetector:
 
     def _way(self, first_ns: int, second_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return the motion between two places by odometry, and variances of its drift (6,)."""
-        first, second = (self._visits[self._numbers[ns]] for ns in (first_ns, second_ns))
+        first, second = (self._visits[ns] for ns in (first_ns, second_ns))
         T = se3.invert(first.T_world_frame) @ second.T_world_frame
         length, angle = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
         turn = (_DRIFT * angle) ** 2 + (_DRIFT * 0.1 * length) ** 2

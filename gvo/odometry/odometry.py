@@ -113,6 +113,14 @@ class Odometry:
         return self._graph
 
     @property
+    def T_map_world(self) -> FloatArray:  # noqa: N802 - the field's name
+        """What loops correct the newest poses by, shape (4, 4): T_map_world @ T_world_frame.
+
+        Optimized in a thread while the run goes, some keyframes behind; the identity until then.
+        """
+        return self._graph.T_map_world
+
+    @property
     def rig_offsets(self) -> RigOffsets | None:
         """What is learnt of the camera, calibrated online; None where nothing is."""
         offsets = self._frontend.rig_offsets
@@ -459,7 +467,9 @@ class Odometry:
         if self._loops is None or not is_keyframe or not self._config.loops.enabled:
             return ()
         self._graph.loops = self._loops.loops
-        return self._loops.look(observations, causal.T_world_frame, near=kept_ns)
+        loops = self._loops.look(observations, causal.T_world_frame, near=kept_ns)
+        self._graph.advance(loops, self._loops)
+        return loops
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""

@@ -379,7 +379,11 @@ def _graph_lines(optimum: Optimum) -> Iterator[str]:
         number = numbers.get(estimate.stamp_ns)
         if number is not None:
             yield f"{format_vertex(number, estimate.T_world_frame)}  # {estimate.stamp_ns}"
-    loops = ((loop.stamp_ns, loop.edge) for loop in optimum.loops if not loop.reason)
+    loops = (
+        (loop.stamp_ns, loop.edge)
+        for loop in optimum.loops
+        if not loop.reason and {loop.stamp_ns, loop.reference_ns} <= numbers.keys()
+    )
     for stamp_ns, edge in chain(optimum.edges, loops):
         ends = numbers[int(edge.reference_id)], numbers[stamp_ns]  # type: ignore[call-overload]
         yield format_edge(*ends, edge.T_reference_frame, edge.covariance)

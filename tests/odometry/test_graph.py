@@ -1,0 +1,259 @@
+"""The graph of a run, by its own truth: simulated drives whose poses are known."""
+
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gvo.odometry.graph as graph_module
+from gvo.backend.batch import BatchOptimizer, WholeGraph
+from gvo.backend.factors import ORIGIN
+from gvo.config import WindowConfig
+from gvo.errors import SmoothingError
+from gvo.geometry import se3
+from gvo.odometry.graph import RunGraph
+from gvo.types import Edge, Estimate, FloatArray, Optimum, PosePrior, Status
+from tests.odometry.drives import (
+    PERIOD_NS,
+    SIGMAS,
+    Bias,
+    Drive,
+    block,
+    go_round,
+    measured,
+    poses,
+    position_error,
+)
+
+N_LAP = 100
+
+
+def looped(
+    seed: int | None,
+    *,
+    n_loops: int = 5,
+    n_laps: float = 1.3,
+    bias: Bias = None,
+    n_links: int = 2,
+) -> Drive:
+    """Return a drive around the block and a bit more, with loops where it came back."""
+    rng = None if seed is None else np.random.default_rng(seed)
+    drive = Drive(block(n_laps, n_per_lap=N_LAP), rng, bias=bias, n_links=n_links).run()
+    drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(n_loops)]
+    return drive
+
+
+def nees(optimum: Optimum, truth: FloatArray) -> FloatArray:
+    """Return the normalized squared error of each pose but the first."""
+    errors = se3.log(se3.invert(truth) @ poses(optimum))
+    covariances = np.array([each.covariance for each in optimum.estimates])
+    return se3.mahalanobis(errors[1:], covariances[1:])
+
+
+def whole(drive: Drive) -> BatchOptimizer:
+    """Return the optimum of all frames at once, with what the graph has condensed."""
+    graph = WholeGraph()
+    for j, T in enumerate(drive.truth):
+        prior = PosePrior(T_world_frame=T, covariance=ORIGIN.covariance) if j == 0 else None
+        graph.add_pose(j * PERIOD_NS, j * PERIOD_NS, prior)
+    for j, edges in enumerate(drive.edges):
+        graph.add_edges(j * PERIOD_NS, edges)
+    for loop in drive.graph.loops:
+        graph.add_edges(loop.stamp_ns, [loop.edge])
+    optimizer = BatchOptimizer(graph)
+    optimizer.run()
+    return optimizer
+
+
+def test_exact_edges_give_the_true_poses() -> None:
+    drive = looped(None)
+    optimum = drive.graph.optimize(covariances=False)
+    assert not any(loop.reason for loop in optimum.loops)
+    np.testing.assert_allclose(poses(optimum), drive.truth, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("n_links", "most"), [(0, 0.05), (2, 0.6)])
+def test_the_condensed_optimum_is_that_of_all_edges(n_links: int, most: float) -> None:
+    drive = looped(3, n_links=n_links)
+    optimizer = whole(drive)
+    differences = se3.log(se3.invert(optimizer.poses()) @ poses(drive.graph.optimize()))
+    sigmas = np.sqrt(se3.mahalanobis(differences[1:], optimizer.covariances()[1:]) / 6.0)
+    assert np.median(sigmas) < most
+
+
+def test_the_covariances_tell_the_errors() -> None:
+    found = []
+    for seed in range(6):
+        drive = looped(seed)
+        found.append(nees(drive.graph.optimize(), drive.truth).mean())
+    assert 3.5 < np.mean(found) < 7.0
+
+
+@settings(max_examples=4, deadline=None)
+@given(
+    twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6), order=st.permutations(range(5))
+)
+def test_neither_the_world_nor_the_order_of_loops_matters(
+    twist: list[float], order: list[int]
+) -> None:
+    T = se3.exp(np.array(twist))
+    drive, moved = looped(1), RunGraph(WindowConfig())
+    for j, edges in enumerate(drive.edges):
+        T_world_frame = T @ drive.truth[j]
+        estimate = Estimate(
+            stamp_ns=j * PERIOD_NS, T_world_frame=T_world_frame, covariance=np.eye(6)
+        )
+        moved.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+    moved.loops = [drive.graph.loops[k] for k in order]
+    expected = T @ poses(drive.graph.optimize(covariances=False))
+    np.testing.assert_allclose(poses(moved.optimize(covariances=False)), expected, atol=1e-6)
+
+
+def test_frames_between_keyframes_lie_between_both_ends() -> None:
+    # Steps of 1 m along x are 10 % short: a loop stretches them.
+    graph = RunGraph(WindowConfig())
+    step = se3.make_transform(np.eye(3), np.array([0.9, 0.0, 0.0]))
+    T, edges = np.eye(4), list[Edge]()
+    for j in range(21):
+        estimate = Estimate(stamp_ns=j * PERIOD_NS, T_world_frame=T, covariance=np.eye(6))
+        graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+        T = T @ step
+        covariance = np.diag(np.full(6, 0.3) ** 2)
+        edges = [Edge(reference_id=j * PERIOD_NS, T_reference_frame=step, covariance=covariance)]
+    whole_way = se3.make_transform(np.eye(3), np.array([20.0, 0.0, 0.0]))
+    drive = Drive(np.array([np.eye(4)] * 21))
+    graph.loops = [drive.loop(0, 20, T=whole_way)]
+    x = poses(graph.optimize(covariances=False))[:, 0, 3]
+    np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
+
+
+def test_frames_after_a_loss_go_with_what_comes_after_it() -> None:
+    truth = np.array([se3.exp(np.array([0, 0.01 * j, 0, 0, 0, 0.5 * j])) for j in range(16)])
+    graph, drive = RunGraph(WindowConfig()), Drive(truth)
+    for j in range(16):
+        # From frame 8 on the camera was somewhere else than the guess says.
+        status, edges = Status.OK, []
+        if j == 8:
+            status = Status.LOST
+        elif j > 0:
+            edges = [measured(truth, j - 1, j, SIGMAS, None)]
+        T = truth[j] if j < 8 else truth[j] @ se3.exp(np.array([0, 0.5, 0, 3.0, 0, 0]))
+        estimate = Estimate(
+            stamp_ns=j * PERIOD_NS, T_world_frame=T, covariance=np.eye(6), status=status
+        )
+        graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+    graph.loops = [drive.loop(0, 15)]
+    optimum = graph.optimize()
+    np.testing.assert_allclose(poses(optimum), truth, atol=1e-3)
+    assert max(float(np.trace(each.covariance)) for each in optimum.estimates) < 0.1
+
+
+def test_an_optimum_on_the_way_changes_nothing_that_comes_later() -> None:
+    asked, other = (Drive(block(1.3, n_per_lap=N_LAP), np.random.default_rng(2)) for _ in range(2))
+    for j in range(len(asked.truth)):
+        asked.step(j)
+        other.step(j)
+        if j % 7 == 3:
+            assert len(asked.graph.optimize(covariances=False).estimates) == j + 1
+    expected, found = other.graph.optimize(), asked.graph.optimize()
+    np.testing.assert_array_equal(poses(found), poses(expected))
+    np.testing.assert_array_equal(poses(asked.graph.optimize()), poses(expected))
+
+
+@pytest.mark.parametrize("is_consistent", [False, True])
+def test_ten_false_loops_among_ten_true_ones_are_refused(is_consistent: bool) -> None:
+    rng = np.random.default_rng(5)
+    drive = looped(5, n_loops=10, n_laps=1.6)
+    true = list(drive.graph.loops)
+    expected = position_error(poses(drive.graph.optimize(covariances=False)), drive.truth)
+    twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
+    false = [
+        drive.loop(20 + 5 * k, 70 + 5 * k, T=twin)  # as on a street that looks alike
+        if is_consistent
+        else drive.loop(5 * k, 55 + 5 * k, T=se3.exp(rng.normal(size=6) * [1, 1, 1, 9, 9, 9]))
+        for k in range(10)
+    ]
+    drive.graph.loops = [*false, *true]
+    optimum = drive.graph.optimize(covariances=False)
+    assert [bool(loop.reason) for loop in optimum.loops] == [True] * 10 + [False] * 10
+    assert position_error(poses(optimum), drive.truth) < 1.05 * expected
+
+
+def test_loops_count_where_odometry_drifts_more_than_it_says() -> None:
+    drive = looped(1, bias=(0.01, 0.001))
+    loops, drive.graph.loops = drive.graph.loops, ()
+    before = position_error(poses(drive.graph.optimize(covariances=False)), drive.truth)
+    drive.graph.loops = loops
+    optimum = drive.graph.optimize()
+    assert not any(loop.reason for loop in optimum.loops)
+    assert position_error(poses(optimum), drive.truth) < before / 3.0
+    # and the covariances say so
+    assert np.mean(nees(optimum, drive.truth)) < 20.0
+
+
+def test_covariances_as_stated_are_left_where_loops_agree_with_them() -> None:
+    drive = looped(1, n_links=0)
+    covariances = np.array([each.covariance for each in drive.graph.optimize().estimates])
+    expected = whole(drive).covariances()[-1]
+    np.testing.assert_allclose(np.diag(covariances[-1]), np.diag(expected), rtol=0.05)
+
+
+def test_the_newest_pose_is_corrected_while_the_run_goes() -> None:
+    drives = [go_round(block(1.35, n_per_lap=N_LAP), N_LAP, bias=(0.0, 0.001))[0] for _ in range(2)]
+    T_map_world, again = (drive.graph.T_map_world for drive in drives)
+    np.testing.assert_array_equal(T_map_world, again)
+    end = drives[0].truth[-1:]
+    causal = position_error(drives[0].T[np.newaxis], end)
+    assert position_error((T_map_world @ drives[0].T)[np.newaxis], end) < 0.35 * causal
+
+
+def test_without_loops_nothing_is_optimized_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(graph: RunGraph) -> None:
+        raise AssertionError("not asked for")
+
+    monkeypatch.setattr(RunGraph, "_solve", refuse)
+    drive, _ = go_round(block(0.9, n_per_lap=N_LAP), N_LAP)
+    np.testing.assert_array_equal(drive.graph.T_map_world, np.eye(4))
+
+
+def test_a_failure_on_the_way_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(graph: RunGraph) -> None:
+        raise SmoothingError("singular")
+
+    monkeypatch.setattr(RunGraph, "_solve", fail)
+    with caplog.at_level(logging.WARNING):
+        drive, _ = go_round(block(1.6, n_per_lap=N_LAP), N_LAP)
+    assert "not corrected while the run goes: singular" in caplog.text
+    np.testing.assert_array_equal(drive.graph.T_map_world, np.eye(4))
+
+
+def test_a_map_does_not_grow_with_laps_of_the_same_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graph_module, "_N_LATEST", 10)
+    truth = block(8, n_per_lap=N_LAP, side_m=25.0)
+    drive, _ = go_round(truth, N_LAP, n_links=1)
+    (keyframes, edges, places), more = drive.sizes[4], drive.sizes[-1]
+    assert more[0] < keyframes + 10
+    assert more[1] < edges + 20
+    assert more[2] < places + 3
+    optimum = drive.graph.optimize()
+    assert len(optimum.estimates) == len(truth)
+    assert np.mean(nees(optimum, truth)) < 9.0
+    # no worse in the latest laps, which are merged with the first ones, than in these
+    first, latest = slice(0, 3 * N_LAP), slice(5 * N_LAP, None)
+    errors = [position_error(poses(optimum)[laps], truth[laps]) for laps in (first, latest)]
+    assert errors[1] < 1.3 * errors[0]
+
+
+@pytest.mark.acceptance
+def test_a_map_of_a_hundred_laps_is_that_of_a_few() -> None:
+    truth = block(100)
+    drive, detector = go_round(truth, 200)
+    optimum = drive.graph.optimize(covariances=False)
+    assert len(drive.graph) < 200
+    assert len(optimum.edges) < 400
+    assert len(detector) < 60
+    assert position_error(poses(optimum), truth) < 0.1
