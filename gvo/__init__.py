@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gvo.io.opening import RecordingOptions, open_recording
     from gvo.io.poses.inputs import read_ground_truth
     from gvo.io.synthetic.recording import SyntheticRecording
+    from gvo.odometry.loops import LoopDetector
     from gvo.odometry.odometry import Odometry
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import RunResult, run_recording
@@ -36,7 +37,9 @@ if TYPE_CHECKING:
         FaultyFrame,
         FrameResult,
         GraphEdge,
+        Loop,
         MotionPrior,
+        Optimum,
         PosePrior,
         PositionPrior,
         Rejected,
@@ -54,6 +57,7 @@ _MODULES = {
     "gvo.errors": ("GvoError",),
     "gvo.frontend.protocol": ("Frontend",),
     "gvo.geometry.camera": ("PinholeCamera", "StereoCamera"),
+    "gvo.odometry.loops": ("LoopDetector",),
     "gvo.odometry.odometry": ("Odometry",),
     "gvo.io.convert.convert": ("convert",),
     "gvo.viz.plots": ("plot_trajectories",),
@@ -76,7 +80,9 @@ _MODULES = {
         "FaultyFrame",
         "FrameResult",
         "GraphEdge",
+        "Loop",
         "MotionPrior",
+        "Optimum",
         "PosePrior",
         "PositionPrior",
         "Rejected",
@@ -100,8 +106,11 @@ __all__ = [
     "Frontend",
     "GraphEdge",
     "GvoError",
+    "Loop",
+    "LoopDetector",
     "MotionPrior",
     "Odometry",
+    "Optimum",
     "PinholeCamera",
     "PosePrior",
     "PositionPrior",

@@ -17,10 +17,12 @@ from gvo.cli.options import (
     Duration,
     Every,
     Left,
+    Loops,
     Right,
     Settings,
     Start,
     recording_options,
+    with_loops,
 )
 from gvo.cli.terminal import (
     Command,
@@ -67,6 +69,7 @@ def batch(
         ),
     ] = None,
     set_: Settings = None,
+    loops: Loops = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Worker processes here; one a core if omitted."),
@@ -100,7 +103,7 @@ def batch(
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
     excerpt = make_excerpt(start, duration, every)
     asked, files = _sort_arguments(recordings, configs)
-    variants = make_variants(files, set_ or [], sweep or [])
+    variants = make_variants(files, with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
     options = BatchOptions(
         recording=recording_options(

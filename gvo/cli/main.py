@@ -25,6 +25,7 @@ from gvo.cli.options import (
     Every,
     Force,
     Left,
+    Loops,
     Out,
     Recordings,
     Right,
@@ -34,6 +35,7 @@ from gvo.cli.options import (
     new_folder,
     open_source,
     recording_options,
+    with_loops,
 )
 from gvo.cli.terminal import (
     EXIT_FAULTS,
@@ -155,6 +157,7 @@ def run(
     rerun: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
     ] = None,
+    loops: Loops = None,
     with_report: Annotated[
         bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
     ] = True,
@@ -174,7 +177,7 @@ def run(
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
-    parameters = load(config, set_)
+    parameters = load(config, with_loops(set_, loops))
     excerpt = make_excerpt(start, duration, every)
     pose = None if initial_pose is None else parse_initial_pose(initial_pose)
     outputs = RunOutputs(

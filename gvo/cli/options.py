@@ -45,6 +45,17 @@ Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to re
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
 
 
+Loops = Annotated[
+    bool | None,
+    typer.Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled."),
+]
+
+
+def with_loops(settings: list[str] | None, loops: bool | None) -> list[str]:
+    """Return the settings, that of loops behind the others where it is given."""
+    return [*(settings or []), *([] if loops is None else [f"loops.enabled={str(loops).lower()}"])]
+
+
 def load(path: Path | None, settings: list[str] | None) -> Config:
     """Return the parameters of a file, changed by settings."""
     from gvo.config import load_configuration

@@ -142,7 +142,7 @@ def exit_code(is_complete: bool) -> int:
 def report(result: RunResult, out: Path) -> NoReturn:
     """Print the result of a run, and end with its exit code."""
     from gvo.frontend.calibration import describe_offsets
-    from gvo.io.run_folder.reader import verdict
+    from gvo.io.run_folder.reader import loop_words, verdict
     from gvo.trajectory.evaluation import format_evaluations
 
     for key in ("base_frame", "ground_truth"):
@@ -153,6 +153,9 @@ def report(result: RunResult, out: Path) -> NoReturn:
     if learnt:
         say(f"learnt of the camera: {learnt}")
     say(verdict(result.summary))
+    loops = loop_words(result.summary)
+    if loops:
+        say(loops)
     say(out if result.report is None else result.report)
     warn(result.warnings)
     raise typer.Exit(exit_code(result.is_complete))

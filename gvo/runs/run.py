@@ -35,7 +35,7 @@ from gvo.io.run_folder.writer import (
 )
 from gvo.runs.loop import RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.summary import RunningSummary, run_identity, summarize
+from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
 from gvo.trajectory.evaluation import Consistency, Evaluation, consistency, motions_of_chain
 from gvo.trajectory.formats import read_trajectory
@@ -54,7 +54,7 @@ class RunResult:
     summary : dict
         As written to `summary.json`.
     evaluations : tuple of Evaluation
-        Of raw, causal and smoothed; empty where they were not compared.
+        Of raw, causal, smoothed and global; empty where they were not compared.
     is_complete : bool
         Whether no frame is missing, all are tracked, and all was compared and drawn as asked.
     warnings : tuple of str
@@ -141,10 +141,11 @@ def run_recording(
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
             loop.run([folder, *others], summary)
-            loop.optimize()
+            optimum = loop.optimize()
             faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
         is_asked = ground_truth is not None
+        identity = {GLOBAL: optimum_json(optimum), "run": identity}
         result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
     if on_written is not None:
         on_written()
@@ -182,7 +183,7 @@ def _find_truth(
 def _conclude(
     loop: RunLoop,
     folder: RunFolder,
-    identity: dict[str, Any],
+    known: dict[str, Any],
     truth: Truth | Failure,
     notes: list[str],
     faults: list[str],
@@ -204,7 +205,7 @@ def _conclude(
         evaluations = compared.evaluations
     is_complete = loop.statistics.is_complete and not faults and bool(compared or not is_asked)
     summary = summarize(loop, compared, warnings)
-    summary |= {"is_complete": is_complete, "run": identity}
+    summary |= {"is_complete": is_complete, **known}
     summary |= _measure(folder, loop, compared)
     folder.write_summary(summary)
     return RunResult(

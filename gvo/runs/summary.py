@@ -6,6 +6,7 @@ import hashlib
 import resource
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import asdict, fields
@@ -25,7 +26,7 @@ from gvo.io.run_folder.writer import RunFolder
 from gvo.runs.loop import RunLoop
 from gvo.trajectory.evaluation import evaluations_json
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Failure, Progress
+from gvo.types import Failure, Optimum, Progress
 
 State: TypeAlias = Literal["running", "interrupted", "complete"]
 
@@ -79,6 +80,25 @@ def _truth_json(compared: TruthComparison | Failure) -> dict[str, Any]:
         "T_base_truth": truth.T_base_point.tolist(),
         "ground_truth_stamps_from": truth.trajectory.stamps_from,
         "errors": evaluations_json(compared.evaluations)["estimates"],
+    }
+
+
+def optimum_json(optimum: Optimum | None) -> dict[str, Any] | None:
+    """Return what `summary.json` tells of the global poses; None without them."""
+    if optimum is None:
+        return None
+    refused = Counter(loop.reason for loop in optimum.loops)
+    return {
+        "keyframes": len(optimum.keyframes_ns),
+        "edges": len(optimum.edges),
+        "loops": {
+            "found": len(optimum.loops),
+            "counted": refused.pop("", 0),
+            "refused": dict(refused),
+        },
+        "error_before": float(optimum.error_before),
+        "error": float(optimum.error),
+        "iterations": optimum.n_iterations,
     }
 
 

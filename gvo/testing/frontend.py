@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gvo.frontend.calibration import RigOffsets
-from gvo.frontend.protocol import CheckedFrontend, Frontend, find_fault
+from gvo.frontend.protocol import CheckedFrontend, Frontend, Recognizer, find_fault
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (
@@ -36,6 +36,7 @@ _SHIFT_PX = 3
 _SHIFT_DEPTH_M = 5.0
 # How deep a fingerprint looks into what a value is made of.
 _MAX_DEPTH = 6
+_MAX_PLACE_BYTES = 100_000
 
 
 class ContractError(AssertionError):
@@ -55,7 +56,9 @@ def check_frontend(
     - it maps the current frame to the reference, not the other way round (camera images only);
     - the same call gives the same result, bit for bit, and changes none of its arguments;
     - where nothing can be seen there is a falsy `Failure` with a reason, and no exception;
-    - `relocalize`, where it has one, fails or says the same as `register`, within 5 sigma.
+    - `relocalize`, where it has one, fails or says the same as `register`, within 5 sigma;
+    - `describe` and `recognize`, where it has them, give places of at most 100 kB, in which the
+      same frame is recognized, within 5 sigma of where it is, and frames without anything are not.
 
     Differences below 0.1 mrad and 1 mm count as none.
 
@@ -99,6 +102,7 @@ def check_frontend(
         for pair, result in zip(pairwise(observations), results, strict=True):
             _check_relocalization(CheckedFrontend(frontend), result, *pair)
     for nothing in _without_anything(frames[0], frames[-1], blank):
+        _check_places(CheckedFrontend(frontend).recognizer, observations[0], nothing)
         _check_nothing_seen(frontend, observations[0], nothing)
 
 
@@ -133,9 +137,11 @@ def _check_capabilities(frontend: Frontend[Any]) -> None:
             value is None or isinstance(value, kinds),
             f"{name} is a {type(value).__name__}, which is none of {kinds}",
         )
-    for name in ("relocalize", "reconfigure"):
+    for name in ("relocalize", "reconfigure", "describe", "recognize"):
         method = getattr(frontend, name, None)
         _require(method is None or callable(method), f"{name} must be a method")
+    is_there = [getattr(frontend, name, None) is not None for name in ("describe", "recognize")]
+    _require(is_there[0] == is_there[1], "of describe and recognize, one needs the other")
 
 
 def _register(
@@ -240,6 +246,40 @@ def _check_relocalization(
         se3.invert(result.T_reference_current) @ first.T_reference_current,
         result.covariance + first.covariance,
     )
+
+
+def _check_places(recognizer: Recognizer | None, observations: Stamped, frame: Stamped) -> None:
+    """Recognize a frame in its own place, and one without anything not."""
+    if recognizer is None:
+        return
+    name = f"recognize of the frame at {observations.stamp_ns} in its own place"
+    place, nothing = _place_of(recognizer, observations), recognizer.extract(frame)
+    result = recognizer.recognize(place, place, observations)
+    if isinstance(result, Failure):
+        raise ContractError(f"{name} fails: {result.reason}")
+    _require(not find_fault(result), f"{name}: {find_fault(result)}")
+    _check_agreement(name, result.T_reference_current, result.covariance)
+    result = recognizer.recognize(place, _place_of(recognizer, nothing), nothing)
+    _require(
+        isinstance(result, Failure),
+        f"frames without anything in common ({observations.stamp_ns}, {frame.stamp_ns}) are "
+        "recognized",
+    )
+
+
+def _place_of(recognizer: Recognizer, observations: Stamped) -> Any:  # noqa: ANN401
+    name = f"describe of the frame at {observations.stamp_ns}"
+    place, again = (recognizer.describe(observations) for _ in range(2))
+    _require(fingerprint(place) == fingerprint(again), f"{name} gives another place when repeated")
+    absent = [
+        attribute
+        for attribute in ("stamp_ns", "points_cam", "descriptors_left")
+        if getattr(place, attribute, None) is None
+    ]
+    _require(not absent, f"{name} gives a place without {', '.join(absent)}")
+    n_bytes = sum(len(part) for part in _parts(place, _MAX_DEPTH))
+    _require(n_bytes <= _MAX_PLACE_BYTES, f"{name} gives a place of {1e-3 * n_bytes:.0f} kB")
+    return place
 
 
 def _check_agreement(name: str, difference: FloatArray, covariance: FloatArray) -> None:

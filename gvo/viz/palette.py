@@ -7,9 +7,10 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-# Okabe and Ito's colours; black is the reference's
-ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73", "global": "#CC79A7"}
-"""Of the three trajectories of a run."""
+# Okabe and Ito's colours, and a violet that every kind of colour blindness tells from them; black
+# is the reference's
+ESTIMATES = {"raw": "#E69F00", "causal": "#56B4E9", "smoothed": "#009E73", "global": "#7F2CCB"}
+"""Of the four trajectories of a run."""
 OTHERS = ("#0072B2", "#D55E00", "#CC79A7", "#999999")
 """Of other estimates, in turn."""
 REFERENCE = "#000000"
@@ -53,9 +54,17 @@ class Style:
     linestyle: str = "-"
     linewidth: float = 1.2
     zorder: float = 2.0
+    marker: str = ""
+    markersize: float = 3.0
 
 
 REFERENCE_STYLE = Style(color="black", linestyle="--", zorder=3.0)
+LOOP_STYLES = {
+    # Both ends may lie on one point of the picture.
+    "loops": Style(color=ESTIMATES["global"], linewidth=0.7, zorder=2.5, marker="o"),
+    "refused loops": Style(color=REFUSED, linestyle="--", linewidth=0.7, zorder=1.4),
+}
+"""Of the lines between both ends of loops."""
 
 
 def styles_of(names: Iterable[str]) -> list[Style]:
@@ -64,7 +73,7 @@ def styles_of(names: Iterable[str]) -> list[Style]:
     Parameters
     ----------
     names : iterable of str
-        Names with the word "raw", "causal" or "smoothed" have fixed colours.
+        Names with the word "raw", "causal", "smoothed" or "global" have fixed colours.
 
     Examples
     --------

@@ -58,7 +58,7 @@ def plot_trajectories(
     reference : Trajectory or None
         Without one, positions over time are drawn instead of errors.
     estimates : mapping of str to Trajectory
-        By name, at least one; "raw", "causal" and "smoothed" have fixed colours.
+        By name, at least one; "raw", "causal", "smoothed" and "global" have fixed colours.
     align : {"none", "origin", "se3", "sim3"}
         Alignment of each estimate with the reference.
 

@@ -102,10 +102,11 @@ def test_configurations_and_sweeps_are_all_pairs(
 
 
 def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path: Path) -> None:
-    options = ["--set", "window.size=3", "--every", "2", "--duration", "10"]
+    options = ["--set", "window.size=3", "--no-loops", "--every", "2", "--duration", "10"]
     assert batch(bags / "walk0.mcap", "--out", tmp_path, *options).code == 0
     summary = read_run(tmp_path / "walk0").summary
     assert summary["configuration"]["window"]["size"] == 3
+    assert not summary["configuration"]["loops"]["enabled"]
     assert summary["frames"] == 4
 
 

@@ -151,6 +151,31 @@ def test_settings_reach_the_run(command: Command, room_bag: Path, tmp_path: Path
     assert all(int(row.split(",")[2]) <= 400 for row in rows)
 
 
+def test_a_run_leaves_loops_where_that_is_asked_for(
+    command: Command, room_bag: Path, tmp_path: Path
+) -> None:
+    options = ["--no-report", "--duration", "0.3"]
+    same = "; global is the batch optimum of the same edges\n"
+    for out, given, is_global in (
+        ("a", ["--set", "loops.enabled=false", "--loops"], True),
+        ("b", ["--no-loops"], False),
+    ):
+        answer = command("run", room_bag, "--out", tmp_path / out, *options, *given)
+        summary = json.loads((tmp_path / out / "summary.json").read_text())
+        assert answer.code == 0, answer.err
+        assert (tmp_path / out / "global.txt").exists() == is_global
+        assert (f"no loop found{same}" in answer.out) == is_global
+        assert summary["configuration"]["loops"]["enabled"] == is_global
+        assert (summary["global"] is not None) == is_global
+        assert ("global" in {row["name"] for row in summary["errors"]}) == is_global
+    told = json.loads((tmp_path / "a" / "summary.json").read_text())["global"]
+    lines = (tmp_path / "a" / "graph.g2o").read_text().splitlines()
+    assert told["keyframes"] == sum(line.startswith("VERTEX") for line in lines) > 0
+    assert told["edges"] == sum(line.startswith("EDGE") for line in lines) > 0
+    assert told["loops"] == {"found": 0, "counted": 0, "refused": {}}
+    assert told["error"] <= told["error_before"]
+
+
 def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path: Path) -> None:
     command("run", "--no-report", room_bag, "--out", tmp_path)
     answer = command("compare", room_bag, tmp_path / "raw.txt", tmp_path / "smoothed.txt", "--json")

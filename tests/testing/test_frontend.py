@@ -194,9 +194,37 @@ class ChangesObservations(ExtractsAtRandom):
         return result
 
 
+def with_places(**methods: Any) -> KltFrontend:
+    """Return a front-end with other methods of places."""
+    kind: type[KltFrontend] = type("Places", (KltFrontend,), methods)
+    return kind(recording("stereo").info.camera, configure())
+
+
+def as_large_as_images(frontend: KltFrontend, observations: KltObservations) -> Any:
+    place = KltFrontend.describe(frontend, observations)
+    return replace(place, patches=np.repeat(place.patches, 40, axis=0))
+
+
+def recognize_anything(*_: Any) -> RelativePose:
+    return RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6))
+
+
+def recognize_elsewhere(frontend: KltFrontend, *places: Any) -> Result:
+    found = KltFrontend.recognize(frontend, *places)
+    if isinstance(found, Failure):
+        return found
+    return replace(found, T_reference_current=offset(found.T_reference_current))
+
+
 @pytest.mark.parametrize(
     ("frontend", "reason"),
     [
+        (with_places(describe=None), "of describe and recognize, one needs the other"),
+        (with_places(describe=as_large_as_images), r"describe.* gives a place of \d{3,} kB"),
+        (with_places(describe=lambda _, it: Scan(it.stamp_ns, np.eye(4))), "without points_cam"),
+        (with_places(recognize=lambda *_: Failure(reason="dark")), "in its own place fails: dark"),
+        (with_places(recognize=recognize_elsewhere), "in its own place disagree by"),
+        (with_places(recognize=recognize_anything), "in common .* are recognized"),
         (spoil_pose(se3.invert), "maps the current frame to the reference"),
         (spoil_pose(offset), "with itself and the identity disagree"),
         (spoil_pose(scaled), "holds no rotation"),

@@ -33,6 +33,7 @@ _COLUMNS: tuple[tuple[str, Callable[[BatchRow], float | None], str], ...] = (
     ("segments", lambda row: row.segments, "d"),
     ("ATE raw [m]", lambda row: row.ate_raw_m, ".4g"),
     (_ATE, lambda row: row.ate_smoothed_m, ".4g"),
+    ("ATE global [m]", lambda row: row.ate_global_m, ".4g"),
     ("RPE [m]", lambda row: row.rpe_smoothed_m, ".4g"),
     ("RPE [deg]", lambda row: row.rpe_smoothed_deg, ".4g"),
     ("t_err [%]", lambda row: row.t_smoothed_percent, ".4g"),

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from gvo._text import read_text
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
-from gvo.io.run_folder.writer import GLOBAL, TRAJECTORIES, TRUE_POSITIONS, TRUTH
+from gvo.io.run_folder.writer import GLOBAL, LOOPS, TRAJECTORIES, TRUE_POSITIONS, TRUTH
 from gvo.trajectory.formats import MAX_POSITION_M, read_covariances, read_trajectory
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
@@ -88,6 +88,42 @@ class TimingTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopTable:
+    """What `loops.csv` holds, a row per loop.
+
+    Parameters
+    ----------
+    stamps_ns, reference_ns : ndarray of int64, shape (m,)
+        Stamps of the two frames, nanoseconds.
+    n_inliers : ndarray of int64, shape (m,)
+    residuals : ndarray of float64, shape (m,)
+        Norms of the whitened residuals.
+    reasons : tuple of str
+        Why a loop does not count; empty where it does.
+    """
+
+    stamps_ns: IntArray
+    reference_ns: IntArray
+    n_inliers: IntArray
+    residuals: FloatArray
+    reasons: tuple[str, ...]
+
+    def lines_on(self, trajectory: Trajectory) -> dict[str, FloatArray]:
+        """Return the lines between both ends, shape (n, 2, 3), metres, without what has no pose.
+
+        By "loops" and "refused loops".
+        """
+        ends_ns = np.stack([self.reference_ns, self.stamps_ns], axis=1)
+        is_there = np.isin(ends_ns, trajectory.stamps_ns).all(axis=1)
+        is_refused = np.array([bool(reason) for reason in self.reasons], dtype=np.bool_)
+        lines = {}
+        for name, is_such in (("loops", ~is_refused), ("refused loops", is_refused)):
+            rows = np.searchsorted(trajectory.stamps_ns, ends_ns[is_there & is_such])
+            lines[name] = trajectory.positions[rows]
+        return lines
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunRecord:
     """A run folder.
 
@@ -102,6 +138,8 @@ class RunRecord:
         None where the folder holds no such table, as that of `gvo smooth`.
     timings : TimingTable or None
         Likewise.
+    loops : LoopTable or None
+        None where no global poses were written.
     trajectories : dict of str to Trajectory
         "raw", "causal" and "smoothed", with covariances where the run computed them; may be
         empty, as "causal" where all was optimized at once. "global" where there is one.
@@ -114,6 +152,7 @@ class RunRecord:
     frames: FrameTable
     edges: EdgeTable | None
     timings: TimingTable | None
+    loops: LoopTable | None
     trajectories: dict[str, Trajectory]
     truth: Trajectory | None
 
@@ -175,6 +214,7 @@ def read_run(folder: str | Path) -> RunRecord:
         frames=_read_frames(folder / "frames.csv"),
         edges=_read_edges(folder / "edges.csv"),
         timings=_read_timings(folder / "timings.csv"),
+        loops=_read_loops(folder / LOOPS),
         trajectories=trajectories,
         truth=_read_truth(folder, summary),
     )
@@ -285,6 +325,19 @@ def _read_timings(path: Path) -> TimingTable | None:
     )
 
 
+def _read_loops(path: Path) -> LoopTable | None:
+    rows = _rows(path, ("stamp_ns", "reference_ns", "n_inliers", "residual", "reason"))
+    if rows is None:
+        return None
+    return LoopTable(
+        stamps_ns=_integers(path, rows, "stamp_ns"),
+        reference_ns=_integers(path, rows, "reference_ns"),
+        n_inliers=_integers(path, rows, "n_inliers"),
+        residuals=_floats(path, rows, "residual"),
+        reasons=tuple(row["reason"] for row in rows),
+    )
+
+
 def _read_estimate(folder: Path, name: str) -> Trajectory:
     """Read poses and covariances; in the middle of a run either may be a line ahead."""
     if not (folder / f"{name}.txt").is_file():
@@ -369,14 +422,40 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _how_good(summary: Mapping[str, Any]) -> str:
     errors = {row["name"]: row for row in summary.get("errors", ())}
-    if "smoothed" in errors:
-        n, n_true = summary["frames"], errors["smoothed"]["n"]
+    is_closed = GLOBAL in errors and _n_closed(summary) > 0
+    best = errors.get(GLOBAL if is_closed else "smoothed")
+    if best is not None:
+        n, n_true = summary["frames"], best["n"]
         where = "" if n_true >= 0.9 * n else f", known of {n_true} frames"
-        return f"{errors['smoothed']['ate_m']:.2g} m from the truth{where}"
+        how = " with loops closed" if is_closed else ""
+        return f"{best['ate_m']:.2g} m from the truth{how}{where}"
     if any(str(each).startswith("not compared") for each in summary.get("warnings", ())):
         return "not compared with the truth"
     is_over = summary.get("state", "complete") == "complete"
     return "no truth to compare with" if is_over else ""
+
+
+def _n_closed(summary: Mapping[str, Any]) -> int:
+    return int(((summary.get(GLOBAL) or {}).get("loops") or {}).get("counted", 0))
+
+
+def loop_words(summary: Mapping[str, Any]) -> str:
+    """Say how many loops were closed, and why others were not; empty without global poses.
+
+    Parameters
+    ----------
+    summary : mapping
+        As `summary.json` holds it.
+    """
+    loops = (summary.get(GLOBAL) or {}).get("loops")
+    if loops is None:
+        return ""
+    n, refused = loops["counted"], loops["refused"]
+    words = f"{n or 'no'} loop{'s' if n > 1 else ''} {'closed' if loops['found'] else 'found'}"
+    if refused:
+        reasons = ", ".join(f"{count}: {reason}" for reason, count in refused.items())
+        words += f", {sum(refused.values())} refused ({reasons})"
+    return words if n else f"{words}; global is the batch optimum of the same edges"
 
 
 def _how_sure(summary: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from gvo.viz.palette import REFERENCE_STYLE, Style, styles_of
+from gvo.viz.palette import LOOP_STYLES, REFERENCE_STYLE, Style, styles_of
 from gvo.viz.plots import HOLLOW, is_of_camera, plain
 from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left, new_figure
 
@@ -79,6 +79,19 @@ def lines_of(reference: Trajectory | None, estimates: Mapping[str, Trajectory]) 
     return lines
 
 
+def loop_lines(ends: Mapping[str, FloatArray]) -> list[Line]:
+    """Return the lines between both ends of loops, shape (n, 2, 3) by a name of `LOOP_STYLES`."""
+    return [
+        Line(
+            name=f"{name} ({len(segments)})",
+            points=np.insert(segments, 2, np.nan, axis=1).reshape(-1, 3),
+            style=LOOP_STYLES[name],
+        )
+        for name, segments in ends.items()
+        if len(segments) > 0
+    ]
+
+
 def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
     """Return the views from above, from the side and in space."""
     scale = "Both axes have one scale; the circle is the start."
@@ -108,9 +121,12 @@ def path_plots(lines: Sequence[Line], world: World) -> list[Plot]:
 
 
 def _good_words(lines: Sequence[Line]) -> str:
+    words = "Without ground truth, look for jumps and for a path that cannot be what was driven."
     if any(line.name == "truth" for line in lines):
-        return "In a good run the estimates lie on the dashed ground truth at this scale."
-    return "Without ground truth, look for jumps and for a path that cannot be what was driven."
+        words = "In a good run the estimates lie on the dashed ground truth at this scale."
+    if any(line.style in LOOP_STYLES.values() for line in lines):
+        words += " Thin lines join both ends of a loop, dashed where it was refused."
+    return words
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from gvo._text import html_text, number_text
 from gvo.config import Config
 from gvo.errors import TrajectoryError
 from gvo.frontend.calibration import describe_offsets
-from gvo.io.run_folder.reader import RunRecord, verdict
+from gvo.io.run_folder.reader import LoopTable, RunRecord, loop_words, verdict
 from gvo.trajectory.evaluation import consistency, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.report.comparison import truth_around
@@ -27,10 +27,12 @@ from gvo.viz.report.page import (
     table_html,
     write_page,
 )
-from gvo.viz.report.paths import Line, World, lines_of, path_plots
-from gvo.viz.report.sheets import Plot, settings, write_plots
+from gvo.viz.report.paths import Line, World, lines_of, loop_lines, path_plots
+from gvo.viz.report.sheets import Plot, elapsed, settings, write_plots
 
 _TRUTH_PLOTS = ("errors_over_time", "errors_over_distance", "drift", "covariance")
+_LOOP_COLUMNS = ("at [s]", "place of [s]", "inliers", "residual", "why refused")
+_MAX_LOOPS = 20
 _ERROR_COLUMNS = {
     "ate_m": "ATE RMSE [m]",
     "rpe_m": "RPE [m]",
@@ -82,6 +84,9 @@ def write_run_report(
     compared, reason = _compare(record, estimates)
     with settings():
         lines, world = _lines(record, estimates, compared)
+        if record.loops is not None and "global" in estimates:
+            shown = {"global": estimates["global"]} | {c.name: c.trajectory for c in compared}
+            lines += loop_lines(record.loops.lines_on(shown["global"]))
         sheets = [
             *_path_plots(lines, world),
             *_truth_plots(record, compared, reason),
@@ -165,6 +170,8 @@ def _head(record: RunRecord) -> list[str]:
     parts = [f"<h1>{html_text(record.name)}</h1>"]
     if "frames" in summary:
         parts.append(f'<p class="verdict">{html_text(verdict(summary))}</p>')
+    if loop_words(summary):
+        parts.append(f"<p>{html_text(loop_words(summary))}.</p>")
     if not record.is_finished:
         parts.append(
             '<p class="absent">This run has not ended: it is running or was interrupted. '
@@ -184,8 +191,34 @@ def _head(record: RunRecord) -> list[str]:
 def _tail(record: RunRecord) -> list[str]:
     summary = record.summary
     return [
+        *_loops(record.loops, _first_ns(record)),
         list_html("Decisions", map(str, summary.get("decisions", ()))),
         configuration_html(summary.get("configuration", {}), Config().model_dump()),
+    ]
+
+
+def _loops(loops: LoopTable | None, first_ns: int) -> list[str]:
+    """Return the table of loops; of many, some all over the run."""
+    if loops is None or not loops.reasons:
+        return []
+    n = len(loops.reasons)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, _MAX_LOOPS)).round().astype(np.int64))
+    ends = (elapsed(stamps_ns, first_ns) for stamps_ns in (loops.stamps_ns, loops.reference_ns))
+    columns = (
+        *([f"{end_s:.1f}" for end_s in each] for each in ends),
+        [str(count) for count in loops.n_inliers],
+        [number_text(float(residual)) for residual in loops.residuals],
+        loops.reasons,
+    )
+    rows = [[column[index] for column in columns] for index in chosen]
+    rest = f"; {n - len(chosen)} more are in loops.csv" if n > len(chosen) else ""
+    note = (
+        "Frames that were registered against a place of long before. The residual is the norm of "
+        f"the whitened one, about 2.4 where the covariances fit{rest}."
+    )
+    return [
+        f'<section id="loops">\n<h2>Loops</h2>\n<p class="note">{note}</p>\n'
+        f"{table_html(_LOOP_COLUMNS, rows)}</section>"
     ]
 
 

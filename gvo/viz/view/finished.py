@@ -12,6 +12,7 @@ import viser
 
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.run_folder.writer import GLOBAL
 from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
@@ -38,7 +39,8 @@ N_ELLIPSOIDS = 60
 _MAX_START_SIGMAS = 10
 # Largest half axis at first, as a share of the extent of the path.
 _ELLIPSOID_SHARE = 0.07
-_PATHS = ("raw", "causal", "smoothed")
+_PATHS = ("raw", "causal", "smoothed", "global")
+_DRAWN = {*_PATHS, "truth", "ellipsoids", "loops", "refused loops"}
 _NOT_RECORDED = {"keyframes", "links", "image", "points", "cloud"}
 
 
@@ -104,6 +106,10 @@ class FinishedPage:
         self._server = server
         self._record = record
         self._truth = aligned_truth(record)
+        self._absent = {*_NOT_RECORDED}
+        self._absent |= set() if self._truth is not None else {"truth"}
+        if GLOBAL not in record.trajectories:
+            self._absent |= {GLOBAL, "loops", "refused loops"}
         up = world_up(record)
         self.scene = Scene(server.scene, up=up)
         self._add_frame_panel()
@@ -114,7 +120,7 @@ class FinishedPage:
         self._sigmas = add_scene_controls(
             server.gui,
             self.scene,
-            without=_NOT_RECORDED if self._truth is not None else {*_NOT_RECORDED, "truth"},
+            without=self._absent,
             n_sigmas=start_sigmas(record),
             redraw=self._painter.offer,
         )
@@ -142,9 +148,14 @@ class FinishedPage:
         with self._server.atomic():
             self.playback.show(index)
             self._numbers.content = numbers_html(self._rows(index, stamp_ns))
-            for name in _PATHS:
-                trajectory = self._record.trajectories[name]
-                self.scene.show_path(name, trajectory.positions[trajectory.stamps_ns <= stamp_ns])
+            past = {
+                name: trajectory.select(trajectory.stamps_ns <= stamp_ns)
+                for name, trajectory in self._record.trajectories.items()
+            }
+            for name, trajectory in past.items():
+                self.scene.show_path(name, trajectory.positions)
+            if self._record.loops is not None and GLOBAL in past:
+                self.scene.show_links(self._record.loops.lines_on(past[GLOBAL]))
             if self._truth is not None:
                 is_past = self._truth.stamps_ns <= stamp_ns
                 self.scene.show_path("truth", self._truth.positions[is_past])
@@ -157,8 +168,8 @@ class FinishedPage:
     def _add_frame_panel(self) -> None:
         with add_frame_panel(self._server):
             self._numbers = self._server.gui.add_html("")
-            names = [*_PATHS, *(["truth"] if self._truth is not None else []), "ellipsoids"]
-            self._server.gui.add_html(legend_html(name for name in COLOURS if name in names))
+            shown = _DRAWN - self._absent
+            self._server.gui.add_html(legend_html(name for name in COLOURS if name in shown))
 
     def _show_all(self) -> None:
         """Choose sizes and the view by the whole path."""

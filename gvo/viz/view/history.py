@@ -219,6 +219,17 @@ class History:
             stamps_ns, T_world_frame = self._smoothed()
             return stamps_ns, T_world_frame[:, :3, 3]
 
+    def loop_lines(self) -> FloatArray:
+        """Return both ends of the loops so far as of the frame shown, shape (n, 2, 3), metres."""
+        with self._lock:
+            told = self._told[: self._shown + 1 - self.first_index]
+            loops = [loop for _, result, _ in told if result is not None for loop in result.loops]
+            if not loops:
+                return np.zeros((0, 2, 3))
+            stamps_ns, T_world_frame = self._smoothed()
+            ends_ns = [(loop.reference_ns, loop.stamp_ns) for loop in loops]
+            return T_world_frame[np.searchsorted(stamps_ns, ends_ns), :3, 3]
+
     def accumulated_cloud(self) -> Cloud:
         """Return the points of all keyframes in the world, metres, and their colours, RGB.
 

@@ -9,7 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from gvo.types import FloatArray
-from gvo.viz.palette import ESTIMATES, LINKS, OTHERS, REFERENCE, REFUSED
+from gvo.viz.palette import ESTIMATES, LINKS, LOOP_STYLES, OTHERS, REFERENCE, REFUSED
 
 COLOURS = {
     **ESTIMATES,
@@ -20,6 +20,7 @@ COLOURS = {
     "depth": LINKS["depth"],
     "standstill": LINKS["standstill"],
     "refused": REFUSED,
+    **{name: style.color for name, style in LOOP_STYLES.items()},
     "ellipsoids": OTHERS[3],
 }
 """By name of what is drawn."""

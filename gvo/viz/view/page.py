@@ -79,6 +79,8 @@ class Page:
         self._server = server
         self._player = player
         self._truth = None if truth is None else TruthPath(truth)
+        # Refused loops and global poses come at the end of a run.
+        self._absent = {"global", "refused loops"} | ({"truth"} if truth is None else set())
         self._shown_cloud: tuple[int, int] | None = None
         self._placed_for: int | None = None
         self._refusal = ""
@@ -135,7 +137,7 @@ class Page:
             self._message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
             start = {"frame": f"the first of {self._player.n_frames} is coming"}
             self._numbers = gui.add_html(numbers_html(start))
-            hidden = {"standstill", "global"} | (set() if self._truth is not None else {"truth"})
+            hidden = {"standstill", *self._absent}
             gui.add_html(legend_html(name for name in COLOURS if name not in hidden))
 
     def _add_main_panel(self) -> None:
@@ -152,7 +154,7 @@ class Page:
         self._sigmas = add_scene_controls(
             gui,
             self.scene,
-            without=() if self._truth is not None else ("truth",),
+            without=self._absent,
             n_sigmas=_START_SIGMAS,
             redraw=lambda: self._painter.offer(),
         )
@@ -227,7 +229,7 @@ class Page:
         poses = frame.window_poses
         keyframes = [poses[stamp] for stamp in frame.keyframes if stamp in poses]
         self.scene.show_keyframes(np.array(keyframes).reshape(-1, 4, 4))
-        self.scene.show_links(_link_lines(frame))
+        self.scene.show_links({**_link_lines(frame), "loops": self._player.history.loop_lines()})
         stamps = [stamp for stamp in frame.window_covariances if stamp in poses]
         self.scene.show_ellipsoids(
             np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4),

@@ -38,6 +38,8 @@ _MEANINGS = {
     "depth": "link by depth alone",
     "standstill": "link without motion",
     "refused": "link that the window refused",
+    "loops": "a place seen again",
+    "refused loops": "a place that is none, or another one",
     "ellipsoids": "position covariances",
 }
 

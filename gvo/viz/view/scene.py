@@ -14,15 +14,20 @@ from gvo.types import FloatArray, ImageArray, IntArray
 from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, add_points, rgb
 
 Up = Literal["-y", "+z"]
-LINKS = ("step", "keyframe link", "depth", "standstill", "refused")
+_LINES = {
+    **dict.fromkeys(("step", "keyframe link", "depth", "standstill", "refused"), "links"),
+    **dict.fromkeys(("loops", "refused loops"), "loops"),
+}
+LINKS = tuple(_LINES)
 """Kinds of lines between poses."""
 
-_PATHS = ("raw", "causal", "smoothed", "truth")
+_PATHS = ("raw", "causal", "smoothed", "global", "truth")
 # Where in the scene each layer hangs; what is below a hidden node is hidden.
 _NODES = {
     **{name: f"/paths/{name}" for name in _PATHS},
     "keyframes": "/keyframes",
     "links": "/links",
+    "loops": "/loops",
     "ellipsoids": "/ellipsoids",
     "image": "/camera/image",
     "points": "/camera/points",
@@ -62,8 +67,8 @@ class Scene:
         }
         self._cloud = Cloud(scene, _NODES["cloud"])
         self._links = {
-            name: Segments(scene, f"/links/{name.replace(' ', '_')}", COLOURS[name])
-            for name in LINKS
+            name: Segments(scene, f"{_NODES[layer]}/{name.replace(' ', '_')}", COLOURS[name])
+            for name, layer in _LINES.items()
         }
         self._keyframes = Segments(scene, "/keyframes/cameras", COLOURS["keyframes"])
         self._ellipsoids: Any = None
@@ -118,7 +123,7 @@ class Scene:
         )
 
     def show_path(self, name: str, positions_world: FloatArray) -> None:
-        """Draw a path: raw, causal, smoothed or truth.
+        """Draw a path: raw, causal, smoothed, global or truth.
 
         Parameters
         ----------

@@ -79,6 +79,26 @@ def _part(record: RunRecord, name: str) -> Sized:
     return parts[name]
 
 
+def test_loops_are_lines_between_their_poses(copy: Path) -> None:
+    trajectory = read_run(copy).trajectories["global"]
+    stamps_ns = trajectory.stamps_ns.tolist()
+    rows = [(5, 1, ""), (4, 0, "odd"), (5, 2, "")]
+    table = [f"{stamps_ns[end]},{stamps_ns[start]},9,1.5,{why}" for end, start, why in rows]
+    header = "stamp_ns,reference_ns,n_inliers,residual,reason"
+    (copy / "loops.csv").write_text("\n".join([header, *table, ""]))
+    loops = read_run(copy).loops
+    assert loops is not None
+    assert loops.reasons == ("", "odd", "")
+    assert loops.n_inliers.tolist() == [9, 9, 9]
+    lines, at = loops.lines_on(trajectory), trajectory.positions
+    np.testing.assert_array_equal(lines["loops"], [at[[1, 5]], at[[2, 5]]])
+    np.testing.assert_array_equal(lines["refused loops"], [at[[0, 4]]])
+    # Up to the fifth frame.
+    until = loops.lines_on(trajectory.select(slice(0, 5)))
+    assert {name: len(ends) for name, ends in until.items()} == {"loops": 0, "refused loops": 1}
+    assert [len(ends) for ends in loops.lines_on(trajectory.select(slice(0, 0))).values()] == [0, 0]
+
+
 def test_smoothed_poses_may_come_in_any_order(copy: Path) -> None:
     path = copy / "smoothed.txt"
     expected = read_run(copy).trajectories["smoothed"]
@@ -124,6 +144,7 @@ def test_positions_are_read_as_such_and_estimates_moved_to_their_point(copy: Pat
         ("edges.csv", "stamp_ns\n1\n", RecordingError, "no column reference_ns"),
         ("timings.csv", "stamp_ns,read_ms\n1,fast\n", RecordingError, "fast"),
         ("timings.csv", "stamp_ns,read_ms\n1\n", RecordingError, "expected 2 fields"),
+        ("loops.csv", "stamp_ns,reference_ns\n1,2\n", RecordingError, "no column n_inliers"),
         ("raw.txt", "0.000000000 1 2 3\n", TrajectoryError, "raw.txt:1: expected 8 columns, got 4"),
         ("raw.txt", "a b\n", TrajectoryError, "raw.txt:1"),
         ("raw.txt", "0.000000000 0 0 0 0 0 0 0\n", TrajectoryError, "raw.txt"),

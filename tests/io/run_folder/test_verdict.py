@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gvo.io.run_folder.reader import verdict
+from gvo.io.run_folder.reader import loop_words, verdict
 
 
 def row(nees: float, *, error_m: float = 0.05, motion: str = "window over 1 s") -> dict[str, Any]:
@@ -39,6 +39,15 @@ def without_truth(**changes: Any) -> dict[str, Any]:
     return summary(errors=[], covariances=[], **changes)
 
 
+def optimum(counted: int, **refused: int) -> dict[str, Any]:
+    n_found = counted + sum(refused.values())
+    return {"loops": {"found": n_found, "counted": counted, "refused": refused}}
+
+
+CLOSED = [
+    {"name": "smoothed", "n": 393, "ate_m": 0.304},
+    {"name": "global", "n": 393, "ate_m": 0.1},
+]
 LOOK = "frames.csv, which says why frames are not tracked"
 LEARNT = "(learnt and corrected)"
 CASES = [
@@ -98,6 +107,15 @@ CASES = [
         "298 m in 393 frames, all tracked; 0.0039 m from the truth, known of 64 frames; "
         "covariances fit.",
     ),
+    # global poses are the best where loops were closed, and else as good as the smoothed ones
+    (
+        summary(errors=CLOSED, covariances=[], **{"global": optimum(3, odd=2)}),
+        "298 m in 393 frames, all tracked; 0.1 m from the truth with loops closed.",
+    ),
+    (
+        summary(errors=CLOSED, covariances=[], **{"global": optimum(0, odd=2)}),
+        "298 m in 393 frames, all tracked; 0.3 m from the truth.",
+    ),
     # positions without rotations say nothing of covariances
     (
         summary(covariances=[]),
@@ -110,6 +128,24 @@ CASES = [
 def test_the_verdict_says_how_far_and_how_good(told: dict[str, Any], words: str) -> None:
     assert verdict(told) == words
     assert verdict(json.loads(json.dumps(told))) == words
+
+
+SAME = "global is the batch optimum of the same edges"
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (None, ""),
+        (optimum(0), f"no loop found; {SAME}"),
+        (optimum(0, odd=2), f"no loop closed, 2 refused (2: odd); {SAME}"),
+        (optimum(1), "1 loop closed"),
+        (optimum(31, odd=18, alone=2), "31 loops closed, 20 refused (18: odd, 2: alone)"),
+    ],
+)
+def test_loops_are_counted_in_a_line(told: dict[str, Any] | None, words: str) -> None:
+    assert loop_words({"global": told}) == words
+    assert loop_words({}) == ""
 
 
 FIT = "covariances fit"

@@ -62,6 +62,7 @@ def make_long_run(folder: Path, n_frames: int) -> RunRecord:
             is_accepted=rng.random(len(references)) > 0.02,
             chi2=rng.chisquare(6, len(references)),
         ),
+        loops=None,
         timings=TimingTable(
             stamps_ns=stamps_ns,
             stages_ms={name: rng.gamma(8.0, 0.5, n_frames) for name in STAGES},

@@ -154,6 +154,42 @@ def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
     assert _Page(text).drawn == SECTIONS[:6]
 
 
+def write_loops(folder: Path, n: int, *, reason: str) -> None:
+    """Write loops from frame 0 to the last one, the first half of them refused."""
+    header = "stamp_ns,reference_ns,n_inliers,residual,reason"
+    stamps_ns = read_run(folder).trajectories["global"].stamps_ns
+    ends = f"{stamps_ns[-1]},{stamps_ns[0]}"
+    rows = [f"{ends},{50 + k},1.5,{reason if k < n // 2 else ''}" for k in range(n)]
+    (folder / "loops.csv").write_text("\n".join([header, *rows, ""]))
+    loops = {"found": n, "counted": n - n // 2, "refused": {reason: n // 2}}
+    rewrite_summary(folder, **{"global": {"loops": loops}})
+
+
+def test_loops_are_counted_drawn_and_listed(copy: Path, page: Path) -> None:
+    assert "no loop found; global is the batch optimum of the same edges." in page.read_text()
+    assert "Thin lines" not in page.read_text()
+    assert "loops" not in _Page(page.read_text()).ids
+    write_loops(copy, 90, reason="odd & <b>")
+    text = page_of(copy)
+    assert "<p>45 loops closed, 45 refused (45: odd &amp; &lt;b&gt;).</p>" in text
+    for name in ("loops (45)", "refused loops (45)"):
+        assert text.count(f">{name}<") == 4  # above, aside, and twice in space
+    assert "Thin lines join both ends of a loop" in text
+    table = text[text.index('<section id="loops">') :]
+    table = table[: table.index("</section>")]
+    assert table.count("<tr>") == 1 + 20
+    assert table.count("odd &amp; &lt;b&gt;") == 10
+    assert "70 more are in loops.csv" in table
+
+
+def test_a_few_loops_are_all_listed(copy: Path) -> None:
+    write_loops(copy, 3, reason="odd")
+    text = page_of(copy)
+    table = text[text.index('<section id="loops">') :]
+    assert [f">{count}</td>" in table for count in (50, 51, 52)] == [True] * 3
+    assert "more are in loops.csv" not in text
+
+
 def straight(n: int, *, bend: float = 0.0) -> Trajectory:
     twist = np.array([0.0, bend, 0.0, 0.0, 0.0, 1.0])
     T = np.array([se3.exp(k * twist) for k in range(n)])

@@ -97,6 +97,9 @@ class FakeHistory:
     def smoothed_path(self) -> tuple[IntArray, FloatArray]:
         return stamps_of(self.n)[:-1], self._positions()[:-1]
 
+    def loop_lines(self) -> FloatArray:
+        return self._positions()[[0, -1]][np.newaxis]
+
     def accumulated_cloud(self) -> tuple[Any, Any]:
         return self._positions().astype(np.float32), np.zeros((self.n, 3), dtype=np.uint8)
 

@@ -10,7 +10,7 @@ import pytest
 
 from gvo.errors import GvoError
 from gvo.geometry import se3
-from gvo.io.run_folder.reader import RunRecord, read_run
+from gvo.io.run_folder.reader import LoopTable, RunRecord, read_run
 from gvo.io.run_folder.writer import RunFolder
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
@@ -91,6 +91,33 @@ def test_the_paths_end_at_the_frame(page: FinishedPage, view: ViewServer, folder
         page.settle()
         steps = np.diff(poses[: index + 1], axis=0)
         assert drawn(view, "causal") == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
+
+
+def test_global_poses_and_loops_are_drawn_up_to_the_frame(
+    view: ViewServer, record: RunRecord
+) -> None:
+    assert "global" not in record.trajectories
+    ends = np.array([[8, 2], [10, 2]]) * int(stamps_of(2)[1])
+    loops = LoopTable(
+        stamps_ns=ends[:, 0],
+        reference_ns=ends[:, 1],
+        n_inliers=np.array([9, 9]),
+        residuals=np.ones(2),
+        reasons=("", "odd"),
+    )
+    trajectories = {**record.trajectories, "global": record.trajectories["causal"]}
+    page = FinishedPage(view.viser, replace(record, loops=loops, trajectories=trajectories))
+    find = view.viser.scene.get_handle_by_name
+    page.settle()
+    for name, last_m in (("loops", 8.0), ("refused_loops", 10.0)):
+        node: Any = find(f"/loops/{name}")
+        np.testing.assert_allclose(node.points[0, :, 2], [2.0, last_m])
+    page.player.seek(9)
+    page.settle()
+    assert drawn(view, "global") == pytest.approx(9.0, rel=1e-4)
+    assert find("/loops/loops") is not None
+    assert find("/loops/refused_loops") is None
+    page.close()
 
 
 def test_the_truth_lies_on_the_estimate(record: RunRecord) -> None:

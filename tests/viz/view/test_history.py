@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from gvo.types import (
     Estimate,
     FloatArray,
     FrameResult,
+    Loop,
     RelativePose,
     RgbdFrame,
     Status,
@@ -117,6 +119,26 @@ def test_paths_go_up_to_the_frame_shown_as_it_was_known_then(history: History) -
         assert xs(history.raw_path()) == [frame + 0.1 for frame in frames]
         assert xs(history.causal_path()) == [frame + 0.2 for frame in frames]
         assert history.raw_path()[0].tolist() == [10 * frame for frame in frames]
+
+
+def test_loops_join_the_best_poses_as_of_the_frame_shown() -> None:
+    history, last = History(2), record(5, finished=(2,), window=(5,))
+    for each in (record(2), record(3)):
+        history.add(each)
+    loop = Loop(
+        stamp_ns=50,
+        reference_ns=20,
+        T_reference_frame=np.eye(4),
+        covariance=np.eye(6),
+        n_matches=9,
+        n_inliers=8,
+    )
+    assert last.result is not None
+    history.add(replace(last, result=replace(last.result, loops=(loop,))))
+    history.show(3)
+    assert history.loop_lines().shape == (0, 2, 3)
+    history.show(4)
+    np.testing.assert_allclose(history.loop_lines()[:, :, 0], [[2.4, 5.3]])
 
 
 def test_frames_come_back_from_disk_as_they_were(history: History) -> None:

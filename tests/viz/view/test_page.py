@@ -90,6 +90,8 @@ def test_links_are_told_apart(page: Page, player: FakePlayer, view: ViewServer) 
     (refused,) = nodes(view, "/links/refused")
     np.testing.assert_allclose(step.points, [[[0, 0, 3], [0, 0, 4]]])
     np.testing.assert_allclose(refused.points, [[[0, 0, 0], [0, 0, 4]]])
+    (loop,) = nodes(view, "/loops/loops")
+    np.testing.assert_allclose(loop.points, [[[0, 0, 0], [0, 0, 4]]])
 
 
 def test_the_camera_stands_at_the_pose(page: Page, player: FakePlayer, view: ViewServer) -> None:
