@@ -16,6 +16,7 @@ from gvo._text import plain_number
 from gvo._version import __version__
 from gvo.cli import batch as cli_batch
 from gvo.cli import inspect as cli_inspect
+from gvo.cli import live as cli_live
 from gvo.cli.options import (
     CalibrationFiles,
     Color,
@@ -540,15 +541,15 @@ def _parse_lengths(text: str) -> list[float]:
 
 
 cli_batch.add_commands(app)
+cli_live.add_commands(app)
 cli_inspect.add_commands(app)
 
 
 def _run() -> Any:  # noqa: ANN401 - an exit code, or None
     group: Any = get_command(app)
     for option in group.params:
-        option.hidden = option.name == "show_completion"
-        if option.name == "install_completion":
-            option.help = "Complete commands in this shell."
+        # the list of commands fits a screen
+        option.hidden = option.name in ("show_completion", "install_completion")
     try:
         return group(prog_name="gvo", standalone_mode=False)
     except _UsageError as error:

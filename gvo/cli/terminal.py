@@ -301,6 +301,24 @@ def ended_by_signals() -> Iterator[None]:
 
 
 @contextmanager
+def ended_by_a_signal(stop: Callable[[], None]) -> Iterator[None]:
+    """Let the first signal end what has no end of its own; a second one interrupts it."""
+    received: list[int] = []
+
+    def receive(number: int, frame: object) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+        stop()
+
+    try:
+        with _handling(receive):
+            yield
+    except KeyboardInterrupt:
+        raise SystemExit(_EXIT_CODES_OF_SIGNALS[received[0]] if received else 130) from None
+
+
+@contextmanager
 def interruptible() -> Iterator[Callable[[object], None]]:
     """Yield a function that ends the work once a signal has come; call it between frames.
 

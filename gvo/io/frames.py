@@ -32,6 +32,8 @@ _MILLIMETRES = 1000.0
 _LOAD_ERRORS = (OSError, MemoryError, ValueError, cv2.error)
 _Item: TypeAlias = Pair | FaultyFrame
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
+Through: TypeAlias = Callable[[Iterator[_Item]], Iterator[_Item]]
+"""What pairs go through before they are decoded."""
 _Started: TypeAlias = tuple[_Item, list[Future[NDArray[Any] | str]]]
 
 
@@ -41,6 +43,7 @@ def frames(
     excerpt: Excerpt | None = None,
     *,
     with_unpaired: bool = True,
+    through: Through | None = None,
 ) -> Iterator[Frame | FaultyFrame]:
     """Read a recording as frames.
 
@@ -56,6 +59,9 @@ def frames(
         The part that is wanted; the whole where omitted.
     with_unpaired : bool
         False leaves out what is no frame of a run, see `is_lost`.
+    through : callable, optional
+        What pairs go through before they are decoded, as the queue of a running camera. Nothing
+        is decoded ahead then.
 
     Yields
     ------
@@ -72,8 +78,14 @@ def frames(
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)
     preparers = make_preparers(source.info)
-    make = _one_by_one if config.runtime.threads == 1 else _ahead
-    made = make(pairs, preparers, source.info)
+    if through is not None:
+        pairs = through(pairs)
+    n_ahead = _N_AHEAD if through is None else 0
+    made = (
+        _one_by_one(pairs, preparers, source.info)
+        if config.runtime.threads == 1
+        else _ahead(pairs, preparers, source.info, n_ahead)
+    )
     if config.sync.repeated_images == "skip":
         made = refuse_repeats(made, source.info.stream_names)
     for item in made:
@@ -160,7 +172,7 @@ def _one_by_one(
 
 
 def _ahead(
-    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo
+    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
         started: deque[_Started] = deque()
@@ -174,7 +186,7 @@ def _ahead(
                 fault = error  # what was read before it counts
             else:
                 started.append(_start(pool.submit, item, preparers, info))
-                if len(started) > _N_AHEAD:
+                if len(started) > n_ahead:
                     yield _finish(started.popleft(), info.sensor)
         while started:
             yield _finish(started.popleft(), info.sensor)
@@ -344,6 +356,8 @@ class Rig:
     ----------
     info : RecordingInfo
         What a recording of this camera has; for a `Source` of your own.
+    depth_scale : float
+        Counts of depth per metre.
 
     Raises
     ------
@@ -368,7 +382,7 @@ class Rig:
             n_images=0,
             T_body_cam=cameras.T_body_cam,
         )
-        self._depth_scale = cameras.depth_scale or _MILLIMETRES
+        self.depth_scale = cameras.depth_scale or _MILLIMETRES
         self._preparers = make_preparers(self.info)
 
     @property
@@ -407,7 +421,7 @@ class Rig:
     def _metres(self, depth: NDArray[Any]) -> DepthArray:
         if depth.dtype.kind == "f":
             return depth_from_metres(depth)
-        return depth_from_counts(depth, self._depth_scale, "depth image")
+        return depth_from_counts(depth, self.depth_scale, "depth image")
 
 
 class ImagePreparer:

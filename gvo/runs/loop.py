@@ -14,7 +14,7 @@ from gvo.backend.window import SlidingWindow
 from gvo.config import Config
 from gvo.errors import OutputError, RecordingError, SmoothingError
 from gvo.io.excerpt import Excerpt
-from gvo.io.frames import frames, is_lost, one_opencv_thread
+from gvo.io.frames import Through, frames, is_lost, one_opencv_thread
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
@@ -71,6 +71,8 @@ class RunLoop:
         Returns T_world_base, shape (4, 4), of the first frame by its stamp.
     items : iterable of StereoFrame, RgbdFrame or FaultyFrame, optional
         The frames in another order than that of the recording.
+    through : callable, optional
+        See `gvo.frames`.
 
     Attributes
     ----------
@@ -92,6 +94,7 @@ class RunLoop:
         excerpt: Excerpt | None = None,
         first_pose: Callable[[int], FloatArray] | None = None,
         items: Iterable[Frame | FaultyFrame] | None = None,
+        through: Through | None = None,
     ) -> None:
         self.source = source
         self.config = config
@@ -100,6 +103,7 @@ class RunLoop:
         self._excerpt = excerpt or Excerpt()
         self._first_pose = first_pose
         self._items = items
+        self._through = through
         self._read_ms = 0.0
         self._first_ns: int | None = None
         self._previous_ns: int | None = None
@@ -198,7 +202,11 @@ class RunLoop:
 
     def _read(self) -> Iterator[Frame | FaultyFrame]:
         items = self._items
-        iterator = frames(self.source, self.config, self._excerpt) if items is None else iter(items)
+        iterator = (
+            frames(self.source, self.config, self._excerpt, through=self._through)
+            if items is None
+            else iter(items)
+        )
         while True:
             start = time.perf_counter()
             try:

@@ -15,6 +15,7 @@ import numpy as np
 from gvo.config import Config
 from gvo.errors import GvoError, RecordingError
 from gvo.io.excerpt import Excerpt
+from gvo.io.frames import Through
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.inputs import (
     CAMERA_CHANGED,
@@ -81,6 +82,7 @@ def run_recording(
     excerpt: Excerpt | None = None,
     outputs: RunOutputs | None = None,
     force: bool = False,
+    through: Through | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_written: Callable[[], None] | None = None,
 ) -> RunResult:
@@ -106,6 +108,8 @@ def run_recording(
         What is written besides the folder's tables; the report where omitted.
     force : bool
         Replace an earlier run in the folder, complete or not, and plots.
+    through : callable, optional
+        Of a camera that is running, see `gvo.frames`; its first images identify no recording.
     on_progress : callable, optional
         Called after each frame.
     on_written : callable, optional
@@ -133,8 +137,10 @@ def run_recording(
     _LOGGER.debug("ground truth: %s", truth.decision if isinstance(truth, Truth) else truth.reason)
     first_pose = partial(initial_pose, truth) if starts_at_truth else None
     start = truth.trajectory if starts_at_truth and isinstance(truth, Truth) else None
-    identity = run_identity(source, base_frame, excerpt, start=start)
-    loop = RunLoop(source, config, base_frame, excerpt=excerpt, first_pose=first_pose)
+    identity = run_identity(source, base_frame, excerpt, start=start, is_live=through is not None)
+    loop = RunLoop(
+        *(source, config, base_frame), excerpt=excerpt, first_pose=first_pose, through=through
+    )
     with ExitStack() as stack, ExitStack() as files:
         stack.enter_context(written_alone(Path(out), force=force))
         others, notes = outputs.open(loop, files)

@@ -119,6 +119,7 @@ def run_identity(
     excerpt: Excerpt | None,
     *,
     start: Trajectory | None = None,
+    is_live: bool = False,
 ) -> dict[str, Any]:
     """Return what identifies a run, besides its configuration.
 
@@ -131,6 +132,8 @@ def run_identity(
     excerpt : Excerpt or None
     start : Trajectory, optional
         The true poses, where the run starts at one of them.
+    is_live : bool
+        Then no image is read.
 
     Returns
     -------
@@ -139,7 +142,7 @@ def run_identity(
     """
     return {
         "version of gvo": __version__,
-        "recording": _describe_recording(source),
+        "recording": _describe_recording(source, is_live=is_live),
         "excerpt": asdict(excerpt or Excerpt()),
         "output": {
             "frame": base_frame.name,
@@ -150,14 +153,14 @@ def run_identity(
     }
 
 
-def _describe_recording(source: Source) -> dict[str, Any]:
+def _describe_recording(source: Source, *, is_live: bool) -> dict[str, Any]:
     info = source.info
     return {
         "sensor": info.sensor,
         "number of images": info.n_images,
         "frame_id": info.frame_id,
         "calibration": _digest(_calibration_parts(info)),
-        "first images": dict(_first_images(source)),
+        "first images": {} if is_live else dict(_first_images(source)),
     }
 
 

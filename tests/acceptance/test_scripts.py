@@ -16,6 +16,7 @@ import pytest
 
 import gvo
 from gvo.geometry import se3
+from tests.conftest import GVO
 
 pytestmark = pytest.mark.acceptance
 
@@ -322,3 +323,26 @@ def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at() -> 
         assert n_pairs > 50
         assert 0.2 < rotation < 2.5
         assert 0.2 < translation < 2.5
+
+
+def test_a_recording_is_fed_to_a_live_run(drive_bag: Path, tmp_path: Path) -> None:
+    info = gvo.open_recording(drive_bag).info
+    calibrations = []
+    for side, camera in zip("lr", info.calibrations, strict=True):
+        calibrations.append(tmp_path / f"{side}.yaml")
+        matrices = {"camera_matrix": camera.P[:, :3], "projection_matrix": camera.P}
+        content: dict[str, object] = {
+            name: {"data": [*each.flat]} for name, each in matrices.items()
+        }
+        content |= {"image_width": camera.width, "image_height": camera.height}
+        calibrations[-1].write_text(json.dumps(content))
+    feeder = [sys.executable, *map(str, (SCRIPTS / "feed_recording.py", drive_bag, "--rate=0"))]
+    given = [f"--calibration={path}" for path in calibrations]
+    options = ["--rectified", "--no-report", "--queue=1000", f"--out={tmp_path / 'out'}", *given]
+    with subprocess.Popen(feeder, stdout=subprocess.PIPE, env=ENVIRONMENT) as sending:
+        live = [*GVO, "live", "-", *options]
+        answer = subprocess.run(
+            live, stdin=sending.stdout, capture_output=True, text=True, env=ENVIRONMENT, check=False
+        )
+    assert answer.returncode == 0, answer.stderr
+    assert "20 frames, all tracked" in answer.stdout

@@ -1,0 +1,247 @@
+"""Cameras that are running: images from another program through a pipe, or from a device.
+
+Through a pipe each image is a line of JSON, then the bytes of its pixels, row by row:
+
+    {"stream": "left", "stamp_ns": 1700000000000000000, "encoding": "mono8", "width": 640,
+     "height": 480}
+
+(on one line). `stream` is left or right, or color or depth; `encoding` is one of ROS. A compressed
+image has `"format": "png"` (or jpeg, ...) and its `"size"` in bytes in place of `encoding`, `width`
+and `height`.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvo._text import cut
+from gvo.config import Config
+from gvo.errors import RecordingError
+from gvo.io.bag.image_encodings import DEPTHS, IMAGES, find_encoding
+from gvo.io.bag.messages import (
+    decode_compressed,
+    decode_compressed_depth,
+    decode_depth,
+    decode_grey_or_color,
+)
+from gvo.io.images import MILLIMETRES, GreyRange, check_size
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.trajectory.trajectory import Trajectory
+
+_MILLISECOND_NS = 1_000_000
+_STREAMS = {"left": 0, "color": 0, "right": 1, "depth": 1}
+_WHERE = "standard input"
+_SIZES = ("width", "height")
+_MAX_LINE = 1 << 16
+_MAX_COMPRESSED = 1 << 28
+_N_SHOWN = 80
+
+
+@dataclass(slots=True, kw_only=True)
+class _Raw:
+    """An image as `sensor_msgs/Image` has it."""
+
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: NDArray[np.uint8]
+    is_bigendian: int = 0
+    header: Any = None
+
+
+@dataclass(slots=True, kw_only=True)
+class _Compressed:
+    """An image as `sensor_msgs/CompressedImage` has it."""
+
+    format: str
+    data: NDArray[np.uint8] = field(repr=False)
+    header: Any = None
+
+
+class StandardInput:
+    """A camera whose images another program writes into a pipe.
+
+    Parameters
+    ----------
+    stream : binary file
+        Read to its end.
+    info : RecordingInfo
+        Of the camera, as `gvo.Rig` has it.
+    config : Config, optional
+        `images`, and `depth.scale` in place of the calibration's.
+    depth_scale : float, optional
+        Counts per metre; 1000 where omitted.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        info: RecordingInfo,
+        config: Config | None = None,
+        *,
+        depth_scale: float | None = None,
+    ) -> None:
+        config = config or Config()
+        self.info = info
+        self._stream = stream
+        self._scale = config.depth.scale or depth_scale or MILLIMETRES
+        self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images as they come.
+
+        Raises
+        ------
+        RecordingError
+            For a line that is no header, or an end in the middle of an image.
+        """
+        while line := self._stream.readline(_MAX_LINE):
+            if not line.strip():
+                continue
+            header = _parse(line)
+            stream = self._stream_of(header)
+            yield StampedImage(
+                stream=stream,
+                stamp_ns=_whole(header, "stamp_ns", lowest=-(2**63), highest=2**63 - 1),
+                load=self._loader(header, is_depth=stream == 1 and self.info.sensor == "rgbd"),
+            )
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return None: a pipe holds no true poses."""
+        return None
+
+    def _stream_of(self, header: dict[str, Any]) -> int:
+        names = ("left", "right") if self.info.sensor == "stereo" else ("color", "depth")
+        name = header.get("stream")
+        if name not in names:
+            shown = cut(repr(name), _N_SHOWN)
+            raise RecordingError(f'{_WHERE}: "stream" must be one of {names}, got {shown}')
+        return _STREAMS[str(name)]
+
+    def _loader(self, header: dict[str, Any], *, is_depth: bool) -> Callable[[], NDArray[Any]]:
+        """Read the bytes of an image, and return what decodes them."""
+        if "format" in header:
+            size = _whole(header, "size", lowest=0, highest=_MAX_COMPRESSED)
+            packed = _Compressed(format=str(header["format"]), data=self._read(size))
+            if is_depth:
+                return partial(decode_compressed_depth, packed, self._scale, _WHERE)
+            return partial(decode_compressed, packed, _WHERE, self._grey_range)
+        raw = self._read_raw(header, is_depth=is_depth)
+        if is_depth:
+            return partial(decode_depth, raw, self._scale, _WHERE)
+        return partial(decode_grey_or_color, raw, _WHERE, self._grey_range)
+
+    def _read_raw(self, header: dict[str, Any], *, is_depth: bool) -> _Raw:
+        width, height = (_whole(header, name, lowest=1, highest=1 << 20) for name in _SIZES)
+        check_size(width, height, _WHERE)
+        name = str(header.get("encoding", ""))
+        encoding = find_encoding(name, DEPTHS if is_depth else IMAGES, _WHERE)
+        step = width * encoding.n_channels * np.dtype(encoding.dtype).itemsize
+        data = self._read(step * height * encoding.rows_per_two // 2)
+        return _Raw(height=height, width=width, encoding=name, step=step, data=data)
+
+    def _read(self, size: int) -> NDArray[np.uint8]:
+        data = self._stream.read(size)
+        if len(data) < size:
+            raise RecordingError(f"{_WHERE}: ends after {len(data)} of {size} bytes of an image")
+        return np.frombuffer(data, dtype=np.uint8)
+
+
+def _parse(line: bytes) -> dict[str, Any]:
+    try:
+        header = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        shown = cut(repr(line[:_N_SHOWN]), _N_SHOWN)
+        raise RecordingError(f"{_WHERE}: expected a line of JSON, got {shown}: {error}") from error
+    if not isinstance(header, dict):
+        raise RecordingError(f"{_WHERE}: expected an object of JSON, got {cut(repr(header), 40)}")
+    return header
+
+
+def _whole(header: dict[str, Any], name: str, *, lowest: int, highest: int) -> int:
+    value = header.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+        shown = cut(repr(value), _N_SHOWN)
+        raise RecordingError(
+            f'{_WHERE}: "{name}" must be a whole number from {lowest} to {highest}, got {shown}'
+        )
+    return value
+
+
+class Device:
+    """A stereo camera behind `cv2.VideoCapture`.
+
+    Images are stamped when they were grabbed; those of a film by its own clock.
+
+    Parameters
+    ----------
+    names : sequence of str
+        A number, a device or a file: one that shows left and right side by side, or two.
+    info : RecordingInfo
+        Of a stereo camera, as `gvo.Rig` has it.
+
+    Raises
+    ------
+    RecordingError
+        When one cannot be opened.
+    """
+
+    def __init__(self, names: Sequence[str], info: RecordingInfo) -> None:
+        if info.sensor != "stereo" or len(names) not in (1, 2):
+            raise RecordingError(
+                "a camera read by OpenCV has no depth: name one device that shows left and right "
+                f"side by side, or two, not {len(names)} of a {info.sensor} camera"
+            )
+        self.info = info
+        self._captures = [_opened(name) for name in names]
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield left and right images as they are grabbed, until a device gives no more."""
+        first_ns = time.time_ns()
+        try:
+            while all(capture.grab() for capture in self._captures):
+                stamp_ns = self._stamp_ns(first_ns)
+                for stream, pixels in enumerate(self._retrieve()):
+                    load = partial(np.asarray, pixels)
+                    yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=load)
+        finally:
+            for capture in self._captures:
+                capture.release()
+
+    def ground_truth(self) -> Trajectory | None:
+        """Return None: a camera knows no true poses."""
+        return None
+
+    def _stamp_ns(self, first_ns: int) -> int:
+        """Return the time of a film, else that of now."""
+        capture = self._captures[0]
+        if capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
+            return first_ns + round(capture.get(cv2.CAP_PROP_POS_MSEC) * _MILLISECOND_NS)
+        return time.time_ns()
+
+    def _retrieve(self) -> list[NDArray[Any]]:
+        found = [capture.retrieve() for capture in self._captures]
+        if not all(is_there for is_there, _ in found):
+            raise RecordingError("a device gave an image that cannot be decoded")
+        pixels = [image for _, image in found]
+        if len(pixels) == 1:
+            width = pixels[0].shape[1] // 2
+            pixels = [pixels[0][:, :width], pixels[0][:, width : 2 * width]]
+        return pixels
+
+
+def _opened(name: str) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(int(name) if name.isdigit() else name)
+    if not capture.isOpened():
+        raise RecordingError(f"{name}: OpenCV opens no camera or film by this name")
+    return capture

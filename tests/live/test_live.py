@@ -1,0 +1,317 @@
+"""Odometry of a camera that is running: what waits, what is dropped, pipes and devices."""
+
+import io
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import gvo
+from gvo.errors import RecordingError
+from gvo.io.recording import Source, StampedImage
+from gvo.io.sync import Pair
+from gvo.live.odometry import LiveOdometry, WaitingPairs
+from gvo.live.sources import Device, StandardInput
+from gvo.types import FaultyFrame, Progress
+from tests.conftest import GVO, TABLES, Command, is_one_line
+
+TIED = Progress(n_done=3, n_total=0, n_tracked=2)
+NO_REPORT = gvo.RunOutputs(report=False)
+MILLISECOND_NS = 1_000_000
+
+
+def pair(stamp_ms: int) -> Pair:
+    first, second = (
+        StampedImage(stream=stream, stamp_ns=stamp_ms * MILLISECOND_NS, load=lambda: np.eye(2))
+        for stream in (0, 1)
+    )
+    return first, second
+
+
+def taken(waiting: WaitingPairs) -> list[tuple[int, str]]:
+    """Return the stamps in ms of all that waits, and the reasons of what was dropped."""
+    waiting.close()
+    found = []
+    while (item := waiting.take()) is not None:
+        if isinstance(item, FaultyFrame):
+            found.append((item.stamp_ns // MILLISECOND_NS, item.reason))
+        else:
+            found.append((item[0].stamp_ns // MILLISECOND_NS, ""))
+    return found
+
+
+def test_what_waits_comes_in_its_order() -> None:
+    waiting = WaitingPairs()
+    faulty = FaultyFrame(stamp_ns=20 * MILLISECOND_NS, reason="alone")
+    for item in (pair(10), faulty, pair(30)):
+        waiting.put(item)
+    assert taken(waiting) == [(10, ""), (20, "alone"), (30, "")]
+    assert waiting.n_dropped == 0
+
+
+def test_for_one_more_the_oldest_is_dropped_and_says_so() -> None:
+    waiting = WaitingPairs(max_waiting=2)
+    waiting.note(TIED)
+    for stamp_ms in range(1, 6):
+        waiting.put(pair(stamp_ms))
+    found = taken(waiting)
+    assert [stamp for stamp, _ in found] == [1, 2, 3, 4, 5]
+    assert ["2 pairs wait (--queue)" in reason for _, reason in found] == [True] * 3 + [False] * 2
+    assert waiting.n_dropped == 3
+
+
+def test_nothing_is_dropped_before_two_frames_are_tied() -> None:
+    waiting = WaitingPairs(max_waiting=2, max_lag_s=0.001)
+    for stamp_ms in range(50):
+        waiting.put(pair(10 * stamp_ms))
+    waiting.note(Progress(n_done=1, n_total=0, n_tracked=1))
+    assert not any(isinstance(waiting.take(), FaultyFrame) for _ in range(2))
+    assert waiting.n_dropped == 0
+    for stamp_ms in range(50, 400):  # but memory has an end
+        waiting.put(pair(10 * stamp_ms))
+    assert waiting.n_dropped == 400 - 2 - 300
+
+
+def test_what_is_too_old_is_dropped_when_it_is_taken() -> None:
+    waiting = WaitingPairs(max_lag_s=0.1)
+    waiting.note(TIED)
+    for stamp_ms in (0, 100, 200):
+        waiting.put(pair(stamp_ms))
+    assert taken(waiting) == [
+        (0, "dropped, tracking is behind: 0.20 s behind the newest (--max-lag)"),
+        (100, ""),
+        (200, ""),
+    ]
+
+
+@pytest.mark.parametrize("arguments", [{"max_waiting": 0}, {"max_lag_s": 0.0}])
+def test_a_queue_of_nothing_is_refused(arguments: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="max_waiting >= 1 and max_lag_s > 0"):
+        WaitingPairs(**arguments)
+
+
+def test_a_fault_of_the_stream_comes_after_what_was_received() -> None:
+    waiting = WaitingPairs()
+
+    def received() -> Iterator[Pair]:
+        yield pair(1)
+        raise RecordingError("the cable")
+
+    through = waiting.through(received())
+    assert not isinstance(first := next(through), FaultyFrame)
+    assert first[0].stamp_ns == MILLISECOND_NS
+    with pytest.raises(RecordingError, match="the cable"):
+        next(through)
+
+
+def names_of(source: Source) -> tuple[str, str]:
+    return ("left", "right") if source.info.sensor == "stereo" else ("color", "depth")
+
+
+def sent(source: Source, *, compressed: str = "") -> bytes:
+    """Return the images of a recording as a program would write them into a pipe."""
+    parts: list[bytes] = []
+    for image in source.images():
+        pixels = image.load()
+        header: dict[str, object] = {"stream": names_of(source)[image.stream]}
+        header["stamp_ns"] = image.stamp_ns
+        if pixels.dtype == np.float32:
+            pixels = np.nan_to_num(pixels)
+        if compressed and pixels.dtype == np.uint8:
+            data = cv2.imencode(f".{compressed}", pixels)[1].tobytes()
+            header |= {"format": compressed, "size": len(data)}
+        else:
+            encoding = {(2, "u"): "mono8", (3, "u"): "bgr8", (2, "f"): "32FC1"}
+            height, width = pixels.shape[:2]
+            header["encoding"] = encoding[pixels.ndim, pixels.dtype.kind]
+            header |= {"width": width, "height": height}
+            data = pixels.tobytes()
+        parts += [json.dumps(header).encode(), b"\n", data]
+    return b"".join(parts)
+
+
+@pytest.mark.parametrize("compressed", ["", "png"])
+@pytest.mark.parametrize("bag", ["drive_bag", "room_bag"])
+def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
+    bag: str, compressed: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    source = gvo.open_recording(request.getfixturevalue(bag))
+    gvo.run_recording(source, tmp_path / "run", outputs=NO_REPORT)
+    pipe = StandardInput(io.BytesIO(sent(source, compressed=compressed)), source.info)
+    live = LiveOdometry(pipe, max_waiting=1000)
+    assert live.run(tmp_path / "live", outputs=NO_REPORT).is_complete
+    assert live.n_dropped == 0
+    for name in (*TABLES, "global.txt", "graph.g2o"):
+        written = (tmp_path / "live" / name).read_bytes()
+        assert written == (tmp_path / "run" / name).read_bytes(), name
+
+
+@pytest.fixture(scope="session")
+def calibration(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return the calibration files of the rendered stereo camera."""
+    folder = tmp_path_factory.mktemp("calibration")
+    paths = []
+    for side, camera in zip("lr", gvo.open_recording(drive_bag).info.calibrations, strict=True):
+        content = {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_matrix": {"rows": 3, "cols": 3, "data": camera.P[:, :3].ravel().tolist()},
+            "projection_matrix": {"rows": 3, "cols": 4, "data": camera.P.ravel().tolist()},
+        }
+        paths.append(folder / f"{side}.yaml")
+        paths[-1].write_text(json.dumps(content))
+    return paths
+
+
+def n_poses(out: Path) -> int:
+    path = out / "causal.txt"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def live(*arguments: object, calibration: list[Path], out: Path) -> list[str]:
+    given = [f"--calibration={path}" for path in calibration]
+    return [*map(str, arguments), *given, "--rectified", "--no-report", f"--out={out}"]
+
+
+def test_the_command_tracks_what_comes_through_a_pipe_until_a_signal(
+    drive_bag: Path, calibration: list[Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    command = [*GVO, "live", *live("-", "--queue=1000", calibration=calibration, out=out)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=False
+    ) as process:
+        assert process.stdin is not None
+        process.stdin.write(sent(gvo.open_recording(drive_bag)))
+        process.stdin.flush()
+        while n_poses(out) < 20:  # the pipe stays open
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        answer, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert b"20 frames, all tracked" in answer
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["state"] == "complete"
+    assert (out / "global.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("header", "fault"),
+    [
+        (b"left\n", "expected a line of JSON"),
+        (b"[]\n", "expected an object of JSON"),
+        (b'{"stream": "up", "stamp_ns": 0}\n', '"stream" must be one of'),
+        (b'{"stream": "left"}\n', '"stamp_ns" must be a whole number'),
+        (b'{"stream": "left", "stamp_ns": 1e3}\n', '"stamp_ns" must be a whole number'),
+        (b'{"stream": "left", "stamp_ns": 1, "encoding": "mono8"}\n', '"width" must be a whole'),
+        (
+            b'{"stream":"left","stamp_ns":1,"encoding":"mono8","width":1000000,"height":1000000}\n',
+            "pixels",
+        ),
+        (b'{"stream":"left","stamp_ns":1,"encoding":"grey","width":4,"height":4}\n', "grey"),
+        (b'{"stream":"left","stamp_ns":1,"encoding":"mono8","width":4,"height":4}\n...', "ends"),
+        (b'{"stream": "left", "stamp_ns": 1, "format": "png", "size": -1}\n', '"size" must be'),
+        (b"x" * 100_000, "expected a line of JSON"),
+        (b"[" * 50_000 + b"\n", "expected a line of JSON"),
+    ],
+)
+def test_what_is_no_image_ends_in_one_line(
+    header: bytes,
+    fault: str,
+    drive_bag: Path,
+    calibration: list[Path],
+    tmp_path: Path,
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = gvo.open_recording(drive_bag)
+    pipe = StandardInput(io.BytesIO(header), source.info)
+    with pytest.raises(RecordingError, match=fault) as raised:
+        list(pipe.images())
+    assert len(str(raised.value)) < 400
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(header)))
+    answer = command("live", *live("-", calibration=calibration, out=tmp_path / "out"))
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert fault in answer.err
+
+
+def test_a_stream_that_breaks_off_keeps_what_was_tracked(drive_bag: Path, tmp_path: Path) -> None:
+    source = gvo.open_recording(drive_bag)
+    pipe = StandardInput(io.BytesIO(sent(source)[:-1000]), source.info)
+    result = LiveOdometry(pipe, max_waiting=1000).run(tmp_path / "out", outputs=NO_REPORT)
+    assert not result.is_complete
+    assert any("ends after" in line for line in result.warnings)
+    assert n_poses(tmp_path / "out") == 19
+
+
+@pytest.fixture(scope="session")
+def films(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of pictures, which OpenCV reads as a film: left, right, side by side."""
+    folder = tmp_path_factory.mktemp("films")
+    for index, frame in enumerate(gvo.frames(gvo.open_recording(drive_bag))):
+        assert isinstance(frame, gvo.StereoFrame)
+        both = np.hstack([frame.left, frame.right])
+        for name, pixels in (("left", frame.left), ("right", frame.right), ("both", both)):
+            cv2.imwrite(str(folder / f"{name}{index:03}.png"), pixels)
+    return folder
+
+
+@pytest.mark.parametrize("names", [["both%03d.png"], ["left%03d.png", "right%03d.png"]])
+def test_a_device_gives_the_images_of_both_cameras(
+    names: list[str],
+    films: Path,
+    drive_bag: Path,
+    calibration: list[Path],
+    tmp_path: Path,
+    command: Command,
+) -> None:
+    devices = [films / name for name in names]
+    out = tmp_path / "out"
+    options = live("camera", *devices, "--queue=1000", calibration=calibration, out=out)
+    answer = command("live", *options)
+    assert answer.code == 0, answer.err
+    assert "20 frames, all tracked" in answer.out
+    gvo.run_recording(gvo.open_recording(drive_bag), tmp_path / "run", outputs=NO_REPORT)
+    tracked, expected = (
+        gvo.read_trajectory(folder / "raw.txt") for folder in (out, tmp_path / "run")
+    )
+    np.testing.assert_allclose(tracked.T_world_frame, expected.T_world_frame, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (("camera",), "expected - or camera DEVICE"),
+        (("-", "0"), "expected - or camera DEVICE"),
+        (("radio",), "expected - or camera DEVICE"),
+        (("camera", "/nowhere/film.avi"), "OpenCV opens no camera or film"),
+        (("camera", "a", "b", "c"), "side by side, or two"),
+        (("camera", "a", "--sensor=rgbd"), "has no depth"),
+        (("-", "--queue=0"), "max_waiting >= 1"),
+    ],
+)
+def test_what_cannot_be_opened_is_refused(
+    words: tuple[str, ...], fault: str, calibration: list[Path], tmp_path: Path, command: Command
+) -> None:
+    one = calibration[:1] if "--sensor=rgbd" in words else calibration
+    answer = command("live", *live(*words, calibration=one, out=tmp_path / "out"))
+    assert answer.code == 2
+    assert fault in answer.err
+    assert is_one_line(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_device_lets_go_of_its_cameras(films: Path, drive_bag: Path) -> None:
+    info = gvo.open_recording(drive_bag).info
+    device = Device([str(films / "both%03d.png")], info)
+    images = device.images()
+    first = next(images)
+    assert first.load().shape[:2] == (info.calibrations[0].height, info.calibrations[0].width)
+    images.close()  # type: ignore[attr-defined]
