@@ -106,8 +106,11 @@ class FinishedPage:
         self._server = server
         self._record = record
         self._truth = aligned_truth(record)
-        self._absent = {*_NOT_RECORDED}
+        held = record.trajectories
+        # Of a graph optimized at once there are no causal poses, and covariances only on request.
+        self._absent = {*_NOT_RECORDED, *(name for name in held if len(held[name]) == 0)}
         self._absent |= set() if self._truth is not None else {"truth"}
+        self._absent |= set() if held["smoothed"].covariances is not None else {"ellipsoids"}
         if GLOBAL not in record.trajectories:
             self._absent |= {GLOBAL, "loops", "refused loops"}
         up = world_up(record)
@@ -124,6 +127,7 @@ class FinishedPage:
             n_sigmas=start_sigmas(record),
             redraw=self._painter.offer,
         )
+        self._sigmas.visible = "ellipsoids" not in self._absent
         self._show_all()
         self.player.seek(self.player.n_frames - 1)
 

@@ -29,6 +29,11 @@ return [...document.querySelectorAll('section[id]')].map(section => {
 });
 """
 
+_TEXT_HEIGHTS = """
+return [...document.querySelectorAll('.panel > svg text')]
+  .map(e => e.getBoundingClientRect().height).filter(height => height > 0);
+"""
+
 
 @pytest.fixture(scope="module")
 def short_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -74,6 +79,20 @@ def test_the_report_stands_alone_and_shows_every_plot(browser: Browser, report: 
     shown = _shown(browser)
     assert len(shown) >= SECTIONS
     assert min(shown.values()) >= 1, f"not to be seen: {shown}"
+
+
+def test_on_a_narrow_screen_plots_can_be_read(browser: Browser, short_report: Path) -> None:
+    browser.open_file(short_report)
+    narrow = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+    try:
+        assert browser.run("return document.documentElement.scrollWidth <= innerWidth")
+        heights = browser.run(_TEXT_HEIGHTS)
+    finally:
+        browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert isinstance(heights, list)
+    assert len(heights) > 50
+    assert min(heights) > 7.5
 
 
 @pytest.mark.acceptance

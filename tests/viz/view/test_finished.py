@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,27 @@ def test_the_world_of_the_first_camera_has_its_up_against_y(record: RunRecord) -
     assert world_up(record) == "-y"
     record.summary["base_frame"] = "base_link"
     assert world_up(record) == "+z"
+
+
+def test_what_a_run_does_not_hold_is_not_named(
+    view: ViewServer, record: RunRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the run of a graph that was optimized at once."""
+    gui, added = view.viser.gui, list[str]()
+
+    def add(original: Any, text: str, *given: Any, **options: Any) -> Any:
+        added.append(text)
+        return original(text, *given, **options)
+
+    for name in ("add_html", "add_checkbox"):
+        monkeypatch.setattr(gui, name, partial(add, getattr(gui, name)))
+    held = dict(record.trajectories)
+    held["causal"] = held["causal"].select(slice(0))
+    held["smoothed"] = replace(held["smoothed"], covariances=None)
+    page = FinishedPage(view.viser, replace(record, trajectories=held))
+    page.close()
+    assert not [text for text in added if "causal" in text or "ellipsoid" in text]
+    assert all([text for text in added if name in text] for name in ("raw", "smoothed", "truth"))
 
 
 def test_a_folder_is_served(folder: Path) -> None:
