@@ -19,6 +19,7 @@ shutter by `--readout`. `--keep DIR` keeps what is rendered.
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 `--graphs` optimizes whole pose graphs, those named, GTSAM's and generated ones, beside GTSAM used
 by hand (see benchmark_graphs.py).
+`--map` measures what the map of a long run costs, on a simulated stream (see benchmark_map.py).
 
 Example: python scripts/benchmark.py kitti_06_start euroc_mh01_start
 Example: python scripts/benchmark.py --seeds 10 --kind hand --readout 25 --keep rendered
@@ -31,6 +32,7 @@ from pathlib import Path
 
 import benchmark_graphs  # type: ignore[import-not-found]  # beside this one
 import benchmark_loops  # type: ignore[import-not-found]
+import benchmark_map  # type: ignore[import-not-found]
 import benchmark_passes as passes  # type: ignore[import-not-found]
 import benchmark_seeds  # type: ignore[import-not-found]
 import benchmark_tables as tables  # type: ignore[import-not-found]
@@ -52,6 +54,8 @@ def main() -> None:
             sys.exit("benchmark: " + "; ".join(faults))
     if arguments.graphs is not None:
         benchmark_graphs.measure(arguments.graphs)
+    if arguments.map is not None:
+        benchmark_map.measure(arguments.map)
     if arguments.loops:
         spoiling = benchmark_loops.Spoiling(dark_s=arguments.dark, drift=arguments.drift)
         benchmark_loops.measure(sources_of(arguments), arguments.set, spoiling)
@@ -77,18 +81,21 @@ def parse() -> argparse.Namespace:
         "--soak", type=int, nargs="?", const=1_000_000, metavar="N", help="a life of N poses"
     )
     parser.add_argument("--graphs", type=Path, nargs="*", metavar="G2O", help="whole pose graphs")
+    parser.add_argument(
+        "--map", type=int, nargs="?", const=10_000, metavar="N", help="a map, of N frames"
+    )
     parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
     parser.add_argument("--loops", action="store_true", help="judge loop closure")
     parser.add_argument("--drift", type=float, default=0.0, metavar="PERCENT", help="of a lap")
     parser.add_argument("--dark", type=span, metavar="A-B", help="seconds without light")
     add_seeds(parser)
     arguments = parser.parse_args()
-    lengths = [n for n in (arguments.window, arguments.soak) if n is not None]
+    lengths = [n for n in (arguments.window, arguments.soak, arguments.map) if n is not None]
     is_graphs = arguments.graphs is not None
     if not (arguments.recordings or arguments.seeds or lengths or is_graphs):
-        parser.error("name recordings, or --seeds, --window, --soak or --graphs")
+        parser.error("name recordings, or --seeds, --window, --soak, --map or --graphs")
     if min(lengths, default=1000) < 1000:
-        parser.error("--window and --soak take at least 1000 poses")
+        parser.error("--window, --soak and --map take at least 1000 poses")
     if arguments.rounds < 1:
         parser.error("--rounds takes at least 1")
     if (arguments.drift or arguments.dark) and not arguments.loops:
