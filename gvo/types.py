@@ -666,6 +666,9 @@ class FrameResult:
     T_previous_frame : ndarray of float64, shape (4, 4), or None
         The pose in the frame before, both as the window has them after this one: a correction of
         the past is no motion. None for the first frame.
+    T_map_world : ndarray of float64, shape (4, 4)
+        What loops correct the causal pose by, as last optimized while the run goes:
+        T_map_world @ T_world_frame.
     stage_ms : dict of str to float
         Milliseconds by stage.
     """
@@ -687,6 +690,7 @@ class FrameResult:
     joins: tuple[SegmentJoin, ...] = ()
     loops: tuple[Loop, ...] = ()
     T_previous_frame: FloatArray | None = None
+    T_map_world: FloatArray = field(default_factory=lambda: np.eye(4))
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property

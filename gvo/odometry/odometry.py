@@ -199,7 +199,12 @@ class Odometry:
             loops = self._close_loops(observations, causal)
         self._keep_frame(frame)
         result = self._result(observations, step, offered, causal, joins, watch.stage_ms)
-        return replace(result, loops=loops, T_previous_frame=T_previous_frame)
+        return replace(
+            result,
+            loops=loops,
+            T_previous_frame=T_previous_frame,
+            T_map_world=self._graph.T_map_world,
+        )
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""

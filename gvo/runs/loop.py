@@ -276,6 +276,7 @@ class RunLoop:
             finished=self._placed(result.finished),
             loops=self._placed_loops(result.loops),
             T_previous_frame=step,
+            T_map_world=self.base_frame.apply_to_world(result.T_map_world),
             stage_ms={"read": self._read_ms, **result.stage_ms},
         )
 

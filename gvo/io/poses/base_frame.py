@@ -227,6 +227,11 @@ class BaseFrame:
         T_end = se3.invert(self.T_base_cam(stamp_ns))
         return np.asarray(self.T_base_cam(start_ns) @ T_start_end @ T_end)
 
+    def apply_to_world(self, T_map_world: FloatArray) -> FloatArray:
+        """Return a correction of poses of the camera, (4, 4), as one of those of the base frame."""
+        T = self._T_world_cam_first
+        return np.asarray(T @ T_map_world @ se3.invert(T))
+
     def apply_to_edge(self, stamp_ns: int, edge: Edge) -> Edge:
         """Return an edge between two stamps, the later one given, as one of the base frame."""
         if self._is_camera:

@@ -20,7 +20,7 @@ cloud and a picture without lines.
 The frames of REP 105 stand beside those of the estimates: from the world, its `map`, to `gvo/odom`
 to the base frame. The pose in `gvo/odom` is the product of the steps from frame to frame, each as
 the window has it when the frame comes: it drifts and never jumps. Corrections move `gvo/odom`; both
-together are the causal pose.
+together are the causal pose, corrected by the loops that were closed so far.
 
 Global poses come at the end, with their own stamps. Loops are drawn when they are confirmed,
 between the causal poses of their frames (namespace `causal`); at the end all that count, between
@@ -236,7 +236,8 @@ class RunBag(AbstractContextManager["RunBag"]):
         """Go on by the step of a frame, and write where that leads and what corrects it."""
         if result.T_previous_frame is not None:
             self._T_odom_base = se3.normalize(self._T_odom_base @ result.T_previous_frame)
-        poses = self._frames.corrected(result.causal, self._T_odom_base)
+        T_world_base = result.T_map_world @ result.causal.T_world_frame
+        poses = self._frames.corrected(result.stamp_ns, T_world_base, self._T_odom_base)
         write_transforms(self._bag, "/tf", poses)
 
     def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:

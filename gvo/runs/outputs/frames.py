@@ -100,11 +100,13 @@ class RunFrames:
         """Yield the moving transforms of a pose."""
         return self._moving(name, self.world, estimate.stamp_ns, estimate.T_world_frame)
 
-    def corrected(self, estimate: Estimate, T_odom_base: FloatArray) -> Iterator[FramePose]:
-        """Yield those of REP 105: a pose that never jumps, and what corrects it to an estimate."""
-        odom, T_world_odom = f"gvo/{ODOM}", estimate.T_world_frame @ se3.invert(T_odom_base)
-        yield FramePose(estimate.stamp_ns, self.world, odom, T_world_odom)
-        yield from self._moving(ODOM, odom, estimate.stamp_ns, T_odom_base)
+    def corrected(
+        self, stamp_ns: int, T_world_base: FloatArray, T_odom_base: FloatArray
+    ) -> Iterator[FramePose]:
+        """Yield those of REP 105: a pose that never jumps, and what corrects it to another one."""
+        odom, T_world_odom = f"gvo/{ODOM}", T_world_base @ se3.invert(T_odom_base)
+        yield FramePose(stamp_ns, self.world, odom, T_world_odom)
+        yield from self._moving(ODOM, odom, stamp_ns, T_odom_base)
 
     def _moving(
         self, name: str, parent: str, stamp_ns: int, T_parent_base: FloatArray

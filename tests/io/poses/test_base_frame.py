@@ -1,6 +1,7 @@
 """Poses of the base frame, against composition by hand and sampled covariances."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -315,3 +316,19 @@ def test_an_initial_pose_that_is_none_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ConfigurationError, match=r"--initial-pose .*expected") as caught:
         parse_initial_pose(text)
     assert "\n" not in str(caught.value)
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+def test_a_correction_of_the_camera_is_that_of_the_base_frame(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drive = camera_drive(rng)
+    buffer, _ = mounted(rng, STAMPS_NS)
+    frame = BaseFrame.from_tf(buffer, "base", "cam")
+    frame.start(STAMPS_NS[0], random_transform(rng))
+    T_map_world = random_transform(rng)
+    for estimate in drive:
+        corrected = replace(estimate, T_world_frame=T_map_world @ estimate.T_world_frame)
+        expected = frame.apply(corrected).T_world_frame
+        found = frame.apply_to_world(T_map_world) @ frame.apply(estimate).T_world_frame
+        np.testing.assert_allclose(found, expected, atol=1e-9)

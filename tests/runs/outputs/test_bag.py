@@ -334,24 +334,27 @@ def test_above_the_world_of_a_camera_stands_one_with_z_up(tmp_path: Path, stereo
 
 @_KINDS
 @pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
-def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_causal_pose(
+def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_corrected_pose(
     tmp_path: Path, name: str, names: RunFrames
 ) -> None:
     stamps = [_START_NS + k * _SECOND_NS for k in range(5)]
     rng = np.random.default_rng(1)
     steps = [np.eye(4), *(np.asarray(expm(_hat(rng.normal(0.0, 0.1, 6)))) for _ in stamps[1:])]
+    T_map_world = np.asarray(expm(_hat(rng.normal(0.0, 1.0, 6))))  # of loops, from some frame on
+    corrections = [np.eye(4), np.eye(4), T_map_world, T_map_world, T_map_world]
     with RunBag(tmp_path / name, names) as bag:
-        for stamp_ns, step in zip(stamps, steps, strict=True):
+        for stamp_ns, step, T in zip(stamps, steps, corrections, strict=True):
             frame, result = _made_up(stamp_ns)  # ten metres from frame to frame
+            result = replace(result, T_map_world=T)
             first = stamp_ns == stamps[0]
             bag.add_frame(frame, replace(result, T_previous_frame=None if first else step))
     buffer = _buffer(_read(tmp_path / name))
     T_odom_base = np.eye(4)
-    for stamp_ns, step in zip(stamps, steps, strict=True):
+    for stamp_ns, step, T in zip(stamps, steps, corrections, strict=True):
         T_odom_base = T_odom_base @ step
         found = _lookup(buffer, "gvo/odom", f"gvo/odom/{names.base}", stamp_ns)
         np.testing.assert_allclose(found, T_odom_base, atol=1e-12)
-        T_world_base = _made_up(stamp_ns)[1].causal.T_world_frame
+        T_world_base = T @ _made_up(stamp_ns)[1].causal.T_world_frame
         found = _lookup(buffer, "world", f"gvo/odom/{names.camera}", stamp_ns)
         np.testing.assert_allclose(found, T_world_base @ names.mount(stamp_ns), atol=1e-12)
 
