@@ -18,30 +18,34 @@ from __future__ import annotations
 
 import copy
 import logging
+from bisect import bisect
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from gvo.backend.batch import BatchOptimizer, LocalGraph, WholeGraph
 from gvo.backend.factors import ORIGIN, Factors
+from gvo.backend.motion_model import predict_step
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Loop, Optimum, PosePrior, Status
 
+# Of keyframes: that of the reference and that of the frame of an edge.
+_Pairs: TypeAlias = AbstractSet[tuple[object, int]]
+
 _LOGGER = logging.getLogger(__name__)
 
-# Sigmas of a step of a camera that is lost: rad and m.
-_LOST_SIGMA = 100.0
+# Sigmas of a guess after a loss, and upper bounds of others: rad and m.
+_GUESS_SIGMAS = np.array([3.0, 3.0, 3.0, 100.0, 100.0, 100.0])
 # 99 % quantile of chi-square with six degrees of freedom, of each.
 _MAX_CHANCE = 16.812 / 6.0
-# Beyond this sigma in metres a step tells nothing.
-_LOOSE_SIGMA_M = 10.0
-# Drift that is allowed for when loops are judged, over the whole path: a share of it, and radians
-# per metre.
+# Drift that is allowed for when loops are judged, over the whole path: a share of the way and of
+# the turn, and radians per metre.
 _DRIFT = 0.01
 _TURN_PER_M = 0.0005
 # An optimization begins with a loop when the graph has grown by this share, and by so many
@@ -70,6 +74,8 @@ class _Stretch:
         The next keyframe; None while there is none.
     step : Edge or None
         Its pose in the keyframe.
+    is_guess : bool
+        Nothing measured what is between them.
     """
 
     keyframe_ns: int
@@ -79,6 +85,7 @@ class _Stretch:
     statuses: tuple[Status, ...]
     next_ns: int | None
     step: Edge | None
+    is_guess: bool
 
     def edge_to(self, stamp_ns: int) -> Edge:
         """Return the pose of a frame in the keyframe."""
@@ -92,7 +99,7 @@ class _Stretch:
     def _shares(self, step: Edge) -> FloatArray:
         """Return how much of the way to the next keyframe lies before the frames, shape (n,)."""
         n = len(self.stamps_ns)
-        if not _is_loose(step):
+        if not self.is_guess:
             return np.arange(1, n + 1) / (n + 1)
         # Of its uncertainty, as the mean over its directions.
         solved = np.linalg.solve(step.covariance, self.covariances)
@@ -111,7 +118,7 @@ class _Stretch:
             bend = poses[self.keyframe_ns], poses[self.next_ns] @ T_next_keyframe
             bend_twist = se3.log(se3.invert(bend[0]) @ bend[1])
             T_keyframe_frame = se3.exp(shares[:, np.newaxis] * bend_twist) @ T_keyframe_frame
-            if _is_loose(self.step):
+            if self.is_guess:
                 rests = (1.0 - shares)[:, np.newaxis, np.newaxis] * self.step.covariance
                 zero = np.zeros((6, 6))
                 back = covariances[self.next_ns] + rests
@@ -138,6 +145,49 @@ class _Merged(NamedTuple):
     edge: Edge
 
 
+class _Way(NamedTuple):
+    """The way along all keyframes to one of them, as measured.
+
+    Parameters
+    ----------
+    T_first_keyframe : ndarray of float64, shape (4, 4)
+    covariance, drift : ndarray of float64, shape (6, 6)
+        In the axes of the first one, where they add up. The drift is that of the steps as if they
+        drifted each on its own: they do so all alike, and their sigmas add up.
+    n_steps : int
+    part : int
+        The number of guesses before.
+    """
+
+    T_first_keyframe: FloatArray
+    covariance: FloatArray
+    drift: FloatArray
+    n_steps: int
+    part: int
+
+    def then(self, step: Edge, *, is_guess: bool) -> _Way:
+        """Return the way to the next keyframe."""
+        T_first_keyframe = self.T_first_keyframe @ step.T_reference_frame
+        Ad = se3.adjoint(T_first_keyframe)
+        return _Way(
+            T_first_keyframe,
+            self.covariance + Ad @ step.covariance @ Ad.T,
+            self.drift + Ad @ _drift(step, _DRIFT) @ Ad.T,
+            self.n_steps + 1,
+            self.part + is_guess,
+        )
+
+    def chi2(self, loop: Loop, before: _Way, *, drifts: bool) -> float:
+        """Return by how much a loop to a keyframe before contradicts the way from there."""
+        T_frame_first = se3.invert(self.T_first_keyframe)
+        covariance, n_steps = self.covariance - before.covariance, self.n_steps - before.n_steps
+        if drifts:
+            covariance = covariance + n_steps * (self.drift - before.drift)
+        Ad = se3.adjoint(T_frame_first)
+        error = se3.log(T_frame_first @ before.T_first_keyframe @ loop.T_reference_frame)
+        return float(se3.mahalanobis(error, Ad @ covariance @ Ad.T + loop.covariance))
+
+
 class _Solution(NamedTuple):
     """The poses of keyframes, merged ones among them, and the loops as judged with them."""
 
@@ -145,6 +195,7 @@ class _Solution(NamedTuple):
     loops: tuple[Loop, ...]
     error_before: float
     optimizer: BatchOptimizer
+    firsts: dict[int, int]
 
 
 class RunGraph:
@@ -176,6 +227,13 @@ class RunGraph:
         self._stretches: dict[int, _Stretch] = {}
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
+        # Where nothing measured connects a keyframe with those before: the one before it.
+        self._guesses: dict[int, int] = {}
+        # The frames since the latest keyframe that follow a guess; worlds of frames, but for the
+        # first one.
+        self._adrift: set[object] = set()
+        self._worlds: dict[object, int] = {}
+        self._n_worlds = self._measured_ns = 0
         self._running: Future[_Solution] | None = None
         self._began_with: Estimate | None = None
         # Numbers of keyframes, merged ones too, at which the next one begins and is taken over.
@@ -208,26 +266,47 @@ class RunGraph:
         last, self._last = self._last, estimate
         if last is None:
             self._keyframes[estimate.stamp_ns] = estimate
+            self._n_worlds, self._measured_ns = 1, estimate.stamp_ns
             return
-        edges = list(edges)
-        near = {next(reversed(self._keyframes)), *(each.stamp_ns for each, _ in self._arrivals)}
-        if not any(edge.reference_id in near for edge in edges):
-            edges.append(self._unmeasured(last, estimate))
-        self._arrivals.append((estimate, edges))
+        stamp_ns, latest_ns = estimate.stamp_ns, next(reversed(self._keyframes))
+        if world := self.world_of(edges):
+            self._worlds[stamp_ns] = world
+            self._n_worlds = max(self._n_worlds, world + 1)
+        near = {latest_ns, *(each.stamp_ns for each, _ in self._arrivals)}
+        ties = [edge for edge in edges if edge.reference_id in near]
+        if ties and ties[0].reference_id in self._adrift:
+            self._close(last.stamp_ns)  # so that the guess is an edge of its own
+        guess = [] if ties else [self._unmeasured(last, estimate)]
+        self._adrift |= {stamp_ns} if guess else set()
+        self._measured_ns = stamp_ns if edges else self._measured_ns
+        self._arrivals.append((estimate, [*edges, *guess]))
         if is_keyframe:
-            self._condense()
-            self._arrivals = []
+            self._close(stamp_ns)
+
+    def _close(self, stamp_ns: int) -> None:
+        """Make the newest frame a keyframe."""
+        if stamp_ns in self._adrift:
+            self._guesses[stamp_ns] = next(reversed(self._keyframes))
+        self._condense()
+        self._arrivals, self._adrift = [], set()
+
+    def world_of(self, edges: Sequence[Edge]) -> int:
+        """Return the number of the world that the edges of the next frame connect it with.
+
+        Where nothing connects a frame with earlier ones, another world begins: its place among
+        the others is only guessed.
+        """
+        return min((self._worlds.get(e.reference_id, 0) for e in edges), default=self._n_worlds)
 
     def _unmeasured(self, last: Estimate, estimate: Estimate) -> Edge:
-        config, elapsed_s = self._config, 1e-9 * (estimate.stamp_ns - last.stamp_ns)
-        turn = np.radians(config.coasting_sigma_deg_per_s)
-        sigmas = elapsed_s * np.repeat([turn, config.coasting_sigma_m_per_s], 3)
+        coasted_s, elapsed_s = 1e-9 * np.diff([self._measured_ns, last.stamp_ns, estimate.stamp_ns])
+        _, covariance = predict_step(None, elapsed_s, self._config, coasted_s=coasted_s)
         if estimate.status is Status.LOST:
-            sigmas = np.full(6, _LOST_SIGMA)
+            covariance = np.diag(_GUESS_SIGMAS**2)
         return Edge(
             reference_id=last.stamp_ns,
             T_reference_frame=se3.invert(last.T_world_frame) @ estimate.T_world_frame,
-            covariance=np.diag(sigmas**2),
+            covariance=covariance,
         )
 
     def _condense(self, *, is_closed: bool = True) -> None:
@@ -250,6 +329,11 @@ class RunGraph:
             int(stamp_ns): Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)  # type: ignore[call-overload]
             for stamp_ns, (T, covariance) in solved.items()
         }
+        is_guess = newest is not None and newest.stamp_ns in self._guesses
+        if newest is not None and is_guess:
+            step = others[newest.stamp_ns]
+            variances = np.minimum(np.diagonal(step.covariance), _GUESS_SIGMAS**2)
+            others[newest.stamp_ns] = replace(step, covariance=np.diag(variances))
         self._edges += others.items()
         self._stretches[origin_ns] = _Stretch(
             keyframe_ns=origin_ns,
@@ -259,6 +343,7 @@ class RunGraph:
             statuses=tuple(frame.status for frame in frames),
             next_ns=None if newest is None else newest.stamp_ns,
             step=None if newest is None else others[newest.stamp_ns],
+            is_guess=is_guess,
         )
         if newest is not None:
             self._keyframes[newest.stamp_ns] = newest
@@ -315,6 +400,7 @@ class RunGraph:
         references = {loop.reference_ns for loop in counting.values()}
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
         before = {each.next_ns: each.keyframe_ns for each in self._stretches.values()}
+        references |= {*self._guesses, *self._guesses.values()}
         for ns in list(self._keyframes)[1:-_N_LATEST]:
             loop = counting.get(ns)
             if ns in places or ns in references:
@@ -360,7 +446,7 @@ class RunGraph:
         graph = copy.copy(self)
         graph._keyframes, graph._merged = dict(self._keyframes), dict(self._merged)
         graph._stretches, graph._edges = dict(self._stretches), list(self._edges)
-        graph.loops = tuple(self.loops)
+        graph._guesses, graph.loops = dict(self._guesses), tuple(self.loops)
         if graph._arrivals:
             graph._condense(is_closed=False)
         return graph
@@ -390,11 +476,15 @@ class RunGraph:
         if not self._keyframes:
             raise ValueError("the graph of the run is empty: no frame has come")
         graph = self._copied()
-        poses, loops, error_before, optimizer = graph._solve(on_step)
+        poses, loops, error_before, optimizer, firsts = graph._solve(on_step)
         found = np.broadcast_to(np.eye(6), (len(graph), 6, 6))
         if covariances:
             found = graph._variance_factor(loops) * optimizer.covariances()
         by_keyframe = dict(zip(graph._keyframes, found, strict=True))
+        for stamp_ns, first_ns in firsts.items():
+            Ad = se3.adjoint(se3.invert(poses[stamp_ns]) @ poses[first_ns])
+            guessed = Ad @ graph._keyframes[first_ns].covariance @ Ad.T
+            by_keyframe[stamp_ns] = by_keyframe[stamp_ns] + guessed
         return Optimum(
             estimates=graph._place(poses, by_keyframe),
             keyframes_ns=tuple(graph._keyframes),
@@ -407,26 +497,33 @@ class RunGraph:
         )
 
     def _solve(self, on_step: Callable[[str], None] = lambda _: None) -> _Solution:
-        loops = self._judged(on_step)
-        graph = self._whole([loop for loop in loops if not loop.reason])
+        loops, refused = self._judged(on_step)
+        graph = self._whole(loops, refused=refused)
+        firsts = self._bridge(graph)
         optimizer = BatchOptimizer(graph, on_step=on_step)
         error_before = optimizer.starts["odometry"]
         optimizer.run()
         poses = dict(zip(self._keyframes, optimizer.poses(), strict=True))
         for stamp_ns, (_, edge) in reversed(self._merged.items()):
             poses[stamp_ns] = poses[int(edge.reference_id)] @ edge.T_reference_frame  # type: ignore[call-overload]
-        return _Solution(poses, loops, error_before, optimizer)
+        return _Solution(poses, loops, error_before, optimizer, firsts)
 
-    def _judged(self, on_step: Callable[[str], None]) -> tuple[Loop, ...]:
-        """Return the loops, those with a reason that contradict odometry and the other ones."""
-        confirmed = [loop for loop in self.loops if not loop.reason]
-        if not confirmed:
-            return tuple(self.loops)
-        graph = self._whole(confirmed, drift=_DRIFT * np.sqrt(len(self._edges)))
+    def _judged(self, on_step: Callable[[str], None]) -> tuple[tuple[Loop, ...], _Pairs]:
+        """Return the loops, those with a reason that contradict odometry and the other ones.
+
+        And the pairs of keyframes whose loops, or edges between parts, are refused.
+        """
+        loops = self._possible()
+        confirmed = [loop for loop in loops if not loop.reason]
+        if not (confirmed or self._guesses):
+            return loops, frozenset()
+        graph = self._whole(loops, drift=_DRIFT * np.sqrt(len(self._edges)))
         optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
         optimizer.run()
         keyframes = list(self._keyframes)
-        refused = {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
+        refused: set[tuple[object, int]] = {
+            (keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused
+        }
         # A keyframe that was merged elsewhere had its loop refused.
         refused |= {
             (loop.reference_ns, loop.stamp_ns)
@@ -435,52 +532,111 @@ class RunGraph:
             and self._merged[loop.stamp_ns].edge.reference_id != loop.reference_ns
         }
         reason = "contradicts odometry or the other loops"
-        return tuple(
+        loops = tuple(
             replace(loop, reason=loop.reason or reason)
             if (loop.reference_ns, loop.stamp_ns) in refused
             else loop
-            for loop in self.loops
+            for loop in loops
         )
+        return loops, refused
 
-    def _whole(self, loops: Sequence[Loop], *, drift: float = 0.0) -> WholeGraph:
-        """Return the graph; with a share of each way by which odometry may be wrong besides."""
+    def _bridge(self, graph: WholeGraph) -> dict[int, int]:
+        """Add the guesses that alone connect keyframes: elsewhere they tell nothing.
+
+        They are added as if they were known: the rest of a graph does not depend on that, and
+        sigmas so far apart would be too much for a solver.
+
+        Returns
+        -------
+        dict of int to int
+            By keyframes that only guesses connect with the first one: the first of those that
+            are connected with them.
+        """
+        stamps_ns = list(self._keyframes)
+        roots = {ns: ns for ns in stamps_ns}
+
+        def root(stamp_ns: int) -> int:
+            while roots[stamp_ns] != stamp_ns:
+                stamp_ns = roots[stamp_ns]
+            return stamp_ns
+
+        for reference, frame, _ in graph.links:
+            first, second = sorted((root(stamps_ns[reference]), root(stamps_ns[frame])))
+            roots[second] = first
+        firsts = {ns: root(ns) for ns in stamps_ns if root(ns) != stamps_ns[0]}
+        for stamp_ns, edge in self._edges:
+            before_ns = self._guesses.get(stamp_ns, stamp_ns)
+            if edge.reference_id == before_ns and root(before_ns) != root(stamp_ns):
+                roots[root(stamp_ns)] = root(before_ns)
+                graph.add_edges(stamp_ns, [replace(edge, covariance=ORIGIN.covariance)])
+        return firsts
+
+    def _whole(
+        self, loops: Sequence[Loop], *, drift: float = 0.0, refused: _Pairs = frozenset()
+    ) -> WholeGraph:
+        """Return the graph without guesses; or with a share of each way that odometry may drift.
+
+        Edges between two parts, which only guesses connect besides, may be refused as loops are.
+        """
         graph, first = WholeGraph(), next(iter(self._keyframes.values()))
         origin = PosePrior(T_world_frame=first.T_world_frame, covariance=ORIGIN.covariance)
         for stamp_ns, estimate in self._keyframes.items():
             graph.add_pose(stamp_ns, stamp_ns, origin if estimate is first else None)
             graph.given[stamp_ns] = estimate.T_world_frame
+        starts_ns = list(self._guesses)
         for stamp_ns, edge in self._edges:
-            graph.add_edges(stamp_ns, [_drifting(edge, drift)], is_trusted=True)
+            reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
+            is_guess = self._guesses.get(stamp_ns) == reference_ns
+            is_inside = bisect(starts_ns, stamp_ns) == bisect(starts_ns, reference_ns)
+            if drift if is_guess else (reference_ns, stamp_ns) not in refused or is_inside:
+                is_trusted = is_inside or is_guess
+                graph.add_edges(
+                    stamp_ns,
+                    [replace(edge, covariance=edge.covariance + _drift(edge, drift))],
+                    is_trusted=is_trusted,
+                )
         for loop in loops:
-            if loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes:
+            is_there = loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes
+            if is_there and not loop.reason:
                 graph.add_edges(loop.stamp_ns, [loop.edge])
         return graph
+
+    def _ways(self) -> dict[int | None, _Way]:
+        """Return the way to each keyframe, merged ones among them."""
+        way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
+        ways = {next(iter(self._keyframes)): way, None: way}
+        for stretch in self._stretches.values():
+            if stretch.step is not None:
+                way = ways[stretch.next_ns] = way.then(stretch.step, is_guess=stretch.is_guess)
+        return ways
+
+    def _possible(self) -> tuple[Loop, ...]:
+        """Return the loops, those with a reason that odometry alone does not allow.
+
+        However many agree with each other: those between equal rooms do.
+        """
+        ways = self._ways()
+        reason = "farther from odometry than that drifts"
+        return tuple(
+            replace(loop, reason=reason)
+            if not loop.reason
+            and ways[loop.stamp_ns].chi2(loop, ways[loop.reference_ns], drifts=True)
+            > 6.0 * _MAX_CHANCE
+            else loop
+            for loop in self.loops
+        )
 
     def _variance_factor(self, loops: Sequence[Loop]) -> float:
         """Return how much more odometry drifts than its covariances say, 1 at least.
 
         The median over the loops of what each contradicts it by, unless that may be chance.
         """
-        T_first_frame, covariance, part = np.eye(4), np.zeros((6, 6)), 0
-        ways = {next(iter(self._stretches), None): (T_first_frame, covariance, part)}
-        for stretch in self._stretches.values():
-            if (step := stretch.step) is not None:
-                T_first_frame = T_first_frame @ step.T_reference_frame
-                Ad = se3.adjoint(T_first_frame)
-                covariance = covariance + Ad @ step.covariance @ Ad.T
-                if _is_loose(step):
-                    covariance, part = np.zeros((6, 6)), part + 1
-                ways[stretch.next_ns] = T_first_frame, covariance, part
+        ways = self._ways()
         ratios = []
         for loop in loops:
-            T, covariance, part = ways[loop.stamp_ns]
-            T_reference, before, part_before = ways[loop.reference_ns]
-            if not loop.reason and part == part_before:
-                T_frame_first = se3.invert(T)
-                Ad = se3.adjoint(T_frame_first)
-                total = Ad @ (covariance - before) @ Ad.T + loop.covariance
-                error = se3.log(T_frame_first @ T_reference @ loop.T_reference_frame)
-                ratios.append(float(se3.mahalanobis(error, total)) / 6.0)
+            way, before = ways[loop.stamp_ns], ways[loop.reference_ns]
+            if not loop.reason and way.part == before.part:
+                ratios.append(way.chi2(loop, before, drifts=False) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
         return factor if factor > _MAX_CHANCE else 1.0
 
@@ -500,11 +656,6 @@ class RunGraph:
         for stretch in self._stretches.values():
             estimates += stretch.place(poses, covariances)
         return tuple(sorted(estimates, key=lambda estimate: estimate.stamp_ns))
-
-
-def _is_loose(step: Edge) -> bool:
-    """Tell whether a step says nothing of where the camera went."""
-    return bool(step.covariance[3, 3] > _LOOSE_SIGMA_M**2)
 
 
 def _join(first: Edge, second: Edge) -> Edge:
@@ -542,13 +693,12 @@ def _fuse(edges: dict[int, Edge], key: int, edge: Edge) -> None:
     edges[key] = replace(edge, T_reference_frame=se3.normalize(T), covariance=covariance)
 
 
-def _drifting(edge: Edge, drift: float) -> Edge:
-    """Widen an edge by a share of its way."""
-    if drift == 0.0:
-        return edge
-    sigma_m = drift * float(np.linalg.norm(edge.T_reference_frame[:3, 3]))
-    variances = np.repeat([(_TURN_PER_M / _DRIFT * sigma_m) ** 2, sigma_m**2], 3)
-    return replace(edge, covariance=edge.covariance + np.diag(variances))
+def _drift(edge: Edge, share: float) -> FloatArray:
+    """Return the covariance of a drift that is a share of a way and of its turn."""
+    T = edge.T_reference_frame
+    sigma_m = share * float(np.linalg.norm(T[:3, 3]))
+    turn = share * float(se3.rotation_angle(T)) + _TURN_PER_M / _DRIFT * sigma_m
+    return np.diag(np.repeat([turn, sigma_m], 3) ** 2)
 
 
 def _residual(edge: Edge, stamp_ns: int, poses: dict[int, FloatArray]) -> float:

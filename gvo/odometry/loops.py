@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
@@ -30,17 +30,22 @@ _SURE_SCORE = 0.06
 # Places within which a second loop has to confirm one, the sigmas by which both may differ, and by
 # how much odometry may be wrong between them: per metre, and per radian.
 _N_WAITING = 5
+# In a world that no loop connects with the others, so many frames search all of them; later ones
+# with growing pauses of at most so many frames.
+_N_EAGER = 15
+_MAX_PAUSE = 30
 _AGREEMENT = 5.0
 _DRIFT = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Visit:
-    """A place, and where odometry was when it was seen."""
+    """A place, and where odometry was when it was seen, in one of its worlds."""
 
     number: int
     place: Any
     T_world_frame: FloatArray
+    world: int
 
 
 class LoopDetector:
@@ -49,6 +54,9 @@ class LoopDetector:
     Candidates come by appearance, the latest places apart. What is registered has to be seen in
     most of the view. It is a loop when another one confirms it: two loops of neighbouring frames
     and the odometry between them agree.
+
+    Where odometry was lost it goes on in another world, whose place among the others is not known
+    until a loop tells: its first frames search all other places, whatever they look like.
 
     Parameters
     ----------
@@ -80,6 +88,10 @@ class LoopDetector:
         self._indexed: list[_Visit] = []
         self._recent: list[_Visit] = []
         self._waiting: list[tuple[int, Loop]] = []
+        self._n_visits = 0
+        self._connected: set[int] = set()
+        self._n_searches: dict[int, int] = {}
+        self._n_paused = 0
         self.loops: list[Loop] = []
 
     def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
@@ -119,33 +131,70 @@ class LoopDetector:
         T_world_frame: FloatArray,
         *,
         near: Container[int] = (),
+        world: int = 0,
+        is_keyframe: bool = True,
     ) -> tuple[Loop, ...]:
         """Detect, by what a front-end extracted; places whose stamps are `near` are no loops.
 
         A frame that shows most of the latest place is none of its own, and nothing is looked for.
+        Those that are no keyframes are looked at only in a `world` that is not connected with the
+        others, and are places where they are found.
         """
-        if self._shows_latest(T_world_frame):
+        if self._recent and self._recent[-1].world != world:
+            self._leave_world()
+        is_search = self._is_search(world)
+        is_place = is_keyframe and not self._shows_latest(T_world_frame)
+        if not (is_search or is_place):
             return ()
         place = self._frontend.describe(observations)
-        found: list[Loop] = []
-        for number in self._candidates(place.descriptors_left, near):
+        scores = self._index.scores(place.descriptors_left)
+        numbers = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
+        loop = self._register(numbers, place, observations)
+        if not is_place and loop is None:
+            return ()
+        visit = _Visit(number=self._n_visits, place=place, T_world_frame=T_world_frame, world=world)
+        self._n_visits += 1
+        self._visits[place.stamp_ns] = visit
+        self._recent.append(visit)
+        confirmed = () if loop is None else tuple(self._confirm(loop))
+        if len(self._recent) > _N_RECENT:
+            self._keep_oldest_recent()
+        return confirmed
+
+    def _leave_world(self) -> None:
+        """Add all places to the index: odometry does not know where they are any more."""
+        self._waiting = []
+        while self._recent:
+            self._keep_oldest_recent()
+
+    def _is_search(self, world: int) -> bool:
+        """Tell whether a frame of a world that is not connected searches all others."""
+        if self._n_visits == 0:
+            self._connected.add(world)
+        if world in self._connected:
+            return False
+        n_searches = self._n_searches.get(world, 0)
+        self._n_paused += 1
+        if self._n_paused <= min(n_searches - _N_EAGER, _MAX_PAUSE):
+            return False
+        self._n_searches[world], self._n_paused = n_searches + 1, 0
+        return True
+
+    def _register(
+        self,
+        numbers: Sequence[int],
+        place: Any,  # noqa: ANN401
+        observations: Any,  # noqa: ANN401
+    ) -> Loop | None:
+        for number in numbers:
             reference = self._indexed[number].place
             result = self._frontend.recognize(reference, place, observations)
             if isinstance(result, RelativePose):
-                found.append(_loop(reference.stamp_ns, place.stamp_ns, result))
-                break
-        number = self._recent[-1].number + 1 if self._recent else 0
-        visit = _Visit(number=number, place=place, T_world_frame=T_world_frame)
-        self._visits[place.stamp_ns] = visit
-        self._recent.append(visit)
-        confirmed = [each for loop in found for each in self._confirm(loop)]
-        self._keep_oldest_recent()
-        return tuple(confirmed)
+                return _loop(reference.stamp_ns, place.stamp_ns, result)
+        return None
 
     def _keep_oldest_recent(self) -> None:
-        """Add the latest place but some to the index, unless it is known by another frame."""
-        if len(self._recent) <= _N_RECENT:
-            return
+        """Add the oldest of the latest places to the index, unless another frame knows it."""
         visit = self._recent.pop(0)
         stamp_ns = visit.place.stamp_ns
         newest = reversed(self.loops)
@@ -164,8 +213,12 @@ class LoopDetector:
         points, camera = latest.place.points_cam, self._frontend.camera
         return view_overlap(points, T, camera) > _MAX_OVERLAP
 
-    def _candidates(self, descriptors: Any, near: Container[int]) -> list[int]:  # noqa: ANN401
-        scores = self._index.scores(descriptors)
+    def _elsewhere(self, scores: FloatArray, world: int) -> list[int]:
+        """Return the places of other worlds that a view is most like."""
+        best = np.argsort(-scores).tolist()
+        return [k for k in best if self._indexed[k].world != world][:_N_CANDIDATES]
+
+    def _candidates(self, scores: FloatArray, near: Container[int]) -> list[int]:
         if len(scores) == 0:
             return []
         limit = min(_ABOVE_NOISE * float(np.quantile(scores, _NOISE_QUANTILE)), _SURE_SCORE)
@@ -189,12 +242,21 @@ class LoopDetector:
                 self.loops[self.loops.index(other)] = self._waiting[k][1]
         if agreeing:
             confirmed.append(loop := replace(loop, reason=""))
+        world, reference_world = (
+            self._visits[ns].world for ns in (loop.stamp_ns, loop.reference_ns)
+        )
+        if agreeing and world != reference_world:
+            self._connected.add(world)
+        elif world in self._n_searches:  # the next frames may confirm it
+            self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
         self._waiting.append((newest, loop))
         self.loops.append(loop)
         return confirmed
 
     def _agree(self, first: Loop, second: Loop) -> bool:
         """Tell whether two loops and the odometry between their ends agree."""
+        if self._visits[first.reference_ns].world != self._visits[second.reference_ns].world:
+            return False
         T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
         T_references, other_drift = self._way(first.reference_ns, second.reference_ns)
         T_expected = se3.invert(T_references) @ first.T_reference_frame @ T_first_second

@@ -467,13 +467,23 @@ class Odometry:
         """Add a frame to the graph of the run, and the loops of a keyframe."""
         stamp_ns = causal.stamp_ns
         kept_ns = self._keyframes.stamps_ns
-        is_keyframe = stamp_ns in kept_ns
-        self._graph.add_frame(causal, self._window.edges(stamp_ns), is_keyframe=is_keyframe)
-        if self._loops is None or not is_keyframe or not self._config.loops.enabled:
+        edges, is_keyframe = self._window.edges(stamp_ns), stamp_ns in kept_ns
+        is_tied = causal.status in (Status.OK, Status.RESUMED)
+        if self._loops is None or not self._config.loops.enabled or not is_tied:
+            self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
             return ()
+        loops = self._loops.look(
+            observations,
+            causal.T_world_frame,
+            near=set(kept_ns).difference(self._unjoined()),
+            world=self._graph.world_of(edges),
+            is_keyframe=is_keyframe,
+        )
         self._graph.loops = self._loops.loops
-        loops = self._loops.look(observations, causal.T_world_frame, near=kept_ns)
-        self._graph.advance(loops, self._loops)
+        is_keyframe = is_keyframe or stamp_ns in self._loops
+        self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
+        if is_keyframe:
+            self._graph.advance(loops, self._loops)
         return loops
 
     def _keep_anchor(self) -> None:

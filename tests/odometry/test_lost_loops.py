@@ -1,0 +1,205 @@
+"""Loops connect what a lost camera measured before and after; odometry tells which are false."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gvo.config import WindowConfig
+from gvo.geometry import se3
+from gvo.odometry.graph import RunGraph
+from gvo.odometry.loops import LoopDetector
+from gvo.types import Edge, Estimate, FloatArray, Optimum, Status
+from tests.odometry.drives import (
+    PERIOD_NS,
+    SIGMAS,
+    Drive,
+    MadeUpPlaces,
+    block,
+    measured,
+    poses,
+    position_error,
+)
+
+N_LAP = 100
+# Dark frames; the guess is wrong by far from the first one on.
+DARK = range(50, 55)
+AWAY = se3.exp(np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5]))
+
+
+def lit_again(
+    truth: FloatArray, *, dark: range = DARK, away: FloatArray = AWAY, status: Status = Status.LOST
+) -> Drive:
+    """Return a drive without measurements of dark frames, and none across them."""
+    drive = Drive(truth)
+    T_guess_truth = truth[dark.start] @ away @ se3.invert(truth[dark.start])
+    for j, T in enumerate(truth):
+        edges: list[Edge] = []
+        if j > 0 and j not in dark and j != dark.stop:
+            edges = [measured(truth, j - 1, j, SIGMAS, None)]
+        is_dark = j in dark or j == dark.stop
+        estimate = Estimate(
+            stamp_ns=j * PERIOD_NS,
+            T_world_frame=T if j < dark.start else T_guess_truth @ T,
+            covariance=np.eye(6) if j < dark.start else 4.0 * np.eye(6),
+            status=status if is_dark else Status.OK,
+        )
+        drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0 and not is_dark)
+    return drive
+
+
+def bright(optimum: Optimum, truth: FloatArray) -> float:
+    """Return the error of the frames that were measured."""
+    seen = [j for j in range(len(truth)) if j not in DARK and j != DARK.stop]
+    return position_error(poses(optimum)[seen], truth[seen])
+
+
+@pytest.mark.parametrize("status", [Status.COASTING, Status.LOST])
+def test_a_loop_takes_what_came_after_the_dark_to_its_place(status: Status) -> None:
+    truth = block(1.2, n_per_lap=N_LAP)
+    drive = lit_again(truth, status=status)
+    before = bright(drive.graph.optimize(), truth)
+    drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(3)]
+    optimum = drive.graph.optimize()
+    assert before > 1.0
+    assert not any(loop.reason for loop in optimum.loops)
+    assert bright(optimum, truth) < 0.01
+    assert max(float(each.covariance[3, 3]) for each in optimum.estimates[60:]) < 0.1
+
+
+def test_without_a_loop_it_stays_where_it_was_guessed_as_uncertain_as_that() -> None:
+    truth = block(1.0, n_per_lap=N_LAP)
+    drive = lit_again(truth)
+    optimum = drive.graph.optimize()
+    found = se3.invert(poses(optimum)[60]) @ poses(optimum)[-1]
+    np.testing.assert_allclose(found, se3.invert(truth[60]) @ truth[-1], atol=1e-6)
+    assert float(optimum.estimates[40].covariance[3, 3]) < 0.1
+    assert float(optimum.estimates[-1].covariance[3, 3]) > 4.0
+
+
+def test_false_loops_after_a_loss_are_refused_where_more_true_ones_follow() -> None:
+    truth = block(1.4, n_per_lap=N_LAP)
+    drive = lit_again(truth, dark=range(20, 25))
+    twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
+    false = [drive.loop(5 * k, 50 + 5 * k, T=twin) for k in range(3)]
+    true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
+    drive.graph.loops = false
+    # with nothing against them they count
+    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+    drive.graph.loops = [*false, *true]
+    optimum = drive.graph.optimize(covariances=False)
+    assert [bool(loop.reason) for loop in optimum.loops] == [True] * 3 + [False] * 4
+    assert position_error(poses(optimum)[30:], truth[30:]) < 0.01
+
+
+def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
+    truth = block(1.3, n_per_lap=N_LAP)
+    drive = Drive(truth)
+    for j, T in enumerate(truth):
+        edges = [] if j in (0, 50) else [measured(truth, j - 1, j, SIGMAS, None)]
+        if j == 55:  # as by a keyframe that looks alike
+            edges.append(drive.loop(10, 55, T=AWAY).edge)
+        estimate = Estimate(
+            stamp_ns=j * PERIOD_NS,
+            T_world_frame=T,
+            covariance=np.eye(6),
+            status=Status.LOST if j == 50 else Status.OK,
+        )
+        drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+    drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
+    optimum = drive.graph.optimize(covariances=False)
+    assert position_error(poses(optimum), truth) < 0.01
+
+
+def walk(n: int = 120, step_m: float = 0.1) -> FloatArray:
+    """Return a straight walk of 12 m."""
+    return np.array([se3.exp(np.array([0, 0, 0, 0, 0, step_m * j])) for j in range(n)])
+
+
+def test_loops_between_equal_rooms_are_refused_however_many_agree() -> None:
+    drive = Drive(walk()).run()
+    drive.graph.loops = [drive.loop(5 * k, 50 + 5 * k, T=np.eye(4)) for k in range(12)]
+    optimum = drive.graph.optimize(covariances=False)
+    assert {loop.reason for loop in optimum.loops} == {"farther from odometry than that drifts"}
+    assert position_error(poses(optimum), drive.truth) < 0.01
+
+
+@pytest.mark.parametrize("n_more", [0, 300])
+def test_the_way_between_two_places_counts_not_what_came_before(n_more: int) -> None:
+    truth = walk(120 + n_more)
+    drive = Drive(truth).run()
+    last = len(truth) - 1 - (len(truth) - 1) % 5
+    drive.graph.loops = [drive.loop(last - 50, last, T=np.eye(4))] * 2
+    assert all(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+
+
+@pytest.mark.parametrize("bias", [(0.01, 0.0), (0.0, 0.0005), (-0.01, -0.0005)])
+def test_true_loops_count_after_one_percent_of_drift(bias: tuple[float, float]) -> None:
+    drive = Drive(block(1.3, n_per_lap=N_LAP), np.random.default_rng(1), bias=bias).run()
+    drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(5)]
+    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+
+
+class CountedPlaces(MadeUpPlaces):
+    """The same, with the numbers of the frames that were looked at."""
+
+    def __init__(self, truth: FloatArray, n_per_lap: int) -> None:
+        super().__init__(truth, n_per_lap)
+        self.described: list[int] = []
+
+    def describe(self, observations: int) -> SimpleNamespace:
+        self.described.append(observations)
+        return super().describe(observations)
+
+
+def test_frames_of_another_world_search_eagerly_and_then_more_rarely() -> None:
+    truth = block(3.0, n_per_lap=N_LAP)
+    frontend = CountedPlaces(truth, N_LAP)
+    detector = LoopDetector(frontend=frontend)
+    for j in range(0, 50, 5):
+        detector.look(j, truth[j])
+    for j in range(60, 100):
+        assert detector.look(j, truth[j], world=1, is_keyframe=False) == ()
+    found = frontend.described[10:]
+    assert found[:15] == list(range(60, 75))
+    assert 4 <= len(found) - 15 <= 8
+
+
+def test_two_frames_of_another_world_are_connected_by_two_loops_to_the_same_one() -> None:
+    truth = block(2.0, n_per_lap=N_LAP)
+    detector = LoopDetector(frontend=MadeUpPlaces(truth, N_LAP))
+    for j in range(0, 50, 5):
+        detector.look(j, truth[j])
+    # Its poses have nothing to do with those of the first world.
+    looks = [
+        detector.look(N_LAP + j, AWAY @ truth[N_LAP + j], world=1, is_keyframe=False)
+        for j in (10, 15, 20, 25)
+    ]
+    assert [len(loops) for loops in looks] == [0, 2, 0, 0]
+    assert (N_LAP + 15) * PERIOD_NS in detector
+    assert (N_LAP + 20) * PERIOD_NS not in detector
+
+
+def test_loops_to_two_different_worlds_confirm_nothing() -> None:
+    truth = block(2.0, n_per_lap=N_LAP)
+    detector = LoopDetector(frontend=MadeUpPlaces(truth, N_LAP))
+    detector.look(10, truth[10])
+    detector.look(15, truth[15], world=1)
+    for j in (N_LAP + 10, N_LAP + 15):
+        assert detector.look(j, truth[j], world=2) == ()
+    assert [bool(loop.reason) for loop in detector.loops] == [True, True]
+
+
+def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
+    graph, drive = RunGraph(WindowConfig()), Drive(walk(10))
+    for j in range(10):
+        edges = [] if j in (0, 4) else [measured(drive.truth, j - 1, j, SIGMAS, None)]
+        worlds = graph.world_of(edges)
+        assert worlds == (0 if j < 4 else 1)
+        estimate = Estimate(
+            stamp_ns=j * PERIOD_NS, T_world_frame=drive.truth[j], covariance=np.eye(6)
+        )
+        graph.add_frame(estimate, edges, is_keyframe=j == 2)
+    back = [measured(drive.truth, k, 9, SIGMAS, None) for k in (2, 8)]
+    assert graph.world_of(back) == 0
+    assert graph.world_of(back[1:]) == 1
