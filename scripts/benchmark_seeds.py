@@ -41,6 +41,8 @@ KINDS = {
     "lap": Kind("driving", "stereo", n_frames=560, scale=0.5),
     "room": Kind("handheld", "rgbd", n_frames=600, scale=0.5),
     "block": Kind("block", "stereo", n_frames=600, scale=0.5),
+    "facade": Kind("facade", "stereo", scale=0.5),
+    "mirror": Kind("mirror", "rgbd", scale=0.5),
     "rooms": Kind("rooms", "rgbd", n_frames=1080, scale=0.5),
 }
 SPANS_S = (1, 10)
