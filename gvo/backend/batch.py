@@ -20,6 +20,8 @@ from typing import Literal, NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from gvo.backend.factors import ORIGIN, Factors, Measurement, find_faults, place_fault, prior_fault
 from gvo.backend.pose_graph import definite, first_line
@@ -43,6 +45,8 @@ _MAX_SHARPENINGS = 200
 _STEPS_EACH = 2
 # Steps of a small graph, whose start is good.
 _N_LOCAL_STEPS = 5
+# Below this share of the largest pivot one is rounding.
+_LEAST_PIVOT = 1e-15
 # Covariances between two reports of progress.
 _REPORTED = 20
 
@@ -491,21 +495,52 @@ class BatchOptimizer:
     def covariances(self) -> FloatArray:
         """Return the marginal covariances of the poses, shape (n, 6, 6).
 
+        GTSAM refuses some graphs of stiff parts that are loosely joined, as by coasting frames;
+        they are solved here.
+
         Raises
         ------
         SmoothingError
             If a pose is not determined by the edges that count.
         """
         found = []
+        marginals: Callable[[int], FloatArray]
         try:
-            marginals = gtsam.Marginals(self._factors, self.values)
+            try:
+                marginals = gtsam.Marginals(self._factors, self.values).marginalCovariance
+            except RuntimeError:
+                marginals = sparse_marginals(self._factors.linearize(self.values))
             for key in self.numbers:
-                found.append(definite(marginals.marginalCovariance(key)))
+                found.append(definite(marginals(key)))
                 if len(found) % _REPORTED == 0:
                     self._on_step(f"covariance {len(found)} of {len(self.numbers)}")
         except RuntimeError as error:
-            raise SmoothingError(f"no covariances: GTSAM: {first_line(error)}") from error
+            raise SmoothingError(f"no covariances: {first_line(error)}") from error
         return np.array(found)
+
+
+def sparse_marginals(graph: gtsam.GaussianFactorGraph) -> Callable[[int], FloatArray]:
+    """Return what computes the marginal covariance of a pose by its key, of keys from 0 on.
+
+    Raises
+    ------
+    RuntimeError
+        If the poses are not determined.
+    """
+    rows, columns, values = graph.sparseJacobian_()
+    J = csc_array((values, (rows.astype(int) - 1, columns.astype(int) - 1)))[:, :-1]
+    solved = splu((J.T @ J).tocsc())
+    pivots = np.abs(solved.U.diagonal())
+    if pivots.min() < _LEAST_PIVOT * pivots.max():
+        raise RuntimeError("a pose is not determined")
+
+    def marginal(key: int) -> FloatArray:
+        block = slice(6 * key, 6 * key + 6)
+        unit = np.zeros((J.shape[1], 6))
+        unit[block] = np.eye(6)
+        return np.asarray(solved.solve(unit)[block])
+
+    return marginal
 
 
 def as_transforms(values: gtsam.Values) -> FloatArray:

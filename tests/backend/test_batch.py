@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvo
-from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph
+from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph, sparse_marginals
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior
 from tests.backend.walks import seeds
@@ -120,6 +122,30 @@ def test_the_error_and_covariances_are_those_of_gtsam_by_hand() -> None:
     marginals = gtsam.Marginals(factors, values)
     expected = [marginals.marginalCovariance(number) for number in range(N)]
     np.testing.assert_allclose(found.covariances(), expected, rtol=1e-3, atol=1e-9)
+
+
+def test_stiff_parts_that_are_loosely_joined_have_covariances() -> None:
+    """As keyframes before and after frames that coast: GTSAM's marginals refuse them."""
+    poses = circle(40)
+    loose, stiff = np.array([0.04] * 3 + [0.3] * 3) ** 2, np.full(6, 1e-10)
+    ends = [(a, b) for a in range(40) for b in range(a + 1, min(a + 6, 40)) if not a < 20 <= b]
+    edges = [
+        (b, replace(edge(poses, a, b), covariance=np.diag(loose if a == 19 else stiff)))
+        for a, b in [*ends, (19, 20)]
+    ]
+    covariances = optimum(graph_of(edges, n=40)).covariances()
+    for number in (20, 39):
+        Ad = se3.adjoint(se3.invert(poses[number]) @ poses[20])
+        expected = Ad @ np.diag(loose) @ Ad.T
+        np.testing.assert_allclose(covariances[number], expected, rtol=1e-3, atol=1e-6)
+    assert np.diagonal(covariances[19]).max() < 1e-6
+
+
+def test_poses_that_nothing_joins_to_the_first_have_no_covariances() -> None:
+    poses = circle()
+    apart = [(b, each) for b, each in links(poses)[: N - 1] if b != N // 2]
+    with pytest.raises(RuntimeError):
+        sparse_marginals(by_gtsam(apart, np.eye(4)).linearize(values_of(poses)))
 
 
 @given(seeds)
