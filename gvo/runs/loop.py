@@ -20,17 +20,7 @@ from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
 from gvo.runs.statistics import RunStatistics
 from gvo.trajectory.evaluation import Motions
-from gvo.types import (
-    Edge,
-    Estimate,
-    FaultyFrame,
-    FloatArray,
-    Frame,
-    FrameResult,
-    Loop,
-    Optimum,
-    Progress,
-)
+from gvo.types import Edge, Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -173,7 +163,7 @@ class RunLoop:
             optimum,
             estimates=self._placed(optimum.estimates),
             edges=tuple((stamp_ns, place(stamp_ns, edge)) for stamp_ns, edge in optimum.edges),
-            loops=self._placed_loops(optimum.loops),
+            loops=tuple(map(self.base_frame.apply_to_loop, optimum.loops)),
         )
         self._give(lambda output: output.add_optimum(placed))
         return placed
@@ -274,17 +264,10 @@ class RunLoop:
             raw=self.base_frame.apply(result.raw),
             causal=self.base_frame.apply(result.causal),
             finished=self._placed(result.finished),
-            loops=self._placed_loops(result.loops),
+            loops=tuple(map(self.base_frame.apply_to_loop, result.loops)),
             T_previous_frame=step,
             T_map_world=self.base_frame.apply_to_world(result.T_map_world),
             stage_ms={"read": self._read_ms, **result.stage_ms},
-        )
-
-    def _placed_loops(self, loops: tuple[Loop, ...]) -> tuple[Loop, ...]:
-        edges = [self.base_frame.apply_to_edge(loop.stamp_ns, loop.edge) for loop in loops]
-        return tuple(
-            replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
-            for loop, edge in zip(loops, edges, strict=True)
         )
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:

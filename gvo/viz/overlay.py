@@ -52,6 +52,8 @@ MIN_WIDTH_PX: Final = 640
 """Of a picture, for its text."""
 MAX_WIDTH_PX: Final = 1280
 """Of a picture, by default."""
+NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
+"""A registration without matches."""
 
 _WIDE = 2.0  # least aspect ratio of images whose panels are stacked
 _MARGIN_PX = 8
@@ -60,7 +62,6 @@ _ROWS_PX = (17, 37)
 _DARK_TEXT = frozenset({Status.OK, Status.COASTING})
 _CHARACTER_PX = 10  # above the mean width
 _DIMMED = 0.4  # brightness of the image below coloured lines
-_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 def compose_overlay(
@@ -108,7 +109,7 @@ def compose_overlay(
         raise ValueError(f"expected images of {camera.width}x{camera.height}, got {image.shape}")
     layout = Layout.of(camera, max_width)
     canvas = layout.empty()
-    _draw_panels(canvas, layout, frame, result.registration or _NOTHING, camera)
+    _draw_panels(canvas, layout, frame, result.registration or NOTHING, camera)
     _write_header(canvas, layout, result, index=index, rate_hz=rate_hz)
     _write_footer(canvas, layout, camera, result.reason)
     return canvas
@@ -342,6 +343,13 @@ def loop_text(result: FrameResult) -> str:
     loop = result.loops[-1]
     ago_s = 1e-9 * (loop.stamp_ns - loop.reference_ns)
     return f"loop to {ago_s:.1f} s before, {loop.n_inliers} inliers"
+
+
+def caption(result: FrameResult) -> list[str]:
+    """Say how a frame was tracked, in a line, and what is special about it, in others."""
+    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers, {result.n_links} links"
+    special = result.reason, loop_text(result)
+    return [f"{result.status}: {counts}", *(text for text in special if text)]
 
 
 def _counts(result: FrameResult) -> list[tuple[str, Colour]]:

@@ -21,7 +21,7 @@ from gvo.geometry import se3
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.poses.tf_paths import bare, list_names
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray
+from gvo.types import Edge, Estimate, Failure, FloatArray, IntArray, Loop
 
 InitialPose: TypeAlias = FloatArray | Literal["truth"]
 
@@ -243,6 +243,11 @@ class BaseFrame:
             T_reference_frame=self.apply_to_step(start_ns, stamp_ns, edge.T_reference_frame),
             covariance=Ad @ edge.covariance @ Ad.T,
         )
+
+    def apply_to_loop(self, loop: Loop) -> Loop:
+        """Return a loop as one of the base frame."""
+        edge = self.apply_to_edge(loop.stamp_ns, loop.edge)
+        return replace(loop, T_reference_frame=edge.T_reference_frame, covariance=edge.covariance)
 
     def convert(self, trajectory: Trajectory) -> Trajectory:
         """Convert a trajectory of the camera into that of the base frame.

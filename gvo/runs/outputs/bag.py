@@ -43,7 +43,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Final
 
@@ -73,18 +73,16 @@ from gvo.types import (
     ImageArray,
     Loop,
     Optimum,
-    RelativePose,
     Status,
     StereoFrame,
 )
-from gvo.viz.overlay import draw_matches, loop_text
+from gvo.viz.overlay import NOTHING, caption, draw_matches
 
 SUFFIXES: Final = (".mcap", ".bag")
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
 
 _SECOND_NS: Final = 10**9
-_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 class RunBag(AbstractContextManager["RunBag"]):
@@ -110,9 +108,9 @@ class RunBag(AbstractContextManager["RunBag"]):
         self._frames = frames or RunFrames()
         self._tracks = {name: Track() for name in ("raw", "smoothed", GLOBAL)}
         self._causal = Track()
-        self._n_markers = 0
+        self._numbers = count()
         self._T_odom_base = np.eye(4)
-        self._last: dict[str, Estimate] = {}
+        self._last: Estimate | None = None  # of the raw chain
         self._first_ns: int | None = None
         self._newest_ns = 0
         self._n_seconds = 0
@@ -147,11 +145,11 @@ class RunBag(AbstractContextManager["RunBag"]):
             self._write_tf([("raw", raw), ("causal", causal)])
             self._write_odom(result)
             covariance = self._step_covariance(result, raw)
-            self._write_odometry("raw", raw, self._previous("raw"), covariance)
-            self._write_odometry("causal", causal, self._previous("causal"))
+            self._write_odometry("raw", raw, self._tracks["raw"].before(raw.stamp_ns), covariance)
+            self._write_odometry("causal", causal, self._causal.before(causal.stamp_ns))
             self._tracks["raw"].add(raw)
             self._causal.add(causal)
-            self._last.update(raw=raw, causal=causal)
+            self._last = raw
             self._write_matches(frame, result)
             self._write_loops("causal", self._causal, result.loops)
             self._write_paths_of_second(frame.stamp_ns)
@@ -243,20 +241,15 @@ class RunBag(AbstractContextManager["RunBag"]):
     def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:
         segments = track.segments(loops)
         if len(segments) > 0:
-            header, number = Header(self._newest_ns, self._frames.world), self._n_markers
-            self._n_markers += 1
+            header, number = Header(self._newest_ns, self._frames.world), next(self._numbers)
             write_lines(self._bag, "/gvo/loops", header, segments, name=name, number=number)
-
-    def _previous(self, name: str) -> StampedPose | None:
-        last = self._last.get(name)
-        return None if last is None else StampedPose(last.stamp_ns, last.T_world_frame)
 
     def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
         """Return the covariance (6, 6) of the last step of the raw chain, where it is known.
 
         After coasting, the registration is against an older frame than the pose before.
         """
-        last = self._last.get("raw")
+        last = self._last
         is_step = last is not None and last.status == raw.status == Status.OK
         if not is_step or result.registration is None:
             return None
@@ -281,7 +274,7 @@ class RunBag(AbstractContextManager["RunBag"]):
     def _write_matches(self, frame: Frame, result: FrameResult) -> None:
         """Write points, picture and diagnostics of a frame."""
         image = frame.left if isinstance(frame, StereoFrame) else frame.image
-        found = result.registration or _NOTHING
+        found = result.registration or NOTHING
         n_told = min(len(found.pixels_current), len(found.points_current))
         inliers = found.inliers[:n_told]
         header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
@@ -298,11 +291,11 @@ class RunBag(AbstractContextManager["RunBag"]):
             found.pixels_reference[:n_told],
             found.pixels_current[:n_told],
             inliers,
-            lines=_caption(result),
+            lines=caption(result),
         )
         write_picture(self._bag, "/gvo/matches/compressed", header, picture)
         hardware = Header(frame.stamp_ns, self._frames.camera)
-        text = " ".join(_caption(result))
+        text = " ".join(caption(result))
         write_diagnostics(self._bag, hardware, result.status, text, _numbers(result))
 
     def _write_paths_of_second(self, stamp_ns: int) -> None:
@@ -327,12 +320,6 @@ def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:
     values = np.zeros(len(pixels))
     values[is_inside] = image[v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)]
     return values
-
-
-def _caption(result: FrameResult) -> list[str]:
-    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers, {result.n_links} links"
-    lines = [f"{result.status}: {counts}"]
-    return [*lines, *(text for text in (result.reason, loop_text(result)) if text)]
 
 
 def _numbers(result: FrameResult) -> dict[str, object]:

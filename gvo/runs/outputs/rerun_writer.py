@@ -31,7 +31,7 @@ from gvo.types import (
     StereoFrame,
 )
 from gvo.viz import palette
-from gvo.viz.overlay import compose_overlay
+from gvo.viz.overlay import NOTHING, caption, compose_overlay
 
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
@@ -39,7 +39,6 @@ N_SHOWN_POSES: Final = 500
 _SECOND_NS: Final = 10**9
 _TRACKED: Final = "world/causal/frame"
 _CAMERA: Final = f"{_TRACKED}/camera"
-_NOTHING: Final = RelativePose(T_reference_current=np.eye(4), covariance=np.zeros((6, 6)))
 
 
 class RerunWriter:
@@ -83,7 +82,7 @@ class RerunWriter:
         self._begin(result)
         self._stamps_ns.append(frame.stamp_ns)
         self._indices.append(self._n_seen)
-        self.add_status(frame.stamp_ns, result.status, _caption(result))
+        self.add_status(frame.stamp_ns, result.status, "; ".join(caption(result)))
         self._add_poses(result)
         self._add_picture(frame, image, result)
         self._add_points(image, result)
@@ -161,7 +160,7 @@ class RerunWriter:
         self.stream.log(f"{_CAMERA}/image", make_image(halve(image)))
 
     def _add_points(self, image: ImageArray, result: FrameResult) -> None:
-        found = result.registration or _NOTHING
+        found = result.registration or NOTHING
         self.stream.log(f"{_CAMERA}/points", make_matches(found))
         if result.stamp_ns in result.keyframes_ns and len(found.points_current) > 0:
             T_world_cam = result.causal.T_world_frame @ self._frames.mount(result.stamp_ns)
@@ -219,12 +218,6 @@ class RerunWriter:
         for name, recent in self._recent.items():
             positions = np.array(recent).reshape(-1, 3)
             self.stream.log(f"world/{name}/recent", make_path(name, positions))
-
-
-def _caption(result: FrameResult) -> str:
-    counts = f"{result.n_inliers} of {result.n_matches} matches are inliers"
-    text = f"{result.status}: {counts}, {result.n_links} links"
-    return f"{text}; {result.reason}" if result.reason else text
 
 
 Colour: TypeAlias = tuple[int, int, int]
