@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
@@ -59,7 +60,15 @@ def world_up(record: RunRecord) -> Up:
     """Return which axis points up: -y where the world is the first camera, else +z."""
     poses = tracked(record)
     is_first = len(poses) == 0 or np.allclose(poses.T_world_frame[0], np.eye(4), atol=1e-6)
-    return "-y" if is_first and record.summary.get("base_frame", "camera") == "camera" else "+z"
+    return "-y" if is_first and _is_of_camera(record.summary) else "+z"
+
+
+def _is_of_camera(summary: Mapping[str, Any]) -> bool:
+    """Tell whether the poses are those of the camera, whatever its frame is called."""
+    run = summary.get("run")
+    if run is None:
+        return bool(summary.get("base_frame", "camera") == "camera")
+    return bool(run["output"]["frame"] == run["recording"]["frame_id"])
 
 
 def tracked(record: RunRecord) -> Trajectory:

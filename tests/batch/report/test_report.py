@@ -267,6 +267,16 @@ def test_the_worst_run_of_a_sweep_stands_first(tmp_path: Path) -> None:
     ]
 
 
+def test_global_errors_have_a_column_where_there_are_any(tmp_path: Path) -> None:
+    rows = made_up({}, 2)
+    assert "ATE global [m]" not in page_of(tmp_path, rows).rows["runs"][0]
+    rows[0] = replace(rows[0], ate_global_m=0.0123)
+    header, *lines = page_of(tmp_path, rows).rows["runs"]
+    at = header.index("ATE global [m]")
+    assert header[at - 1] == "ATE smoothed [m]"
+    assert sorted(line[at] for line in lines) == ["-", "0.0123"]
+
+
 def test_the_worst_recording_of_one_configuration_stands_first(tmp_path: Path) -> None:
     rows = made_up({}, 4)
     rows[1] = failed(rows[1])

@@ -132,6 +132,9 @@ def test_the_world_of_the_first_camera_has_its_up_against_y(record: RunRecord) -
     assert world_up(record) == "-y"
     record.summary["base_frame"] = "base_link"
     assert world_up(record) == "+z"
+    for frame, up in (("left", "-y"), ("base_link", "+z")):
+        record.summary["run"] = {"output": {"frame": frame}, "recording": {"frame_id": "left"}}
+        assert world_up(record) == up
 
 
 def test_what_a_run_does_not_hold_is_not_named(
