@@ -225,6 +225,7 @@ class RunGraph:
         self._edges: list[tuple[int, Edge]] = []
         # By their keyframe; that of the latest one has not ended.
         self._stretches: dict[int, _Stretch] = {}
+        self._ways: dict[int, _Way] = {}  # to all keyframes, merged ones among them
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
         # Where nothing measured connects a keyframe with those before: the one before it.
@@ -266,6 +267,8 @@ class RunGraph:
         last, self._last = self._last, estimate
         if last is None:
             self._keyframes[estimate.stamp_ns] = estimate
+            way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
+            self._ways[estimate.stamp_ns] = way
             self._n_worlds, self._measured_ns = 1, estimate.stamp_ns
             return
         stamp_ns, latest_ns = estimate.stamp_ns, next(reversed(self._keyframes))
@@ -346,7 +349,8 @@ class RunGraph:
             is_guess=is_guess,
         )
         if newest is not None:
-            self._keyframes[newest.stamp_ns] = newest
+            way = self._ways[origin_ns].then(others[newest.stamp_ns], is_guess=is_guess)
+            self._keyframes[newest.stamp_ns], self._ways[newest.stamp_ns] = newest, way
 
     def _from_keyframe(self, edge: Edge) -> Edge:
         """Return an edge from a frame that hangs on a keyframe as one from the keyframe."""
@@ -446,7 +450,8 @@ class RunGraph:
         graph = copy.copy(self)
         graph._keyframes, graph._merged = dict(self._keyframes), dict(self._merged)
         graph._stretches, graph._edges = dict(self._stretches), list(self._edges)
-        graph._guesses, graph.loops = dict(self._guesses), tuple(self.loops)
+        graph._guesses, graph._ways = dict(self._guesses), dict(self._ways)
+        graph.loops = tuple(self.loops)
         if graph._arrivals:
             graph._condense(is_closed=False)
         return graph
@@ -601,25 +606,17 @@ class RunGraph:
                 graph.add_edges(loop.stamp_ns, [loop.edge])
         return graph
 
-    def _ways(self) -> dict[int | None, _Way]:
-        """Return the way to each keyframe, merged ones among them."""
-        way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
-        ways = {next(iter(self._keyframes)): way, None: way}
-        for stretch in self._stretches.values():
-            if stretch.step is not None:
-                way = ways[stretch.next_ns] = way.then(stretch.step, is_guess=stretch.is_guess)
-        return ways
-
     def _possible(self) -> tuple[Loop, ...]:
         """Return the loops, those with a reason that odometry alone does not allow.
 
         However many agree with each other: those between equal rooms do.
         """
-        ways = self._ways()
+        ways = self._ways
         reason = "farther from odometry than that drifts"
         return tuple(
             replace(loop, reason=reason)
             if not loop.reason
+            and loop.stamp_ns not in self._merged
             and ways[loop.stamp_ns].chi2(loop, ways[loop.reference_ns], drifts=True)
             > 6.0 * _MAX_CHANCE
             else loop
@@ -631,7 +628,7 @@ class RunGraph:
 
         The median over the loops of what each contradicts it by, unless that may be chance.
         """
-        ways = self._ways()
+        ways = self._ways
         ratios = []
         for loop in loops:
             way, before = ways[loop.stamp_ns], ways[loop.reference_ns]

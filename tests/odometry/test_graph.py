@@ -248,12 +248,30 @@ def test_a_map_does_not_grow_with_laps_of_the_same_block(monkeypatch: pytest.Mon
     assert errors[1] < 1.3 * errors[0]
 
 
+def test_merged_keyframes_tell_no_more_than_they_did() -> None:
+    drive = looped(3)
+    before = drive.graph.optimize()
+    for loop in list(drive.graph.loops):
+        drive.graph._merge(loop.stamp_ns, loop.edge)
+    after = drive.graph.optimize()
+    assert len(drive.graph) == len(before.keyframes_ns) - 5
+    sigmas = [
+        np.sqrt([np.diag(each.covariance)[3:] for each in optimum.estimates[10:]])
+        for optimum in (before, after)
+    ]
+    assert (sigmas[1] > 0.97 * sigmas[0]).all()
+    assert np.median(sigmas[1] / sigmas[0]) < 1.5
+    differences = poses(after)[10:, :3, 3] - poses(before)[10:, :3, 3]
+    assert np.median(np.abs(differences) / sigmas[0]) < 0.5
+
+
 @pytest.mark.acceptance
 def test_a_map_of_a_hundred_laps_is_that_of_a_few() -> None:
     truth = block(100)
     drive, detector = go_round(truth, 200)
     optimum = drive.graph.optimize(covariances=False)
-    assert len(drive.graph) < 200
-    assert len(optimum.edges) < 400
+    # Four at each of 40 places, the latest, and those since the map was last optimized.
+    assert len(drive.graph) < 260
+    assert len(optimum.edges) < 520
     assert len(detector) < 60
     assert position_error(poses(optimum), truth) < 0.1
