@@ -252,6 +252,14 @@ class WholeGraph:
         return poses
 
 
+class LocalPose(NamedTuple):
+    """A pose in the origin of a small graph, its covariance, and that with the last pose."""
+
+    T_origin_frame: FloatArray
+    covariance: FloatArray
+    with_last: FloatArray
+
+
 class LocalGraph:
     """A few poses around one of them, which is the origin.
 
@@ -268,6 +276,7 @@ class LocalGraph:
         self._graph = gtsam.NonlinearFactorGraph()
         # Along the first edges: T_origin_frame and its covariance.
         self._poses = {origin: (np.eye(4), np.zeros((6, 6)))}
+        self._references: dict[FrameId, FrameId] = {}
         self._keys: dict[FrameId, int] = {}
 
     def __contains__(self, frame_id: object) -> bool:
@@ -281,11 +290,13 @@ class LocalGraph:
             T_reference, covariance = self._poses[reference_id]
             moved = se3.compose_covariance(covariance, T, edge.covariance)
             self._poses[frame_id] = T_reference @ T, moved
+            self._references[frame_id] = reference_id
         elif reference_id not in self._poses:
             T_frame, covariance = self._poses[frame_id]
             Ad, T = se3.adjoint(T), se3.invert(T)
             moved = se3.compose_covariance(covariance, T, Ad @ edge.covariance @ Ad.T)
             self._poses[reference_id] = T_frame @ T, moved
+            self._references[reference_id] = frame_id
         if reference_id == self._origin:
             prior = PosePrior(
                 T_world_frame=edge.T_reference_frame,
@@ -300,25 +311,56 @@ class LocalGraph:
     def _key(self, frame_id: FrameId) -> int:
         return self._keys.setdefault(frame_id, len(self._keys))
 
-    def solve(self) -> dict[FrameId, tuple[FloatArray, FloatArray]]:
-        """Return the poses in the origin, and their covariances (6, 6), by name."""
-        found = {frame_id: self._poses[frame_id] for frame_id in self._keys}
+    def solve(self, last: FrameId = None) -> dict[FrameId, LocalPose]:
+        """Return the poses, by name.
+
+        Parameters
+        ----------
+        last : hashable, optional
+            The pose with which the covariances of the others are wanted.
+        """
+        found = self._along_first_edges(last)
         if self._graph.size() == len(found):  # a tree
             return found
         values = gtsam.Values()
         for frame_id, key in self._keys.items():
-            values.insert(key, gtsam.Pose3(found[frame_id][0]))
+            values.insert(key, gtsam.Pose3(found[frame_id].T_origin_frame))
+        last_key = self._keys.get(last)
         try:
             for values, _ in descend(self._graph, values, n_steps=_N_LOCAL_STEPS):  # noqa: B007, B020
                 pass
             marginals = gtsam.Marginals(self._graph, values)
             poses = as_transforms(values)
             return {
-                frame_id: (poses[key], definite(marginals.marginalCovariance(key)))
+                frame_id: LocalPose(
+                    poses[key],
+                    definite(marginals.marginalCovariance(key)),
+                    found[frame_id].with_last
+                    if last_key in (None, key)
+                    else marginals.jointMarginalCovariance([key, last_key]).at(key, last_key),
+                )
                 for frame_id, key in self._keys.items()
             }
         except RuntimeError:
             return found
+
+    def _along_first_edges(self, last: FrameId) -> dict[FrameId, LocalPose]:
+        """Return the poses as the first edge of each tells."""
+        before, before_last = last, set[FrameId]()
+        while before in self._references:
+            before_last.add(before)
+            before = self._references[before]
+        none, (T_origin_last, _) = (
+            np.zeros((6, 6)),
+            self._poses.get(last, self._poses[self._origin]),
+        )
+        found = {}
+        for frame_id in self._keys:
+            T, covariance = self._poses[frame_id]
+            Ad = se3.adjoint(se3.invert(T_origin_last) @ T)
+            with_last = covariance @ Ad.T if frame_id in before_last else none
+            found[frame_id] = LocalPose(T, covariance, with_last)
+        return found
 
 
 class BatchOptimizer:

@@ -53,6 +53,8 @@ _TURN_PER_M = 0.0005
 _GROWTH = 0.25
 _N_APART = 20
 _N_LATER = 5
+# Keyframes up to which linked frames are keyframes too: some seconds of work at the end.
+_MAX_LINKED = 2000
 # Keyframes that came back to a place and stay; the latest ones stay in any case.
 _N_PER_PLACE = 3
 _N_LATEST = 50
@@ -69,6 +71,8 @@ class _Stretch:
     T_keyframe_frame : ndarray of float64, shape (n, 4, 4)
     covariances : ndarray of float64, shape (n, 6, 6)
         Of T_keyframe_frame.
+    with_next : ndarray of float64, shape (n, 6, 6)
+        Their covariances with the pose of the next keyframe.
     statuses : tuple of Status
     next_ns : int or None
         The next keyframe; None while there is none.
@@ -82,6 +86,7 @@ class _Stretch:
     stamps_ns: tuple[int, ...]
     T_keyframe_frame: FloatArray
     covariances: FloatArray
+    with_next: FloatArray
     statuses: tuple[Status, ...]
     next_ns: int | None
     step: Edge | None
@@ -96,15 +101,6 @@ class _Stretch:
             covariance=self.covariances[index],
         )
 
-    def _shares(self, step: Edge) -> FloatArray:
-        """Return how much of the way to the next keyframe lies before the frames, shape (n,)."""
-        n = len(self.stamps_ns)
-        if not self.is_guess:
-            return np.arange(1, n + 1) / (n + 1)
-        # Of its uncertainty, as the mean over its directions.
-        solved = np.linalg.solve(step.covariance, self.covariances)
-        return np.asarray(np.clip(np.trace(solved, axis1=1, axis2=2) / 6.0, 0.0, 1.0))
-
     def place(
         self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
     ) -> Iterator[Estimate]:
@@ -114,17 +110,25 @@ class _Stretch:
         if self.step is not None and self.next_ns is not None:
             T_next_keyframe = se3.invert(self.step.T_reference_frame)
             T_next_frame = T_next_keyframe @ T_keyframe_frame
-            shares = self._shares(self.step)
-            bend = poses[self.keyframe_ns], poses[self.next_ns] @ T_next_keyframe
-            bend_twist = se3.log(se3.invert(bend[0]) @ bend[1])
-            T_keyframe_frame = se3.exp(shares[:, np.newaxis] * bend_twist) @ T_keyframe_frame
+            T_keyframe_next = se3.invert(poses[self.keyframe_ns]) @ poses[self.next_ns]
+            # what the next keyframe tells of a frame when it turns out to be elsewhere
+            gains = self.with_next @ np.linalg.inv(self.step.covariance)
             if self.is_guess:
-                rests = (1.0 - shares)[:, np.newaxis, np.newaxis] * self.step.covariance
-                zero = np.zeros((6, 6))
-                back = covariances[self.next_ns] + rests
-                back = se3.compose_covariance(back, T_next_frame, zero)
-                is_nearer = np.linalg.det(back) < np.linalg.det(placed)
-                placed = np.where(is_nearer[:, np.newaxis, np.newaxis], back, placed)
+                # too far for that: as much of the way as of the uncertainty
+                shares = np.clip(np.trace(gains, axis1=1, axis2=2) / 6.0, 0.0, 1.0)
+                bend = se3.log(T_keyframe_next @ T_next_keyframe)
+                T_keyframe_frame = se3.exp(shares[:, np.newaxis] * bend) @ T_keyframe_frame
+            else:
+                miss = se3.log(T_next_keyframe @ T_keyframe_next)
+                T_keyframe_frame = T_keyframe_frame @ se3.exp(gains @ miss)
+            rest = found - gains @ np.swapaxes(self.with_next, 1, 2)
+            rest = 0.5 * (rest + np.swapaxes(rest, 1, 2))
+            forth, back = (
+                se3.compose_covariance(covariances[ns], T, rest)
+                for ns, T in ((self.keyframe_ns, T_keyframe_frame), (self.next_ns, T_next_frame))
+            )
+            is_larger = np.linalg.det(back) > np.linalg.det(forth)
+            placed = np.where((is_larger ^ self.is_guess)[:, np.newaxis, np.newaxis], back, forth)
         T_world_frame = poses[self.keyframe_ns] @ T_keyframe_frame
         for stamp_ns, status, T, covariance in zip(
             self.stamps_ns, self.statuses, T_world_frame, placed, strict=True
@@ -262,7 +266,8 @@ class RunGraph:
             Without one from a recent frame, it continues the motion before it, with the sigmas of
             a step that was not measured.
         is_keyframe : bool
-            The very first frame is one in any case.
+            The very first frame is one in any case; so is one that is linked to more than those
+            just before it, as long as the graph is small: what is condensed loses a little.
         """
         last, self._last = self._last, estimate
         if last is None:
@@ -279,11 +284,12 @@ class RunGraph:
         ties = [edge for edge in edges if edge.reference_id in near]
         if ties and ties[0].reference_id in self._adrift:
             self._close(last.stamp_ns)  # so that the guess is an edge of its own
+        is_linked = len(ties) < len(edges)
         guess = [] if ties else [self._unmeasured(last, estimate)]
         self._adrift |= {stamp_ns} if guess else set()
         self._measured_ns = stamp_ns if edges else self._measured_ns
         self._arrivals.append((estimate, [*edges, *guess]))
-        if is_keyframe:
+        if is_keyframe or (is_linked and len(self) < _MAX_LINKED):
             self._close(stamp_ns)
 
     def _close(self, stamp_ns: int) -> None:
@@ -326,11 +332,11 @@ class RunGraph:
                     self._edges.append((estimate.stamp_ns, edge))  # as it is
                 else:
                     local.add(estimate.stamp_ns, edge)
-        solved = local.solve()
+        solved = local.solve(None if newest is None else newest.stamp_ns)
         hanging = [solved.pop(frame.stamp_ns) for frame in frames]
         others = {
             int(stamp_ns): Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)  # type: ignore[call-overload]
-            for stamp_ns, (T, covariance) in solved.items()
+            for stamp_ns, (T, covariance, _) in solved.items()
         }
         is_guess = newest is not None and newest.stamp_ns in self._guesses
         if newest is not None and is_guess:
@@ -341,8 +347,9 @@ class RunGraph:
         self._stretches[origin_ns] = _Stretch(
             keyframe_ns=origin_ns,
             stamps_ns=tuple(frame.stamp_ns for frame in frames),
-            T_keyframe_frame=np.array([T for T, _ in hanging]).reshape(-1, 4, 4),
-            covariances=np.array([each for _, each in hanging]).reshape(-1, 6, 6),
+            T_keyframe_frame=np.array([each.T_origin_frame for each in hanging]).reshape(-1, 4, 4),
+            covariances=np.array([each.covariance for each in hanging]).reshape(-1, 6, 6),
+            with_next=np.array([each.with_last for each in hanging]).reshape(-1, 6, 6),
             statuses=tuple(frame.status for frame in frames),
             next_ns=None if newest is None else newest.stamp_ns,
             step=None if newest is None else others[newest.stamp_ns],
