@@ -1,0 +1,64 @@
+"""Where a camera comes back after the dark, the global poses are those of the unbroken run."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.io.recording import Source
+from gvo.testing.faults import Black, FaultySource
+from gvo.types import FaultyFrame, FrameResult, Status
+
+pytestmark = pytest.mark.acceptance
+
+
+def follow(recording: Source) -> tuple[gvo.Odometry, list[FrameResult]]:
+    odometry = gvo.Odometry(recording.info.camera, gvo.Config())
+    frames = gvo.frames(recording, gvo.Config())
+    return odometry, [
+        odometry.track(frame) for frame in frames if not isinstance(frame, FaultyFrame)
+    ]
+
+
+def global_error(recording: Source, odometry: gvo.Odometry, stamps_ns: set[int]) -> float:
+    estimates = [each for each in odometry.optimize().estimates if each.stamp_ns in stamps_ns]
+    truth = recording.ground_truth()
+    assert truth is not None
+    return gvo.evaluate(truth, gvo.Trajectory.of(estimates), name="global").ate_m
+
+
+def check(recording: Source, black: Black) -> None:
+    unbroken, _ = follow(recording)
+    dark, results = follow(FaultySource(recording, black))
+    tracked = {each.stamp_ns for each in results if each.status in (Status.OK, Status.RESUMED)}
+    assert len(tracked) < len(results) - 20
+    expected, found = (global_error(recording, each, tracked) for each in (unbroken, dark))
+    assert found < 1.5 * expected
+
+
+@pytest.mark.recorded
+def test_a_second_in_the_dark_costs_the_global_poses_nothing(gvo_data: Path) -> None:
+    # Shorter than window.lost_after_s, and the camera turns: the frame before is not seen again.
+    check(gvo.open_recording(gvo_data / "rgbd_dataset_freiburg1_rpy_part"), Black(first=60, end=90))
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+def test_a_camera_that_was_lost_in_a_room_finds_its_place(
+    sensor: Literal["stereo", "rgbd"],
+) -> None:
+    check(
+        gvo.SyntheticRecording("handheld", sensor, n_frames=300, seed=4, scale=0.5),
+        Black(first=90, end=160),
+    )
+
+
+def test_equal_rooms_are_not_taken_for_each_other() -> None:
+    rooms = gvo.SyntheticRecording("rooms", "rgbd", n_frames=1080, seed=1, scale=0.5)
+    odometry, _ = follow(rooms)
+    loops = odometry.optimize().loops
+    assert len(loops) > 5
+    assert all(loop.reason for loop in loops)
+    truth = rooms.ground_truth()
+    assert global_error(rooms, odometry, set(np.asarray(truth.stamps_ns).tolist())) < 0.1
