@@ -30,12 +30,12 @@ _SURE_SCORE = 0.06
 # Places within which a second loop has to confirm one, the sigmas by which both may differ, and by
 # how much odometry may be wrong between them: per metre, and per radian.
 _N_WAITING = 5
+_AGREEMENT = 5.0
+_DRIFT = 0.02
 # In a world that no loop connects with the others, so many frames search all of them; later ones
 # with growing pauses of at most so many frames.
 _N_EAGER = 15
 _MAX_PAUSE = 30
-_AGREEMENT = 5.0
-_DRIFT = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
