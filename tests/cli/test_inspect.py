@@ -23,7 +23,7 @@ from tests.conftest import GVO, TABLES, Command, is_one_line
 
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
-    *("batch", "explain", "view", "round-trip"),
+    *("batch", "live", "explain", "view", "round-trip"),
 )
 FILE_STARTS = {".png": b"\x89PNG\r\n\x1a\n", ".pdf": b"%PDF-", ".rrd": b"RRF"}
 # Of rendered recordings.
