@@ -31,6 +31,7 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import (
     ConstantError,
+    Contradiction,
     Failure,
     FloatArray,
     IntArray,
@@ -483,6 +484,12 @@ class CalibratedCamera:
                 velocities.expect(first, second, se3.invert(rough))
         corrected = self._with_sensitivities(self._corrected(measured), measured)
         result = self._register(corrected, measured, config, hints)
+        if isinstance(result, Contradiction) and hints.pop("T_start", None) is not None:
+            # What was found roughly may be the other one of two motions.
+            T_predicted = None if prior is None else prior.T_predicted
+            velocities.expect(first, second, T_predicted)
+            corrected = self._with_sensitivities(self._corrected(measured), measured)
+            result = self._register(corrected, measured, config, hints)
         if isinstance(result, Failure):
             return result
         if is_step:
