@@ -267,9 +267,9 @@ def test_merged_keyframes_tell_no_more_than_they_did() -> None:
 
 
 @pytest.mark.acceptance
-def test_a_map_of_a_hundred_laps_is_that_of_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_of_many_laps_is_that_of_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graph_module, "_MAX_LINKED", 0)
-    truth = block(100)
+    truth = block(40)
     drive, detector = go_round(truth, 200)
     optimum = drive.graph.optimize(covariances=False)
     # Four at each of 40 places, the latest, and those since the map was last optimized.
