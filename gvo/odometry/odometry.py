@@ -1,4 +1,4 @@
-"""Odometry: drives front-end and back-end, frame by frame, and keeps three trajectories."""
+"""Odometry: drives front-end and back-end, frame by frame, and keeps four trajectories."""
 
 from __future__ import annotations
 
