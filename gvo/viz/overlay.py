@@ -319,10 +319,10 @@ def _write_header(
     texts = [] if index is None else [f"frame {index}"]
     texts.append(f"stamp {seconds}.{nanoseconds // 1000:06d} s")
     start = _write_badge(canvas, status) + _GAP_PX
-    _write_row(canvas, [(text, WHITE) for text in texts], (start, upper))
+    end = _write_row(canvas, [(text, WHITE) for text in texts], (start, upper))
     if isinstance(result, FrameResult):
         _write_row(canvas, _counts(result), (_MARGIN_PX, lower))
-        loop = loop_text(result)
+        loop = shortened(loop_text(result), layout.size[0] - _MARGIN_PX - end)
         write(canvas, loop, (layout.size[0] - text_width(loop) - _MARGIN_PX, upper), LOOP_COLOUR)
         rate = _rate_text(result, rate_hz)
         write(canvas, rate, (layout.size[0] - text_width(rate) - _MARGIN_PX, lower))
@@ -330,10 +330,12 @@ def _write_header(
 
 def _write_row(
     canvas: ImageArray, texts: Sequence[tuple[str, Colour]], corner: tuple[int, int]
-) -> None:
+) -> int:
+    """Write texts beside one another; return where the next one would begin."""
     u, v = corner
     for text, colour in texts:
         u = write(canvas, text, (u, v), colour)[0] + _GAP_PX
+    return u
 
 
 def loop_text(result: FrameResult) -> str:

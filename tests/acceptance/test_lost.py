@@ -1,7 +1,6 @@
 """Where a camera comes back after the dark, the global poses are those of the unbroken run."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -44,12 +43,9 @@ def test_a_second_in_the_dark_costs_the_global_poses_nothing(gvo_data: Path) -> 
     check(gvo.open_recording(gvo_data / "rgbd_dataset_freiburg1_rpy_part"), Black(first=60, end=90))
 
 
-@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
-def test_a_camera_that_was_lost_in_a_room_finds_its_place(
-    sensor: Literal["stereo", "rgbd"],
-) -> None:
+def test_a_camera_that_was_lost_in_a_room_finds_its_place() -> None:
     check(
-        gvo.SyntheticRecording("handheld", sensor, n_frames=240, seed=4, scale=0.5),
+        gvo.SyntheticRecording("handheld", "rgbd", n_frames=240, seed=4, scale=0.5),
         Black(first=80, end=150),
     )
 

@@ -361,7 +361,7 @@ def test_motions_are_those_between_the_middles_of_the_exposures(kind: str, senso
     ]
     known, ignored = np.array(errors)
     # Descriptors find pixels less exactly, whatever the shutter.
-    assert np.mean(known[1:]) < (0.7 if kind == "klt" else 0.9) * np.mean(ignored[1:])
+    assert np.mean(known[1:]) < (0.7 if kind == "klt" else 0.95) * np.mean(ignored[1:])
 
 
 @cache
