@@ -38,7 +38,7 @@ Robust = Literal["none", "huber", "gnc"]
 _TOLERANCE = 1e-10
 _MAX_ITERATIONS = 200
 # 99 % quantile of chi-square with six degrees of freedom: what an edge may have and be right.
-_INLIER_CHI2 = 16.812
+INLIER_CHI2 = 16.812
 # By which graduated non-convexity sharpens its cost, and how well each of its steps is solved.
 _SHARPENING = 1.4
 _MAX_SHARPENINGS = 200
@@ -453,7 +453,7 @@ class BatchOptimizer:
         return np.array([2.0 * self._all.at(index).error(values) for index in doubted])
 
     def _error_of(self, values: gtsam.Values) -> float:
-        doubted = np.minimum(self._chi2(values), _INLIER_CHI2).sum()
+        doubted = np.minimum(self._chi2(values), INLIER_CHI2).sum()
         return float(self._kept.error(values) + 0.5 * doubted)
 
     def _choose_start(self, *, is_given: bool) -> None:
@@ -492,7 +492,7 @@ class BatchOptimizer:
 
     def _graduate(self) -> None:
         """Find out which of the doubted edges count, by a cost that becomes ever sharper."""
-        c2, chi2 = _INLIER_CHI2, self._chi2(self.values)
+        c2, chi2 = INLIER_CHI2, self._chi2(self.values)
         mu = c2 / max(2.0 * float(chi2.max()) - c2, c2)
         for _ in range(_MAX_SHARPENINGS):
             # eq. (14): 1 below the lower limit, 0 beyond the upper one

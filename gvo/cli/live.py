@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gvo.cli.options import ConfigFile, Force, Out, Settings, load, new_folder
+from gvo.cli.options import Bag, ConfigFile, Force, Out, Report, Settings, load, new_folder
 from gvo.cli.terminal import Command, ended_by_a_signal, report, say, told_where_it_stands
 from gvo.errors import ConfigurationError
 
@@ -57,13 +57,8 @@ def live(
         float | None,
         typer.Option(metavar="S", help="Drop pairs that are older than the newest by more."),
     ] = None,
-    bag: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too."),
-    ] = None,
-    with_report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
-    ] = True,
+    bag: Bag = None,
+    with_report: Report = True,
 ) -> None:
     """Track a running camera: images through a pipe, or from a device."""
     from gvo.live.odometry import LiveOdometry

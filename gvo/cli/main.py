@@ -18,6 +18,7 @@ from gvo.cli import batch as cli_batch
 from gvo.cli import inspect as cli_inspect
 from gvo.cli import live as cli_live
 from gvo.cli.options import (
+    Bag,
     CalibrationFiles,
     Color,
     ConfigFile,
@@ -29,6 +30,7 @@ from gvo.cli.options import (
     Loops,
     Out,
     Recordings,
+    Report,
     Right,
     Settings,
     Start,
@@ -144,10 +146,7 @@ def run(
         str | None,
         typer.Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
     ] = None,
-    bag: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too."),
-    ] = None,
+    bag: Bag = None,
     world: Annotated[
         str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
     ] = "world",
@@ -159,9 +158,7 @@ def run(
         Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
     ] = None,
     loops: Loops = None,
-    with_report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
-    ] = True,
+    with_report: Report = True,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
     ] = None,

@@ -40,6 +40,12 @@ Out = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace earlier results.")]
+Bag = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Write a .mcap (ROS 2) or .bag (ROS 1) too.")
+]
+Report = Annotated[
+    bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
+]
 Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
 Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to read from there.")]
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]

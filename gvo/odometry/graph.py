@@ -28,11 +28,12 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from gvo.backend.batch import BatchOptimizer, LocalGraph, WholeGraph
+from gvo.backend.batch import INLIER_CHI2, BatchOptimizer, LocalGraph, WholeGraph
 from gvo.backend.factors import ORIGIN, Factors
 from gvo.backend.motion_model import predict_step
 from gvo.config import WindowConfig
 from gvo.geometry import se3
+from gvo.odometry.keyframes import chi2
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Loop, Optimum, PosePrior, Status
 
 # Of keyframes: that of the reference and that of the frame of an edge.
@@ -42,8 +43,6 @@ _LOGGER = logging.getLogger(__name__)
 
 # Sigmas of a guess after a loss, and upper bounds of others: rad and m.
 _GUESS_SIGMAS = np.array([3.0, 3.0, 3.0, 100.0, 100.0, 100.0])
-# 99 % quantile of chi-square with six degrees of freedom, of each.
-_MAX_CHANCE = 16.812 / 6.0
 # Drift that is allowed for when loops are judged, over the whole path: a share of the way and of
 # the turn, and radians per metre.
 _DRIFT = 0.01
@@ -502,7 +501,9 @@ class RunGraph:
             keyframes_ns=tuple(graph._keyframes),
             edges=tuple(graph._edges),
             loops=loops,
-            residuals=np.array([_residual(loop.edge, loop.stamp_ns, poses) for loop in loops]),
+            residuals=np.sqrt(
+                [chi2(each.edge, poses[each.reference_ns], poses[each.stamp_ns]) for each in loops]
+            ),
             error_before=error_before,
             error=optimizer.error,
             n_iterations=optimizer.n_iterations,
@@ -624,8 +625,7 @@ class RunGraph:
             replace(loop, reason=reason)
             if not loop.reason
             and loop.stamp_ns not in self._merged
-            and ways[loop.stamp_ns].chi2(loop, ways[loop.reference_ns], drifts=True)
-            > 6.0 * _MAX_CHANCE
+            and ways[loop.stamp_ns].chi2(loop, ways[loop.reference_ns], drifts=True) > INLIER_CHI2
             else loop
             for loop in self.loops
         )
@@ -642,7 +642,7 @@ class RunGraph:
             if not loop.reason and way.part == before.part:
                 ratios.append(way.chi2(loop, before, drifts=False) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
-        return factor if factor > _MAX_CHANCE else 1.0
+        return factor if factor > INLIER_CHI2 / 6.0 else 1.0
 
     def _place(
         self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
@@ -703,9 +703,3 @@ def _drift(edge: Edge, share: float) -> FloatArray:
     sigma_m = share * float(np.linalg.norm(T[:3, 3]))
     turn = share * float(se3.rotation_angle(T)) + _TURN_PER_M / _DRIFT * sigma_m
     return np.diag(np.repeat([turn, sigma_m], 3) ** 2)
-
-
-def _residual(edge: Edge, stamp_ns: int, poses: dict[int, FloatArray]) -> float:
-    T = se3.invert(poses[int(edge.reference_id)]) @ poses[stamp_ns]  # type: ignore[call-overload]
-    error = se3.log(se3.invert(edge.T_reference_frame) @ T)
-    return float(np.sqrt(se3.mahalanobis(error, edge.covariance)))

@@ -281,7 +281,7 @@ def judge_links(
         FrameLink(
             reference_ns=int(edge.reference_id),  # type: ignore[call-overload]
             kind=kind,
-            chi2=_chi2(edge, frame_id, window)
+            chi2=chi2(edge, window.pose(edge.reference_id), window.pose(frame_id))
             if is_there and edge.reference_id in window
             else None,
             is_accepted=id(edge) in accepted,
@@ -290,7 +290,8 @@ def judge_links(
     )
 
 
-def _chi2(edge: Edge, frame_id: int, window: SlidingWindow) -> float:
-    T_reference_frame = se3.invert(window.pose(edge.reference_id)) @ window.pose(frame_id)
+def chi2(edge: Edge, T_world_reference: FloatArray, T_world_frame: FloatArray) -> float:
+    """Return the squared norm of the whitened residual of an edge between two poses (4, 4)."""
+    T_reference_frame = se3.invert(T_world_reference) @ T_world_frame
     residual = se3.log(se3.invert(edge.T_reference_frame) @ T_reference_frame)
     return float(se3.mahalanobis(residual, edge.covariance))

@@ -25,12 +25,11 @@ from gvo.io.poses.inputs import (
 )
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
-from gvo.io.run_folder.reader import read_run
+from gvo.io.run_folder.reader import read_run, trajectory_names
 from gvo.io.run_folder.writer import (
     GLOBAL,
     PICTURE,
     REPORT,
-    TRAJECTORIES,
     RunFolder,
     written_alone,
 )
@@ -242,7 +241,7 @@ def _measure(
 def _compare(truth: Truth | Failure, folder: RunFolder, loop: RunLoop) -> TruthComparison | Failure:
     if isinstance(truth, Failure):
         return truth
-    names = [*TRAJECTORIES, *([GLOBAL] if (folder.path / f"{GLOBAL}.txt").is_file() else [])]
+    names = trajectory_names(folder.path)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in names}
     try:
         return TruthComparison.of(_within(truth, folder, loop), estimates)

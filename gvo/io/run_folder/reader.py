@@ -206,8 +206,7 @@ def read_run(folder: str | Path) -> RunRecord:
     if missing:
         raise RecordingError(f"{folder}: is no run folder: no {missing[0]}; {_EXPECTED}")
     summary = _read_summary(folder / "summary.json")
-    names = [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
-    trajectories = {name: _read_estimate(folder, name) for name in names}
+    trajectories = {name: _read_estimate(folder, name) for name in trajectory_names(folder)}
     return RunRecord(
         folder=folder,
         summary=summary,
@@ -218,6 +217,11 @@ def read_run(folder: str | Path) -> RunRecord:
         trajectories=trajectories,
         truth=_read_truth(folder, summary),
     )
+
+
+def trajectory_names(folder: Path) -> list[str]:
+    """Return the names of the trajectories of a run: the global one where there is one."""
+    return [*TRAJECTORIES, *([GLOBAL] if (folder / f"{GLOBAL}.txt").is_file() else [])]
 
 
 def _read_summary(path: Path) -> dict[str, Any]:
