@@ -7,10 +7,13 @@ The models are frozen and refuse unknown keys. `load_configuration` reads YAML a
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, TypeAlias, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -44,6 +47,15 @@ _common = partial(_parameter, is_expert=False)
 
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
+Value: TypeAlias = bool | int | float | str | None
+Kind = Literal["switch", "choice", "integer", "number"]
+_WIDEST_SLIDER = 1000.0
+_N_STEPS = 200
+# what a number starts from where its default is null
+_STARTS: Mapping[tuple[str, str], float] = {
+    ("depth", "scale"): 1000.0,
+    ("window", "kernel_threshold"): 3.55,
+}
 
 
 class Section(BaseModel):
@@ -569,3 +581,114 @@ def _choices(field: Any) -> str:  # noqa: ANN401
         for limit in field.metadata
         if type(limit).__name__ in signs
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """How a parameter is shown and changed.
+
+    Parameters
+    ----------
+    section, key : str
+        Its name is `section.key`.
+    kind : {"switch", "choice", "integer", "number"}
+    is_optional : bool
+        Whether null is a value, too.
+    choices : tuple of str
+        Of a choice.
+    minimum, maximum : float or None
+        Smallest and largest value that the control offers, where there is one.
+    step : float
+        Between two values that the control offers.
+    is_slider : bool
+        Whether both bounds are near enough for a slider.
+    default, start : bool, int, float, str or None
+        The default; what a number starts from that was null.
+    hint : str
+        Meaning, unit, range and default, on one line.
+    """
+
+    section: str
+    key: str
+    kind: Kind
+    is_optional: bool
+    choices: tuple[str, ...]
+    minimum: float | None
+    maximum: float | None
+    step: float
+    is_slider: bool
+    default: Value
+    start: Value
+    hint: str
+
+
+def list_parameters() -> dict[str, list[Parameter]]:
+    """Return the parameters by section, in the order of the configuration."""
+    return {
+        section: [_shown(section, key, field) for key, field in model.model_fields.items()]
+        for section, model in sections().items()
+    }
+
+
+def _shown(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
+    options = get_args(field.annotation)
+    default = yaml.safe_dump(field.default).splitlines()[0]
+    limits = {type(limit).__name__: limit for limit in field.metadata}
+    kind = _kind(field.annotation)
+    lower, upper = _bound(limits, "Ge", "Gt"), _bound(limits, "Le")
+    start = field.default
+    if start is None:
+        start = _STARTS.get((section, key), 1.0)
+    span = math.inf if lower is None or upper is None else upper - lower
+    is_slider = kind in ("integer", "number") and span <= _WIDEST_SLIDER
+    step = _step(kind, float(start) if _is_number(start) else 0.0, span)
+    if lower is not None and "Gt" in limits and (is_slider or kind == "integer"):
+        lower += step
+    return Parameter(
+        section=section,
+        key=key,
+        kind=kind,
+        is_optional=NoneType in options,
+        choices=tuple(options) if kind == "choice" else (),
+        minimum=lower,
+        maximum=upper,
+        step=step,
+        is_slider=is_slider,
+        default=field.default,
+        start=start,
+        hint=f"{describe_field(field)}; default {default}",
+    )
+
+
+def _is_number(value: object) -> bool:
+    """Tell whether a value is a number; True and False are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _kind(annotation: Any) -> Kind:  # noqa: ANN401
+    options = [option for option in get_args(annotation) if option is not NoneType]
+    if options and all(isinstance(option, str) for option in options):
+        return "choice"
+    plain = options[0] if options else annotation
+    kinds: dict[type, Kind] = {bool: "switch", int: "integer", float: "number"}
+    return kinds[plain]
+
+
+def _bound(limits: Mapping[str, Any], *names: str) -> float | None:
+    found = [getattr(limits[name], name.lower()) for name in names if name in limits]
+    return float(found[0]) if found else None
+
+
+def _step(kind: Kind, start: float, span: float) -> float:
+    """Return a step of one digit, fine enough for the range, or for the start value."""
+    if kind == "integer":
+        return 1.0
+    if span <= _WIDEST_SLIDER:
+        return _one_digit(span / _N_STEPS)
+    return 10.0 ** (math.floor(math.log10(start)) - 1) if start > 0 else 0.1
+
+
+def _one_digit(value: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above a value."""
+    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
+    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= value * 1.001))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
@@ -68,54 +69,20 @@ class FramePose(NamedTuple):
     T_parent_child: FloatArray
 
 
-class BagWriter:
-    """A new bag, open inside a `with` block.
+class MessageWriter(ABC):
+    """Makes messages of ROS 1 or ROS 2 and writes them to topics.
 
     Parameters
     ----------
-    path : Path
-        `.bag`: ROS 1. `.mcap` or `.db3`: a file of ROS 2, made inside a folder of the same
-        name without the suffix. No suffix: a ROS 2 bag folder.
-    keeps_order : bool
-        Every reader is to give the messages in the order in which they were written: one whose
-        stamp goes back, or repeats within its topic, is logged a nanosecond after the last.
-
-    Attributes
-    ----------
-    result : Path
-        The finished file or folder.
+    name : str
+        Where to, for messages.
+    is_ros1 : bool
     """
 
-    def __init__(self, path: Path, *, keeps_order: bool = False) -> None:
-        self.is_ros1 = path.suffix == ".bag"
-        self.result = path
-        self._writer: Writer1 | Writer2
-        if self.is_ros1:
-            self._writer = Writer1(path)
-        else:
-            folder = path.with_suffix("")
-            is_mcap = path.suffix == ".mcap"
-            plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
-            self._writer = Writer2(folder, version=_ROS2_VERSION, storage_plugin=plugin)
-            if path.suffix:
-                self.result = folder / path.name
-        self._store = typestore(is_ros1=self.is_ros1)
-        self._connections: dict[str, Connection] = {}
-        self._log_time_ns = 0
-        self._keeps_order = keeps_order
-        self._newest_ns: dict[str, int] = {}  # log times by topic
-
-    def __enter__(self) -> BagWriter:
-        self._writer.open()
-        return self
-
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(error_type, error, traceback)
+    def __init__(self, name: str, *, is_ros1: bool) -> None:
+        self.is_ros1 = is_ros1
+        self._name = name
+        self._store = typestore(is_ros1=is_ros1)
 
     def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time
         """Return a message.
@@ -142,17 +109,27 @@ class BagWriter:
         max_seconds = _MAX_SECONDS_ROS1 if self.is_ros1 else _MAX_SECONDS_ROS2
         if not 0 <= sec <= max_seconds:
             raise RecordingError(
-                f"{self.result.name}: the stamp {header.stamp_ns} ns cannot be written, expected "
+                f"{self._name}: the stamp {header.stamp_ns} ns cannot be written, expected "
                 f"0 to {max_seconds} s"
             )
         stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         sequence = {"seq": 0} if self.is_ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id, **sequence)
 
+    def serialize(self, message: object, type_: str) -> bytes:
+        """Return the bytes of a message, as ROS 1 has them or as CDR."""
+        serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
+        return bytes(serialize(message, type_))
+
+    def is_wanted(self, topic: str) -> bool:
+        """Tell whether anybody takes the messages of a topic; else none need be made."""
+        return True
+
+    @abstractmethod
     def write(
         self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
     ) -> None:
-        """Write a message; its log time is the stamp, but never goes back, see `keeps_order`.
+        """Write a message.
 
         Parameters
         ----------
@@ -166,6 +143,62 @@ class BagWriter:
             Of the topic, told with its first message: the last message is kept for those who
             subscribe later.
         """
+
+
+class BagWriter(MessageWriter):
+    """A new bag, open inside a `with` block.
+
+    The log time of a message is its stamp, but never goes back.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag`: ROS 1. `.mcap` or `.db3`: a file of ROS 2, made inside a folder of the same
+        name without the suffix. No suffix: a ROS 2 bag folder.
+    keeps_order : bool
+        Every reader is to give the messages in the order in which they were written: one whose
+        stamp goes back, or repeats within its topic, is logged a nanosecond after the last.
+
+    Attributes
+    ----------
+    result : Path
+        The finished file or folder.
+    """
+
+    def __init__(self, path: Path, *, keeps_order: bool = False) -> None:
+        super().__init__(path.name, is_ros1=path.suffix == ".bag")
+        self.result = path
+        self._writer: Writer1 | Writer2
+        if self.is_ros1:
+            self._writer = Writer1(path)
+        else:
+            folder = path.with_suffix("")
+            is_mcap = path.suffix == ".mcap"
+            plugin = StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3
+            self._writer = Writer2(folder, version=_ROS2_VERSION, storage_plugin=plugin)
+            if path.suffix:
+                self.result = folder / path.name
+        self._connections: dict[str, Connection] = {}
+        self._log_time_ns = 0
+        self._keeps_order = keeps_order
+        self._newest_ns: dict[str, int] = {}  # log times by topic
+
+    def __enter__(self) -> BagWriter:
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self,
+        error_type: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(error_type, error, traceback)
+
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
+        """Write a message; its log time is the stamp, but never goes back, see `keeps_order`."""
         # Readers sort by log time: a frame whose stamp goes back must stay where it was. Those of
         # one log time some readers sort by topic.
         is_behind = stamp_ns < self._log_time_ns or stamp_ns == self._newest_ns.get(topic)
@@ -174,8 +207,8 @@ class BagWriter:
         self._newest_ns[topic] = self._log_time_ns
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, type_, is_latched=is_latched)
-        serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
-        self._writer.write(self._connections[topic], self._log_time_ns, serialize(message, type_))
+        data = self.serialize(message, type_)
+        self._writer.write(self._connections[topic], self._log_time_ns, data)
 
     def _connect(self, topic: str, type_: str, *, is_latched: bool) -> Connection:
         if isinstance(self._writer, Writer1):
@@ -190,7 +223,7 @@ class BagWriter:
         )
 
 
-def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
+def write_image(writer: MessageWriter, topic: str, pixels: NDArray[Any], header: Header) -> None:
     """Write an image: uint8 (h, w) as mono8, uint8 (h, w, 3) as bgr8, float32 (h, w) as 32FC1."""
     encoding = {2: "mono8", 3: "bgr8"}[pixels.ndim]
     if pixels.dtype == np.float32:
@@ -198,9 +231,9 @@ def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header
     height, width = pixels.shape[:2]
     # Bags of both generations are little-endian, whatever the machine.
     data = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<"))
-    message = bag.make(
+    message = writer.make(
         IMAGE_TYPE,
-        header=bag.header(header),
+        header=writer.header(header),
         height=height,
         width=width,
         encoding=encoding,
@@ -208,23 +241,26 @@ def write_image(bag: BagWriter, topic: str, pixels: NDArray[Any], header: Header
         step=data.nbytes // height,
         data=data.view(np.uint8).ravel(),
     )
-    bag.write(topic, IMAGE_TYPE, message, header.stamp_ns)
+    writer.write(topic, IMAGE_TYPE, message, header.stamp_ns)
 
 
-def write_compressed(bag: BagWriter, topic: str, pixels: NDArray[np.uint8], header: Header) -> None:
+def write_compressed(
+    writer: MessageWriter, topic: str, pixels: NDArray[np.uint8], header: Header
+) -> None:
     """Write an image, uint8 (h, w) or BGR (h, w, 3), as PNG to a topic ending in `/compressed`."""
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"
     kind = f"{encoding}; png compressed {'' if pixels.ndim == 2 else encoding}"
-    _write(bag, topic, kind, encode_image(pixels, ".png"), header)
+    _write(writer, topic, kind, encode_image(pixels, ".png"), header)
 
 
-def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header: Header) -> None:
+def write_compressed_depth(
+    writer: MessageWriter, topic: str, depth: DepthArray, header: Header
+) -> None:
     """Write depth without loss: in whole millimetres as the transport `compressedDepth` does.
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         Ends in `/compressedDepth`.
     depth : ndarray of float32, shape (h, w)
@@ -233,54 +269,55 @@ def write_compressed_depth(bag: BagWriter, topic: str, depth: DepthArray, header
     """
     counts = exact_counts(depth, MILLIMETRES)
     if counts is None:
-        _write(bag, topic, "32FC1; tiff compressed ", encode_image(depth, ".tiff"), header)
+        _write(writer, topic, "32FC1; tiff compressed ", encode_image(depth, ".tiff"), header)
     else:
         data = _DEPTH_HEADER + encode_image(counts, ".png")
-        _write(bag, topic, "16UC1; compressedDepth", data, header)
+        _write(writer, topic, "16UC1; compressedDepth", data, header)
 
 
-def write_picture(bag: BagWriter, topic: str, header: Header, image: ImageArray) -> None:
+def write_picture(writer: MessageWriter, topic: str, header: Header, image: ImageArray) -> None:
     """Write a picture, uint8 (h, w, 3) in BGR order, as JPEG to a topic ending in `/compressed`."""
-    _write(bag, topic, "jpeg", encode_image(image, ".jpg"), header)
+    _write(writer, topic, "jpeg", encode_image(image, ".jpg"), header)
 
 
-def _write(bag: BagWriter, topic: str, kind: str, data: bytes, header: Header) -> None:
-    message = bag.make(
+def _write(writer: MessageWriter, topic: str, kind: str, data: bytes, header: Header) -> None:
+    message = writer.make(
         COMPRESSED_TYPE,
-        header=bag.header(header),
+        header=writer.header(header),
         format=kind,
         data=np.frombuffer(data, dtype=np.uint8),
     )
-    bag.write(topic, COMPRESSED_TYPE, message, header.stamp_ns)
+    writer.write(topic, COMPRESSED_TYPE, message, header.stamp_ns)
 
 
-def write_camera_info(bag: BagWriter, topic: str, calibration: Calibration, header: Header) -> None:
+def write_camera_info(
+    writer: MessageWriter, topic: str, calibration: Calibration, header: Header
+) -> None:
     """Write a calibration as `CameraInfo`, all numbers without loss."""
     matrices = {name: getattr(calibration, name).ravel() for name in "DKRP"}
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
-    message = bag.make(
+    message = writer.make(
         CAMERA_INFO_TYPE,
-        header=bag.header(header),
+        header=writer.header(header),
         height=calibration.height,
         width=calibration.width,
         distortion_model=calibration.model,
         binning_x=0,
         binning_y=0,
-        roi=bag.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
-        **{name if bag.is_ros1 else name.lower(): M for name, M in matrices.items()},
+        roi=writer.make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **region),
+        **{name if writer.is_ros1 else name.lower(): M for name, M in matrices.items()},
     )
-    bag.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
+    writer.write(topic, CAMERA_INFO_TYPE, message, header.stamp_ns)
 
 
 def write_transforms(
-    bag: BagWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
+    writer: MessageWriter, topic: str, poses: Iterable[FramePose], *, is_latched: bool = False
 ) -> None:
     """Write poses of frames as one `tf2_msgs/TFMessage`; of none: nothing.
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         `/tf`, or `/tf_static` for what never moves, with `is_latched`.
     poses : iterable of FramePose
@@ -289,21 +326,21 @@ def write_transforms(
     """
     poses = tuple(poses)
     if poses:
-        message = bag.make(TF_TYPE, transforms=[_transform(bag, pose) for pose in poses])
+        message = writer.make(TF_TYPE, transforms=[_transform(writer, pose) for pose in poses])
         stamp_ns = max(pose.stamp_ns for pose in poses)
-        bag.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
+        writer.write(topic, TF_TYPE, message, stamp_ns, is_latched=is_latched)
 
 
-def _transform(bag: BagWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
+def _transform(writer: MessageWriter, pose: FramePose) -> Any:  # noqa: ANN401 - made at run time
     x, y, z, *q = pose_numbers(pose.T_parent_child).tolist()
-    transform = bag.make(
+    transform = writer.make(
         "geometry_msgs/msg/Transform",
-        translation=bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-        rotation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+        translation=writer.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        rotation=writer.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
     )
-    return bag.make(
+    return writer.make(
         "geometry_msgs/msg/TransformStamped",
-        header=bag.header(Header(pose.stamp_ns, pose.parent)),
+        header=writer.header(Header(pose.stamp_ns, pose.parent)),
         child_frame_id=pose.child,
         transform=transform,
     )
@@ -315,7 +352,7 @@ def pose_numbers(T_parent_child: FloatArray) -> FloatArray:
     return np.concatenate([T_parent_child[:3, 3], quaternion_xyzw])
 
 
-def write_truth(bag: BagWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
+def write_truth(writer: MessageWriter, stamp_ns: int, T_world_cam: FloatArray) -> None:
     """Write a true pose of the rectified camera, shape (4, 4), metres, to `/tf`."""
     parent, child = TRUTH_FRAMES.parent, TRUTH_FRAMES.child
-    write_transforms(bag, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])
+    write_transforms(writer, "/tf", [FramePose(stamp_ns, parent, child, T_world_cam)])

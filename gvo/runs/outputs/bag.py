@@ -5,6 +5,7 @@ Topics (frames: see `RunFrames`)
 ===========================  ==============================  ======================================
 `/tf`, `/tf_static`          `tf2_msgs/TFMessage`            the frames and their poses
 `/gvo/NAME/odometry`         `nav_msgs/Odometry`             NAME: raw, causal, smoothed, global
+`/gvo/odom/odometry`         `nav_msgs/Odometry`             the pose that never jumps, REP 105
 `/gvo/NAME/path`             `nav_msgs/Path`                 NAME: raw, smoothed, global
 `/gvo/loops`                 `visualization_msgs/Marker`     a line for each loop, by namespace
 `/gvo/points`                `sensor_msgs/PointCloud2`       matched points in `gvo/causal/CAMERA`
@@ -43,6 +44,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Final
@@ -53,7 +55,13 @@ from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.convert.bag_messages import BagWriter, Header, write_picture, write_transforms
+from gvo.io.convert.bag_messages import (
+    BagWriter,
+    Header,
+    MessageWriter,
+    write_picture,
+    write_transforms,
+)
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.bag_messages import (
     write_diagnostics,
@@ -62,7 +70,7 @@ from gvo.runs.outputs.bag_messages import (
     write_path,
     write_points,
 )
-from gvo.runs.outputs.frames import GLOBAL, RunFrames, StampedPose, Track, twist_between
+from gvo.runs.outputs.frames import GLOBAL, ODOM, RunFrames, StampedPose, Track, twist_between
 from gvo.types import (
     BoolArray,
     Estimate,
@@ -83,29 +91,22 @@ N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
 
 _SECOND_NS: Final = 10**9
+_POINTS, _PICTURE = "/gvo/points", "/gvo/matches/compressed"
 
 
-class RunBag(AbstractContextManager["RunBag"]):
-    """A bag of the results of a run, open inside a `with` block.
-
-    It is written under another name in the same folder and takes its own when it is closed, also
-    where the run is interrupted. Without a single frame no file is left.
+class RunMessages:
+    """The results of a run as messages, written to a bag or into a network.
 
     Parameters
     ----------
-    path : Path
-        `.mcap`: one file of ROS 2; `.bag`: of ROS 1. Its folder is made where it is missing.
-    frames : RunFrames, optional
-
-    Raises
-    ------
-    RecordingError
-        When the path exists, ends otherwise or cannot be written.
+    writer : MessageWriter
+        Where to.
+    frames : RunFrames
     """
 
-    def __init__(self, path: str | Path, frames: RunFrames | None = None) -> None:
-        self.path = Path(path)
-        self._frames = frames or RunFrames()
+    def __init__(self, writer: MessageWriter, frames: RunFrames) -> None:
+        self._writer = writer
+        self._frames = frames
         self._tracks = {name: Track() for name in ("raw", "smoothed", GLOBAL)}
         self._causal = Track()
         self._numbers = count()
@@ -114,15 +115,11 @@ class RunBag(AbstractContextManager["RunBag"]):
         self._first_ns: int | None = None
         self._newest_ns = 0
         self._n_seconds = 0
-        self._is_open = True
-        if self.path.suffix not in SUFFIXES:
-            raise RecordingError(
-                f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got "
-                f"{self.path.name}"
-            )
-        self._file = PartFile(self.path, WriterError1, WriterError2)
-        with self._file.refused_on_error():
-            self._bag = BagWriter(self._file.part).__enter__()
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether any frame was written."""
+        return self._first_ns is not None
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Write the result of a frame.
@@ -133,90 +130,45 @@ class RunBag(AbstractContextManager["RunBag"]):
             Whose image the matches are drawn over.
         result : FrameResult
             Its poses are those of the base frame.
-
-        Raises
-        ------
-        RecordingError
-            When the file cannot be written.
         """
         raw, causal = result.raw, result.causal
-        with self._file.refused_on_error():
-            self._begin(frame.stamp_ns)
-            self._write_tf([("raw", raw), ("causal", causal)])
-            self._write_odom(result)
-            covariance = self._step_covariance(result, raw)
-            self._write_odometry("raw", raw, self._tracks["raw"].before(raw.stamp_ns), covariance)
-            self._write_odometry("causal", causal, self._causal.before(causal.stamp_ns))
-            self._tracks["raw"].add(raw)
-            self._causal.add(causal)
-            self._last = raw
-            self._write_matches(frame, result)
-            self._write_loops("causal", self._causal, result.loops)
-            self._write_paths_of_second(frame.stamp_ns)
+        self._begin(frame.stamp_ns)
+        self._write_odom(result)
+        self._write_tf([("raw", raw), ("causal", causal)])
+        covariance = self._step_covariance(result, raw)
+        self._write_odometry("raw", raw, self._tracks["raw"].before(raw.stamp_ns), covariance)
+        self._write_odometry("causal", causal, self._causal.before(causal.stamp_ns))
+        self._tracks["raw"].add(raw)
+        self._causal.add(causal)
+        self._last = raw
+        self._write_matches(frame, result)
+        self._write_loops("causal", self._causal, result.loops)
+        self._write_paths_of_second(frame.stamp_ns)
         self.add_smoothed(result.finished)
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
-        """Write smoothed poses of the base frame that are final, in any order.
-
-        Raises
-        ------
-        RecordingError
-            When the file cannot be written.
-        """
+        """Write smoothed poses of the base frame that are final, in any order."""
         self._add_late("smoothed", estimates)
 
     def add_optimum(self, optimum: Optimum) -> None:
-        """Write the global poses of the base frame, and the loops that count.
-
-        Raises
-        ------
-        RecordingError
-            When the file cannot be written.
-        """
+        """Write the global poses of the base frame, and the loops that count."""
         self._add_late(GLOBAL, optimum.estimates)
-        with self._file.refused_on_error():
-            self._write_loops(GLOBAL, self._tracks[GLOBAL], optimum.loops)
+        self._write_loops(GLOBAL, self._tracks[GLOBAL], optimum.loops)
 
     def _add_late(self, name: str, estimates: Iterable[Estimate]) -> None:
         estimates = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
         track = self._tracks[name]
-        with self._file.refused_on_error():
-            self._write_tf([(name, estimate) for estimate in estimates])
-            for estimate in estimates:
-                self._write_odometry(name, estimate, track.before(estimate.stamp_ns))
-                track.add(estimate)
+        self._write_tf([(name, estimate) for estimate in estimates])
+        for estimate in estimates:
+            self._write_odometry(name, estimate, track.before(estimate.stamp_ns))
+            track.add(estimate)
 
     def add_faulty(self, frame: FaultyFrame) -> None:
         """Write a frame without a pose to the diagnostics."""
         if self._first_ns is None:
             return
-        with self._file.refused_on_error():
-            header = Header(frame.stamp_ns, self._frames.camera)
-            write_diagnostics(self._bag, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
-
-    def close(self) -> None:
-        """Write the whole paths and give the file its name; a second call does nothing.
-
-        Raises
-        ------
-        RecordingError
-            When the file cannot be written.
-        """
-        if not self._is_open:
-            return
-        self._is_open = False
-        has_frames = self._first_ns is not None
-        with self._file.completed(is_kept=has_frames):
-            try:
-                if has_frames:
-                    self._write_paths()
-            finally:
-                self._bag.__exit__(None, None, None)
-                self._file.part = self._bag.result
-
-    def __exit__(self, *exception: object) -> None:
-        """Close it."""
-        self.close()
+        header = Header(frame.stamp_ns, self._frames.camera)
+        write_diagnostics(self._writer, header, Status.SKIPPED, f"skipped: {frame.reason}", {})
 
     def _begin(self, stamp_ns: int) -> None:
         """Note the stamp of a frame; at the first, write the static transforms."""
@@ -224,25 +176,32 @@ class RunBag(AbstractContextManager["RunBag"]):
         if self._first_ns is not None:
             return
         self._first_ns = stamp_ns
-        write_transforms(self._bag, "/tf_static", self._frames.fixed(stamp_ns), is_latched=True)
+        write_transforms(self._writer, "/tf_static", self._frames.fixed(stamp_ns), is_latched=True)
 
     def _write_tf(self, named: Iterable[tuple[str, Estimate]]) -> None:
         poses = [self._frames.moving(name, estimate) for name, estimate in named]
-        write_transforms(self._bag, "/tf", chain.from_iterable(poses))
+        write_transforms(self._writer, "/tf", chain.from_iterable(poses))
 
     def _write_odom(self, result: FrameResult) -> None:
         """Go on by the step of a frame, and write where that leads and what corrects it."""
-        if result.T_previous_frame is not None:
+        previous = None
+        if result.T_previous_frame is not None and self._last is not None:
+            previous = StampedPose(self._last.stamp_ns, self._T_odom_base)
             self._T_odom_base = se3.normalize(self._T_odom_base @ result.T_previous_frame)
-        T_world_base = result.T_map_world @ result.causal.T_world_frame
-        poses = self._frames.corrected(result.stamp_ns, T_world_base, self._T_odom_base)
-        write_transforms(self._bag, "/tf", poses)
+        frames, causal = self._frames, result.causal
+        T_world_base = result.T_map_world @ causal.T_world_frame
+        poses = frames.corrected(result.stamp_ns, T_world_base, self._T_odom_base)
+        write_transforms(self._writer, "/tf", poses)
+        estimate = replace(causal, T_world_frame=self._T_odom_base)
+        twist = twist_between(estimate, previous, self._step_covariance(result, result.raw))
+        names = frames.odom, frames.base_by(ODOM)
+        write_odometry(self._writer, f"/gvo/{ODOM}/odometry", estimate, names, twist)
 
     def _write_loops(self, name: str, track: Track, loops: Iterable[Loop]) -> None:
         segments = track.segments(loops)
         if len(segments) > 0:
             header, number = Header(self._newest_ns, self._frames.world), next(self._numbers)
-            write_lines(self._bag, "/gvo/loops", header, segments, name=name, number=number)
+            write_lines(self._writer, "/gvo/loops", header, segments, name=name, number=number)
 
     def _step_covariance(self, result: FrameResult, raw: Estimate) -> FloatArray | None:
         """Return the covariance (6, 6) of the last step of the raw chain, where it is known.
@@ -264,7 +223,7 @@ class RunBag(AbstractContextManager["RunBag"]):
         step_covariance: FloatArray | None = None,
     ) -> None:
         write_odometry(
-            self._bag,
+            self._writer,
             f"/gvo/{name}/odometry",
             estimate,
             (self._frames.world, self._frames.base_by(name)),
@@ -272,44 +231,122 @@ class RunBag(AbstractContextManager["RunBag"]):
         )
 
     def _write_matches(self, frame: Frame, result: FrameResult) -> None:
-        """Write points, picture and diagnostics of a frame."""
-        image = frame.left if isinstance(frame, StereoFrame) else frame.image
-        found = result.registration or NOTHING
-        n_told = min(len(found.pixels_current), len(found.points_current))
-        inliers = found.inliers[:n_told]
-        header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
-        write_points(
-            self._bag,
-            "/gvo/points",
-            header,
-            found.points_current[:n_told],
-            intensities=_grey_values(image, found.pixels_current[:n_told]),
-            inliers=inliers,
-        )
-        picture = draw_matches(
-            image,
-            found.pixels_reference[:n_told],
-            found.pixels_current[:n_told],
-            inliers,
-            lines=caption(result),
-        )
-        write_picture(self._bag, "/gvo/matches/compressed", header, picture)
+        """Write diagnostics, points and picture of a frame; the last two where they are wanted."""
         hardware = Header(frame.stamp_ns, self._frames.camera)
         text = " ".join(caption(result))
-        write_diagnostics(self._bag, hardware, result.status, text, _numbers(result))
+        write_diagnostics(self._writer, hardware, result.status, text, _numbers(result))
+        header = Header(frame.stamp_ns, self._frames.camera_by("causal"))
+        if self._writer.is_wanted(_POINTS):
+            self._write_points(frame, result, header)
+        if self._writer.is_wanted(_PICTURE):
+            self._write_picture(frame, result, header)
+
+    def _write_points(self, frame: Frame, result: FrameResult, header: Header) -> None:
+        found = result.registration or NOTHING
+        n_told = min(len(found.pixels_current), len(found.points_current))
+        write_points(
+            self._writer,
+            _POINTS,
+            header,
+            found.points_current[:n_told],
+            intensities=_grey_values(_image(frame), found.pixels_current[:n_told]),
+            inliers=found.inliers[:n_told],
+        )
+
+    def _write_picture(self, frame: Frame, result: FrameResult, header: Header) -> None:
+        found = result.registration or NOTHING
+        n_told = min(len(found.pixels_current), len(found.points_current))
+        matches = found.pixels_reference[:n_told], found.pixels_current[:n_told]
+        inliers = found.inliers[:n_told]
+        picture = draw_matches(_image(frame), *matches, inliers, lines=caption(result))
+        write_picture(self._writer, _PICTURE, header, picture)
 
     def _write_paths_of_second(self, stamp_ns: int) -> None:
         """Write the paths where a new second of the recording has begun."""
         n_seconds = (stamp_ns - (self._first_ns or 0)) // _SECOND_NS
         if n_seconds > self._n_seconds:
             self._n_seconds = n_seconds
-            self._write_paths(N_SHOWN_POSES)
+            self.write_paths(N_SHOWN_POSES)
 
-    def _write_paths(self, n_most: int | None = None) -> None:
+    def write_paths(self, n_most: int | None = None) -> None:
+        """Write the paths so far, of at most so many poses each; of all without a number."""
         header = Header(self._newest_ns, self._frames.world)
         for name, track in self._tracks.items():
             if len(track) > 0:
-                write_path(self._bag, f"/gvo/{name}/path", header, *track.poses(n_most))
+                write_path(self._writer, f"/gvo/{name}/path", header, *track.poses(n_most))
+
+
+class RunBag(AbstractContextManager["RunBag"]):
+    """A bag of the results of a run, open inside a `with` block.
+
+    It is written under another name in the same folder and takes its own when it is closed, also
+    where the run is interrupted. Without a single frame no file is left.
+
+    Parameters
+    ----------
+    path : Path
+        `.mcap`: one file of ROS 2; `.bag`: of ROS 1. Its folder is made where it is missing.
+    frames : RunFrames, optional
+
+    Raises
+    ------
+    RecordingError
+        When the path exists, ends otherwise or cannot be written; so do all methods.
+    """
+
+    def __init__(self, path: str | Path, frames: RunFrames | None = None) -> None:
+        self.path = Path(path)
+        self._is_open = True
+        if self.path.suffix not in SUFFIXES:
+            raise RecordingError(
+                f"{path}: expected a name ending in .mcap (ROS 2) or .bag (ROS 1), got "
+                f"{self.path.name}"
+            )
+        self._file = PartFile(self.path, WriterError1, WriterError2)
+        with self._file.refused_on_error():
+            self._bag = BagWriter(self._file.part).__enter__()
+        self._messages = RunMessages(self._bag, frames or RunFrames())
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Write the result of a frame, see `RunMessages`."""
+        with self._file.refused_on_error():
+            self._messages.add_frame(frame, result)
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Write a frame without a pose to the diagnostics."""
+        with self._file.refused_on_error():
+            self._messages.add_faulty(frame)
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Write smoothed poses of the base frame that are final, in any order."""
+        with self._file.refused_on_error():
+            self._messages.add_smoothed(estimates)
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Write the global poses of the base frame, and the loops that count."""
+        with self._file.refused_on_error():
+            self._messages.add_optimum(optimum)
+
+    def close(self) -> None:
+        """Write the whole paths and give the file its name; a second call does nothing."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        with self._file.completed(is_kept=self._messages.has_frames):
+            try:
+                if self._messages.has_frames:
+                    self._messages.write_paths()
+            finally:
+                self._bag.__exit__(None, None, None)
+                self._file.part = self._bag.result
+
+    def __exit__(self, *exception: object) -> None:
+        """Close it."""
+        self.close()
+
+
+def _image(frame: Frame) -> ImageArray:
+    return frame.left if isinstance(frame, StereoFrame) else frame.image
 
 
 def _grey_values(image: ImageArray, pixels: FloatArray) -> FloatArray:

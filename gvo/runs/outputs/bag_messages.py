@@ -9,7 +9,7 @@ import numpy as np
 
 from gvo.geometry import se3
 from gvo.io.bag.topics import COMPRESSED_TYPE
-from gvo.io.convert.bag_messages import BagWriter, Header, pose_numbers
+from gvo.io.convert.bag_messages import Header, MessageWriter, pose_numbers
 from gvo.runs.outputs.frames import Twist
 from gvo.types import BoolArray, Estimate, FloatArray, IntArray, Status
 from gvo.viz.palette import ESTIMATES
@@ -62,7 +62,7 @@ def covariance_to_ros(covariance: FloatArray, R_parent_frame: FloatArray) -> Flo
 
 
 def write_odometry(
-    bag: BagWriter, topic: str, estimate: Estimate, frames: tuple[str, str], twist: Twist
+    writer: MessageWriter, topic: str, estimate: Estimate, frames: tuple[str, str], twist: Twist
 ) -> None:
     """Write a pose and a velocity with their covariances as `nav_msgs/Odometry`.
 
@@ -70,8 +70,7 @@ def write_odometry(
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         Where to.
     estimate : Estimate
@@ -83,29 +82,28 @@ def write_odometry(
     """
     parent, child = frames
     R = estimate.T_world_frame[:3, :3]
-    message = bag.make(
+    message = writer.make(
         ODOMETRY_TYPE,
-        header=bag.header(Header(estimate.stamp_ns, parent)),
+        header=writer.header(Header(estimate.stamp_ns, parent)),
         child_frame_id=child,
-        pose=bag.make(
+        pose=writer.make(
             "geometry_msgs/msg/PoseWithCovariance",
-            pose=_pose(bag, pose_numbers(estimate.T_world_frame).tolist()),
+            pose=_pose(writer, pose_numbers(estimate.T_world_frame).tolist()),
             covariance=covariance_to_ros(estimate.covariance, R).ravel(),
         ),
-        twist=_twist(bag, twist),
+        twist=_twist(writer, twist),
     )
-    bag.write(topic, ODOMETRY_TYPE, message, estimate.stamp_ns)
+    writer.write(topic, ODOMETRY_TYPE, message, estimate.stamp_ns)
 
 
 def write_path(
-    bag: BagWriter, topic: str, header: Header, stamps_ns: IntArray, poses: FloatArray
+    writer: MessageWriter, topic: str, header: Header, stamps_ns: IntArray, poses: FloatArray
 ) -> None:
     """Write poses as `nav_msgs/Path`.
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         Where to.
     header : Header
@@ -116,26 +114,31 @@ def write_path(
         Position in metres and quaternion (x, y, z, w).
     """
     stamped = [
-        bag.make(
+        writer.make(
             "geometry_msgs/msg/PoseStamped",
-            header=bag.header(Header(stamp_ns, header.frame_id)),
-            pose=_pose(bag, numbers),
+            header=writer.header(Header(stamp_ns, header.frame_id)),
+            pose=_pose(writer, numbers),
         )
         for stamp_ns, numbers in zip(stamps_ns.tolist(), poses.tolist(), strict=True)
     ]
-    message = bag.make(PATH_TYPE, header=bag.header(header), poses=stamped)
-    bag.write(topic, PATH_TYPE, message, header.stamp_ns)
+    message = writer.make(PATH_TYPE, header=writer.header(header), poses=stamped)
+    writer.write(topic, PATH_TYPE, message, header.stamp_ns)
 
 
 def write_lines(
-    bag: BagWriter, topic: str, header: Header, segments: FloatArray, *, name: str, number: int
+    writer: MessageWriter,
+    topic: str,
+    header: Header,
+    segments: FloatArray,
+    *,
+    name: str,
+    number: int,
 ) -> None:
     """Write lines as a `visualization_msgs/Marker`, in the colour of loops.
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         Where to.
     header : Header
@@ -146,45 +149,45 @@ def write_lines(
         Namespace and id: another marker of both replaces this one.
     """
     red, green, blue = (value / 255 for value in bytes.fromhex(ESTIMATES["global"][1:]))
-    message = bag.make(
+    message = writer.make(
         MARKER_TYPE,
-        header=bag.header(header),
+        header=writer.header(header),
         ns=name,
         id=number,
         type=_LINE_LIST,
         action=_ADD,
-        pose=_pose(bag, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
-        scale=bag.make("geometry_msgs/msg/Vector3", x=_LINE_WIDTH_M, y=0.0, z=0.0),
-        color=bag.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
-        lifetime=bag.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        pose=_pose(writer, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+        scale=writer.make("geometry_msgs/msg/Vector3", x=_LINE_WIDTH_M, y=0.0, z=0.0),
+        color=writer.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        lifetime=writer.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,
         points=[
-            bag.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+            writer.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
             for x, y, z in segments.reshape(-1, 3).tolist()
         ],
         colors=[],
         text="",
         mesh_resource="",
         mesh_use_embedded_materials=False,
-        **({} if bag.is_ros1 else _untextured(bag)),
+        **({} if writer.is_ros1 else _untextured(writer)),
     )
-    bag.write(topic, MARKER_TYPE, message, header.stamp_ns)
+    writer.write(topic, MARKER_TYPE, message, header.stamp_ns)
 
 
-def _untextured(bag: BagWriter) -> dict[str, object]:
+def _untextured(writer: MessageWriter) -> dict[str, object]:
     """Return what the markers of ROS 2 hold besides."""
     nothing = np.zeros(0, dtype=np.uint8)
-    header = bag.header(Header(0, ""))
+    header = writer.header(Header(0, ""))
     return {
         "texture_resource": "",
-        "texture": bag.make(COMPRESSED_TYPE, header=header, format="", data=nothing),
+        "texture": writer.make(COMPRESSED_TYPE, header=header, format="", data=nothing),
         "uv_coordinates": [],
-        "mesh_file": bag.make("visualization_msgs/msg/MeshFile", filename="", data=nothing),
+        "mesh_file": writer.make("visualization_msgs/msg/MeshFile", filename="", data=nothing),
     }
 
 
 def write_points(
-    bag: BagWriter,
+    writer: MessageWriter,
     topic: str,
     header: Header,
     points: FloatArray,
@@ -199,8 +202,7 @@ def write_points(
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     topic : str
         Where to.
     header : Header
@@ -215,23 +217,23 @@ def write_points(
     for name, values in zip("xyz", points[is_finite].T, strict=True):
         cloud[name] = values
     cloud["intensity"], cloud["inlier"] = intensities[is_finite], inliers[is_finite]
-    message = bag.make(
+    message = writer.make(
         CLOUD_TYPE,
-        header=bag.header(header),
+        header=writer.header(header),
         height=1,
         width=len(cloud),
-        fields=_point_fields(bag),
+        fields=_point_fields(writer),
         is_bigendian=False,
         point_step=_POINT.itemsize,
         row_step=cloud.nbytes,
         data=cloud.view(np.uint8).reshape(-1),
         is_dense=True,
     )
-    bag.write(topic, CLOUD_TYPE, message, header.stamp_ns)
+    writer.write(topic, CLOUD_TYPE, message, header.stamp_ns)
 
 
 def write_diagnostics(
-    bag: BagWriter, header: Header, status: Status, text: str, values: Mapping[str, object]
+    writer: MessageWriter, header: Header, status: Status, text: str, values: Mapping[str, object]
 ) -> None:
     """Write the state of a frame to `/diagnostics`.
 
@@ -240,8 +242,7 @@ def write_diagnostics(
 
     Parameters
     ----------
-    bag : BagWriter
-        Open.
+    writer : MessageWriter
     header : Header
         Stamp of the frame, and what it was seen by: the hardware.
     status : Status
@@ -251,49 +252,49 @@ def write_diagnostics(
     values : mapping of str to object
         Numbers to show.
     """
-    message = bag.make(
+    message = writer.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=_LEVELS[status],
         name="gvo: odometry",
         message=text,
         hardware_id=header.frame_id,
         values=[
-            bag.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+            writer.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
             for key, value in values.items()
         ],
     )
-    array = bag.make(
-        DIAGNOSTICS_TYPE, header=bag.header(Header(header.stamp_ns, "")), status=[message]
+    array = writer.make(
+        DIAGNOSTICS_TYPE, header=writer.header(Header(header.stamp_ns, "")), status=[message]
     )
-    bag.write("/diagnostics", DIAGNOSTICS_TYPE, array, header.stamp_ns)
+    writer.write("/diagnostics", DIAGNOSTICS_TYPE, array, header.stamp_ns)
 
 
-def _pose(bag: BagWriter, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - made at run time
+def _pose(writer: MessageWriter, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - made at run time
     x, y, z, *q = numbers
-    return bag.make(
+    return writer.make(
         "geometry_msgs/msg/Pose",
-        position=bag.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=bag.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
+        position=writer.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=writer.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3]),
     )
 
 
-def _twist(bag: BagWriter, twist: Twist) -> Any:  # noqa: ANN401 - made at run time
+def _twist(writer: MessageWriter, twist: Twist) -> Any:  # noqa: ANN401 - made at run time
     covariance = -np.eye(6) if twist.covariance is None else twist.covariance
     angular, linear = (
-        bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+        writer.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
         for x, y, z in twist.velocity.reshape(2, 3).tolist()
     )
-    return bag.make(
+    return writer.make(
         "geometry_msgs/msg/TwistWithCovariance",
-        twist=bag.make("geometry_msgs/msg/Twist", linear=linear, angular=angular),
+        twist=writer.make("geometry_msgs/msg/Twist", linear=linear, angular=angular),
         # In the child's own axes: nothing is turned, rotation and translation change places.
         covariance=covariance_to_ros(covariance, np.eye(3)).ravel(),
     )
 
 
-def _point_fields(bag: BagWriter) -> list[Any]:
+def _point_fields(writer: MessageWriter) -> list[Any]:
     return [
-        bag.make(
+        writer.make(
             "sensor_msgs/msg/PointField",
             name=name,
             offset=offset,

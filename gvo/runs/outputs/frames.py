@@ -45,6 +45,9 @@ class RunFrames:
         camera moves in that frame.
     is_world_optical : bool
         Whether `world` has the axes of a camera: z forward.
+    is_robot : bool
+        Whether the frames of REP 105 are those of a robot, `odom` and the base frame itself, where
+        the robot tells how the camera is mounted; otherwise they are below `gvo/` as all others.
 
     Raises
     ------
@@ -57,6 +60,7 @@ class RunFrames:
     base: str = ""
     T_base_cam: FloatArray | Callable[[int], FloatArray] = field(default_factory=lambda: np.eye(4))
     is_world_optical: bool = False
+    is_robot: bool = False
 
     def __post_init__(self) -> None:
         """Fill in names; tf refuses a leading slash."""
@@ -88,9 +92,14 @@ class RunFrames:
             return np.eye(4)
         return self.T_base_cam(stamp_ns) if callable(self.T_base_cam) else self.T_base_cam
 
+    @property
+    def odom(self) -> str:
+        """The frame in which the base frame never jumps."""
+        return ODOM if self.is_robot else f"gvo/{ODOM}"
+
     def base_by(self, name: str) -> str:
         """Return the base frame as an estimate places it, or `ODOM`."""
-        return f"gvo/{name}/{self.base}"
+        return self.base if self.is_robot and name == ODOM else f"gvo/{name}/{self.base}"
 
     def camera_by(self, name: str) -> str:
         """Return the camera's optical frame as an estimate places it, or `ODOM`."""
@@ -104,15 +113,15 @@ class RunFrames:
         self, stamp_ns: int, T_world_base: FloatArray, T_odom_base: FloatArray
     ) -> Iterator[FramePose]:
         """Yield those of REP 105: a pose that never jumps, and what corrects it to another one."""
-        odom, T_world_odom = f"gvo/{ODOM}", T_world_base @ se3.invert(T_odom_base)
-        yield FramePose(stamp_ns, self.world, odom, T_world_odom)
-        yield from self._moving(ODOM, odom, stamp_ns, T_odom_base)
+        T_world_odom = T_world_base @ se3.invert(T_odom_base)
+        yield FramePose(stamp_ns, self.world, self.odom, T_world_odom)
+        yield from self._moving(ODOM, self.odom, stamp_ns, T_odom_base)
 
     def _moving(
         self, name: str, parent: str, stamp_ns: int, T_parent_base: FloatArray
     ) -> Iterator[FramePose]:
         yield FramePose(stamp_ns, parent, self.base_by(name), T_parent_base)
-        if callable(self.T_base_cam) and not self.is_camera:
+        if callable(self.T_base_cam) and not self.is_camera and self._mounts(name):
             yield self._mounted(stamp_ns, name)
 
     def fixed(self, stamp_ns: int) -> Iterator[FramePose]:
@@ -120,8 +129,12 @@ class RunFrames:
         if self.is_world_optical:
             yield FramePose(stamp_ns, f"{self.world}_flu", self.world, _T_FLU_OPTICAL)
         if not callable(self.T_base_cam) and not self.is_camera:
-            for name in (*ESTIMATES, GLOBAL, ODOM):
+            for name in filter(self._mounts, (*ESTIMATES, GLOBAL, ODOM)):
                 yield self._mounted(stamp_ns, name)
+
+    def _mounts(self, name: str) -> bool:
+        """Tell whether nobody else says where the camera is on the base frame of that name."""
+        return not (self.is_robot and name == ODOM)
 
     def _mounted(self, stamp_ns: int, name: str) -> FramePose:
         parent, child = self.base_by(name), self.camera_by(name)

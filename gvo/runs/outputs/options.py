@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gvo.errors import ConfigurationError, RecordingError, write_faults
@@ -117,7 +117,9 @@ class RunOutputs:
         return outputs, warnings
 
 
-def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str) -> RunFrames:
+def name_frames(
+    source: Source, base_frame: BaseFrame, *, is_placed: bool, world: str, is_robot: bool = False
+) -> RunFrames:
     """Name the frames of a run for a bag.
 
     Parameters
@@ -130,6 +132,8 @@ def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world
         Whether an initial pose was asked for: the world is not that of the first frame.
     world : str
         The fixed frame.
+    is_robot : bool
+        See `RunFrames`.
 
     Raises
     ------
@@ -137,7 +141,8 @@ def name_frames(source: Source, base_frame: BaseFrame, *, is_placed: bool, world
         When a frame's name is invalid.
     """
     try:
-        return _named(source, base_frame, is_placed=is_placed, world=world)
+        frames = _named(source, base_frame, is_placed=is_placed, world=world)
+        return replace(frames, is_robot=is_robot)
     except ValueError as error:
         raise ConfigurationError(f"--world {world}: {error}") from error
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from types import NoneType
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 
 import viser
-import yaml
 
-from gvo.config import Config, describe_field, sections, validate_configuration
+from gvo.config import (
+    Config,
+    Parameter,
+    Value,
+    list_parameters,
+    sections,
+    validate_configuration,
+)
 from gvo.errors import ConfigurationError
 
 DELAY_S = 0.4
@@ -20,16 +25,6 @@ DELAY_S = 0.4
 
 PATIENCE_S = 2.0
 """How long a refused value is shown, to be corrected, before the valid one comes back."""
-
-Value: TypeAlias = bool | int | float | str | None
-Kind = Literal["switch", "choice", "integer", "number"]
-_WIDEST_SLIDER = 1000.0
-_N_STEPS = 200
-# what a number starts from where its default is null
-_STARTS: Mapping[tuple[str, str], float] = {
-    ("depth", "scale"): 1000.0,
-    ("window", "kernel_threshold"): 3.55,
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,114 +213,3 @@ def _add_number(gui: viser.GuiApi, parameter: Parameter, value: Any) -> Any:  # 
     if cast is float:  # values finer than the step can be typed
         handle.precision = max(handle.precision, 2 - math.floor(math.log10(step)))
     return handle
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Parameter:
-    """How a parameter is shown and changed.
-
-    Parameters
-    ----------
-    section, key : str
-        Its name is `section.key`.
-    kind : {"switch", "choice", "integer", "number"}
-    is_optional : bool
-        Whether null is a value, too.
-    choices : tuple of str
-        Of a choice.
-    minimum, maximum : float or None
-        Smallest and largest value that the control offers, where there is one.
-    step : float
-        Between two values that the control offers.
-    is_slider : bool
-        Whether both bounds are near enough for a slider.
-    default, start : bool, int, float, str or None
-        The default; what a number starts from that was null.
-    hint : str
-        Meaning, unit, range and default, on one line.
-    """
-
-    section: str
-    key: str
-    kind: Kind
-    is_optional: bool
-    choices: tuple[str, ...]
-    minimum: float | None
-    maximum: float | None
-    step: float
-    is_slider: bool
-    default: Value
-    start: Value
-    hint: str
-
-
-def list_parameters() -> dict[str, list[Parameter]]:
-    """Return the parameters by section, in the order of the configuration."""
-    return {
-        section: [_parameter(section, key, field) for key, field in model.model_fields.items()]
-        for section, model in sections().items()
-    }
-
-
-def _parameter(section: str, key: str, field: Any) -> Parameter:  # noqa: ANN401
-    options = get_args(field.annotation)
-    default = yaml.safe_dump(field.default).splitlines()[0]
-    limits = {type(limit).__name__: limit for limit in field.metadata}
-    kind = _kind(field.annotation)
-    lower, upper = _bound(limits, "Ge", "Gt"), _bound(limits, "Le")
-    start = field.default
-    if start is None:
-        start = _STARTS.get((section, key), 1.0)
-    span = math.inf if lower is None or upper is None else upper - lower
-    is_slider = kind in ("integer", "number") and span <= _WIDEST_SLIDER
-    step = _step(kind, float(start) if is_number(start) else 0.0, span)
-    if lower is not None and "Gt" in limits and (is_slider or kind == "integer"):
-        lower += step
-    return Parameter(
-        section=section,
-        key=key,
-        kind=kind,
-        is_optional=NoneType in options,
-        choices=tuple(options) if kind == "choice" else (),
-        minimum=lower,
-        maximum=upper,
-        step=step,
-        is_slider=is_slider,
-        default=field.default,
-        start=start,
-        hint=f"{describe_field(field)}; default {default}",
-    )
-
-
-def is_number(value: object) -> bool:
-    """Tell whether a value is a number; True and False are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _kind(annotation: Any) -> Kind:  # noqa: ANN401
-    options = [option for option in get_args(annotation) if option is not NoneType]
-    if options and all(isinstance(option, str) for option in options):
-        return "choice"
-    plain = options[0] if options else annotation
-    kinds: dict[type, Kind] = {bool: "switch", int: "integer", float: "number"}
-    return kinds[plain]
-
-
-def _bound(limits: Mapping[str, Any], *names: str) -> float | None:
-    found = [getattr(limits[name], name.lower()) for name in names if name in limits]
-    return float(found[0]) if found else None
-
-
-def _step(kind: Kind, start: float, span: float) -> float:
-    """Return a step of one digit, fine enough for the range, or for the start value."""
-    if kind == "integer":
-        return 1.0
-    if span <= _WIDEST_SLIDER:
-        return _one_digit(span / _N_STEPS)
-    return 10.0 ** (math.floor(math.log10(start)) - 1) if start > 0 else 0.1
-
-
-def _one_digit(value: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten that is not above a value."""
-    power = 10.0 ** math.floor(math.log10(value) + 1e-9)
-    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= value * 1.001))

@@ -216,13 +216,13 @@ def test_every_topic_comes_once_a_frame_with_the_stamp_of_the_frame(
     messages = _read(tmp_path / name)
     stamps = [frame.stamp_ns for frame in any_run.frames]
     once = ["/gvo/points", "/gvo/matches/compressed", "/diagnostics"]
-    for topic in [*once, "/gvo/raw/odometry", "/gvo/causal/odometry"]:
+    for topic in [*once, *(f"/gvo/{kind}/odometry" for kind in ("raw", "causal", "odom"))]:
         assert [m.stamp_ns for m in messages[topic]] == stamps
         assert [m.log_time_ns for m in messages[topic]] == stamps
     assert sorted(m.stamp_ns for m in messages["/gvo/smoothed/odometry"]) == stamps
     assert sorted(messages) == sorted(
         [*once, "/tf", "/tf_static"]
-        + [f"/gvo/{kind}/odometry" for kind in _ESTIMATES]
+        + [f"/gvo/{kind}/odometry" for kind in (*_ESTIMATES, "odom")]
         + ["/gvo/raw/path", "/gvo/smoothed/path"]
     )
     assert [path.name for path in tmp_path.iterdir()] == [name]

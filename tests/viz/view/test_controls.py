@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 
 from gvo.config import (
     Config,
+    Parameter,
     describe_configuration,
+    list_parameters,
     load_configuration,
     validate_configuration,
 )
 from gvo.errors import ConfigurationError
-from gvo.viz.view.controls import Parameter, ParameterControls, list_parameters
+from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.server import ViewServer
 
 

@@ -1,0 +1,266 @@
+"""What a network of topics must be able to do, and messages written into it.
+
+Messages are bytes: rosbags makes and reads them, so that no package of messages is needed.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from rosbags.typesys import get_types_from_msg
+
+from gvo._text import cut
+from gvo.config import Config, validate_configuration
+from gvo.errors import ConfigurationError
+from gvo.io.bag.reader import BagMessage, typestore
+from gvo.io.bag.topics import Topic
+from gvo.io.convert.bag_messages import MessageWriter
+
+
+class Publisher(Protocol):
+    """A topic that messages are written to."""
+
+    def publish(self, data: bytes, stamp_ns: int) -> None:
+        """Send a message of that stamp; called by any thread."""
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether anybody listens; what is dear to make is not made otherwise."""
+
+
+class Sink(Protocol):
+    """A network or a viewer that takes messages, and may ask for something.
+
+    Attributes
+    ----------
+    is_ros1 : bool
+        Messages are serialised the way of ROS 1, not as CDR.
+    """
+
+    is_ros1: bool
+
+    def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> Publisher:
+        """Open a topic for writing.
+
+        Parameters
+        ----------
+        topic : str
+            With its leading slash.
+        type_ : str
+            `package/msg/Name`.
+        is_latched : bool
+            Who comes late is given the last message.
+        """
+
+    def serve(self, service: Service) -> None:
+        """Answer the calls of a service, in a thread of the transport."""
+
+    def offer(self, parameters: Parameters) -> None:
+        """Let parameters be seen and changed in the way of the transport, if it has one."""
+
+    def close(self) -> None:
+        """Leave; nothing is sent or received any more."""
+
+
+class Transport(Sink, Protocol):
+    """A network in which cameras send, too.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    """
+
+    name: str
+
+    def topics(self) -> Sequence[Topic]:
+        """Return what others announce now, each with one message at least."""
+
+    def subscribe(
+        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
+    ) -> Callable[[], None]:
+        """Receive the messages of a topic, those that are latched too.
+
+        Parameters
+        ----------
+        topic, type_ : str
+            As `topics` has them.
+        callback : callable
+            Takes the bytes of a message, and the time by the clock of the transport, nanoseconds
+            (simulated, where that is the clock). Called in a thread of the transport.
+
+        Returns
+        -------
+        callable
+            Ends it.
+        """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceType:
+    """Names and definitions of a type of services, as of ROS 2.
+
+    Parameters
+    ----------
+    name : str
+        `package/srv/Name`.
+    request, response : str
+        What a `.srv` file has above and below its line.
+    """
+
+    name: str
+    request: str
+    response: str
+
+    @property
+    def request_type(self) -> str:
+        """Name of the message of a request."""
+        return f"{self.name.replace('/srv/', '/msg/')}_Request"
+
+    @property
+    def response_type(self) -> str:
+        """Name of the message of an answer."""
+        return f"{self.name.replace('/srv/', '/msg/')}_Response"
+
+    def register(self, *, is_ros1: bool) -> None:
+        """Make both messages known to rosbags."""
+        store = typestore(is_ros1=is_ros1)
+        for type_, text in (self.request_type, self.request), (self.response_type, self.response):
+            if type_ not in store.fielddefs:
+                store.register(get_types_from_msg(text, type_))
+
+
+TRIGGER: Final = ServiceType(
+    name="std_srvs/srv/Trigger", request="", response="bool success\nstring message"
+)
+SET_POSE: Final = ServiceType(
+    name="robot_localization/srv/SetPose",
+    request="geometry_msgs/PoseWithCovarianceStamped pose",
+    response="",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """What is done when it is called.
+
+    Parameters
+    ----------
+    name : str
+        With its leading slash.
+    type : ServiceType
+    answer : callable
+        Takes the message of the request and returns the fields of the answer. Called by any
+        thread.
+    """
+
+    name: str
+    type: ServiceType
+    answer: Callable[[Any], Mapping[str, Any]]
+
+    def call(self, request: bytes, *, is_ros1: bool) -> bytes:
+        """Return the bytes of the answer.
+
+        Raises
+        ------
+        RecordingError
+            When the bytes are no request.
+        """
+        self.type.register(is_ros1=is_ros1)
+        message = decode(request, self.type.request_type, is_ros1=is_ros1)
+        store = typestore(is_ros1=is_ros1)
+        response = store.types[self.type.response_type](**self.answer(message))
+        serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+        return bytes(serialize(response, self.type.response_type))
+
+
+def decode(data: bytes, type_: str, *, is_ros1: bool) -> Any:  # noqa: ANN401 - made at run time
+    """Return a message that came from a network.
+
+    Raises
+    ------
+    RecordingError
+        When the bytes are no message of the type.
+    """
+    topic = Topic(name=type_, type=type_, n_messages=1)
+    return BagMessage(topic=topic, log_time_ns=0, data=data, is_ros1=is_ros1).decode()
+
+
+class Parameters:
+    """The configuration while it runs, changed from anywhere.
+
+    What a parameter is called, its range and its meaning: `gvo.config.list_parameters`.
+
+    Parameters
+    ----------
+    config : Config
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._followers: list[Callable[[Config], None]] = []
+        self._lock = threading.Lock()
+
+    @property
+    def config(self) -> Config:
+        """The configuration as it was set last; the next frame has it."""
+        return self._config
+
+    def follow(self, callback: Callable[[Config], None]) -> None:
+        """Call back after each change, in the thread that made it."""
+        self._followers.append(callback)
+
+    def set(self, values: Mapping[str, object]) -> Config:
+        """Change parameters.
+
+        Parameters
+        ----------
+        values : mapping of str to object
+            By `section.key`.
+
+        Returns
+        -------
+        Config
+            With the changes.
+
+        Raises
+        ------
+        ConfigurationError
+            When one does not exist or is out of its range; nothing is changed then.
+        """
+        with self._lock:
+            nested = self._config.model_dump()
+            for name, value in values.items():
+                section, _, key = name.partition(".")
+                if key not in nested.get(section, ()):
+                    raise ConfigurationError(f"there is no parameter {cut(name, 60)}")
+                nested[section][key] = value
+            self._config = config = validate_configuration(nested)
+        for callback in self._followers:
+            callback(config)
+        return config
+
+
+class NetworkWriter(MessageWriter):
+    """Writes messages into a network."""
+
+    def __init__(self, sink: Sink, name: str) -> None:
+        super().__init__(name, is_ros1=sink.is_ros1)
+        self._sink = sink
+        self._publishers: dict[str, Publisher] = {}
+
+    def is_wanted(self, topic: str) -> bool:
+        """Tell whether anybody listens, or the topic is not announced yet."""
+        publisher = self._publishers.get(topic)
+        return publisher is None or publisher.is_heard
+
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
+        """Send a message."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self._sink.advertise(topic, type_, is_latched=is_latched)
+        self._publishers[topic].publish(self.serialize(message, type_), stamp_ns)
