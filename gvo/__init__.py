@@ -6,49 +6,56 @@ The public names are loaded when they are first used, so that the command line a
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from gvo._version import __version__
+from gvo._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from gvo.backend.window import SlidingWindow
-    from gvo.config import Config, WindowConfig, load_configuration
-    from gvo.diagnostics.check.recording import check_recording
-    from gvo.errors import GvoError
-    from gvo.frontend.protocol import Frontend
-    from gvo.geometry.camera import PinholeCamera, StereoCamera
-    from gvo.io.convert.convert import convert
-    from gvo.io.edges.opening import open_edges
-    from gvo.io.excerpt import Excerpt
-    from gvo.io.frames import Rig, frames
-    from gvo.io.opening import RecordingOptions, open_recording
-    from gvo.io.poses.inputs import read_ground_truth
-    from gvo.io.synthetic.recording import SyntheticRecording
-    from gvo.odometry.loops import LoopDetector
-    from gvo.odometry.odometry import Odometry
-    from gvo.runs.outputs.options import RunOutputs
-    from gvo.runs.run import RunResult, run_recording
-    from gvo.runs.smooth import optimize, smooth_edges
-    from gvo.trajectory.evaluation import Evaluation, evaluate, format_evaluations
-    from gvo.trajectory.formats import read_trajectory
-    from gvo.trajectory.trajectory import Trajectory
-    from gvo.types import (
-        Edge,
-        Estimate,
-        Failure,
-        FaultyFrame,
-        FrameResult,
-        GraphEdge,
-        Loop,
-        MotionPrior,
-        Optimum,
-        PosePrior,
-        PositionPrior,
-        Rejected,
-        RelativePose,
-        RgbdFrame,
-        Status,
-        StereoFrame,
-    )
-    from gvo.viz.plots import plot_trajectories
+    from gvo.backend.window import SlidingWindow as SlidingWindow
+    from gvo.config import Config as Config
+    from gvo.config import WindowConfig as WindowConfig
+    from gvo.config import load_configuration as load_configuration
+    from gvo.diagnostics.check.recording import check_recording as check_recording
+    from gvo.errors import GvoError as GvoError
+    from gvo.frontend.protocol import Frontend as Frontend
+    from gvo.geometry.camera import PinholeCamera as PinholeCamera
+    from gvo.geometry.camera import StereoCamera as StereoCamera
+    from gvo.io.convert.convert import convert as convert
+    from gvo.io.edges.opening import open_edges as open_edges
+    from gvo.io.excerpt import Excerpt as Excerpt
+    from gvo.io.frames import Rig as Rig
+    from gvo.io.frames import frames as frames
+    from gvo.io.opening import RecordingOptions as RecordingOptions
+    from gvo.io.opening import open_recording as open_recording
+    from gvo.io.poses.inputs import read_ground_truth as read_ground_truth
+    from gvo.io.synthetic.recording import SyntheticRecording as SyntheticRecording
+    from gvo.odometry.loops import LoopDetector as LoopDetector
+    from gvo.odometry.odometry import Odometry as Odometry
+    from gvo.runs.outputs.options import RunOutputs as RunOutputs
+    from gvo.runs.run import RunResult as RunResult
+    from gvo.runs.run import run_recording as run_recording
+    from gvo.runs.smooth import optimize as optimize
+    from gvo.runs.smooth import smooth_edges as smooth_edges
+    from gvo.trajectory.evaluation import Evaluation as Evaluation
+    from gvo.trajectory.evaluation import evaluate as evaluate
+    from gvo.trajectory.evaluation import format_evaluations as format_evaluations
+    from gvo.trajectory.formats import read_trajectory as read_trajectory
+    from gvo.trajectory.trajectory import Trajectory as Trajectory
+    from gvo.types import Edge as Edge
+    from gvo.types import Estimate as Estimate
+    from gvo.types import Failure as Failure
+    from gvo.types import FaultyFrame as FaultyFrame
+    from gvo.types import FrameResult as FrameResult
+    from gvo.types import GraphEdge as GraphEdge
+    from gvo.types import Loop as Loop
+    from gvo.types import MotionPrior as MotionPrior
+    from gvo.types import Optimum as Optimum
+    from gvo.types import PosePrior as PosePrior
+    from gvo.types import PositionPrior as PositionPrior
+    from gvo.types import Rejected as Rejected
+    from gvo.types import RelativePose as RelativePose
+    from gvo.types import RgbdFrame as RgbdFrame
+    from gvo.types import Status as Status
+    from gvo.types import StereoFrame as StereoFrame
+    from gvo.viz.plots import plot_trajectories as plot_trajectories
 
 _MODULES = {
     "gvo.backend.window": ("SlidingWindow",),
@@ -94,56 +101,7 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = [
-    "Config",
-    "Edge",
-    "Estimate",
-    "Evaluation",
-    "Excerpt",
-    "Failure",
-    "FaultyFrame",
-    "FrameResult",
-    "Frontend",
-    "GraphEdge",
-    "GvoError",
-    "Loop",
-    "LoopDetector",
-    "MotionPrior",
-    "Odometry",
-    "Optimum",
-    "PinholeCamera",
-    "PosePrior",
-    "PositionPrior",
-    "RecordingOptions",
-    "Rejected",
-    "RelativePose",
-    "RgbdFrame",
-    "Rig",
-    "RunOutputs",
-    "RunResult",
-    "SlidingWindow",
-    "Status",
-    "StereoCamera",
-    "StereoFrame",
-    "SyntheticRecording",
-    "Trajectory",
-    "WindowConfig",
-    "__version__",
-    "check_recording",
-    "convert",
-    "evaluate",
-    "format_evaluations",
-    "frames",
-    "load_configuration",
-    "open_edges",
-    "open_recording",
-    "optimize",
-    "plot_trajectories",
-    "read_ground_truth",
-    "read_trajectory",
-    "run_recording",
-    "smooth_edges",
-]
+__all__ = sorted(["__version__", *_MODULE_OF])
 
 
 def __getattr__(name: str) -> object:

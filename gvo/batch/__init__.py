@@ -16,11 +16,16 @@ from typing import TYPE_CHECKING
 from gvo.errors import missing_extra
 
 if TYPE_CHECKING:
-    from gvo.batch.engine import BatchProgress, ClusterError, connected
-    from gvo.batch.recordings import NamedRecording, find_recordings
-    from gvo.batch.running import run, run_batch
-    from gvo.batch.tasks import BatchOptions
-    from gvo.batch.variants import Variant, make_variants
+    from gvo.batch.engine import BatchProgress as BatchProgress
+    from gvo.batch.engine import ClusterError as ClusterError
+    from gvo.batch.engine import connected as connected
+    from gvo.batch.recordings import NamedRecording as NamedRecording
+    from gvo.batch.recordings import find_recordings as find_recordings
+    from gvo.batch.running import run as run
+    from gvo.batch.running import run_batch as run_batch
+    from gvo.batch.tasks import BatchOptions as BatchOptions
+    from gvo.batch.variants import Variant as Variant
+    from gvo.batch.variants import make_variants as make_variants
 
 _MODULES = {
     "gvo.batch.engine": ("BatchProgress", "ClusterError", "connected"),
@@ -32,18 +37,7 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 _NEEDED = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
 
-__all__ = [
-    "BatchOptions",
-    "BatchProgress",
-    "ClusterError",
-    "NamedRecording",
-    "Variant",
-    "connected",
-    "find_recordings",
-    "make_variants",
-    "run",
-    "run_batch",
-]
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> object:

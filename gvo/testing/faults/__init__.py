@@ -1,113 +1,52 @@
 """Faults that are put into any recording."""
 
-from gvo.testing.faults.delivery import (
-    BrokenOff,
-    Dropped,
-    Elsewhere,
-    Exchanged,
-    Frozen,
-    Lagging,
-    Late,
-    Repeated,
-    Shuffled,
-    StampBackwards,
-    StampConstant,
-    StampFault,
-    StampFromZero,
-    StampJitter,
-    StampRate,
-    StampShift,
-    StampUnit,
-    Unloadable,
-)
-from gvo.testing.faults.fault import (
-    CalibrationFault,
-    Fault,
-    FaultyImage,
-    FaultySource,
-    ImageFault,
-    PixelFault,
-    WrongBaseline,
-    WrongFocalLength,
-    WrongPrincipalPoint,
-)
-from gvo.testing.faults.images import (
-    Banded,
-    Black,
-    Blurred,
-    Covered,
-    DepthConstant,
-    DepthFault,
-    DepthHoles,
-    DepthNoisy,
-    DepthQuantized,
-    DepthSaturated,
-    DepthScaled,
-    Exposed,
-    Flickering,
-    MotionBlurred,
-    Noisy,
-    SaltAndPepper,
-    White,
-)
-from gvo.testing.faults.transfer import (
-    HalfWritten,
-    OfType,
-    Resized,
-    RowsShifted,
-    Shifted,
-    Turned,
-)
-
-__all__ = [
-    "Banded",
-    "Black",
-    "Blurred",
-    "BrokenOff",
-    "CalibrationFault",
-    "Covered",
-    "DepthConstant",
-    "DepthFault",
-    "DepthHoles",
-    "DepthNoisy",
-    "DepthQuantized",
-    "DepthSaturated",
-    "DepthScaled",
-    "Dropped",
-    "Elsewhere",
-    "Exchanged",
-    "Exposed",
-    "Fault",
-    "FaultyImage",
-    "FaultySource",
-    "Flickering",
-    "Frozen",
-    "HalfWritten",
-    "ImageFault",
-    "Lagging",
-    "Late",
-    "MotionBlurred",
-    "Noisy",
-    "OfType",
-    "PixelFault",
-    "Repeated",
-    "Resized",
-    "RowsShifted",
-    "SaltAndPepper",
-    "Shifted",
-    "Shuffled",
-    "StampBackwards",
-    "StampConstant",
-    "StampFault",
-    "StampFromZero",
-    "StampJitter",
-    "StampRate",
-    "StampShift",
-    "StampUnit",
-    "Turned",
-    "Unloadable",
-    "White",
-    "WrongBaseline",
-    "WrongFocalLength",
-    "WrongPrincipalPoint",
-]
+from gvo.testing.faults.delivery import BrokenOff as BrokenOff
+from gvo.testing.faults.delivery import Dropped as Dropped
+from gvo.testing.faults.delivery import Elsewhere as Elsewhere
+from gvo.testing.faults.delivery import Exchanged as Exchanged
+from gvo.testing.faults.delivery import Frozen as Frozen
+from gvo.testing.faults.delivery import Lagging as Lagging
+from gvo.testing.faults.delivery import Late as Late
+from gvo.testing.faults.delivery import Repeated as Repeated
+from gvo.testing.faults.delivery import Shuffled as Shuffled
+from gvo.testing.faults.delivery import StampBackwards as StampBackwards
+from gvo.testing.faults.delivery import StampConstant as StampConstant
+from gvo.testing.faults.delivery import StampFault as StampFault
+from gvo.testing.faults.delivery import StampFromZero as StampFromZero
+from gvo.testing.faults.delivery import StampJitter as StampJitter
+from gvo.testing.faults.delivery import StampRate as StampRate
+from gvo.testing.faults.delivery import StampShift as StampShift
+from gvo.testing.faults.delivery import StampUnit as StampUnit
+from gvo.testing.faults.delivery import Unloadable as Unloadable
+from gvo.testing.faults.fault import CalibrationFault as CalibrationFault
+from gvo.testing.faults.fault import Fault as Fault
+from gvo.testing.faults.fault import FaultyImage as FaultyImage
+from gvo.testing.faults.fault import FaultySource as FaultySource
+from gvo.testing.faults.fault import ImageFault as ImageFault
+from gvo.testing.faults.fault import PixelFault as PixelFault
+from gvo.testing.faults.fault import WrongBaseline as WrongBaseline
+from gvo.testing.faults.fault import WrongFocalLength as WrongFocalLength
+from gvo.testing.faults.fault import WrongPrincipalPoint as WrongPrincipalPoint
+from gvo.testing.faults.images import Banded as Banded
+from gvo.testing.faults.images import Black as Black
+from gvo.testing.faults.images import Blurred as Blurred
+from gvo.testing.faults.images import Covered as Covered
+from gvo.testing.faults.images import DepthConstant as DepthConstant
+from gvo.testing.faults.images import DepthFault as DepthFault
+from gvo.testing.faults.images import DepthHoles as DepthHoles
+from gvo.testing.faults.images import DepthNoisy as DepthNoisy
+from gvo.testing.faults.images import DepthQuantized as DepthQuantized
+from gvo.testing.faults.images import DepthSaturated as DepthSaturated
+from gvo.testing.faults.images import DepthScaled as DepthScaled
+from gvo.testing.faults.images import Exposed as Exposed
+from gvo.testing.faults.images import Flickering as Flickering
+from gvo.testing.faults.images import MotionBlurred as MotionBlurred
+from gvo.testing.faults.images import Noisy as Noisy
+from gvo.testing.faults.images import SaltAndPepper as SaltAndPepper
+from gvo.testing.faults.images import White as White
+from gvo.testing.faults.transfer import HalfWritten as HalfWritten
+from gvo.testing.faults.transfer import OfType as OfType
+from gvo.testing.faults.transfer import Resized as Resized
+from gvo.testing.faults.transfer import RowsShifted as RowsShifted
+from gvo.testing.faults.transfer import Shifted as Shifted
+from gvo.testing.faults.transfer import Turned as Turned
