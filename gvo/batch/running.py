@@ -18,12 +18,12 @@ from gvo.batch.engine import BatchProgress, Engine, connected
 from gvo.batch.recordings import NamedRecording, find_recordings
 from gvo.batch.results import to_frame, write_results
 from gvo.batch.rows import BatchRow
-from gvo.batch.storage import is_url, store
+from gvo.batch.storage import Place, is_url, store
 from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions
 from gvo.batch.variants import Variant, differences, name_variants
 from gvo.config import Config
 from gvo.errors import OutputError, write_faults
-from gvo.io.run_folder.line_file import replace_text
+from gvo.io.run_folder.line_file import check_new, replace_text
 from gvo.io.run_folder.writer import REPORT
 
 # How often the table is written while the batch runs.
@@ -97,6 +97,7 @@ def run_batch(
     on_progress: Callable[[BatchProgress], None] | None = None,
 ) -> pd.DataFrame:
     """Run recordings with named configurations; see `run`."""
+    check_plots(out, options)
     tasks = make_tasks(recordings, variants)
     table = _Table(out, tasks, options.plots)
     shared = TaskOptions(out=table.location, mark=table.mark, batch=options)
@@ -108,6 +109,18 @@ def run_batch(
         for row in rows:
             table.add(row)
     return table.frame()
+
+
+def check_plots(out: str | Path, options: BatchOptions) -> None:
+    """Refuse to replace the plots of another batch, before any work.
+
+    Raises
+    ------
+    RecordingError
+        With what to do.
+    """
+    if options.plots is not None and not (options.force or Place.of(f"{out}/{MARK}").exists()):
+        check_new(options.plots, otherwise="--force to replace its plots")
 
 
 def make_tasks(recordings: Sequence[NamedRecording], variants: Sequence[Variant]) -> list[Task]:

@@ -47,7 +47,8 @@ class BatchOptions:
     force : bool
         Run what an earlier batch has finished again.
     plots : Path, optional
-        Folder for each plot of the batch's report as PNG and PDF.
+        Folder for each plot of the batch's report as PNG and PDF; one that holds something is
+        refused, unless `force` is set or the batch is one that goes on.
     """
 
     recording: RecordingOptions = field(default_factory=RecordingOptions)

@@ -26,9 +26,8 @@ from gvo.cli.options import (
 )
 from gvo.cli.terminal import (
     Command,
-    both,
+    at_work,
     exit_code,
-    interruptible,
     is_shown,
     say,
     told_where_it_stands,
@@ -97,6 +96,7 @@ def batch(
     """Run many recordings or configurations: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
     from gvo.batch.results import outcome
+    from gvo.batch.running import check_plots
     from gvo.io.excerpt import make_excerpt
 
     if scheduler is not None and workers is not None:
@@ -114,16 +114,14 @@ def batch(
         force=force,
         plots=plots,
     )
+    check_plots(out, options)
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
     say(", ".join(counts))
-    with (
-        interruptible() as check,
-        told_where_it_stands(out, and_then=": the same command goes on"),
-        connected(scheduler, workers) as client,
-        _progress() as show,
-    ):
+    told = told_where_it_stands(out, and_then=": the same command goes on")
+    with at_work(told, _progress()) as work, connected(scheduler, workers) as client:
+        progress = work.on_progress
         table = run_batch(
-            found, variants, out=out, client=client, options=options, on_progress=both(show, check)
+            found, variants, out=out, client=client, options=options, on_progress=progress
         )
     _report(*outcome(table), out)
 

@@ -30,7 +30,7 @@ from gvo.cli.options import (
 )
 from gvo.cli.terminal import (
     Command,
-    both,
+    at_work,
     exit_code,
     interruptible,
     progress,
@@ -188,18 +188,15 @@ def round_trip(
     source = open_source(recordings, parameters, options)
     for line in source.info.decisions:
         say(line)
-    with (
-        interruptible() as check,
-        told_where_it_stands(out),
-        progress(source.info.name) as show,
-    ):
+    with at_work(told_where_it_stands(out), progress(source.info.name)) as work:
         result = run_round_trip(
             source,
             out,
             config=parameters,
             excerpt=excerpt,
             force=force,
-            on_progress=both(show, check),
+            on_progress=work.on_progress,
+            on_written=work.on_written,
         )
     say(format_round_trip_errors(result.errors), nl=False)
     say(out / "round_trip.png")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.main import get_command
@@ -43,9 +44,8 @@ from gvo.cli.options import (
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
-    WRITTEN,
     Command,
-    both,
+    at_work,
     ended_by_signals,
     exit_code,
     interruptible,
@@ -61,9 +61,8 @@ from gvo.cli.terminal import (
 from gvo.errors import ConfigurationError, GvoError, OutputError, named_faults
 
 if TYPE_CHECKING:
-    from gvo.config import Config
     from gvo.io.edges.events import EdgeSource
-    from gvo.trajectory.trajectory import Trajectory
+    from gvo.runs.run import RunResult
 
 app = typer.Typer(
     name="gvo",
@@ -113,12 +112,10 @@ def demo(
     from gvo.runs.demo import BAG_NAME, run_demo
 
     say(f"rendering a drive into {out / BAG_NAME}")
-    with (
-        interruptible() as check,
-        told_what_stands(f"what is done is in {out}; the same command begins anew"),
-        progress("demo") as show,
-    ):
-        result = run_demo(out, on_rendered=check, on_progress=both(show, check))
+    told = told_what_stands(f"what is done is in {out}; the same command begins anew")
+    with at_work(told, progress("demo")) as work:
+        check, on_progress, on_written = work
+        result = run_demo(out, on_rendered=check, on_progress=on_progress, on_written=on_written)
     report(result, out)
 
 
@@ -191,11 +188,7 @@ def run(
     )
     for line in source.info.decisions:
         say(line)
-    with (
-        interruptible() as check,
-        told_where_it_stands(out),
-        progress(source.info.name) as show,
-    ):
+    with at_work(told_where_it_stands(out), progress(source.info.name)) as work:
         result = run_recording(
             source,
             out,
@@ -206,8 +199,8 @@ def run(
             excerpt=excerpt,
             outputs=outputs,
             force=force,
-            on_progress=both(show, check),
-            on_written=partial(check, WRITTEN),
+            on_progress=work.on_progress,
+            on_written=work.on_written,
         )
     report(result, out)
 
@@ -290,110 +283,61 @@ def smooth(
     from gvo.io.edges.opening import open_edges, parse_sigma
     from gvo.io.poses.inputs import read_ground_truth
 
-    if "-" in inputs:
-        _refuse_with_lines(inputs, topic=topic, sigma=sigma)
-    if window or "-" in inputs:
-        _refuse(
-            "is of a file optimized at once, not of the window",
-            robust=robust,
-            covariances=covariances,
-        )
+    is_stream = "-" in inputs
+    if is_stream and len(inputs) > 1:
+        raise ConfigurationError("-: standard input does not go with another input")
+    if is_stream:
+        _refuse("does not go with standard input", topic=topic, sigma=sigma)
+    if window or is_stream:
+        why = "is of a file optimized at once, not of the window"
+        _refuse(why, robust=robust, covariances=covariances)
     else:
         _refuse("is of the window; add --window", config=config, set=set_, keyframes=keyframes)
     parameters = load(config, set_)
-    kept = keyframes or "distance"
-    out = new_folder(out, "lines" if "-" in inputs else inputs[0], force=force)
+    out = new_folder(out, "lines" if is_stream else inputs[0], force=force)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
-    if "-" in inputs:
-        _smooth_lines(out, force, config=parameters, keyframes=kept, ground_truth=truth)
-    sigmas = [parse_sigma(text) for text in sigma or []]
-    source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
-    for decision in source.decisions:
+    source = None
+    if not is_stream:
+        sigmas = [parse_sigma(text) for text in sigma or []]
+        source = open_edges(inputs, topics=topic or [], sigmas=sigmas)
+    for decision in [] if source is None else source.decisions:
         say(decision)
+    of_batch = {"robust": robust, "covariances": covariances}
+    of_window = {"config": parameters, "keyframes": keyframes or "distance"}
+    options = of_window if window or is_stream else of_batch
+    result = _smoothed(source, out, window, **options, ground_truth=truth, force=force)
+    report_smoothed(result, out, is_stdout_taken=is_stream)
+
+
+def _smoothed(source: EdgeSource | None, out: Path, window: bool, **options: Any) -> RunResult:  # noqa: ANN401
+    """Smooth an input; without one answer standard input, line by line."""
+    from gvo.io.edges.lines import read_lines
+    from gvo.runs import smooth
+
+    told = told_where_it_stands(out)
+    if source is None:
+        with at_work(told, nullcontext(lambda _: None)) as work:
+            lines = read_lines(sys.stdin.fileno(), lambda: work.check(None))
+            return smooth.smooth_lines(lines, _answer, out, on_written=work.on_written, **options)
     if window:
-        _smooth_by_window(source, out, force, config=parameters, keyframes=kept, ground_truth=truth)
-    from gvo.runs.smooth import optimize_edges
-
-    with interruptible() as check, told_where_it_stands(out), status(source.name) as show:
-        result = optimize_edges(
-            source,
-            out,
-            robust=robust,
-            covariances=covariances,
-            ground_truth=truth,
-            force=force,
-            on_step=both(show, check),
-        )
-    report_smoothed(result, out)
+        with at_work(told, progress(source.name, "poses")) as work:
+            options |= {"on_progress": work.on_progress, "on_written": work.on_written}
+            return smooth.smooth_edges(source, out, **options)
+    with at_work(told, status(source.name)) as work:
+        options |= {"on_step": work.on_progress, "on_written": work.on_written}
+        return smooth.optimize_edges(source, out, **options)
 
 
-def _smooth_by_window(
-    source: EdgeSource,
-    out: Path,
-    force: bool,
-    *,
-    config: Config,
-    keyframes: _KeyframePolicy,
-    ground_truth: Trajectory | None,
-) -> NoReturn:
-    from gvo.runs.smooth import smooth_edges
-
-    with (
-        interruptible() as check,
-        told_where_it_stands(out),
-        progress(source.name, "poses") as show,
-    ):
-        result = smooth_edges(
-            source,
-            out,
-            config=config,
-            keyframes=keyframes,
-            ground_truth=ground_truth,
-            force=force,
-            on_progress=both(show, check),
-        )
-    report_smoothed(result, out)
-
-
-def _refuse_with_lines(inputs: list[str], **options: object) -> None:
-    if len(inputs) > 1:
-        raise ConfigurationError("-: standard input does not go with another input")
-    _refuse("does not go with standard input", **options)
+def _answer(line: str) -> None:
+    """Answer at once; nothing else goes to standard output."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def _refuse(why: str, **options: object) -> None:
     for name, given in options.items():
         if given:
             raise ConfigurationError(f"--{name}: {why}")
-
-
-def _smooth_lines(
-    out: Path,
-    force: bool,
-    *,
-    config: Config,
-    keyframes: _KeyframePolicy,
-    ground_truth: Trajectory | None,
-) -> NoReturn:
-    """Answer standard input line by line; nothing else goes to standard output."""
-    from gvo.io.edges.lines import read_lines
-    from gvo.runs.smooth import smooth_lines
-
-    def answer(line: str) -> None:
-        sys.stdout.write(f"{line}\n")
-        sys.stdout.flush()
-
-    with interruptible() as check, told_where_it_stands(out):
-        result = smooth_lines(
-            read_lines(sys.stdin.fileno(), lambda: check(None)),
-            answer,
-            out,
-            config=config,
-            keyframes=keyframes,
-            ground_truth=ground_truth,
-            force=force,
-        )
-    report_smoothed(result, out, is_stdout_taken=True)
 
 
 @_command()

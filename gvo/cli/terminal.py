@@ -8,8 +8,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
 
 import typer
 from typer.core import TyperCommand
@@ -21,18 +22,17 @@ if TYPE_CHECKING:
     from gvo.runs.run import RunResult
     from gvo.types import Progress
 
-ProgressT = TypeVar("ProgressT")
 # Share by which the total of a progress bar may be off.
 _MAX_OFF = 0.02
 _MAX_CHATTER = 1 << 15  # bytes; half of what a pipe holds
 _EXIT_CODES_OF_SIGNALS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
-WRITTEN = "all is written"
 EXIT_FAULTS = 1
 EXIT_UNUSABLE = 2
 
 
 _LOGGER = logging.getLogger("gvo")
 _LEVELS = {True: logging.DEBUG, None: logging.WARNING, False: logging.ERROR}
+_WRITTEN = "all is written"
 
 
 def _set_verbosity(value: bool | None) -> None:
@@ -260,18 +260,6 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: shown.update(f"{title}: {text}")
 
 
-def both(
-    show: Callable[[ProgressT], None], check: Callable[[object], None]
-) -> Callable[[ProgressT], None]:
-    """Return a callback that draws, then looks for signals."""
-
-    def on_progress(progress: ProgressT) -> None:
-        show(progress)
-        check(progress)
-
-    return on_progress
-
-
 @contextmanager
 def _handling(receive: Callable[[int, object], None]) -> Iterator[None]:
     """Handle signals by a function as long as the context lasts."""
@@ -323,7 +311,7 @@ def interruptible() -> Iterator[Callable[[object], None]]:
     """Yield a function that ends the work once a signal has come; call it between frames.
 
     So a frame is either in all files or in none. A second signal ends at once, as does the first
-    one after a call with `WRITTEN`.
+    one after a call with `_WRITTEN`.
     """
     received: list[int] = []
     is_written = False
@@ -337,7 +325,7 @@ def interruptible() -> Iterator[Callable[[object], None]]:
         nonlocal is_written
         if received:
             raise KeyboardInterrupt
-        is_written = state is WRITTEN
+        is_written = state is _WRITTEN
 
     try:
         with _handling(receive):
@@ -361,3 +349,25 @@ def told_where_it_stands(
 ) -> AbstractContextManager[None]:
     """Say, if the work is interrupted, where its poses are, and how to go on."""
     return told_what_stands(f"the poses so far are in {out}{and_then}")
+
+
+class Work(NamedTuple):
+    """What to call as work goes on: between two steps, after each one, once all is written."""
+
+    check: Callable[[object], None]
+    on_progress: Callable[[Any], None]
+    on_written: Callable[[], None]
+
+
+@contextmanager
+def at_work(
+    told: AbstractContextManager[None], drawn: AbstractContextManager[Callable[[Any], None]]
+) -> Iterator[Work]:
+    """Draw how far work is, end it at a signal between two steps, and tell what stands then."""
+    with interruptible() as check, told, drawn as show:
+
+        def on_progress(progress: object) -> None:
+            show(progress)
+            check(progress)
+
+        yield Work(check, on_progress, partial(check, _WRITTEN))

@@ -198,13 +198,8 @@ class Odometry:
         with watch.stage("loops"):
             loops = self._close_loops(observations, causal)
         self._keep_frame(frame)
-        result = self._result(observations, step, offered, causal, joins, watch.stage_ms)
-        return replace(
-            result,
-            loops=loops,
-            T_previous_frame=T_previous_frame,
-            T_map_world=self._graph.T_map_world,
-        )
+        poses = causal, T_previous_frame
+        return self._result(observations, step, offered, *poses, joins, loops, watch.stage_ms)
 
     def finish(self) -> tuple[Estimate, ...]:
         """Return the smoothed poses of the frames still in the window."""
@@ -231,7 +226,9 @@ class Odometry:
         step: RawStep,
         offered: list[_Offer],
         causal: Estimate,
+        T_previous_frame: FloatArray | None,
         joins: tuple[SegmentJoin, ...],
+        loops: tuple[Loop, ...],
         stage_ms: dict[str, float],
     ) -> FrameResult:
         n_keypoints, n_points = count_points(observations)
@@ -252,6 +249,9 @@ class Odometry:
             keyframes_ns=tuple(self._keyframes.stamps_ns),
             segment=self._segments.current,
             joins=joins,
+            loops=loops,
+            T_previous_frame=T_previous_frame,
+            T_map_world=self._graph.T_map_world,
             stage_ms=stage_ms,
         )
 

@@ -8,7 +8,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from gvo.config import Config
 from gvo.errors import RecordingError, write_faults
 from gvo.io.convert.bag_messages import BagWriter, FramePose, write_transforms
 from gvo.io.convert.bag_writer import write_bag
@@ -80,6 +79,7 @@ def run_demo(
     *,
     on_rendered: Callable[[int], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    on_written: Callable[[], None] | None = None,
 ) -> RunResult:
     """Write the demo's bags into a folder, run on the drive, compare with the exact truth.
 
@@ -90,8 +90,8 @@ def run_demo(
         `robot.mcap`, is made anew.
     on_rendered : callable, optional
         Called with the number of images written to the bag so far.
-    on_progress : callable, optional
-        Called after each frame of the run.
+    on_progress, on_written : callable, optional
+        As of `run_recording`.
 
     Raises
     ------
@@ -104,4 +104,4 @@ def run_demo(
         check_new(out / BAG_NAME)
     write_demo_bags(out, progress=on_rendered)
     source = open_recording(out / BAG_NAME)
-    return run_recording(source, out, config=Config(), force=True, on_progress=on_progress)
+    return run_recording(source, out, force=True, on_progress=on_progress, on_written=on_written)

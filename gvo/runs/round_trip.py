@@ -226,6 +226,7 @@ def run_round_trip(
     excerpt: Excerpt | None = None,
     force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
+    on_written: Callable[[], None] | None = None,
 ) -> RoundTripResult:
     """Run odometry over a recording forward, then backward, and measure how far it ends off.
 
@@ -245,6 +246,8 @@ def run_round_trip(
         Replace an earlier run in the folder, complete or not.
     on_progress : callable, optional
         Called after each frame.
+    on_written : callable, optional
+        Called when all is computed and written; only the picture is drawn after it.
 
     Returns
     -------
@@ -295,6 +298,8 @@ def run_round_trip(
     warnings = loop.statistics.warnings()
     summary = _summary(loop, warnings, turn_ns, errors)
     folder.write_summary(summary)
+    if on_written is not None:
+        on_written()
     plot_round_trip(folder.path / ROUND_TRIP_PICTURE, errors)
     return RoundTripResult(
         summary=summary,

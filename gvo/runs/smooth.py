@@ -137,6 +137,7 @@ def smooth_edges(
     ground_truth: Trajectory | None = None,
     force: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
+    on_written: Callable[[], None] | None = None,
 ) -> RunResult:
     """Smooth the edges of an input by the window, as they come, and write a run folder.
 
@@ -157,6 +158,8 @@ def smooth_edges(
         Replace an earlier run in the folder, complete or not.
     on_progress : callable, optional
         Called after each pose and each edge.
+    on_written : callable, optional
+        Called when all poses are written; only the picture is drawn after it.
 
     Returns
     -------
@@ -178,7 +181,7 @@ def smooth_edges(
                     on_progress(_progress(smoother, source.n_poses))
     notes.warnings += source.faults.warnings()
     truth = _with_stamps(ground_truth, source, folder)
-    return conclude(source.name, folder, smoother, config=config, notes=notes, truth=truth)
+    return _conclude(source.name, folder, smoother, config, notes, truth, on_written)
 
 
 @contextmanager
@@ -260,43 +263,41 @@ def _with_stamps(
     return Trajectory(stamps_ns=stamps_ns, T_world_frame=truth.T_world_frame)
 
 
-def conclude(
+def _conclude(
     name: str,
     folder: RunFolder,
     smoother: Smoother,
-    *,
     config: Config,
     notes: SmoothingNotes,
-    truth: Trajectory | None = None,
+    truth: Trajectory | None,
+    on_written: Callable[[], None] | None,
 ) -> RunResult:
     """Write summary and picture of a finished run, and compare with the truth."""
     if smoother.n_poses == 0:
         folder.discard()
-        raise nothing_to_smooth(name, notes)
+        raise _nothing_to_smooth(name, notes)
     estimates = {name: read_trajectory(folder.path / f"{name}.txt") for name in TRAJECTORIES}
     summary = {**_summary(name, smoother, notes), "configuration": config.model_dump()}
     warnings = [*_broken_off(smoother.n_poses, notes), *_warnings(smoother), *notes.warnings]
     counts = smoother.window.counts
     is_complete = not (notes.broken_off or notes.warnings or counts.n_coasting or counts.n_rejected)
-    return _concluded(
-        folder, summary, estimates, truth=truth, warnings=warnings, is_complete=is_complete
-    )
+    return _written(folder, summary, estimates, truth, warnings, is_complete, on_written)
 
 
-def nothing_to_smooth(name: str, notes: SmoothingNotes) -> RecordingError:
+def _nothing_to_smooth(name: str, notes: SmoothingNotes) -> RecordingError:
     """Return the error of an input that gave no pose."""
     reason = notes.broken_off or "; ".join(notes.warnings) or "it holds no pose"
     return RecordingError(f"{name}: nothing to smooth: {reason}")
 
 
-def _concluded(
+def _written(
     folder: RunFolder,
     summary: dict[str, Any],
     estimates: dict[str, Trajectory],
-    *,
     truth: Trajectory | None,
     warnings: list[str],
     is_complete: bool,
+    on_written: Callable[[], None] | None,
 ) -> RunResult:
     """Compare with the truth, write summary and picture."""
     evaluations, fault = _compare(truth, estimates)
@@ -304,6 +305,8 @@ def _concluded(
     summary |= {"errors": evaluations_json(evaluations)["estimates"], "warnings": warnings}
     with _poses_counted(folder.path):
         folder.write_summary(summary)
+        if on_written is not None:
+            on_written()
         plot_trajectories(folder.path / PICTURE, truth if evaluations else None, estimates)
     return RunResult(
         summary=summary,
@@ -453,6 +456,7 @@ def optimize_edges(
     ground_truth: Trajectory | None = None,
     force: bool = False,
     on_step: Callable[[str], None] = lambda _: None,
+    on_written: Callable[[], None] | None = None,
 ) -> RunResult:
     """Optimize the edges of a complete input at once, and write a run folder.
 
@@ -474,6 +478,8 @@ def optimize_edges(
     on_step : callable
         Called with the state in words after each step. What it raises ends the work; the best
         poses so far are written first.
+    on_written : callable, optional
+        As of `smooth_edges`.
 
     Returns
     -------
@@ -491,7 +497,7 @@ def optimize_edges(
     graph = read_graph(source, notes)
     notes.warnings += source.faults.warnings()
     if not graph.frame_ids:
-        raise nothing_to_smooth(source.name, notes)
+        raise _nothing_to_smooth(source.name, notes)
     optimizer = BatchOptimizer(graph, robust, on_step=on_step)
     with _opened(Path(out), source, force=force, names=("raw", "smoothed")) as (folder, file):
         found = None
@@ -522,10 +528,7 @@ def optimize_edges(
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
     warnings += notes.warnings
-    is_complete = not warnings
-    return _concluded(
-        folder, summary, estimates, truth=truth, warnings=warnings, is_complete=is_complete
-    )
+    return _written(folder, summary, estimates, truth, warnings, not warnings, on_written)
 
 
 def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object, ...]]:
@@ -568,6 +571,7 @@ def smooth_lines(
     keyframes: Keeping = "distance",
     ground_truth: Trajectory | None = None,
     force: bool = False,
+    on_written: Callable[[], None] | None = None,
 ) -> RunResult:
     """Smooth a stream of poses and edges, answering each line at once.
 
@@ -587,6 +591,8 @@ def smooth_lines(
         True poses of the same frame.
     force : bool
         Replace an earlier run in the folder, complete or not.
+    on_written : callable, optional
+        As of `smooth_edges`.
 
     Returns
     -------
@@ -612,7 +618,7 @@ def smooth_lines(
             except TrajectoryError as error:
                 notes.broken_off = str(error)
     notes.warnings += faults.warnings()
-    return conclude(name, folder, smoother, config=config, notes=notes, truth=ground_truth)
+    return _conclude(name, folder, smoother, config, notes, ground_truth, on_written)
 
 
 def _answer_all(

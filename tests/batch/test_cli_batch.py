@@ -14,7 +14,8 @@ import pytest
 from distributed import Client
 
 import gvo
-from gvo.batch import BatchProgress
+from gvo.batch import BatchOptions, BatchProgress
+from gvo.batch.running import check_plots
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
 from tests.batch.conftest import (
@@ -99,6 +100,11 @@ def test_configurations_and_sweeps_are_all_pairs(
     plots = {path.stem[3:]: path for path in (tmp_path / "plots").glob("*.png")}
     assert {"boxes", "error_by_value", "front"} <= set(plots)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in plots.values())
+    # The same batch may go on; another one does not replace its plots.
+    check_plots("out", BatchOptions(plots=Path("plots")))
+    refused = batch(bag, "--out", "other", "--plots", "plots")
+    words = "plots: exists already; give another path or --force to replace its plots"
+    assert (refused.code, refused.out, refused.err) == (2, "", f"gvo: error: {words}\n")
 
 
 def test_settings_and_excerpts_reach_the_runs(batch: Batch, bags: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.bag.reader import BagMessage
+from gvo.runs import round_trip, smooth
 from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
 from gvo.viz.report import run as report
@@ -93,6 +94,35 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
     assert json.loads((tmp_path / "summary.json").read_text())["is_complete"]
     for name in ("raw", "causal", "smoothed"):
         assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 3
+
+
+@pytest.mark.parametrize(
+    ("module", "draw", "words"),
+    [
+        (smooth, "plot_trajectories", ("smooth", "{poses}")),
+        (smooth, "plot_trajectories", ("smooth", "{poses}", "--window")),
+        (round_trip, "plot_round_trip", ("round-trip", "{bag}", "--duration", "0.3")),
+    ],
+    ids=["optimized", "window", "round trip"],
+)
+def test_a_signal_while_a_picture_is_drawn_ends_at_once(
+    command: Command,
+    interrupt: Callable[..., None],
+    drive_bag: Path,
+    tmp_path: Path,
+    *,
+    module: object,
+    draw: str,
+    words: tuple[str, ...],
+) -> None:
+    poses, out = tmp_path / "poses.txt", tmp_path / "out"
+    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    interrupt(module, draw, 1)
+    answer = command(*(word.format(bag=drive_bag, poses=poses) for word in words), "--out", out)
+    assert answer.code == 143
+    assert answer.err == f"gvo: interrupted; {POSES_STAND.format(out=out)}\n"
+    assert (out / "summary.json").exists()
+    assert not list(out.glob("*.png"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
