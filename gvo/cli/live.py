@@ -3,24 +3,56 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gvo.cli.options import Bag, ConfigFile, Force, Out, Report, Settings, load, new_folder
-from gvo.cli.terminal import Command, ended_by_a_signal, report, say, told_where_it_stands
+from gvo.cli.options import (
+    Bag,
+    CalibrationFiles,
+    Color,
+    ConfigFile,
+    Depth,
+    Force,
+    Left,
+    Loops,
+    Out,
+    Report,
+    Right,
+    Settings,
+    load,
+    new_folder,
+    recording_options,
+    with_loops,
+)
+from gvo.cli.terminal import (
+    Command,
+    ended_by_a_signal,
+    exit_code,
+    say,
+    tell,
+    told_where_it_stands,
+)
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from gvo.config import Config
+    from gvo.io.opening import RecordingOptions
+    from gvo.io.poses.base_frame import BaseFrame
     from gvo.io.recording import Source
     from gvo.live.odometry import LiveOdometry
+    from gvo.live.transport import Sink, Transport
     from gvo.types import Progress
 
 _EVERY_S = 5.0
+_KINDS = ("ros1", "ros2", "camera", "-")
+_Sensor = Literal["stereo", "rgbd"]
+_Qos = Literal["sensor", "reliable", "system"]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -33,23 +65,34 @@ def live(
         list[str],
         typer.Argument(
             metavar="CAMERA...",
-            help="- for standard input; or camera and its devices: 0, /dev/video0, a film.",
+            help="ros1; ros2; - for standard input; or camera and its devices: 0, a film.",
         ),
     ],
-    calibration: Annotated[
-        list[Path],
-        typer.Option(metavar="FILE", help="ROS, Kalibr or EuRoC YAML; repeat it for two files."),
-    ],
-    sensor: Annotated[
-        Literal["stereo", "rgbd"], typer.Option(help="What standard input gives.")
-    ] = "stereo",
+    calibration: CalibrationFiles = None,
+    sensor: Annotated[_Sensor, typer.Option(help="What standard input gives.")] = "stereo",
     is_rectified: Annotated[
-        bool, typer.Option("--rectified", help="The images are rectified already.")
+        bool, typer.Option("--rectified", help="The images of - and camera are rectified already.")
     ] = False,
+    left: Left = None,
+    right: Right = None,
+    color: Color = None,
+    depth: Depth = None,
+    frame: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The robot's frame, such as base_link.")
+    ] = None,
+    world: Annotated[
+        str, typer.Option(metavar="NAME", help="The fixed frame of what is sent.")
+    ] = "map",
+    with_tf: Annotated[bool, typer.Option("--tf/--no-tf", help="Send transforms.")] = True,
+    qos: Annotated[_Qos, typer.Option(help="How images are received from ROS 2.")] = "sensor",
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove there, too.")
+    ] = None,
     out: Out = None,
     force: Force = False,
     config: ConfigFile = None,
     set_: Settings = None,
+    loops: Loops = None,
     queue: Annotated[
         int, typer.Option(metavar="N", help="Pairs that wait; the oldest is dropped for one more.")
     ] = 10,
@@ -60,45 +103,144 @@ def live(
     bag: Bag = None,
     with_report: Report = True,
 ) -> None:
-    """Track a running camera: images through a pipe, or from a device."""
+    """Track a running camera: of ROS, through a pipe, or a device."""
     from gvo.live.odometry import LiveOdometry
     from gvo.runs.outputs.options import RunOutputs
 
-    parameters = load(config, set_)
+    parameters = load(config, with_loops(set_, loops))
     outputs = RunOutputs(bag=bag, report=with_report)
     out = new_folder(out, "live", force=force)
     outputs.check(force=force)
-    source = _open(camera, parameters, calibration, sensor, is_rectified=is_rectified)
-    try:
-        odometry = LiveOdometry(source, parameters, max_waiting=queue, max_lag_s=max_lag)
-    except ValueError as error:
-        raise ConfigurationError(f"--queue, --max-lag: {error}") from error
-    with told_where_it_stands(out), ended_by_a_signal(odometry.stop):
-        result = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
-    report(result, out)
+    options = recording_options(calibration, left, right, color, depth)
+    end = _End()
+    with ExitStack() as stack, told_where_it_stands(out), ended_by_a_signal(end):
+        sinks = _connect(camera, qos, foxglove, stack)
+        source, base_frame = _open(
+            camera, parameters, options, sinks, end, frame, sensor, is_rectified=is_rectified
+        )
+        make = partial(LiveOdometry, source, parameters, sinks=sinks, base_frame=base_frame)
+        try:
+            odometry = make(
+                world=world, with_tf=with_tf, max_waiting=queue, max_lag_s=max_lag, say=_say
+            )
+        except ValueError as error:
+            raise ConfigurationError(f"--queue, --max-lag: {error}") from error
+        end.stop = odometry.stop
+        runs = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
+    for folder, result in runs:
+        tell(result, folder)
+    raise typer.Exit(exit_code(all(result.is_complete for _, result in runs)))
+
+
+class _End:
+    """Ends what is waited for, and then the run, by a signal."""
+
+    def __init__(self) -> None:
+        self.has_come = threading.Event()
+        self.stop: Callable[[], None] = lambda: None
+
+    def __call__(self) -> None:
+        self.has_come.set()
+        self.stop()
+
+
+def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack) -> list[Sink]:
+    """Join the network that the images come from, if any, and serve viewers."""
+    kind, *rest = words
+    if kind not in _KINDS or (kind == "camera") != bool(rest):
+        raise ConfigurationError(
+            f"expected ros1, ros2, - or camera DEVICE [DEVICE], got {' '.join(words)}"
+        )
+    sinks: list[Sink] = []
+    if kind == "ros1":
+        from gvo.live.ros1 import Ros1  # type: ignore[import-not-found]
+
+        sinks.append(Ros1())
+    elif kind == "ros2":
+        from gvo.live.dds import Dds  # type: ignore[import-not-found]
+
+        sinks.append(Dds(qos=qos))
+    if foxglove is not None:
+        from gvo.live.foxglove import Foxglove  # type: ignore[import-not-found]
+
+        host, _, port = foxglove.rpartition(":")
+        if not port.isdecimal():
+            raise ConfigurationError(f"--foxglove {foxglove}: expected [HOST:]PORT")
+        sinks.append(Foxglove(host=host or "127.0.0.1", port=int(port)))
+    for sink in sinks:
+        stack.callback(sink.close)
+    return sinks
 
 
 def _open(
     words: list[str],
     config: Config,
-    calibration: list[Path],
-    sensor: Literal["stereo", "rgbd"],
+    options: RecordingOptions,
+    sinks: Sequence[Sink],
+    end: _End,
+    frame: str | None,
+    sensor: _Sensor,
+    *,
+    is_rectified: bool,
+) -> tuple[Source, BaseFrame]:
+    """Return the camera and the frame whose poses are wanted, once all about both is known."""
+    from gvo.io.poses.inputs import find_base_frame
+
+    kind, *devices = words
+    if kind in ("ros1", "ros2"):
+        transport: Transport = sinks[0]  # type: ignore[assignment]
+        return _wait(transport, config, options, end, frame)
+    source = _own_camera(devices, config, options, sensor, is_rectified=is_rectified)
+    return source, find_base_frame(source, frame)
+
+
+def _wait(
+    transport: Transport, config: Config, options: RecordingOptions, end: _End, frame: str | None
+) -> tuple[Source, BaseFrame]:
+    from gvo.io.bag.topics import TopicChoice
+    from gvo.io.poses.inputs import find_base_frame
+    from gvo.live.topics import NetworkReader, TopicSource, wait_for
+
+    reader = NetworkReader(transport)
+    choice = TopicChoice(
+        left=options.left, right=options.right, color=options.color, depth=options.depth
+    )
+
+    def find() -> tuple[Source, BaseFrame]:
+        source = TopicSource(reader, topics=choice, calibration=options.calibration, config=config)
+        return source, find_base_frame(source, frame)
+
+    found = wait_for(find, _say, end.has_come)
+    if found is None:
+        raise KeyboardInterrupt
+    for line in found[0].info.decisions:
+        _say(line)
+    return found
+
+
+def _own_camera(
+    devices: list[str],
+    config: Config,
+    options: RecordingOptions,
+    sensor: _Sensor,
     *,
     is_rectified: bool,
 ) -> Source:
+    from gvo.io.calibration.files import paths_of
     from gvo.io.frames import Rig
     from gvo.live.sources import Device, StandardInput
 
-    kind, *devices = words
-    if len(calibration) > 2 or kind not in ("-", "camera") or (kind == "-") == bool(devices):
-        raise ConfigurationError(
-            "expected - or camera DEVICE [DEVICE], and one or two --calibration; got "
-            f"{' '.join(words)} and {len(calibration)}"
-        )
-    rig = Rig(*calibration, sensor=sensor, is_rectified=is_rectified)
-    if kind == "camera":
+    files = paths_of(options.calibration)
+    if not 1 <= len(files) <= 2:
+        raise ConfigurationError(f"expected one or two --calibration, got {len(files)}")
+    rig = Rig(*files, sensor=sensor, is_rectified=is_rectified)
+    if devices:
         return Device(devices, rig.info)
     return StandardInput(sys.stdin.buffer, rig.info, config, depth_scale=rig.depth_scale)
+
+
+def _say(line: str) -> None:
+    say(line, err=True)
 
 
 def _status(odometry: LiveOdometry) -> Callable[[Progress], None]:

@@ -141,6 +141,12 @@ def exit_code(is_complete: bool) -> int:
 
 def report(result: RunResult, out: Path) -> NoReturn:
     """Print the result of a run, and end with its exit code."""
+    tell(result, out)
+    raise typer.Exit(exit_code(result.is_complete))
+
+
+def tell(result: RunResult, out: Path) -> None:
+    """Print the result of a run."""
     from gvo.frontend.calibration import describe_offsets
     from gvo.io.run_folder.reader import loop_words, verdict
     from gvo.trajectory.evaluation import format_evaluations
@@ -158,7 +164,6 @@ def report(result: RunResult, out: Path) -> NoReturn:
         say(loops)
     say(out if result.report is None else result.report)
     warn(result.warnings)
-    raise typer.Exit(exit_code(result.is_complete))
 
 
 def report_smoothed(result: RunResult, out: Path, *, is_stdout_taken: bool = False) -> NoReturn:

@@ -74,13 +74,14 @@ def frames(
         When the recording cannot be read on; the frames before are yielded first.
     """
     config = config or Config()
-    pairs = paired(source.images(), source.info.sensor, config.sync)
+    is_live = through is not None
+    pairs = paired(source.images(), source.info.sensor, config.sync, is_prompt=is_live)
     if excerpt is not None:
         pairs = take_excerpt(pairs, excerpt)
     preparers = make_preparers(source.info)
     if through is not None:
         pairs = through(pairs)
-    n_ahead = _N_AHEAD if through is None else 0
+    n_ahead = 0 if is_live else _N_AHEAD
     made = (
         _one_by_one(pairs, preparers, source.info)
         if config.runtime.threads == 1
@@ -108,6 +109,7 @@ def paired(
     sync: SyncConfig,
     *,
     limit_ms: float | None = None,
+    is_prompt: bool = False,
 ) -> Iterator[Pair | FaultyFrame]:
     """Pair the images of a recording as configured, see `pair_images`.
 
@@ -120,6 +122,8 @@ def paired(
     sync : SyncConfig
     limit_ms : float, optional
         Largest difference of the stamps of a pair, in place of the configured one.
+    is_prompt : bool
+        See `pair_images`.
 
     Yields
     ------
@@ -140,6 +144,7 @@ def paired(
         partner=f"{'right' if sensor == 'stereo' else 'depth'} image within sync.{key}",
         queue_size=sync.queue_size,
         age_penalty=sync.age_penalty,
+        is_prompt=is_prompt,
     )
     for item in pairs:
         yield from stamps.take_faulty()

@@ -17,6 +17,9 @@ Pair: TypeAlias = tuple[StampedImage, StampedImage]
 _LEAP_NS = 1_000_000_000
 # So many images in a row that are all after the leap: it was a gap.
 _N_TO_CONFIRM = 3
+# Periods that are known before one is relied on, and the share of the shortest that counts.
+_N_PERIODS = 10
+_SHORTEST = 0.8
 
 
 def pair_images(
@@ -26,6 +29,7 @@ def pair_images(
     partner: str,
     queue_size: int = 100,
     age_penalty: float = 0.1,
+    is_prompt: bool = False,
 ) -> Iterator[Pair | FaultyFrame]:
     """Pair the images of stream 0 with those of stream 1.
 
@@ -47,6 +51,10 @@ def pair_images(
         partners may still come; then the oldest is given up.
     age_penalty : float
         How much nearer, as a share, a later partner must be to be preferred to an earlier one.
+    is_prompt : bool
+        Give an approximate pair out as soon as the period of the images says that no better
+        partner can come, not with the next image. The pairs are the same, unless a camera
+        suddenly sends faster than ever before.
 
     Returns
     -------
@@ -86,7 +94,7 @@ def pair_images(
     answers = _Answers(limit_ns, partner, queue_size)
     policy: _ExactTime | _ApproximateTime = _ExactTime(queue_size, answers)
     if limit_ns > 0:
-        policy = _ApproximateTime(limit_ns, queue_size, age_penalty, answers)
+        policy = _ApproximateTime(limit_ns, queue_size, age_penalty, answers, is_prompt=is_prompt)
     return _paired(images, policy, answers)
 
 
@@ -224,8 +232,15 @@ class _ApproximateTime:
     """
 
     def __init__(
-        self, limit_ns: int, queue_size: int, age_penalty: float, answers: _Answers
+        self,
+        limit_ns: int,
+        queue_size: int,
+        age_penalty: float,
+        answers: _Answers,
+        *,
+        is_prompt: bool,
     ) -> None:
+        self._periods = (_Period(), _Period()) if is_prompt else None
         self._limit_ns = limit_ns
         self._queue_size = queue_size
         self._factor = 1 + age_penalty
@@ -241,6 +256,8 @@ class _ApproximateTime:
         """Take the next image of either stream."""
         queue = self._queues[image.stream]
         queue.append(image)
+        if self._periods is not None:
+            self._periods[image.stream].add(image.stamp_ns)
         self._advance()
         if len(queue) > self._queue_size:
             self._pivot = None
@@ -281,12 +298,12 @@ class _ApproximateTime:
     def _look_on(self, pivot: int) -> bool:
         """Look at one more image of the other stream; tell whether there was one."""
         others = self._queues[1 - pivot]
-        if self._n_seen == len(others):
-            return False
         pivot_ns = self._queues[pivot][0].stamp_ns
+        if self._n_seen == len(others):
+            return self._give_early(pivot, pivot_ns)
         best_ns, next_ns = others[0].stamp_ns, others[self._n_seen].stamp_ns
         if next_ns > pivot_ns:
-            is_better = _scaled_ns(next_ns - pivot_ns, self._factor) < pivot_ns - best_ns
+            is_better = self._is_nearer(pivot_ns, best_ns, next_ns)
         else:
             is_better = next_ns > best_ns  # it is not where stamps repeat or go back
         if is_better:
@@ -297,6 +314,22 @@ class _ApproximateTime:
         if next_ns >= pivot_ns:
             self._give_candidate()
         return True
+
+    def _give_early(self, pivot: int, pivot_ns: int) -> bool:
+        """Give the candidate out if no image that may come suits the pivot better."""
+        shortest_ns = None if self._periods is None else self._periods[1 - pivot].shortest_ns
+        if shortest_ns is None:
+            return False
+        others = self._queues[1 - pivot]
+        soonest_ns = others[-1].stamp_ns + shortest_ns
+        if soonest_ns < pivot_ns or self._is_nearer(pivot_ns, others[0].stamp_ns, soonest_ns):
+            return False
+        self._give_candidate()
+        return True
+
+    def _is_nearer(self, pivot_ns: int, best_ns: int, later_ns: int) -> bool:
+        """Tell whether a partner after the pivot is preferred to the best one before it."""
+        return _scaled_ns(later_ns - pivot_ns, self._factor) < pivot_ns - best_ns
 
     def _give_candidate(self) -> None:
         self._pivot = None
@@ -309,6 +342,27 @@ class _ApproximateTime:
         else:
             next_ns = self._queues[1][0].stamp_ns if self._queues[1] else None
             self._answers.add_alone(image, next_ns, is_crowded=is_crowded)
+
+
+class _Period:
+    """The time between the images of a stream, by their stamps."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._n_known = 0
+        self._least_ns = 0
+
+    def add(self, stamp_ns: int) -> None:
+        if self._last_ns is not None:
+            step_ns = stamp_ns - self._last_ns
+            self._least_ns = step_ns if self._n_known == 0 else min(self._least_ns, step_ns)
+            self._n_known += 1
+        self._last_ns = stamp_ns
+
+    @property
+    def shortest_ns(self) -> int | None:
+        """What no period is expected to be below; None as long as few are known."""
+        return int(_SHORTEST * self._least_ns) if self._n_known >= _N_PERIODS else None
 
 
 def _scaled_ns(duration_ns: int, factor: float) -> int:

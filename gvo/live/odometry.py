@@ -4,27 +4,48 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from gvo._text import cut
 from gvo.config import Config
-from gvo.errors import GvoError
+from gvo.errors import GvoError, OutputError, RecordingError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
-from gvo.io.recording import Source
+from gvo.io.bag.messages import transform_of
+from gvo.io.poses.base_frame import BaseFrame
+from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.sync import Pair
+from gvo.live.publishing import Arrivals, LiveMessages
+from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, Sink
 from gvo.odometry.odometry import Odometry
-from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.run import RunResult, run_recording
-from gvo.types import FaultyFrame, Progress, RgbdFrame, StereoFrame
+from gvo.runs.loop import RunLoop
+from gvo.runs.outputs.bag import TOPICS
+from gvo.runs.outputs.options import RunOutputs, name_frames
+from gvo.runs.run import RunResult, drawn, run_recording
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import Failure, FaultyFrame, Progress, RgbdFrame, StereoFrame
 
 _Item: TypeAlias = Pair | FaultyFrame
 # Frames that are tied to one another before any is dropped, and what waits for them at most.
 _N_TIED = 2
 _MAX_BEFORE_TIED = 300
 _N_WARMING = 3
+# Stamps that go back by more are those of another run: a clock was set, or a bag begins again.
+_BACK_NS = 1_000_000_000
+_PATIENCE_S = 60.0
+
+
+class LiveRun(NamedTuple):
+    """A stretch of images, and what was written of it."""
+
+    folder: Path
+    result: RunResult
 
 
 class LiveOdometry:
@@ -32,17 +53,29 @@ class LiveOdometry:
 
     Pairs are made in a thread that receives, and wait; decoding and odometry take them one by one
     and look at none ahead. Where nothing is dropped the poses are those of `run_recording`, bit
-    for bit.
+    for bit. Where the stamps go back, and where it is reset, a new run begins.
 
     Parameters
     ----------
     source : Source
-        Whose `images` come as they are taken, such as `StandardInput` or `Device`.
+        Whose `images` come as they are taken: `TopicSource`, `StandardInput`, `Device`.
     config : Config, optional
+    sinks : sequence of Sink
+        Networks and viewers that poses are sent to. They are offered the parameters and the
+        services `/gvo/reset`, `/gvo/save` (Trigger) and `/gvo/set_pose` (SetPose).
+    base_frame : BaseFrame, optional
+        Whose poses are written; with a name, and tf from it to the camera, those of REP 105 are
+        `WORLD -> odom -> NAME`. The camera's where omitted.
+    world : str
+        The fixed frame of what is sent.
+    with_tf : bool
+        Send transforms.
     max_waiting : int
         Pairs that wait at most; the oldest is dropped for one more.
     max_lag_s : float, optional
         Pairs that are older than the newest by more are dropped.
+    say : callable
+        Is told, in a line, what happens to the images.
     """
 
     def __init__(
@@ -50,16 +83,41 @@ class LiveOdometry:
         source: Source,
         config: Config | None = None,
         *,
+        sinks: Sequence[Sink] = (),
+        base_frame: BaseFrame | None = None,
+        world: str = "map",
+        with_tf: bool = True,
         max_waiting: int = 10,
         max_lag_s: float | None = None,
+        say: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._source, self._config = source, config or Config()
-        self._waiting = WaitingPairs(max_waiting=max_waiting, max_lag_s=max_lag_s)
+        self._source, self._say = source, say
+        self._base_frame = base_frame or BaseFrame(source.info.frame_id)
+        self._world = world
+        self._make_queue = partial(WaitingPairs, max_waiting=max_waiting, max_lag_s=max_lag_s)
+        self._waiting = self._make_queue()
+        self._n_dropped = 0
+        self._is_stopped = False
+        self._parameters = Parameters(config or Config())
+        self._parameters.follow(self._reconfigure)
+        left_out = () if with_tf else ("/tf", "/tf_static")
+        self._writers = [NetworkWriter(sink, source.info.name, left_out) for sink in sinks]
+        places = getattr(source, "image_topics", source.info.stream_names)
+        self.arrivals = Arrivals(source.info, places, self._writers, say)
+        self.arrivals.n_dropped = lambda: self.n_dropped
+        self._stretches = Stretches(self.arrivals.watch(source.images()))
+        self._loop: RunLoop | None = None
+        self._save: Callable[[], None] | None = None
+        self._messages: LiveMessages | None = None
+        for sink in sinks:
+            sink.offer(self._parameters)
+            for service in self._services():
+                sink.serve(service)
 
     @property
     def n_dropped(self) -> int:
         """Frames that were dropped so far."""
-        return self._waiting.n_dropped
+        return self._n_dropped + self._waiting.n_dropped
 
     def run(
         self,
@@ -68,30 +126,218 @@ class LiveOdometry:
         outputs: RunOutputs | None = None,
         force: bool = False,
         on_progress: Callable[[Progress], None] = lambda _: None,
-    ) -> RunResult:
+    ) -> list[LiveRun]:
         """Track until the images end, or `stop` is called; then write what a run writes.
 
-        Parameters are those of `run_recording`, and so are the errors.
+        Parameters are those of `run_recording`, and so are the errors. A further run is written
+        beside the first: `OUT-2`, and so are its files.
+
+        Returns
+        -------
+        list of LiveRun
         """
-        _warm(self._source.info.camera, self._config)
-
-        def progress(state: Progress) -> None:
-            self._waiting.note(state)
-            on_progress(state)
-
-        return run_recording(
-            self._source,
-            out,
-            config=self._config,
-            outputs=outputs,
-            force=force,
-            through=self._waiting.through,
-            on_progress=progress,
-        )
+        outputs = outputs or RunOutputs()
+        _warm(self._source.info.camera, self._parameters.config)
+        for writer in self._writers:
+            writer.announce(TOPICS)
+        runs: list[LiveRun] = []
+        with self.arrivals:
+            for number in count(1):
+                folder = _numbered(Path(out), number)
+                try:
+                    runs.append(self._run_stretch(folder, outputs, number, force, on_progress))
+                except RecordingError as error:
+                    if isinstance(error, OutputError) or (self._is_over and not runs):
+                        raise
+                    self._say(str(error))
+                if self._is_over:
+                    break
+        if not outputs.report:
+            return runs
+        return [LiveRun(folder, drawn(result, folder)) for folder, result in runs]
 
     def stop(self) -> None:
         """Take no more images; what waits is tracked. May be called by another thread."""
+        self._is_stopped = True
         self._waiting.close()
+
+    @property
+    def _is_over(self) -> bool:
+        return self._is_stopped or self._stretches.is_ended
+
+    def _run_stretch(
+        self,
+        folder: Path,
+        outputs: RunOutputs,
+        number: int,
+        force: bool,
+        on_progress: Callable[[Progress], None],
+    ) -> LiveRun:
+        if number > 1:
+            self._say(f"a new run begins in {folder}: {self._stretches.reason}")
+            self._base_frame = self._base_frame.restarted()
+        self._n_dropped += self._waiting.n_dropped
+        self._waiting = waiting = self._make_queue()
+        if self._is_stopped:
+            waiting.close()
+        waiting.on_pair = self.arrivals.note_pair
+
+        def progress(state: Progress) -> None:
+            waiting.note(state)
+            on_progress(state)
+
+        result = run_recording(
+            _Stretch(self._source.info, self._stretches),
+            folder,
+            config=self._parameters.config,
+            base_frame=self._base_frame,
+            outputs=replace(
+                outputs,
+                report=False,
+                bag=outputs.bag and _numbered(outputs.bag, number),
+                world=self._world,
+            ),
+            force=force,
+            through=waiting.through,
+            on_start=self._start,
+            on_progress=progress,
+        )
+        return LiveRun(folder, result)
+
+    def _start(self, loop: RunLoop, save: Callable[[], None]) -> list[LiveMessages]:
+        """Take the loop of a run before its first frame; return where its poses go first."""
+        base_frame = self._base_frame
+        frames = name_frames(
+            *(loop.source, base_frame),
+            is_placed=base_frame.is_placed,
+            world=self._world,
+            is_robot=not base_frame.is_camera and not base_frame.origin,
+        )
+        self._loop, self._save = loop, save
+        self._messages = LiveMessages(self._writers, frames, self.arrivals.note_sent)
+        return [self._messages]
+
+    def _reconfigure(self, config: Config) -> None:
+        if self._loop is not None:
+            self._waiting.do(partial(self._loop.reconfigure, config))
+
+    def _services(self) -> list[Service]:
+        return [
+            Service(name="/gvo/reset", type=TRIGGER, answer=self._answer_reset),
+            Service(name="/gvo/save", type=TRIGGER, answer=self._answer_save),
+            Service(name="/gvo/set_pose", type=SET_POSE, answer=self._answer_set_pose),
+        ]
+
+    def _answer_reset(self, _: object) -> dict[str, object]:
+        self._stretches.cut()
+        return {"success": True, "message": "a new run begins with the next image"}
+
+    def _answer_save(self, _: object) -> dict[str, object]:
+        answer: dict[str, object] = {"success": False, "message": "no frame was tracked yet"}
+        is_done = threading.Event()
+
+        def save() -> None:
+            try:
+                if self._save is not None and self._loop is not None:
+                    self._save()
+                    n_frames = self._loop.statistics.n_frames
+                    answer.update(success=True, message=f"{n_frames} frames are written")
+            except GvoError as error:
+                answer["message"] = str(error)
+            finally:
+                is_done.set()
+
+        self._waiting.do(save)
+        if not is_done.wait(_PATIENCE_S):
+            answer["message"] = "the run is ending"
+        return answer
+
+    def _answer_set_pose(self, request: Any) -> dict[str, object]:  # noqa: ANN401 - made at run time
+        stamped = request.pose
+        pose, frame = stamped.pose.pose, stamped.header.frame_id.strip("/")
+        T = transform_of(pose.position, pose.orientation)
+        if isinstance(T, Failure) or frame not in ("", self._world):
+            reason = T.reason if isinstance(T, Failure) else f"it is of {cut(frame, 60)}"
+            self._say(f"the pose is not set: {reason}; expected one in {self._world}")
+        elif self._messages is not None:
+            self._waiting.do(partial(self._messages.set_pose, T))
+        return {}
+
+
+def _numbered(path: Path, number: int) -> Path:
+    """Return the path of the nth run beside the first."""
+    return path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """A source of the images of one run."""
+
+    info: RecordingInfo
+    stretches: Stretches
+
+    def images(self) -> Iterator[StampedImage]:
+        return self.stretches.next_stretch()
+
+    def ground_truth(self) -> Trajectory | None:
+        return None
+
+
+class Stretches:
+    """Cuts images where their stamps go back, and where it is told to.
+
+    An image that alone is behind, by more than a second, is late and cuts nothing.
+
+    Attributes
+    ----------
+    is_ended : bool
+        No more images come.
+    reason : str
+        Why the last stretch ended.
+    """
+
+    def __init__(self, images: Iterator[StampedImage]) -> None:
+        self._images = images
+        self._held: deque[StampedImage] = deque()
+        self._is_cut = False
+        self.is_ended = False
+        self.reason = ""
+
+    def cut(self) -> None:
+        """End the stretch with the next image; may be called by another thread."""
+        self._is_cut = True
+
+    def next_stretch(self) -> Iterator[StampedImage]:
+        """Yield images until the stretch ends."""
+        newest_ns: int | None = None
+        late: list[StampedImage] = []
+        self._is_cut = False
+        while (image := self._next()) is not None:
+            is_back = newest_ns is not None and image.stamp_ns < newest_ns - _BACK_NS
+            if self._is_cut or (is_back and late):
+                self._held.extend([*late, image])
+                is_asked = self._is_cut
+                self.reason = (
+                    "it was reset" if is_asked else f"the stamps go back to {image.stamp_ns} ns"
+                )
+                return
+            if is_back:
+                late.append(image)
+                continue
+            newest_ns = image.stamp_ns if newest_ns is None else max(newest_ns, image.stamp_ns)
+            yield from (*late, image)
+            late = []
+        yield from late
+        self.is_ended = True
+
+    def _next(self) -> StampedImage | None:
+        if self._held:
+            return self._held.popleft()
+        try:
+            return next(self._images, None)
+        except GvoError:
+            self.is_ended = True
+            raise
 
 
 def _warm(camera: StereoCamera | PinholeCamera, config: Config) -> None:
@@ -124,6 +370,8 @@ class WaitingPairs:
     Attributes
     ----------
     n_dropped : int
+    on_pair : callable
+        Called with the stamp of each pair that is put.
     """
 
     def __init__(self, *, max_waiting: int = 10, max_lag_s: float | None = None) -> None:
@@ -138,18 +386,27 @@ class WaitingPairs:
         self._is_tied = self._is_closed = False
         self._fault: GvoError | None = None
         self._changed = threading.Condition()
+        self._actions: deque[Callable[[], object]] = deque()
         self.n_dropped = 0
+        self.on_pair: Callable[[int], None] = lambda _: None
 
     def put(self, item: _Item) -> None:
         """Add a pair, or a frame without one; called by the thread that receives."""
         with self._changed:
             self._items.append(item)
             if not isinstance(item, FaultyFrame):
+                self.on_pair(item[0].stamp_ns)
                 self._n_pairs += 1
                 self._newest_ns = item[0].stamp_ns
                 limit = self._max_waiting if self._is_tied else _MAX_BEFORE_TIED
                 if self._n_pairs > limit:
                     self._drop_oldest(limit)
+            self._changed.notify()
+
+    def do(self, action: Callable[[], object]) -> None:
+        """Call something in the thread that takes, before it takes the next pair."""
+        with self._changed:
+            self._actions.append(action)
             self._changed.notify()
 
     def close(self, fault: GvoError | None = None) -> None:
@@ -171,8 +428,16 @@ class WaitingPairs:
         GvoError
             That ended the stream.
         """
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._actions or self._items or self._is_closed)
+                action = self._actions.popleft() if self._actions else None
+            if action is None:
+                return self._take()
+            action()
+
+    def _take(self) -> _Item | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._items or self._is_closed)
             if not self._items:
                 if self._fault is not None:
                     raise self._fault

@@ -6,7 +6,7 @@ Messages are bytes: rosbags makes and reads them, so that no package of messages
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -245,15 +245,29 @@ class Parameters:
 
 
 class NetworkWriter(MessageWriter):
-    """Writes messages into a network."""
+    """Writes messages into a network.
 
-    def __init__(self, sink: Sink, name: str) -> None:
+    Parameters
+    ----------
+    sink : Sink
+    name : str
+        For messages.
+    left_out : collection of str
+        Topics that are not written.
+    """
+
+    def __init__(self, sink: Sink, name: str, left_out: Collection[str] = ()) -> None:
         super().__init__(name, is_ros1=sink.is_ros1)
-        self._sink = sink
+        self._sink, self._left_out = sink, left_out
         self._publishers: dict[str, Publisher] = {}
 
+    def announce(self, topics: Mapping[str, str]) -> None:
+        """Open topics, by name and type, before there is anything to write."""
+        for topic, type_ in topics.items():
+            self._publisher(topic, type_, is_latched=topic == "/tf_static")
+
     def is_wanted(self, topic: str) -> bool:
-        """Tell whether anybody listens, or the topic is not announced yet."""
+        """Tell whether anybody listens, or the topic is not open yet."""
         publisher = self._publishers.get(topic)
         return publisher is None or publisher.is_heard
 
@@ -261,6 +275,11 @@ class NetworkWriter(MessageWriter):
         self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
     ) -> None:
         """Send a message."""
+        if topic not in self._left_out:
+            data = self.serialize(message, type_)
+            self._publisher(topic, type_, is_latched=is_latched).publish(data, stamp_ns)
+
+    def _publisher(self, topic: str, type_: str, *, is_latched: bool) -> Publisher:
         if topic not in self._publishers:
             self._publishers[topic] = self._sink.advertise(topic, type_, is_latched=is_latched)
-        self._publishers[topic].publish(self.serialize(message, type_), stamp_ns)
+        return self._publishers[topic]

@@ -143,8 +143,20 @@ class RunLoop:
                     self._give(lambda output: output.add_smoothed(finished))
                 self.count()
 
+    def reconfigure(self, config: Config) -> None:
+        """Change the configuration from the next frame on, see `Odometry.reconfigure`."""
+        self._odometry.reconfigure(config)
+        self.config = config
+
     def optimize(self) -> Optimum | None:
-        """Give the outputs of the run the optimum of all measurements, of the base frame.
+        """Give the outputs of the run the optimum of all measurements, see `optimum`."""
+        optimum = self.optimum()
+        if optimum is not None:
+            self._give(lambda output: output.add_optimum(optimum))
+        return optimum
+
+    def optimum(self) -> Optimum | None:
+        """Return the optimum of all measurements so far, of the base frame.
 
         Returns
         -------
@@ -159,14 +171,12 @@ class RunLoop:
             self.output_faults.append(f"no global poses: {error}")
             return None
         place = self.base_frame.apply_to_edge
-        placed = replace(
+        return replace(
             optimum,
             estimates=self._placed(optimum.estimates),
             edges=tuple((stamp_ns, place(stamp_ns, edge)) for stamp_ns, edge in optimum.edges),
             loops=tuple(map(self.base_frame.apply_to_loop, optimum.loops)),
         )
-        self._give(lambda output: output.add_optimum(placed))
-        return placed
 
     def count(self) -> None:
         """Copy the counts of window, front-end and base frame into the statistics."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,7 +33,7 @@ from gvo.io.run_folder.writer import (
     RunFolder,
     written_alone,
 )
-from gvo.runs.loop import RunLoop, motions_of_window
+from gvo.runs.loop import Output, RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
 from gvo.trajectory.alignment import MAX_DIFFERENCE_NS
@@ -82,6 +82,7 @@ def run_recording(
     outputs: RunOutputs | None = None,
     force: bool = False,
     through: Through | None = None,
+    on_start: Callable[[RunLoop, Callable[[], None]], Iterable[Output]] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_written: Callable[[], None] | None = None,
 ) -> RunResult:
@@ -109,6 +110,10 @@ def run_recording(
         Replace an earlier run in the folder, complete or not, and plots.
     through : callable, optional
         Of a camera that is running, see `gvo.frames`; its first images identify no recording.
+    on_start : callable, optional
+        Called before the first frame with the loop, and with what writes the summary and the
+        global poses so far, to be called between frames. Returns outputs that are given each
+        frame first.
     on_progress : callable, optional
         Called after each frame.
     on_written : callable, optional
@@ -145,7 +150,8 @@ def run_recording(
         others, notes = outputs.open(loop, files)
         folder = files.enter_context(RunFolder(Path(out)))
         with RunningSummary(loop, folder, identity, on_progress) as summary:
-            loop.run([folder, *others], summary)
+            first = on_start(loop, partial(_save, loop, folder, summary)) if on_start else ()
+            loop.run([*first, folder, *others], summary)
             optimum = loop.optimize()
             faults = [*dict.fromkeys([*loop.output_faults, *_close(files)])]
         _LOGGER.debug("all frames are tracked; comparing and writing the summary")
@@ -154,7 +160,16 @@ def run_recording(
         result = _conclude(loop, folder, identity, truth, notes, faults, is_asked=is_asked)
     if on_written is not None:
         on_written()
-    return _drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
+    return drawn(result, Path(out), plots=outputs.plots) if outputs.report else result
+
+
+def _save(loop: RunLoop, folder: RunFolder, summary: RunningSummary) -> None:
+    """Write what is known in the middle of a run."""
+    optimum = loop.optimum()
+    if optimum is not None:
+        folder.add_optimum(optimum)
+    loop.count()
+    summary.write("running")
 
 
 def _close(files: ExitStack) -> list[str]:
@@ -275,8 +290,8 @@ def _warnings_of_truth(compared: TruthComparison | Failure) -> list[str]:
     return []
 
 
-def _drawn(result: RunResult, folder: Path, *, plots: Path | None) -> RunResult:
-    """Draw; what cannot be drawn takes nothing from what was computed and written."""
+def drawn(result: RunResult, folder: Path, *, plots: Path | None = None) -> RunResult:
+    """Draw the report of a run; what cannot be drawn takes nothing from what was written."""
     try:
         _draw(folder, plots=plots)
     except (GvoError, OSError) as error:

@@ -255,6 +255,44 @@ def test_a_pair_is_given_as_soon_as_the_next_image_shows_that_it_is_the_best() -
     assert given_after == [4, 5, 6, 7]
 
 
+@given(
+    st.lists(st.integers(0, 4), min_size=40, max_size=40),
+    st.integers(-16, 16),
+    st.sets(st.integers(12, 39)),
+    st.sets(st.integers(12, 39)),
+)
+def test_what_is_given_early_is_what_would_be_given_late(
+    jitter: list[int], offset: int, lost_first: set[int], lost_second: set[int]
+) -> None:
+    first = [33 * n for n in range(40) if n not in lost_first]
+    second = [33 * n + offset + jitter[n] for n in range(40) if n not in lost_second]
+    images = sorted(
+        [*(_image(0, stamp) for stamp in first), *(_image(1, stamp) for stamp in second)],
+        key=lambda image: image.stamp_ns,
+    )
+    found = []
+    for is_prompt in (False, True):
+        items = pair_images(images, limit_ns=20, partner="depth", is_prompt=is_prompt)
+        found.append([item for item in items if not isinstance(item, FaultyFrame)])
+    assert found[0] == found[1]
+
+
+def test_a_pair_is_given_with_its_last_image_where_the_period_is_known() -> None:
+    stamps = [(stream, 33 * n + 10 * stream) for n in range(20) for stream in (0, 1)]
+    n_pushed = 0
+
+    def images() -> Iterator[StampedImage]:
+        nonlocal n_pushed
+        for stream, stamp_ns in stamps:
+            n_pushed += 1
+            yield _image(stream, stamp_ns)
+
+    pairs = pair_images(images(), limit_ns=20, partner="depth", is_prompt=True)
+    given_after = [n_pushed for _ in pairs]
+    assert given_after[:5] == [3, 5, 7, 9, 11]
+    assert given_after[12:] == [2 * n for n in range(13, 21)]
+
+
 def test_pairs_held_back_are_given_at_the_end() -> None:
     assert _pair([100, 130], [110, 140]) == [(100, 110), (130, 140)]
 

@@ -145,7 +145,9 @@ def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
     gvo.run_recording(source, tmp_path / "run", outputs=NO_REPORT)
     pipe = StandardInput(io.BytesIO(sent(source, compressed=compressed)), source.info)
     live = LiveOdometry(pipe, max_waiting=1000)
-    assert live.run(tmp_path / "live", outputs=NO_REPORT).is_complete
+    ((folder, result),) = live.run(tmp_path / "live", outputs=NO_REPORT)
+    assert result.is_complete
+    assert folder == tmp_path / "live"
     assert live.n_dropped == 0
     for name in (*TABLES, "global.txt", "graph.g2o"):
         written = (tmp_path / "live" / name).read_bytes()
@@ -245,7 +247,7 @@ def test_what_is_no_image_ends_in_one_line(
 def test_a_stream_that_breaks_off_keeps_what_was_tracked(drive_bag: Path, tmp_path: Path) -> None:
     source = gvo.open_recording(drive_bag)
     pipe = StandardInput(io.BytesIO(sent(source)[:-1000]), source.info)
-    result = LiveOdometry(pipe, max_waiting=1000).run(tmp_path / "out", outputs=NO_REPORT)
+    ((_, result),) = LiveOdometry(pipe, max_waiting=1000).run(tmp_path / "out", outputs=NO_REPORT)
     assert not result.is_complete
     assert any("ends after" in line for line in result.warnings)
     assert n_poses(tmp_path / "out") == 19
@@ -288,9 +290,9 @@ def test_a_device_gives_the_images_of_both_cameras(
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (("camera",), "expected - or camera DEVICE"),
-        (("-", "0"), "expected - or camera DEVICE"),
-        (("radio",), "expected - or camera DEVICE"),
+        (("camera",), "expected ros1, ros2, - or camera DEVICE"),
+        (("-", "0"), "expected ros1, ros2, - or camera DEVICE"),
+        (("radio",), "expected ros1, ros2, - or camera DEVICE"),
         (("camera", "/nowhere/film.avi"), "OpenCV opens no camera or film"),
         (("camera", "a", "b", "c"), "side by side, or two"),
         (("camera", "a", "--sensor=rgbd"), "has no depth"),

@@ -12,7 +12,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import Calibration, rectification_maps
 from gvo.io.bag.cameras import BagCamera, image_frame, read_bag_cameras, recorded_depth_scale
 from gvo.io.bag.messages import transform_of
-from gvo.io.bag.reader import BagMessage, BagReader
+from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import CameraTopics
 from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
 from gvo.io.calibration.files import CalibrationPaths, read_cameras
@@ -66,7 +66,9 @@ class BagCalibration:
     T_body_cam: FloatArray | None = None
 
 
-def calibrations_of_messages(reader: BagReader, topics: CameraTopics, where: str) -> BagCalibration:
+def calibrations_of_messages(
+    reader: MessageReader, topics: CameraTopics, where: str
+) -> BagCalibration:
     """Read the first `CameraInfo` of a stereo pair, or of the colour camera.
 
     A raw pair whose P hold no baseline is rectified by the transform between the cameras. Later
@@ -74,7 +76,7 @@ def calibrations_of_messages(reader: BagReader, topics: CameraTopics, where: str
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
         The bag; only topics of `CameraInfo` are read, and where they do not say all, transforms
         and an image.
     topics : CameraTopics
@@ -115,7 +117,7 @@ def calibrations_of_messages(reader: BagReader, topics: CameraTopics, where: str
 
 
 def calibrations_of_file(
-    paths: CalibrationPaths, topics: CameraTopics, reader: BagReader | None = None
+    paths: CalibrationPaths, topics: CameraTopics, reader: MessageReader | None = None
 ) -> BagCalibration:
     """Read the calibration of a stereo pair, or of the colour camera, from files.
 
@@ -125,7 +127,7 @@ def calibrations_of_file(
         See `gvo.io.calibration.files.read_cameras`.
     topics : CameraTopics
         The image topics; their names say whether the images are rectified.
-    reader : BagReader, optional
+    reader : MessageReader, optional
         The bag, whose images name the camera's frame.
 
     Raises
@@ -152,7 +154,7 @@ def calibrations_of_file(
 
 
 def _stereo_pair(
-    reader: BagReader, cameras: tuple[BagCamera, BagCamera], where: str
+    reader: MessageReader, cameras: tuple[BagCamera, BagCamera], where: str
 ) -> tuple[tuple[Calibration, Calibration], str]:
     """Return left and right, and the line that says where the baseline comes from."""
     left, right = (
@@ -194,7 +196,7 @@ class DepthChoice:
 
 
 def choose_depth_view(
-    reader: BagReader, color: tuple[BagCamera, Calibration], depth: BagCamera
+    reader: MessageReader, color: tuple[BagCamera, Calibration], depth: BagCamera
 ) -> DepthChoice:
     """Tell whether depth has to be registered to colour.
 
@@ -203,7 +205,7 @@ def choose_depth_view(
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
         The bag; the topics of transforms are read where they are needed.
     color : tuple of BagCamera and Calibration
         The colour camera.
@@ -298,13 +300,13 @@ class Extrinsics:
 
 
 def find_extrinsics(
-    reader: BagReader, target: BagCamera, source: BagCamera
+    reader: MessageReader, target: BagCamera, source: BagCamera
 ) -> Extrinsics | Failure:
     """Find the transform between two cameras of a bag.
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
         The bag; the topics of transforms are read.
     target, source : BagCamera
         The cameras.
@@ -345,7 +347,9 @@ def _lookup(buffer: TfBuffer, frames: tuple[str, str], stamp_ns: int) -> FloatAr
     return np.asarray(T[known[np.argmin(np.abs(stamps_ns[known] - stamp_ns))]])
 
 
-def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Extrinsics | Failure:
+def _of_realsense(
+    reader: MessageReader, target: BagCamera, source: BagCamera
+) -> Extrinsics | Failure:
     streams = [_REALSENSE_STREAM.fullmatch(camera.image.name) for camera in (target, source)]
     references = [set() if stream is None else _references(reader, stream[1]) for stream in streams]
     common = sorted(references[0] & references[1])
@@ -362,7 +366,7 @@ def _of_realsense(reader: BagReader, target: BagCamera, source: BagCamera) -> Ex
     return Extrinsics(T_target_source=T_target_source, origin=" and ".join(names))
 
 
-def _references(reader: BagReader, stream: str) -> set[str]:
+def _references(reader: MessageReader, stream: str) -> set[str]:
     start = f"{stream}/tf/"
     return {
         topic.name.removeprefix(start)

@@ -19,7 +19,7 @@ from gvo.io.bag.messages import (
     decode_compressed_depth,
     stamp_of,
 )
-from gvo.io.bag.reader import BagMessage, BagReader
+from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
     COMPRESSED_TYPE,
@@ -73,13 +73,13 @@ class BagCamera:
 
 
 def read_bag_cameras(
-    reader: BagReader, topics: CameraTopics, where: str
+    reader: MessageReader, topics: CameraTopics, where: str
 ) -> tuple[BagCamera, BagCamera | None]:
     """Read the first `CameraInfo` of both image topics.
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
         The bag.
     topics : CameraTopics
         The image topics.
@@ -204,13 +204,13 @@ def _other_camera(reader: BagReader, files: Sequence[BagFile]) -> str:
     return ""
 
 
-def image_frame(reader: BagReader, image: Topic) -> str:
+def image_frame(reader: MessageReader, image: Topic) -> str:
     """Return the frame that the first image of a topic names; empty where none does."""
     message = _first_messages(reader, {image.name}).get(image.name)
     return "" if message is None else bare(str(message.header.frame_id))
 
 
-def recorded_depth_scale(reader: BagReader, depth: Topic) -> float | None:
+def recorded_depth_scale(reader: MessageReader, depth: Topic) -> float | None:
     """Return the counts per metre that librealsense recorded beside a stream of depth."""
     stream = _REALSENSE_DEPTH.fullmatch(depth.name)
     name = "" if stream is None else f"{stream[1]}/option/Depth Units/value"
@@ -221,7 +221,7 @@ def recorded_depth_scale(reader: BagReader, depth: Topic) -> float | None:
     return round(1.0 / metres, 3) if np.isfinite(metres) and metres > 0 else None
 
 
-def _first_messages(reader: BagReader, names: Collection[str]) -> dict[str, Any]:
+def _first_messages(reader: MessageReader, names: Collection[str]) -> dict[str, Any]:
     """Return the first message of each topic that can be decoded, one that is calibrated first.
 
     A driver may send `CameraInfo` of zeros until it has read its calibration.
@@ -248,7 +248,7 @@ def _is_calibrated(message: Any) -> bool:  # noqa: ANN401 - of any type
 
 
 def _bag_camera(
-    reader: BagReader,
+    reader: MessageReader,
     source: tuple[Topic, str],
     message: Any,  # noqa: ANN401 - ROS 1 or 2
     where: str,
@@ -275,7 +275,7 @@ def _bag_camera(
     )
 
 
-def _image_size(reader: BagReader, image: Topic, where: str) -> tuple[int, int]:
+def _image_size(reader: MessageReader, image: Topic, where: str) -> tuple[int, int]:
     """Return width and height of the first image that can be read."""
     for message in reader.messages([image.name]):
         with suppress(RecordingError):

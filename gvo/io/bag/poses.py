@@ -13,7 +13,7 @@ from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.geodesy import local_enu
 from gvo.io.bag.messages import stamp_of, transform_of
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import BagReader, MessageReader
 from gvo.io.bag.topics import Topic, describe_topics, find_topic
 from gvo.io.edges.events import InputFaults
 from gvo.io.edges.pose_streams import PoseSample
@@ -54,13 +54,13 @@ def open_streams(path: Path, names: Sequence[str]) -> list[TopicStream]:
 
 
 def find_topics(
-    reader: BagReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
+    reader: MessageReader, names: Sequence[str], where: str, *, types: Sequence[str] = POSE_TYPES
 ) -> list[Topic]:
     """Find the topics of poses that were asked for, or the only one there is.
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     names : sequence of str
         With or without the leading slash; empty: the only topic of poses is taken.
     where : str
@@ -104,7 +104,7 @@ class TopicStream:
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     topic : Topic
         Of one of `POSE_TYPES`.
 
@@ -115,7 +115,7 @@ class TopicStream:
         before it is read; the child also where the type names none.
     """
 
-    def __init__(self, reader: BagReader, topic: Topic) -> None:
+    def __init__(self, reader: MessageReader, topic: Topic) -> None:
         self._reader = reader
         self._topic = topic
         self.name = topic.name
@@ -221,7 +221,7 @@ class Positions:
     origin: str = ""
 
 
-def read_positions(reader: BagReader, topic: Topic, faults: InputFaults) -> Positions:
+def read_positions(reader: MessageReader, topic: Topic, faults: InputFaults) -> Positions:
     """Read the positions of a topic.
 
     Those of `NavSatFix` are east, north and up of the first fix. A status below zero, or a
@@ -229,7 +229,7 @@ def read_positions(reader: BagReader, topic: Topic, faults: InputFaults) -> Posi
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     topic : Topic
         Of one of `POSITION_TYPES`.
     faults : InputFaults

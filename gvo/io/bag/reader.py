@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from heapq import merge
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Protocol
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -67,6 +67,27 @@ class BagMessage:
             raise RecordingError(
                 f"{self.topic.name}: a message of {len(self.data)} bytes is no {self.topic.type}"
             ) from error
+
+
+class MessageReader(Protocol):
+    """Messages by topic: of a bag, or of a network as they came so far.
+
+    Attributes
+    ----------
+    topics : list of Topic
+    notes : list of str
+        What was decided, a line each.
+    """
+
+    topics: list[Topic]
+    notes: list[str]
+
+    @property
+    def damage(self) -> str:
+        """What cannot be read, in one line."""
+
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order of recording."""
 
 
 class BagReader:

@@ -24,7 +24,7 @@ from gvo.io.bag.messages import (
     decode_grey_or_color,
     stamp_of,
 )
-from gvo.io.bag.reader import BagMessage, BagReader
+from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.topics import (
     COMPRESSED_TYPE,
     CameraTopics,
@@ -76,28 +76,42 @@ class BagSource:
         calibration: CalibrationPaths = None,
         config: Config | None = None,
     ) -> None:
-        config = config or Config()
         paths = [paths] if isinstance(paths, Path) else list(paths)
-        self._reader = BagReader(paths)
-        self._where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        reader = BagReader(paths)
+        contradiction = find_contradiction(reader, by_camera_info=not paths_of(calibration))
+        if contradiction:
+            raise RecordingError(_describe_parts(paths, reader, contradiction))
+        where = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        path = paths[0].resolve()
+        self._name = path.stem if path.is_file() else path.name
+        self._open(reader, where, topics, calibration, config)
+
+    def _open(
+        self,
+        reader: MessageReader,
+        where: str,
+        topics: TopicChoice | None,
+        calibration: CalibrationPaths,
+        config: Config | None,
+    ) -> None:
+        """Choose the topics of the camera and find its calibration."""
+        config = config or Config()
+        self._reader, self._where = reader, where
         self._tf: TfBuffer | None = None
         self._takes_log_time = config.sync.stamps == "recording"
         is_given = bool(paths_of(calibration))
-        contradiction = find_contradiction(self._reader, by_camera_info=not is_given)
-        if contradiction:
-            raise RecordingError(_describe_parts(paths, self._reader, contradiction))
         self._topics = self._choose_topics(topics or TopicChoice())
         images = (self._topics.first, self._topics.second)
-        infos = [find_camera_info(image, self._reader.topics) for image in images]
+        infos = [find_camera_info(image, reader.topics) for image in images]
         self._info_names = set() if is_given else {name for name in infos if name}
         self._watch = CameraInfoWatch()
         if is_given:
-            found = calibrations_of_file(calibration, self._topics, self._reader)
+            found = calibrations_of_file(calibration, self._topics, reader)
         else:
-            found = calibrations_of_messages(self._reader, self._topics, self._where)
+            found = calibrations_of_messages(reader, self._topics, where)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
-        self._info = self._describe(paths[0].resolve(), found)
+        self._info = self._describe(found)
 
     @property
     def info(self) -> RecordingInfo:
@@ -208,14 +222,14 @@ class BagSource:
         found = self.truth()
         return found.trajectory if isinstance(found, Truth) else None
 
-    def _describe(self, path: Path, found: BagCalibration) -> RecordingInfo:
+    def _describe(self, found: BagCalibration) -> RecordingInfo:
         decisions = [*self._reader.notes, self._topics.describe(), *found.decisions]
         if self._topics.sensor == "rgbd":
             decisions.append(
                 f"depth: metres where it is 32FC1, {self._scale:g} counts per metre where 16UC1"
             )
         return RecordingInfo(
-            name=path.stem if path.is_file() else path.name,
+            name=self._name,
             sensor=self._topics.sensor,
             calibrations=found.calibrations,
             n_images=self._topics.first.n_messages,

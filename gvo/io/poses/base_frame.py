@@ -159,6 +159,13 @@ class BaseFrame:
         """Diagonal of the box around the camera's positions on the base frame so far, metres."""
         return float(np.linalg.norm(np.maximum(self._mount_high - self._mount_low, 0.0)))
 
+    def restarted(self) -> BaseFrame:
+        """Return the same frame before a first frame."""
+        mount = self._mount if self._T_base_cam is None else self._T_base_cam
+        again = BaseFrame(self.name, None if self._is_camera else mount, T_initial=self._T_initial)
+        again.origin = self.origin
+        return again
+
     def start(self, stamp_ns: int, T_initial: FloatArray | None = None) -> None:
         """Say which frame is the first one.
 

@@ -13,7 +13,7 @@ import numpy as np
 from gvo._text import exists
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.io.bag.poses import POSE_TYPES, POSITION_TYPES, TopicStream, find_topics, read_positions
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import MessageReader
 from gvo.io.bag.topics import Topic
 from gvo.io.edges.events import InputFaults
 from gvo.io.poses.tf import TfBuffer, read_tf
@@ -147,13 +147,13 @@ class BagTruth:
 
 
 def read_bag_truth(
-    reader: BagReader, spec: BagTruthSpec, *, where: str, buffer: TfBuffer | None = None
+    reader: MessageReader, spec: BagTruthSpec, *, where: str, buffer: TfBuffer | None = None
 ) -> BagTruth:
     """Read true poses out of a bag.
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     spec : TfTruth or TopicTruth
     where : str
         The bag, for messages.
@@ -211,7 +211,7 @@ def _of_chain(buffer: TfBuffer, spec: TfTruth, where: str) -> BagTruth:
     )
 
 
-def _of_poses(reader: BagReader, topic: Topic) -> BagTruth:
+def _of_poses(reader: MessageReader, topic: Topic) -> BagTruth:
     faults = InputFaults()
     stream = TopicStream(reader, topic)
     # of several of one stamp the last counts, as in tf
@@ -231,7 +231,7 @@ def _of_poses(reader: BagReader, topic: Topic) -> BagTruth:
     )
 
 
-def _of_positions(reader: BagReader, topic: Topic) -> BagTruth:
+def _of_positions(reader: MessageReader, topic: Topic) -> BagTruth:
     faults = InputFaults()
     found = read_positions(reader, topic, faults)
     notes = [found.origin] if found.origin else []
@@ -277,13 +277,13 @@ def is_named_truth(topic: str) -> bool:
 
 
 def find_named_truth(
-    reader: BagReader, buffer: TfBuffer | None = None, *, where: str
+    reader: MessageReader, buffer: TfBuffer | None = None, *, where: str
 ) -> BagTruth | Failure:
     """Find the ground truth by its name: `world` -> `ground_truth` in tf, or one topic.
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     buffer : TfBuffer, optional
         Of the bag; read from it where omitted.
     where : str

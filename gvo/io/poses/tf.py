@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 from gvo.errors import RecordingError
-from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, BagReader
+from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, MessageReader
 from gvo.io.poses.tf_buffer import TfBuffer
 from gvo.io.poses.tf_paths import ancestors, bare
 
@@ -19,7 +19,7 @@ TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
 _N_KEPT_WHOLE = 200_000
 
 
-def read_tf(reader: BagReader, *, frames: Collection[str] | None = None) -> TfBuffer:
+def read_tf(reader: MessageReader, *, frames: Collection[str] | None = None) -> TfBuffer:
     """Read the transforms of a recording.
 
     All topics of type `tf2_msgs/TFMessage` or `tf/tfMessage` are read. Those of topics whose name
@@ -27,7 +27,7 @@ def read_tf(reader: BagReader, *, frames: Collection[str] | None = None) -> TfBu
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     frames : collection of str, optional
         The frames that will be looked up. Of a long recording only what lies above them in the
         tree is kept, so that the memory stays small.
@@ -62,7 +62,7 @@ def _above(buffer: TfBuffer, frames: Collection[str]) -> set[str]:
     return ancestors(buffer.edges, map(bare, frames))
 
 
-def _transforms(reader: BagReader, buffer: TfBuffer) -> Iterator[tuple[Any, bool]]:
+def _transforms(reader: MessageReader, buffer: TfBuffer) -> Iterator[tuple[Any, bool]]:
     """Yield the transforms of all topics, and whether they are static."""
     names = [topic.name for topic in reader.topics if topic.type in TF_TYPES]
     for message in reader.messages(names) if names else ():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gvo.geometry import se3
-from gvo.io.bag.reader import BagReader
+from gvo.io.bag.reader import MessageReader
 from gvo.io.poses.ground_truth import BagTruth, BagTruthSpec, find_named_truth, read_bag_truth
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.poses.tf_paths import bare
@@ -57,7 +57,7 @@ class _Place:
 
 
 def find_truth(
-    reader: BagReader,
+    reader: MessageReader,
     spec: BagTruthSpec | None = None,
     *,
     where: str,
@@ -70,7 +70,7 @@ def find_truth(
 
     Parameters
     ----------
-    reader : BagReader
+    reader : MessageReader
     spec : TfTruth or TopicTruth, optional
         What to read; see `find_named_truth` where omitted.
     where : str

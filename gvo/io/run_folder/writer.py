@@ -238,6 +238,8 @@ class RunFolder(AbstractContextManager["RunFolder"]):
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
     def _open(self, name: str, header: str) -> None:
+        if name in self._files:
+            self._files[name].close()
         self._files[name] = LineFile(self.path / name, header)
 
     def _open_covariances(self, name: str) -> None:

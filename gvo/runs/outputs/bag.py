@@ -55,6 +55,8 @@ from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
 from gvo.geometry import se3
+from gvo.io.bag.reader import TF_TYPE
+from gvo.io.bag.topics import COMPRESSED_TYPE
 from gvo.io.convert.bag_messages import (
     BagWriter,
     Header,
@@ -64,6 +66,11 @@ from gvo.io.convert.bag_messages import (
 )
 from gvo.io.run_folder.line_file import PartFile
 from gvo.runs.outputs.bag_messages import (
+    CLOUD_TYPE,
+    DIAGNOSTICS_TYPE,
+    MARKER_TYPE,
+    ODOMETRY_TYPE,
+    PATH_TYPE,
     write_diagnostics,
     write_lines,
     write_odometry,
@@ -92,6 +99,20 @@ N_SHOWN_POSES: Final = 500
 
 _SECOND_NS: Final = 10**9
 _POINTS, _PICTURE = "/gvo/points", "/gvo/matches/compressed"
+TOPICS: Final = {
+    "/tf": TF_TYPE,
+    "/tf_static": TF_TYPE,
+    **{
+        f"/gvo/{name}/odometry": ODOMETRY_TYPE
+        for name in ("raw", "causal", ODOM, "smoothed", GLOBAL)
+    },
+    **{f"/gvo/{name}/path": PATH_TYPE for name in ("raw", "smoothed", GLOBAL)},
+    "/gvo/loops": MARKER_TYPE,
+    _POINTS: CLOUD_TYPE,
+    _PICTURE: COMPRESSED_TYPE,
+    "/diagnostics": DIAGNOSTICS_TYPE,
+}
+"""All topics, with their types."""
 
 
 class RunMessages:
@@ -120,6 +141,11 @@ class RunMessages:
     def has_frames(self) -> bool:
         """Whether any frame was written."""
         return self._first_ns is not None
+
+    def restart_paths(self) -> None:
+        """Forget the poses so far, as where the world is another one from now on."""
+        self._tracks = {name: Track() for name in self._tracks}
+        self._causal = Track()
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Write the result of a frame.

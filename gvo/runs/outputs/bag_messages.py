@@ -233,9 +233,15 @@ def write_points(
 
 
 def write_diagnostics(
-    writer: MessageWriter, header: Header, status: Status, text: str, values: Mapping[str, object]
+    writer: MessageWriter,
+    header: Header,
+    status: Status,
+    text: str,
+    values: Mapping[str, object],
+    *,
+    of: str = "odometry",
 ) -> None:
-    """Write the state of a frame to `/diagnostics`.
+    """Write the state of a frame, or of what frames come from, to `/diagnostics`.
 
     Its level is OK for a frame registered to its predecessors, WARN where it coasts or has resumed,
     ERROR where it is lost or was skipped.
@@ -251,11 +257,13 @@ def write_diagnostics(
         One line.
     values : mapping of str to object
         Numbers to show.
+    of : str
+        Its name.
     """
     message = writer.make(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=_LEVELS[status],
-        name="gvo: odometry",
+        name=f"gvo: {of}",
         message=text,
         hardware_id=header.frame_id,
         values=[

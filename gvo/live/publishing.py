@@ -1,0 +1,223 @@
+"""What a running camera gives, sent to networks and viewers; and how its images come."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from gvo.errors import RecordingError
+from gvo.geometry import se3
+from gvo.io.convert.bag_messages import Header
+from gvo.io.recording import RecordingInfo, StampedImage
+from gvo.live.transport import NetworkWriter
+from gvo.runs.outputs.bag import RunMessages
+from gvo.runs.outputs.bag_messages import write_diagnostics
+from gvo.runs.outputs.frames import RunFrames
+from gvo.types import (
+    Estimate,
+    FaultyFrame,
+    FloatArray,
+    Frame,
+    FrameResult,
+    Optimum,
+    Status,
+)
+
+_EVERY_S: Final = 1.0
+_SILENT_S: Final = 3.0
+# Over which rates and latencies are told.
+_N_RECENT: Final = 50
+
+
+class LiveMessages:
+    """Sends the results of a run, in the world that was set last.
+
+    Parameters
+    ----------
+    writers : sequence of NetworkWriter
+    frames : RunFrames
+    on_sent : callable
+        Called with the stamp of a frame when its pose was sent.
+    """
+
+    def __init__(
+        self,
+        writers: Sequence[NetworkWriter],
+        frames: RunFrames,
+        on_sent: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self._outputs = [RunMessages(writer, frames) for writer in writers]
+        self._on_sent = on_sent
+        self._T_set_world = np.eye(4)
+        self._T_world_base = np.eye(4)
+
+    def set_pose(self, T_world_base: FloatArray) -> None:
+        """Choose the world so that the newest pose is this one, shape (4, 4), metres.
+
+        The paths begin anew; the pose in `odom` goes on without a jump.
+        """
+        self._T_set_world = T_world_base @ se3.invert(self._T_world_base)
+        for output in self._outputs:
+            output.restart_paths()
+
+    def add_frame(self, frame: Frame, result: FrameResult) -> None:
+        """Send the result of a frame."""
+        self._T_world_base = result.T_map_world @ result.causal.T_world_frame
+        placed = self._placed_result(result)
+        for output in self._outputs:
+            output.add_frame(frame, placed)
+        self._on_sent(frame.stamp_ns)
+
+    def add_faulty(self, frame: FaultyFrame) -> None:
+        """Tell that a frame has no pose."""
+        for output in self._outputs:
+            output.add_faulty(frame)
+
+    def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
+        """Send smoothed poses that are final."""
+        placed = self._placed(estimates)
+        for output in self._outputs:
+            output.add_smoothed(placed)
+
+    def add_optimum(self, optimum: Optimum) -> None:
+        """Send the global poses at the end, and the whole paths."""
+        placed = replace(optimum, estimates=self._placed(optimum.estimates))
+        for output in self._outputs:
+            output.add_optimum(placed)
+            output.write_paths()
+
+    def _placed_result(self, result: FrameResult) -> FrameResult:
+        T = self._T_set_world
+        return replace(
+            result,
+            raw=self._placed([result.raw])[0],
+            causal=self._placed([result.causal])[0],
+            finished=self._placed(result.finished),
+            T_map_world=T @ result.T_map_world @ se3.invert(T),
+        )
+
+    def _placed(self, estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
+        T = self._T_set_world
+        return tuple(
+            replace(estimate, T_world_frame=T @ estimate.T_world_frame) for estimate in estimates
+        )
+
+
+class Arrivals(AbstractContextManager["Arrivals"]):
+    """Watches how images come and how long their poses take, and says when none come.
+
+    Parameters
+    ----------
+    info : RecordingInfo
+        Of the camera.
+    topics : sequence of str
+        Where the images of both streams come from, for messages.
+    writers : sequence of NetworkWriter
+        Are sent the state each second, as `/diagnostics`.
+    say : callable
+        Is told, in a line, when the state changes.
+    """
+
+    def __init__(
+        self,
+        info: RecordingInfo,
+        topics: Sequence[str],
+        writers: Sequence[NetworkWriter],
+        say: Callable[[str], None],
+    ) -> None:
+        self._info, self._topics, self._writers, self._say = info, topics, writers, say
+        self._times_s: tuple[deque[float], deque[float]] = (
+            deque(maxlen=_N_RECENT),
+            deque(maxlen=_N_RECENT),
+        )
+        self._waiting_s: dict[int, float] = {}
+        self._newest_ns = 0
+        self._text = ""
+        self.latencies_ms: deque[float] = deque(maxlen=_N_RECENT)
+        self.n_dropped: Callable[[], int] = lambda: 0
+        self._started_s = time.monotonic()
+        self._is_ended = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="arrivals", daemon=True)
+
+    def __enter__(self) -> Arrivals:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop watching."""
+        self._is_ended.set()
+        self._thread.join()
+
+    def watch(self, images: Iterable[StampedImage]) -> Iterator[StampedImage]:
+        """Yield the images, and note when each came."""
+        for image in images:
+            now_s = time.monotonic()
+            self._times_s[image.stream].append(now_s)
+            self._newest_ns = max(self._newest_ns, image.stamp_ns)
+            yield image
+
+    def note_pair(self, stamp_ns: int) -> None:
+        """Note that a pair is complete."""
+        self._waiting_s[stamp_ns] = time.monotonic()
+
+    def note_sent(self, stamp_ns: int) -> None:
+        """Note that the pose of a pair was sent."""
+        came_s = self._waiting_s.pop(stamp_ns, None)
+        if came_s is not None:
+            self.latencies_ms.append(1e3 * (time.monotonic() - came_s))
+
+    def state(self) -> str:
+        """Return what is wrong with the images in a line; empty where they come."""
+        now_s = time.monotonic()
+        silent_s = [now_s - (times[-1] if times else self._started_s) for times in self._times_s]
+        missing = [stream for stream in (0, 1) if silent_s[stream] > _SILENT_S]
+        if not missing:
+            return ""
+        names = self._info.stream_names
+        lasting = f"for {min(silent_s[stream] for stream in missing):.0f} s"
+        if len(missing) == 2:
+            return f"no images {lasting} on {self._topics[0]} and {self._topics[1]}"
+        (silent,) = missing
+        other = 1 - silent
+        rate = _rate_hz(self._times_s[other])
+        return (
+            f"no {names[silent]} image {lasting} on {self._topics[silent]}; {names[other]} comes "
+            f"at {rate:.3g} Hz"
+        )
+
+    def _work(self) -> None:
+        while not self._is_ended.wait(_EVERY_S):
+            text = self.state()
+            sign = text.partition(" for ")[0]
+            if sign != self._text:
+                self._say(text or "images come")
+            self._text = sign
+            self._send(text)
+
+    def _send(self, text: str) -> None:
+        names = self._info.stream_names
+        values: dict[str, object] = {
+            f"{names[stream]} [Hz]": f"{_rate_hz(self._times_s[stream]):.3g}" for stream in (0, 1)
+        }
+        values["dropped"] = self.n_dropped()
+        if self.latencies_ms:
+            values["latency [ms]"] = f"{float(np.median([*self.latencies_ms])):.1f}"
+        header = Header(self._newest_ns, self._info.frame_id)
+        status = Status.LOST if text else Status.OK
+        for writer in self._writers:
+            try:
+                write_diagnostics(writer, header, status, text or "images come", values, of="input")
+            except RecordingError as error:
+                self._say(str(error))
+
+
+def _rate_hz(times_s: deque[float]) -> float:
+    recent = [*times_s]
+    return 0.0 if len(recent) < 2 else (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)

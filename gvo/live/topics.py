@@ -1,0 +1,223 @@
+"""A camera whose images are topics of a network."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
+from typing import Final, TypeVar
+
+from gvo.config import Config
+from gvo.errors import CalibrationError, RecordingError
+from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, BagMessage
+from gvo.io.bag.source import BagSource
+from gvo.io.bag.topics import (
+    CAMERA_INFO_TYPE,
+    COMPRESSED_TYPE,
+    IMAGE_TYPE,
+    CameraTopics,
+    Topic,
+    TopicChoice,
+    describe_topics,
+)
+from gvo.io.calibration.files import CalibrationPaths
+from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.recording import StampedImage
+from gvo.live.transport import Transport
+
+_TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
+_SMALL = (CAMERA_INFO_TYPE, *_TF_TYPES)
+_IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
+_OWN = "/gvo/"
+# Messages of each topic that are kept: what a calibration or a mount is read from.
+_N_KEPT: Final = 100
+# Images that wait to be paired; pairing is quick, and pairs have a queue of their own.
+_N_WAITING: Final = 300
+_PAUSE_S = 0.2
+_SAID_AFTER = 5
+_Found = TypeVar("_Found")
+
+
+class NetworkReader:
+    """What came of the topics of a network so far, and the images as they come.
+
+    `CameraInfo` and transforms are received from the first `refresh` on, images from `begin` on.
+
+    Parameters
+    ----------
+    transport : Transport
+
+    Attributes
+    ----------
+    topics : list of Topic
+        Those announced, without those of gvo itself.
+    n_dropped : int
+        Images that were given up since too many waited to be paired.
+    """
+
+    damage = ""
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self.topics: list[Topic] = []
+        self.notes: list[str] = []
+        self.n_dropped = 0
+        self._kept: dict[str, deque[BagMessage]] = {}
+        self._images: deque[BagMessage] = deque()
+        self._changed = threading.Condition()
+        self._is_closed = False
+
+    def refresh(self) -> bool:
+        """List the topics anew; tell whether they are those of the last time."""
+        before = self.topics
+        topics = [each for each in self.transport.topics() if not each.name.startswith(_OWN)]
+        self.topics = sorted(topics, key=lambda topic: topic.name)
+        for topic in self.topics:
+            if topic.type in _SMALL and topic.name not in self._kept:
+                self._subscribe(topic)
+        return self.topics == before
+
+    def begin(self, topics: CameraTopics) -> None:
+        """Receive the images of a camera."""
+        for topic in (topics.first, topics.second):
+            if topic.name not in self._kept:
+                self._subscribe(topic)
+
+    def messages(self, names: Collection[str]) -> Iterator[BagMessage]:
+        """Yield what came of some topics, up to a hundred messages of each; of images the first.
+
+        Raises
+        ------
+        RecordingError
+            Where none came of a topic, unless it is of transforms.
+        """
+        types = {topic.name: topic.type for topic in self.topics}
+        for name in names:
+            if not self._kept.get(name) and types.get(name) not in _TF_TYPES:
+                raise RecordingError(f"{self.transport.name}: nothing came on {name}")
+        with self._changed:
+            kept = [message for name in names for message in self._kept[name]]
+        yield from sorted(kept, key=lambda message: message.log_time_ns)
+
+    def images(self) -> Iterator[BagMessage]:
+        """Yield images as they come, until it is closed."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._images or self._is_closed)
+                if not self._images:
+                    return
+                message = self._images.popleft()
+            yield message
+
+    def close(self) -> None:
+        """Give out no more than came so far."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    def _subscribe(self, topic: Topic) -> None:
+        is_image = topic.type in _IMAGES
+        self._kept[topic.name] = deque(maxlen=1 if is_image else _N_KEPT)
+        take = partial(self._take, topic, is_image=is_image)
+        self.transport.subscribe(topic.name, topic.type, take)
+
+    def _take(self, topic: Topic, data: bytes, stamp_ns: int, *, is_image: bool) -> None:
+        is_ros1 = self.transport.is_ros1
+        message = BagMessage(topic=topic, log_time_ns=stamp_ns, data=data, is_ros1=is_ros1)
+        kept = self._kept[topic.name]
+        with self._changed:
+            if not is_image:
+                kept.append(message)
+                return
+            if not kept:
+                kept.append(message)
+            self._images.append(message)
+            if len(self._images) > _N_WAITING:
+                self._images.popleft()
+                self.n_dropped += 1
+            self._changed.notify_all()
+
+
+class TopicSource(BagSource):
+    """A stereo or RGB-D camera that sends its images in a network, found as in a bag.
+
+    Parameters
+    ----------
+    reader : NetworkReader
+    topics, calibration, config
+        As of `BagSource`.
+
+    Raises
+    ------
+    RecordingError, CalibrationError
+        As long as what is needed has not come; see `wait_for`.
+    """
+
+    def __init__(
+        self,
+        reader: NetworkReader,
+        *,
+        topics: TopicChoice | None = None,
+        calibration: CalibrationPaths = None,
+        config: Config | None = None,
+    ) -> None:
+        is_steady = reader.refresh()
+        if not is_steady:
+            held = describe_topics([each for each in reader.topics if each.type in _IMAGES])
+            raise RecordingError(f"{reader.transport.name}: image topics: {held or 'none'}")
+        self._network = reader
+        self._name = reader.transport.name
+        self._open(reader, reader.transport.name, topics, calibration, config)
+
+    def images(self) -> Iterator[StampedImage]:
+        """Yield the images as they come, until `close`."""
+        for message in self._network.images():
+            if message.topic.name in self.image_topics:
+                yield self._stamped(message, self.image_topics.index(message.topic.name))
+
+    def transforms(self, frames: Collection[str] | None = None) -> TfBuffer:
+        """Return the transforms that came so far, all of them."""
+        return read_tf(self._network)
+
+    def close(self) -> None:
+        """End the images."""
+        self._network.close()
+
+    def _choose_topics(self, choice: TopicChoice) -> CameraTopics:
+        topics = super()._choose_topics(choice)
+        self._network.begin(topics)
+        return topics
+
+
+def wait_for(
+    make: Callable[[], _Found], say: Callable[[str], None], is_ended: threading.Event
+) -> _Found | None:
+    """Try until what is needed has come.
+
+    Parameters
+    ----------
+    make : callable
+        Makes it, or raises what is missing.
+    say : callable
+        Is told what is missing, in a line, when it lasts, and when it changes.
+    is_ended : threading.Event
+        Set by whoever gives up.
+
+    Returns
+    -------
+    object or None
+        None where it was given up.
+    """
+    said, n_tries = "", 0
+    while not is_ended.is_set():
+        try:
+            return make()
+        except (RecordingError, CalibrationError) as error:
+            missing = str(error)
+        n_tries += 1
+        if n_tries >= _SAID_AFTER and missing != said:
+            say(f"waiting: {missing}")
+            said = missing
+        is_ended.wait(_PAUSE_S)
+    return None

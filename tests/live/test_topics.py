@@ -1,0 +1,400 @@
+"""A camera in a network: found as in a bag, tracked as a bag, answered in the network."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.config import Config
+from gvo.errors import ConfigurationError
+from gvo.geometry import se3
+from gvo.io.bag.messages import stamp_of, transform_of
+from gvo.io.bag.reader import BagMessage, BagReader, typestore
+from gvo.io.bag.topics import Topic
+from gvo.io.poses.base_frame import BaseFrame
+from gvo.io.recording import StampedImage
+from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
+from gvo.live.topics import NetworkReader, TopicSource, wait_for
+from gvo.live.transport import SET_POSE, Parameters
+from gvo.runs.outputs.bag import TOPICS
+from gvo.trajectory.formats import read_trajectory
+from gvo.types import FloatArray
+from tests.conftest import TABLES
+from tests.live.network import Network, recorded
+
+NO_REPORT = gvo.RunOutputs(report=False)
+SECOND_NS = 10**9
+ODOMETRY = "/gvo/odom/odometry"
+
+
+class Play:
+    """Odometry over a bag that is played in a network.
+
+    The script sends messages in a thread of its own; at its end the images end.
+    """
+
+    def __init__(
+        self, bag: Path, script: Callable[[Play], None] | None = None, **options: Any
+    ) -> None:
+        self.messages = [each for each in recorded(bag) if each.topic.name != "/tf"]
+        self.said: list[str] = []
+        self.network = Network(is_ros1=self.messages[0].is_ros1)
+        self.network.announce(BagReader(bag).topics)
+        self.reader = NetworkReader(self.network)
+        self._script = script or Play.send_all
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+        source = wait_for(lambda: TopicSource(self.reader), self.said.append, threading.Event())
+        assert source is not None
+        options = {"max_waiting": 1000, "say": self.said.append, **options}
+        self.live = LiveOdometry(source, sinks=[self.network], **options)
+
+    def _play(self) -> None:
+        try:
+            self._script(self)
+        finally:
+            self.reader.close()
+
+    def send_all(self) -> None:
+        self.send(0, len(self.messages))
+
+    def send(self, start: int, end: int) -> None:
+        for message in self.messages[start:end]:
+            self.network.send(message)
+
+    def run(self, out: Path, outputs: gvo.RunOutputs = NO_REPORT) -> list[LiveRun]:
+        runs = self.live.run(out, outputs=outputs)
+        self._thread.join(timeout=60)
+        return runs
+
+    def sent(self, topic: str) -> list[Any]:
+        return [message for _, message in self.network.sent[topic]]
+
+    def call(self, name: str, **fields: Any) -> Any:
+        """Call a service as a client does, by bytes."""
+        service, is_ros1 = self.network.services[name], self.network.is_ros1
+        service.type.register(is_ros1=is_ros1)
+        store = typestore(is_ros1=is_ros1)
+        code = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        request = store.types[service.type.request_type](**fields)
+        answer = service.call(bytes(code(request, service.type.request_type)), is_ros1=is_ros1)
+        return decode(answer, service.type.response_type)
+
+
+def pose_of(message: Any) -> FloatArray:
+    pose = message.pose.pose
+    T = transform_of(pose.position, pose.orientation)
+    assert isinstance(T, np.ndarray)
+    return T
+
+
+def half(play: Play) -> int:
+    return len(play.messages) // 2
+
+
+@pytest.mark.parametrize("bag", ["drive_bag", "room_bag"])
+def test_what_is_sent_in_a_network_is_tracked_as_in_a_bag(
+    bag: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    path = request.getfixturevalue(bag)
+    gvo.run_recording(gvo.open_recording(path), tmp_path / "run", outputs=NO_REPORT)
+    play = Play(path)
+    ((folder, result),) = play.run(tmp_path / "live")
+    assert result.is_complete
+    for name in (*TABLES, "global.txt", "graph.g2o"):
+        assert (folder / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
+    assert {name: type_ for name, (type_, _) in play.network.opened.items()} == TOPICS
+    assert play.network.opened["/tf_static"][1]
+    stamps = [stamp_of(each.header) for each in play.sent(ODOMETRY)]
+    assert len(stamps) == 20
+    moved = [
+        (stamp_of(each.header), each.child_frame_id)
+        for message in play.sent("/tf")
+        for each in message.transforms
+    ]
+    camera = play.sent(ODOMETRY)[0].child_frame_id
+    assert [stamp for stamp, child in moved if child == camera] == stamps
+    assert [stamp for stamp, child in moved if child == "gvo/odom"] == stamps
+    assert {each.header.frame_id for each in play.sent("/gvo/points")} == {
+        camera.replace("odom", "causal")
+    }
+    path_poses = play.sent("/gvo/smoothed/path")[-1].poses
+    assert [stamp_of(each.header) for each in path_poses] == stamps
+
+
+def test_without_tf_none_is_sent_and_nobody_is_drawn_pictures_for(
+    drive_bag: Path, tmp_path: Path
+) -> None:
+    play = Play(drive_bag, with_tf=False)
+    play.network.unheard = {"/gvo/points", "/gvo/matches/compressed"}
+    play.run(tmp_path / "out")
+    assert not {"/tf", "/tf_static", *play.network.unheard} & play.network.sent.keys()
+    assert len(play.sent(ODOMETRY)) == 20
+
+
+def test_the_frames_are_those_of_a_robot_where_it_says_where_its_camera_is(
+    drive_bag: Path, tmp_path: Path
+) -> None:
+    base = BaseFrame("base_link", se3.make_transform(np.eye(3), np.array([0.1, 0.0, 0.5])))
+    play = Play(drive_bag, base_frame=base)
+    play.run(tmp_path / "out")
+    pairs = {
+        (each.header.frame_id, each.child_frame_id)
+        for message in play.sent("/tf")
+        for each in message.transforms
+    }
+    assert {("map", "odom"), ("odom", "base_link"), ("map", "gvo/causal/base_link")} <= pairs
+    static = [each.header.frame_id for m in play.sent("/tf_static") for each in m.transforms]
+    assert "base_link" not in static
+    assert "gvo/causal/base_link" in static
+    assert (play.sent(ODOMETRY)[0].header.frame_id, play.sent(ODOMETRY)[0].child_frame_id) == (
+        "odom",
+        "base_link",
+    )
+
+
+def test_where_the_stamps_go_back_another_run_begins(drive_bag: Path, tmp_path: Path) -> None:
+    def script(play: Play) -> None:
+        play.send_all()
+        play.network.wait_for(ODOMETRY, 20)
+        for message in play.messages:
+            play.network.send(shifted(message, -10 * SECOND_NS))
+
+    play = Play(drive_bag, script)
+    outputs = gvo.RunOutputs(report=False, bag=tmp_path / "b.mcap")
+    first, second = play.run(tmp_path / "out", outputs)
+    assert [first.folder.name, second.folder.name] == ["out", "out-2"]
+    assert [each.result.summary["frames"] for each in (first, second)] == [20, 20]
+    assert any("a new run begins" in line and "go back" in line for line in play.said)
+    assert (tmp_path / "b.mcap").exists()
+    assert (tmp_path / "b-2.mcap").exists()
+    np.testing.assert_array_equal(pose_of(play.sent(ODOMETRY)[20]), np.eye(4))
+    poses = [read_trajectory(each.folder / "causal.txt").T_world_frame for each in (first, second)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def shifted(message: BagMessage, by_ns: int) -> BagMessage:
+    """Return a message with another stamp."""
+    store = typestore(is_ros1=message.is_ros1)
+    content = message.decode()
+    if hasattr(content, "header"):
+        stamp = content.header.stamp
+        stamp.sec += by_ns // SECOND_NS
+    code = store.serialize_ros1 if message.is_ros1 else store.serialize_cdr
+    return BagMessage(
+        topic=message.topic,
+        log_time_ns=message.log_time_ns + by_ns,
+        data=bytes(code(content, message.topic.type)),
+        is_ros1=message.is_ros1,
+    )
+
+
+def test_a_reset_begins_another_run_with_the_next_image(drive_bag: Path, tmp_path: Path) -> None:
+    def script(play: Play) -> None:
+        play.send(0, half(play))
+        n = len(play.network.wait_for(ODOMETRY, 8))
+        answer = play.call("/gvo/reset")
+        assert answer.success
+        assert n >= 8
+        play.send(half(play), len(play.messages))
+
+    play = Play(drive_bag, script)
+    runs = play.run(tmp_path / "out")
+    assert len(runs) == 2
+    assert sum(each.result.summary["frames"] for each in runs) == 20
+    assert any("it was reset" in line for line in play.said)
+
+
+def test_a_run_is_saved_while_it_goes_on(drive_bag: Path, tmp_path: Path) -> None:
+    found: list[tuple[int, str]] = []
+
+    def script(play: Play) -> None:
+        play.send(0, half(play))
+        play.network.wait_for(ODOMETRY, 8)
+        answer = play.call("/gvo/save")
+        assert answer.success, answer.message
+        lines = (tmp_path / "out" / "global.txt").read_text().count("\n")
+        found.append((lines, (tmp_path / "out" / "summary.json").read_text()))
+        play.send(half(play), len(play.messages))
+
+    ((folder, result),) = Play(drive_bag, script).run(tmp_path / "out")
+    ((n_saved, summary),) = found
+    assert 8 <= n_saved < 20
+    assert '"state": "running"' in summary
+    assert (folder / "global.txt").read_text().count("\n") == 20
+    assert result.is_complete
+
+
+def test_a_pose_that_is_set_moves_the_world_and_not_odom(drive_bag: Path, tmp_path: Path) -> None:
+    T_set = se3.make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([5.0, -2.0, 1.0]))
+
+    def script(play: Play) -> None:
+        play.send(0, half(play))
+        play.network.wait_for(ODOMETRY, 8)
+        set_pose(play, T_set, "elsewhere")
+        set_pose(play, T_set, "map")
+        play.send(half(play), len(play.messages))
+
+    play = Play(drive_bag, script)
+    ((folder, _),) = play.run(tmp_path / "out")
+    assert any("not set" in line and "elsewhere" in line for line in play.said)
+    odom = np.array([pose_of(each)[:3, 3] for each in play.sent(ODOMETRY)])
+    assert np.linalg.norm(np.diff(odom, axis=0), axis=1).max() < 2.0
+    causal = np.array([pose_of(each) for each in play.sent("/gvo/causal/odometry")])
+    jumps = np.linalg.norm(np.diff(causal[:, :3, 3], axis=0), axis=1)
+    last = int(np.argmax(jumps))
+    step = se3.invert(causal[last]) @ causal[last + 1]
+    written = read_trajectory(folder / "causal.txt").T_world_frame
+    true_step = se3.invert(written[last]) @ written[last + 1]
+    np.testing.assert_allclose(causal[last + 1], T_set @ true_step, atol=1e-6)
+    assert np.linalg.norm(step[:3, 3] - true_step[:3, 3]) > 1.0
+
+
+def set_pose(play: Play, T: FloatArray, frame: str) -> None:
+    """Call the service that sets the pose."""
+    writer = play.live._writers[0]
+    from gvo.io.convert.bag_messages import Header, pose_numbers
+    from gvo.runs.outputs.bag_messages import _pose
+
+    SET_POSE.register(is_ros1=play.network.is_ros1)
+    stamped = writer.make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=writer.header(Header(0, frame)),
+        pose=writer.make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=_pose(writer, pose_numbers(T).tolist()),
+            covariance=np.zeros(36),
+        ),
+    )
+    play.call("/gvo/set_pose", pose=stamped)
+
+
+def test_a_parameter_has_its_effect_on_the_next_frame(drive_bag: Path, tmp_path: Path) -> None:
+    def script(play: Play) -> None:
+        play.send(0, half(play))
+        play.network.wait_for(ODOMETRY, 8)
+        assert play.network.parameters is not None
+        before.append(len(play.network.sent[ODOMETRY]))
+        play.network.parameters.set({"klt.n_corners": 60})
+        play.send(half(play), len(play.messages))
+
+    before: list[int] = []
+    ((folder, result),) = Play(drive_bag, script).run(tmp_path / "out")
+    rows = (folder / "frames.csv").read_text().splitlines()[1:]
+    counts = [int(row.split(",")[3]) for row in rows]
+    assert min(counts[:8]) > 60
+    assert max(counts[12:]) <= 60
+    assert result.summary["configuration"]["klt"]["n_corners"] == 60
+
+
+def test_a_parameter_that_does_not_exist_changes_none() -> None:
+    parameters, told = Parameters(Config()), list[Config]()
+    parameters.follow(told.append)
+    for values in ({"klt.nothing": 1}, {"window": 1}, {"window.size": -1}, {"window.size": "x"}):
+        with pytest.raises(ConfigurationError):
+            parameters.set({"loops.enabled": False, **values})
+    assert parameters.config == Config()
+    assert told == []
+    assert parameters.set({"loops.enabled": False}).loops.enabled is False
+    assert told == [parameters.config]
+
+
+def test_what_is_missing_is_said_until_it_comes(drive_bag: Path) -> None:
+    network, said = Network(), []
+    reader, messages = NetworkReader(network), recorded(drive_bag)
+    topics = BagReader(drive_bag).topics
+    steps: list[Callable[[], object]] = [
+        lambda: network.announce([t for t in topics if "left/image" in t.name]),
+        lambda: network.announce([t for t in topics if "right/image" in t.name]),
+        lambda: network.announce([t for t in topics if "camera_info" in t.name]),
+        lambda: [*map(network.send, [m for m in messages if "camera_info" in m.topic.name])],
+    ]
+
+    def say(line: str) -> None:
+        said.append(line)
+        if steps and "image topics: " not in line:
+            steps.pop(0)()
+
+    source = wait_for(lambda: TopicSource(reader), say, threading.Event())
+    assert source is not None
+    assert source.info.frame_id
+    text = "\n".join(said)
+    for missing in ("no image topics", "one camera alone", "no CameraInfo", "nothing came on"):
+        assert missing in text, said
+
+
+def test_a_damaged_message_is_a_faulty_frame(drive_bag: Path, tmp_path: Path) -> None:
+    def script(play: Play) -> None:
+        n_images = 0
+        for message in play.messages:
+            if "image" in message.topic.name:
+                n_images += 1
+                if n_images == 21:
+                    message = BagMessage(
+                        topic=message.topic,
+                        log_time_ns=message.log_time_ns,
+                        data=message.data[:100],
+                        is_ros1=message.is_ros1,
+                    )
+            play.network.send(message)
+
+    ((_, result),) = Play(drive_bag, script).run(tmp_path / "out")
+    assert result.summary["frames"] >= 19
+    assert not result.is_complete
+
+
+def image(stamp_ms: int, stream: int = 0) -> StampedImage:
+    return StampedImage(stream=stream, stamp_ns=stamp_ms * 10**6, load=lambda: np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "stretches"),
+    [
+        ([], [[]]),
+        ([0, 100, 200], [[0, 100, 200]]),
+        ([5000, 5100, 4900, 5200], [[5000, 5100, 4900, 5200]]),
+        ([5000, 5100, 0, 5200, 5300], [[5000, 5100, 0, 5200, 5300]]),
+        ([5000, 5100, 0, 100, 200], [[5000, 5100], [0, 100, 200]]),
+        ([5000, 0], [[5000, 0]]),
+        ([9000, 5000, 5100, 0, 100], [[9000], [5000, 5100], [0, 100]]),
+    ],
+)
+def test_images_are_cut_where_two_go_back(stamps_ms: list[int], stretches: list[list[int]]) -> None:
+    images = Stretches(image(stamp) for stamp in stamps_ms)
+    found = []
+    while not images.is_ended:
+        found.append([each.stamp_ns // 10**6 for each in images.next_stretch()])
+    assert found == stretches
+
+
+def test_a_stream_that_stops_is_told_with_the_rate_of_the_other(drive_bag: Path) -> None:
+    play = Play(drive_bag)
+    arrivals = play.live.arrivals
+    assert arrivals.state() == ""
+    arrivals._started_s -= 4
+    assert "no images for 4 s on /stereo/left" in arrivals.state()
+    list(arrivals.watch([image(33 * n) for n in range(4)]))
+    state = arrivals.state()
+    assert "no right image for 4 s on /stereo/right" in state
+    assert "left comes at" in state
+
+
+def test_topics_of_gvo_itself_are_no_camera() -> None:
+    network = Network()
+    network.announce(
+        [
+            Topic(
+                name="/gvo/matches/compressed", type=TOPICS["/gvo/matches/compressed"], n_messages=1
+            )
+        ]
+    )
+    reader = NetworkReader(network)
+    reader.refresh()
+    assert reader.topics == []
