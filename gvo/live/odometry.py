@@ -76,6 +76,11 @@ class LiveOdometry:
         Pairs that are older than the newest by more are dropped.
     say : callable
         Is told, in a line, what happens to the images.
+
+    Attributes
+    ----------
+    arrivals : Arrivals
+        How images come, and how long their poses take.
     """
 
     def __init__(
@@ -103,8 +108,9 @@ class LiveOdometry:
         left_out = () if with_tf else ("/tf", "/tf_static")
         self._writers = [NetworkWriter(sink, source.info.name, left_out) for sink in sinks]
         places = getattr(source, "image_topics", source.info.stream_names)
-        self.arrivals = Arrivals(source.info, places, self._writers, say)
-        self.arrivals.n_dropped = lambda: self.n_dropped
+        self.arrivals = Arrivals(
+            *(source.info, places, self._writers, say), n_dropped=lambda: self.n_dropped
+        )
         self._stretches = Stretches(self.arrivals.watch(source.images()))
         self._loop: RunLoop | None = None
         self._save: Callable[[], None] | None = None

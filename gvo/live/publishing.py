@@ -123,6 +123,13 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         Are sent the state each second, as `/diagnostics`.
     say : callable
         Is told, in a line, when the state changes.
+    n_dropped : callable
+        Returns how many frames were dropped.
+
+    Attributes
+    ----------
+    latencies_ms : deque of float
+        Of the newest frames, from the last image of a pair to its pose, milliseconds.
     """
 
     def __init__(
@@ -131,8 +138,10 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         topics: Sequence[str],
         writers: Sequence[NetworkWriter],
         say: Callable[[str], None],
+        n_dropped: Callable[[], int] = lambda: 0,
     ) -> None:
         self._info, self._topics, self._writers, self._say = info, topics, writers, say
+        self._n_dropped = n_dropped
         self._times_s: tuple[deque[float], deque[float]] = (
             deque(maxlen=_N_RECENT),
             deque(maxlen=_N_RECENT),
@@ -141,7 +150,6 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         self._newest_ns = 0
         self._text = ""
         self.latencies_ms: deque[float] = deque(maxlen=_N_RECENT)
-        self.n_dropped: Callable[[], int] = lambda: 0
         self._started_s = time.monotonic()
         self._is_ended = threading.Event()
         self._thread = threading.Thread(target=self._work, name="arrivals", daemon=True)
@@ -206,7 +214,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         values: dict[str, object] = {
             f"{names[stream]} [Hz]": f"{_rate_hz(self._times_s[stream]):.3g}" for stream in (0, 1)
         }
-        values["dropped"] = self.n_dropped()
+        values["dropped"] = self._n_dropped()
         if self.latencies_ms:
             values["latency [ms]"] = f"{float(np.median([*self.latencies_ms])):.1f}"
         header = Header(self._newest_ns, self._info.frame_id)
