@@ -1,0 +1,223 @@
+"""A live view in Foxglove: a WebSocket server of the Foxglove SDK, beside any input.
+
+It needs foxglove-sdk (the extra `foxglove`); who imports this module without it is told so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from gvo.config import Config
+from gvo.errors import ConfigurationError, missing_extra
+from gvo.io.bag.reader import typestore
+from gvo.live.transport import Parameters, Publisher, Service
+
+try:
+    import foxglove
+    from foxglove.websocket import Capability, ChannelView, Client, ServerListener, WebSocketServer
+    from websockets.exceptions import WebSocketException
+    from websockets.sync.client import connect
+    from websockets.typing import Subprotocol
+except ImportError as error:
+    raise missing_extra("--foxglove needs foxglove-sdk", "foxglove") from error
+
+DEFAULT_PORT = 8765
+"""Where Foxglove looks."""
+
+_ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
+# Messages that wait for a client; of a slower one the oldest are dropped.
+_N_WAITING = 256
+# CDR has a byte for a message without fields, which not all clients send.
+_N_BYTES_EMPTY = 5
+_NULL = "null"
+_STATUS = "parameters"
+_PROTOCOL = Subprotocol("foxglove.sdk.v1")
+
+
+class Foxglove:
+    """A WebSocket server for Foxglove: topics, parameters and services of a run.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on; 0.0.0.0 lets everyone on the network see and steer the run.
+    port : int
+        0 takes a free one.
+
+    Raises
+    ------
+    ConfigurationError
+        When the port is taken, or the address is none of this machine.
+    """
+
+    is_ros1 = False
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int = DEFAULT_PORT) -> None:
+        # What clients send wrongly is told to them, not to the terminal.
+        logging.getLogger("foxglove").addHandler(logging.NullHandler())
+        self._host = host
+        self._context = foxglove.Context()
+        self._listener = _Listener()
+        try:
+            self._server = foxglove.start_server(
+                name="gvo",
+                host=host,
+                port=port,
+                capabilities=[Capability.Parameters, Capability.Services],
+                supported_encodings=[_ENCODING],
+                server_listener=self._listener,
+                context=self._context,
+                message_backlog_size=_N_WAITING,
+            )
+        except RuntimeError as error:
+            reason = str(error).rpartition("port: ")[2]
+            raise ConfigurationError(
+                f"--foxglove: cannot listen on {host}:{port}: {reason}; give another port, 0 for "
+                "any, and an address of this machine"
+            ) from error
+        self._listener.server = self._server
+        self._changed, self._is_closed = threading.Event(), False
+        self._teller = threading.Thread(target=self._tell, name="foxglove", daemon=True)
+        self._teller.start()
+
+    @property
+    def url(self) -> str:
+        """Address to be opened in Foxglove on this machine."""
+        host = "localhost" if self._host in ("0.0.0.0", "::") else self._host  # noqa: S104
+        return f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
+
+    def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> Publisher:
+        """Open a channel for CDR messages, described as ROS 2 does."""
+        schema = _schema(type_, type_)
+        channel = foxglove.Channel(
+            topic, schema=schema, message_encoding=_ENCODING, context=self._context
+        )
+        publisher = _Channel(channel, is_latched=is_latched)
+        self._listener.channels[channel.id()] = publisher
+        return publisher
+
+    def serve(self, service: Service) -> None:
+        """Answer the calls of a service; what is no request of it is told to the client."""
+        type_ = service.type
+        type_.register(is_ros1=False)
+        request, response = (
+            foxglove.MessageSchema(encoding=_ENCODING, schema=_schema(f"{type_.name}{end}", name))
+            for end, name in (("_Request", type_.request_type), ("_Response", type_.response_type))
+        )
+
+        def answer(call: foxglove.ServiceRequest) -> bytes:
+            return service.call(call.payload.ljust(_N_BYTES_EMPTY, b"\0"), is_ros1=False)
+
+        schema = foxglove.ServiceSchema(type_.name, request=request, response=response)
+        self._server.add_services([foxglove.Service(service.name, schema=schema, handler=answer)])
+
+    def offer(self, parameters: Parameters) -> None:
+        """Show parameters, and let clients set them; an empty one is the text null."""
+        self._listener.parameters = parameters
+        parameters.follow(lambda config: self._changed.set())
+
+    def _tell(self) -> None:
+        """Tell clients of changes.
+
+        `publish_parameter_values` of the SDK (0.30) is not called: it waits, holding Python's
+        lock, for a lock under which a client's subscription waits for Python's. A client that sets
+        nothing makes the server publish all values, and holds no lock of Python's meanwhile.
+        """
+        while self._changed.wait() and not self._is_closed:
+            self._changed.clear()
+            with (
+                contextlib.suppress(OSError, WebSocketException),
+                connect(self.url, subprotocols=[_PROTOCOL], proxy=None) as client,
+            ):
+                client.send('{"op": "setParameters", "parameters": []}')
+
+    def close(self) -> None:
+        """Disconnect the clients and listen no more."""
+        self._is_closed = True
+        self._changed.set()
+        self._teller.join()
+        self._server.stop()
+        for publisher in self._listener.channels.values():
+            publisher.channel.close()
+
+
+class _Channel:
+    """A publisher of one channel."""
+
+    def __init__(self, channel: foxglove.Channel, *, is_latched: bool) -> None:
+        self.channel = channel
+        self._is_latched = is_latched
+        self._last: tuple[bytes, int] | None = None
+
+    @property
+    def is_heard(self) -> bool:
+        return self.channel.has_sinks()
+
+    def publish(self, data: bytes, stamp_ns: int) -> None:
+        if self._is_latched:
+            self._last = data, stamp_ns
+        self.channel.log(data, log_time=stamp_ns)
+
+    def repeat(self) -> None:
+        """Send the last message again, where it is latched; those who have it, have it twice."""
+        if self._last is not None:
+            data, stamp_ns = self._last
+            self.channel.log(data, log_time=stamp_ns)
+
+
+class _Listener(ServerListener):
+    """What clients ask for, in threads of the server."""
+
+    server: WebSocketServer
+    parameters: Parameters | None = None
+
+    def __init__(self) -> None:
+        self.channels: dict[int, _Channel] = {}
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        if channel.id in self.channels:
+            self.channels[channel.id].repeat()
+
+    def on_get_parameters(
+        self, client: Client, param_names: list[str], request_id: str | None = None
+    ) -> list[foxglove.Parameter]:
+        return [] if self.parameters is None else _values(self.parameters.config, param_names)
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[foxglove.Parameter], request_id: str | None = None
+    ) -> list[foxglove.Parameter]:
+        """Set them, all or none; return those that hold now."""
+        if self.parameters is None:
+            return []
+        try:
+            self.parameters.set({each.name: _value(each) for each in parameters})
+        except ConfigurationError as error:
+            self.server.publish_status(str(error), foxglove.StatusLevel.Warning, _STATUS)
+        else:
+            self.server.remove_status([_STATUS])
+        return _values(self.parameters.config, [each.name for each in parameters])
+
+
+def _schema(name: str, type_: str) -> foxglove.Schema:
+    definition, _ = typestore(is_ros1=False).generate_msgdef(type_, ros_version=2)
+    return foxglove.Schema(name=name, encoding=_SCHEMA_ENCODING, data=definition.encode())
+
+
+def _values(config: Config, names: Sequence[str]) -> list[foxglove.Parameter]:
+    """Return the parameters of those names; of no names, all."""
+    known = {
+        f"{section}.{key}": _NULL if value is None else value
+        for section, values in config.model_dump().items()
+        for key, value in values.items()
+    }
+    chosen = [name for name in names if name in known] or ([] if names else known)
+    return [foxglove.Parameter(name, value=known[name]) for name in chosen]
+
+
+def _value(parameter: foxglove.Parameter) -> Any:  # noqa: ANN401 - whatever a client sends
+    value = parameter.get_value()
+    return None if value == _NULL else value

@@ -1,0 +1,377 @@
+"""A server for Foxglove, asked by a plain WebSocket client in another process."""
+
+import base64
+import contextlib
+import json
+import random
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from gvo.config import Config
+from gvo.errors import ConfigurationError
+from gvo.live.foxglove import Foxglove
+from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, decode
+from gvo.runs.outputs.bag import RunMessages
+from gvo.runs.outputs.frames import RunFrames
+from gvo.types import FrameResult, StereoFrame
+from tests.viz.view.fakes import result_of
+
+# Between lines of JSON, a text or bytes in base 64, and a WebSocket.
+_RELAY = """
+import base64, json, sys, threading
+from websockets.sync.client import connect
+
+def send():
+    for line in sys.stdin:
+        content = json.loads(line)
+        text = isinstance(content, str)
+        socket.send(content if text else base64.b64decode(content["bytes"]))
+
+with connect(sys.argv[1], subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
+    threading.Thread(target=send, daemon=True).start()
+    for message in socket:
+        if isinstance(message, bytes):
+            message = json.dumps({"op": message[0], "bytes": base64.b64encode(message).decode()})
+        print(message, flush=True)
+"""
+_LIMIT_S = 60.0
+PROTOCOL = Subprotocol("foxglove.sdk.v1")
+_DATA, _CALL, _ANSWER = 1, 2, 3
+
+
+class Client:
+    """A client in a process of its own; it is ended where an answer does not come."""
+
+    def __init__(self, url: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _RELAY, url],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._timer = threading.Timer(_LIMIT_S, self.process.kill)
+        self._timer.start()
+        self.info = self.next("serverInfo")
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.services: dict[str, dict[str, Any]] = {}
+        self.data: list[tuple[str, int, bytes]] = []
+        self.said = ""
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._timer.cancel()
+        self.process.kill()
+        self.process.communicate()
+
+    def send(self, op: str, **fields: object) -> None:
+        self._send(json.dumps({"op": op, **fields}))
+
+    def send_bytes(self, data: bytes) -> None:
+        self._send({"bytes": base64.b64encode(data).decode()})
+
+    def _send(self, content: object) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(content) + "\n")
+        self.process.stdin.flush()
+
+    def next(self, *ops: str | int) -> dict[str, Any]:
+        """Return the next message of a kind, and note what comes before."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            message: dict[str, Any] = json.loads(line)
+            self._note(message)
+            if message["op"] in ops:
+                return message
+        raise AssertionError(f"the connection ended before {ops}")
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message["op"] == "advertise":
+            self.channels |= {channel["topic"]: channel for channel in message["channels"]}
+        elif message["op"] == "advertiseServices":
+            self.services |= {service["name"]: service for service in message["services"]}
+        elif message["op"] == "status":
+            self.said = str(message["message"])
+        elif message["op"] == _DATA:
+            data = base64.b64decode(message["bytes"])
+            number, stamp_ns = struct.unpack_from("<xIQ", data)
+            topics = {channel["id"]: topic for topic, channel in self.channels.items()}
+            self.data.append((topics[number], stamp_ns, data[13:]))
+
+    def subscribe(self, *topics: str) -> None:
+        numbers = [self.channels[topic]["id"] for topic in topics]
+        pairs = [{"id": number, "channelId": number} for number in numbers]
+        self.send("subscribe", subscriptions=pairs)
+        self.parameters()  # answered after it
+
+    def parameters(self, *names: str) -> dict[str, object]:
+        self.send("getParameters", parameterNames=names, id="asked")
+        return self.answered("asked")
+
+    def assign(self, **wanted: object) -> dict[str, object]:
+        given = [{"name": name, "value": value} for name, value in wanted.items()]
+        self.send("setParameters", parameters=given, id="set")
+        return self.answered("set")
+
+    def answered(self, id_: str) -> dict[str, object]:
+        """Return the values that answer a request, not those told in between."""
+        while (message := self.next("parameterValues")).get("id") != id_:
+            pass
+        return values(message)
+
+    def call(self, name: str, request: bytes, encoding: bytes = b"cdr") -> bytes | str:
+        head = struct.pack("<BIII", _CALL, self.services[name]["id"], 7, len(encoding))
+        self.send_bytes(head + encoding + request)
+        answer = self.next(_ANSWER, "serviceCallFailure")
+        if answer["op"] != _ANSWER:
+            return str(answer["message"])
+        return base64.b64decode(answer["bytes"])[13 + len(b"cdr") :]
+
+
+def values(message: Mapping[str, Any]) -> dict[str, object]:
+    return {each["name"]: each["value"] for each in message["parameters"]}
+
+
+@pytest.fixture
+def server() -> Iterator[Foxglove]:
+    opened = Foxglove(port=0)
+    yield opened
+    opened.close()
+
+
+class Noting(NetworkWriter):
+    """Notes what it writes."""
+
+    def __init__(self, sink: Foxglove) -> None:
+        super().__init__(sink, "foxglove")
+        self.noted: list[tuple[str, int, str, bytes]] = []
+
+    def write(
+        self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False
+    ) -> None:
+        self.noted.append((topic, stamp_ns, type_, self.serialize(message, type_)))
+        super().write(topic, type_, message, stamp_ns, is_latched=is_latched)
+
+
+def tracked(index: int) -> tuple[StereoFrame, FrameResult]:
+    """Return a frame, and what it gave."""
+    left, right = np.random.default_rng(index).integers(0, 256, (2, 48, 64), dtype=np.uint8)
+    result = result_of(index)
+    return StereoFrame(stamp_ns=result.stamp_ns, left=left, right=right), result
+
+
+def test_a_client_gets_the_messages_of_a_run_and_nothing_is_drawn_for_nobody(
+    server: Foxglove,
+) -> None:
+    writer = Noting(server)
+    messages = RunMessages(writer, RunFrames())
+    for index in (0, 6, 12):
+        messages.add_frame(*tracked(index))
+    unheard = "/gvo/matches/compressed"
+    with Client(server.url) as client:
+        client.next("advertise")
+        assert {topic for topic, *_ in writer.noted} == {*client.channels}
+        heard = {*client.channels} - {unheard}
+        assert heard >= {"/tf", "/gvo/points", "/gvo/raw/path", "/gvo/odom/odometry"}
+        client.subscribe(*heard)
+        latched = [each for each in writer.noted if each[0] == "/tf_static"]
+        assert [each[:2] for each in client.data] == [each[:2] for each in latched]
+        writer.noted.clear()
+        client.data.clear()
+        for index in (18, 24):
+            messages.add_frame(*tracked(index))
+        assert unheard not in {topic for topic, *_ in writer.noted}
+        noted = [each for each in writer.noted if each[0] in heard]
+        while len(client.data) < len(noted):
+            client.next(_DATA)
+        assert client.data == [(topic, stamp_ns, data) for topic, stamp_ns, _, data in noted]
+        for topic, _, type_, data in noted:
+            assert client.channels[topic]["schemaName"] == type_
+            assert read_by_its_schema(client.channels[topic], data) == data
+
+
+def read_by_its_schema(channel: Mapping[str, str], data: bytes) -> bytes:
+    """Decode a message by what its channel says of it alone, and return it encoded again."""
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
+    store, name = get_typestore(Stores.EMPTY), channel["schemaName"]
+    store.register(get_types_from_msg(channel["schema"], name))
+    return bytes(store.serialize_cdr(store.deserialize_cdr(data, name), name))
+
+
+def test_parameters_are_seen_set_refused_and_followed(server: Foxglove) -> None:
+    parameters = Parameters(Config())
+    server.offer(parameters)
+    with Client(server.url) as client:
+        assert {"parameters", "parametersSubscribe"} <= {*client.info["capabilities"]}
+        shown = client.parameters()
+        config = Config().model_dump()
+        assert {*shown} == {f"{name}.{key}" for name in config for key in config[name]}
+        corners = config["klt"]["n_corners"]
+        assert (shown["klt.n_corners"], shown["camera.readout_ms"]) == (corners, "null")
+        assert client.parameters("klt.n_corners", "no.such") == {"klt.n_corners": corners}
+
+        wanted = {"klt.n_corners": 300, "window.size": "null"}
+        client.send("subscribeParameterUpdates", parameterNames=[*wanted])
+        assert client.assign(**wanted) == wanted
+        assert (parameters.config.klt.n_corners, parameters.config.window.size) == (300, None)
+
+        assert client.assign(**{"klt.n_corners": -1}) == {"klt.n_corners": 300}
+        assert "klt.n_corners=-1" in client.said
+        assert parameters.config.klt.n_corners == 300
+
+        parameters.set({"klt.n_corners": 250})  # by someone else
+        while (told := values(client.next("parameterValues")))["klt.n_corners"] != 250:
+            pass
+        assert told == wanted | {"klt.n_corners": 250}
+
+
+def pose_request(x: float) -> bytes:
+    """Return a request of SetPose as CDR: stamp, frame, position, orientation, covariance."""
+    head = struct.pack("<4sIII", b"\0\1\0\0", 12, 34, 4) + b"map\0"
+    return head + struct.pack("<43d", x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *[0.0] * 36)
+
+
+def test_services_are_called(server: Foxglove) -> None:
+    asked: list[Any] = []
+
+    def reset(request: object) -> dict[str, object]:
+        asked.append(request)
+        return {"success": True, "message": f"call {len(asked)}"}
+
+    def set_pose(request: Any) -> dict[str, object]:
+        asked.append(request.pose.pose.pose.position.x)
+        return {}
+
+    server.serve(Service(name="/gvo/reset", type=TRIGGER, answer=reset))
+    server.serve(Service(name="/gvo/set_pose", type=SET_POSE, answer=set_pose))
+    with Client(server.url) as client:
+        client.next("advertiseServices")
+        client.parameters()
+        assert client.services["/gvo/reset"]["type"] == "std_srvs/srv/Trigger"
+        for number, empty in enumerate((b"\0\1\0\0\0", b"\0\1\0\0"), start=1):
+            answer = client.call("/gvo/reset", empty)
+            assert isinstance(answer, bytes)
+            message = decode(answer, TRIGGER.response_type, is_ros1=False)
+            assert (message.success, message.message) == (True, f"call {number}")
+
+        definition = client.services["/gvo/set_pose"]["request"]
+        assert "PoseWithCovarianceStamped pose" in definition["schema"]
+        request = pose_request(3.5)
+        answer = client.call("/gvo/set_pose", request)
+        assert asked[-1] == 3.5
+        assert isinstance(answer, bytes)
+        assert "a message of 5 bytes is no" in str(client.call("/gvo/set_pose", b"\0\1\0\0"))
+        assert "ncoding" in str(client.call("/gvo/set_pose", request, encoding=b"json"))
+
+
+def test_a_port_that_is_taken_ends_in_one_line(server: Foxglove) -> None:
+    port = int(server.url.rpartition(":")[2])
+    with pytest.raises(ConfigurationError, match=f"cannot listen on 127.0.0.1:{port}: ") as raised:
+        Foxglove(port=port)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(ConfigurationError, match=r"cannot listen on 192\.0\.2\.1:0: "):
+        Foxglove(host="192.0.2.1", port=0)
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no list of open ports")
+def test_it_listens_on_this_machine_alone(server: Foxglove) -> None:
+    port = int(server.url.rpartition(":")[2])
+    assert listening(port) == {"0100007F"}
+
+
+def listening(port: int) -> set[str]:
+    """Return the addresses, as of /proc/net/tcp, of those who listen on a port."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    ends = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return {address for address, at in ends if int(at, 16) == port}
+
+
+def test_a_closed_server_lets_go_of_its_port_and_takes_no_harm(server: Foxglove) -> None:
+    parameters = Parameters(Config())
+    server.offer(parameters)
+    publisher = server.advertise("/gvo/note", "std_msgs/msg/String")
+    port = int(server.url.rpartition(":")[2])
+    with Client(server.url) as client:
+        server.close()
+        assert client.process.wait(_LIMIT_S) is not None
+    publisher.publish(b"\0\1\0\0", 0)
+    parameters.set({"klt.n_corners": 250})
+    server.close()
+    Foxglove(port=port).close()
+
+
+def noise(rng: random.Random) -> Iterator[str | bytes]:
+    """Yield what no client of sound mind sends."""
+    yield from ("", "garbage", "[]", "{}", "[" * 100_000, '{"op": 3}', '{"op": "subscribe"}')
+    for number in (-1, 2**31, 2**64, 1e300, None, "x"):
+        pairs = [{"id": number, "channelId": number}]
+        yield json.dumps({"op": "subscribe", "subscriptions": pairs})
+        yield json.dumps({"op": "unsubscribe", "subscriptionIds": [number]})
+    yield json.dumps({"op": "getParameters", "parameterNames": ["x" * 100_000] * 50, "id": "i"})
+    bad: tuple[object, ...] = (
+        None,
+        1e300,
+        10**40,
+        "x" * 100_000,
+        [1] * 10_000,
+        {"a": {}},
+        [[[]]],
+        True,
+    )
+    for value in bad:
+        for kind in ("byte_array", "float64", "float64_array", "none", None):
+            each = {"name": "klt.n_corners", "value": value, "type": kind}
+            yield json.dumps({"op": "setParameters", "parameters": [each, each], "id": "i"})
+    each = {"name": "\0" * 100_000, "value": 1}
+    yield json.dumps({"op": "setParameters", "parameters": [each] * 10})
+    for _ in range(100):
+        yield rng.randbytes(rng.randrange(40))
+        head = struct.pack("<BIII", _CALL, rng.randrange(3), rng.getrandbits(32), 3)
+        yield head + b"cdr" + rng.randbytes(rng.randrange(60))
+    yield bytes([_CALL]) + b"\xff" * 12 + bytes(1_000_000)
+
+
+def test_a_hostile_client_is_survived(server: Foxglove, capfd: pytest.CaptureFixture[str]) -> None:
+    parameters = Parameters(Config())
+    server.offer(parameters)
+    server.serve(Service(name="/gvo/set_pose", type=SET_POSE, answer=lambda request: {}))
+    server.advertise("/gvo/note", "std_msgs/msg/String", is_latched=True).publish(b"\0\1\0\0", 0)
+    address = ("127.0.0.1", int(server.url.rpartition(":")[2]))
+    mute = [socket.create_connection(address) for _ in range(100)]
+    for connection in mute[:50]:
+        connection.sendall(b"\x16\x03\x01 GET / HTTP/9\r\n\r\n")
+    with Client(server.url) as client:
+        for each in noise(random.Random(1)):
+            if isinstance(each, str):
+                client._send(each)
+            else:
+                client.send_bytes(each)
+    huge = connect(server.url, subprotocols=[PROTOCOL], compression=None)
+    with contextlib.suppress(ConnectionClosed), huge:
+        huge.send(bytes(70_000_000))
+        while True:
+            huge.recv(timeout=_LIMIT_S)
+    with Client(server.url) as client:  # others are served as before
+        assert client.parameters("klt.n_corners") == {
+            "klt.n_corners": parameters.config.klt.n_corners
+        }
+        client.subscribe("/gvo/note")
+        assert client.data == [("/gvo/note", 0, b"\0\1\0\0")]
+        assert isinstance(client.call("/gvo/set_pose", pose_request(0.0)), bytes)
+    for connection in mute:
+        connection.close()
+    assert capfd.readouterr().err == ""
