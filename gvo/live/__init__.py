@@ -1,1 +1,21 @@
-"""Odometry of a camera that is running: from any program, or from a device."""
+"""Odometry of a camera that is running: of ROS, from any program, or from a device."""
+
+from gvo.live.odometry import LiveOdometry, LiveRun
+from gvo.live.sources import Device, StandardInput
+from gvo.live.topics import NetworkReader, TopicSource, wait_for
+from gvo.live.transport import Parameters, Publisher, Service, Sink, Transport
+
+__all__ = [
+    "Device",
+    "LiveOdometry",
+    "LiveRun",
+    "NetworkReader",
+    "Parameters",
+    "Publisher",
+    "Service",
+    "Sink",
+    "StandardInput",
+    "TopicSource",
+    "Transport",
+    "wait_for",
+]

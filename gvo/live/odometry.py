@@ -470,9 +470,10 @@ class WaitingPairs:
                 if self._is_closed:
                     return
                 self.put(item)
-            self.close()
         except GvoError as error:
             self.close(error)
+        finally:
+            self.close()  # whatever happened, nobody waits for more
 
     def _drop_oldest(self, limit: int) -> None:
         """Replace the oldest pair by a faulty frame; those before it are faulty already."""
