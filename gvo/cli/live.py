@@ -152,23 +152,26 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
             f"expected ros1, ros2, - or camera DEVICE [DEVICE], got {' '.join(words)}"
         )
     sinks: list[Sink] = []
+
+    def join(sink: Sink) -> None:
+        stack.callback(sink.close)
+        sinks.append(sink)
+
     if kind == "ros1":
         from gvo.live.ros1 import Ros1  # type: ignore[import-not-found]
 
-        sinks.append(Ros1())
+        join(Ros1())
     elif kind == "ros2":
         from gvo.live.dds import Dds  # type: ignore[import-not-found]
 
-        sinks.append(Dds(qos=qos))
+        join(Dds(qos=qos))
     if foxglove is not None:
-        from gvo.live.foxglove import Foxglove  # type: ignore[import-not-found]
+        from gvo.live.foxglove import Foxglove
 
         host, _, port = foxglove.rpartition(":")
         if not port.isdecimal():
             raise ConfigurationError(f"--foxglove {foxglove}: expected [HOST:]PORT")
-        sinks.append(Foxglove(host=host or "127.0.0.1", port=int(port)))
-    for sink in sinks:
-        stack.callback(sink.close)
+        join(Foxglove(host=host or "127.0.0.1", port=int(port)))
     return sinks
 
 
