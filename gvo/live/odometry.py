@@ -20,6 +20,7 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.bag.messages import transform_of
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.run_folder.writer import free_path
 from gvo.io.sync import Pair
 from gvo.live.publishing import Arrivals, LiveMessages
 from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Service, Sink
@@ -136,7 +137,7 @@ class LiveOdometry:
         """Track until the images end, or `stop` is called; then write what a run writes.
 
         Parameters are those of `run_recording`, and so are the errors. A further run is written
-        beside the first: `OUT-2`, and so are its files.
+        beside the first: into the first free one of `OUT-2`, `OUT-3`, ..., and so are its files.
 
         Returns
         -------
@@ -149,9 +150,8 @@ class LiveOdometry:
         runs: list[LiveRun] = []
         with self.arrivals:
             for number in count(1):
-                folder = _numbered(Path(out), number)
                 try:
-                    runs.append(self._run_stretch(folder, outputs, number, force, on_progress))
+                    runs.append(self._run_stretch(Path(out), outputs, number, force, on_progress))
                 except RecordingError as error:
                     if isinstance(error, OutputError) or (self._is_over and not runs):
                         raise
@@ -180,6 +180,8 @@ class LiveOdometry:
         on_progress: Callable[[Progress], None],
     ) -> LiveRun:
         if number > 1:
+            folder = free_path(folder)
+            outputs = replace(outputs, bag=outputs.bag and free_path(outputs.bag))
             self._say(f"a new run begins in {folder}: {self._stretches.reason}")
             self._base_frame = self._base_frame.restarted()
         self._n_dropped += self._waiting.n_dropped
@@ -197,13 +199,8 @@ class LiveOdometry:
             folder,
             config=self._parameters.config,
             base_frame=self._base_frame,
-            outputs=replace(
-                outputs,
-                report=False,
-                bag=outputs.bag and _numbered(outputs.bag, number),
-                world=self._world,
-            ),
-            force=force,
+            outputs=replace(outputs, report=False, world=self._world),
+            force=force and number == 1,
             through=waiting.through,
             on_start=self._start,
             on_progress=progress,
@@ -268,11 +265,6 @@ class LiveOdometry:
         elif self._messages is not None:
             self._waiting.do(partial(self._messages.set_pose, T))
         return {}
-
-
-def _numbered(path: Path, number: int) -> Path:
-    """Return the path of the nth run beside the first."""
-    return path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,9 +103,15 @@ def free_folder(recording: str | Path, what: str = "") -> Path:
     path = Path(recording)
     path = path if path.name not in ("", "..") else path.resolve()
     name = path.name if path.is_dir() else Path(path.name.removesuffix(".zst")).stem
-    first = Path(f"gvo-{visible(name)}{what}")
-    numbered = (first.with_name(f"{first.name}-{n}") for n in count(2))
-    return next(path for path in chain([first], numbered) if not os.path.lexists(path))
+    return free_path(Path(f"gvo-{visible(name)}{what}"))
+
+
+def free_path(path: Path) -> Path:
+    """Return the path, or NAME-2, NAME-3, ... where that is taken."""
+    suffix = "" if path.is_dir() else path.suffix
+    stem = path.name.removesuffix(suffix)
+    numbered = (path.with_name(f"{stem}-{n}{suffix}") for n in count(2))
+    return next(each for each in chain([path], numbered) if not os.path.lexists(each))
 
 
 def check_unused(folder: Path, *, force: bool = False) -> None:
