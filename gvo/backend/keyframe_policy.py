@@ -94,11 +94,7 @@ def choose_links(
     telling = [frame for frame in usable if gains[frame] >= config.link_gain]
     chosen = sorted(telling, key=lambda frame: -gains[frame])[:n]
     rest = [frame for frame in usable if frame not in chosen]
-    return chosen, _nearest_first(rest, scores)[: n - len(chosen)]
-
-
-def _nearest_first(frames: list[_Id], scores: Mapping[_Id, float]) -> list[_Id]:
-    return sorted(frames, key=lambda frame: -scores[frame])
+    return chosen, sorted(rest, key=lambda frame: -scores[frame])[: n - len(chosen)]
 
 
 def choose_unseen(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,7 +44,6 @@ from gvo.errors import ConfigurationError, GvoError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from gvo.config import Config
     from gvo.io.recording import Source
     from gvo.trajectory.trajectory import Trajectory
 
@@ -126,11 +126,8 @@ def view(
             given = {"config": config, "set": set_, **asdict(options)}
             _refuse_for_a_run(recordings[0], given)
         else:
-
-            def open_again(config: Config) -> Source:
-                return open_source(recordings, config, options)
-
-            player = stack.enter_context(Player(open_again, load(config, set_)))
+            reopen = partial(open_source, recordings, options=options)
+            player = stack.enter_context(Player(reopen, load(config, set_)))
             shown, truth = player, _find_truth(player.source)
         server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])

@@ -20,7 +20,7 @@ from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
 from gvo.frontend.features import describe_pixels
 from gvo.frontend.registration import check_view, relocalize_observations
 from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
-from gvo.frontend.stereo.corners import CornerDisparities, measure_corners
+from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
 from gvo.frontend.tracking import detect_corners, track_pixels
@@ -117,7 +117,11 @@ class KltFrontend:
         corners = detect_corners(image_of(frame), self._config.klt)
         row_shift_px = None
         if isinstance(frame, StereoFrame):
-            measured = self._measure_corners(frame, corners, row_offset_px)
+            config, images = self._config.stereo, (frame.left, frame.right)
+            limit = float(self.camera.depth_to_disparity(config.min_depth_m))
+            measured = measure_corners(
+                images, corners, config, max_disparity=limit, row_offset_px=row_offset_px
+            )
             disparities, slopes = measured.disparities, measured.slopes
             row_shift_px = measured.row_shift_px
             is_valid = measured.are_reliable & self._is_in_range(disparities, offset_px)
@@ -134,15 +138,6 @@ class KltFrontend:
             n_keypoints=len(corners),
             row_shift_px=row_shift_px,
             templates=Templates.of(image_of(frame), keypoints),
-        )
-
-    def _measure_corners(
-        self, frame: StereoFrame, corners: FloatArray, row_offset_px: float
-    ) -> CornerDisparities:
-        config, images = self._config.stereo, (frame.left, frame.right)
-        limit = float(self.camera.depth_to_disparity(config.min_depth_m))
-        return measure_corners(
-            images, corners, config, max_disparity=limit, row_offset_px=row_offset_px
         )
 
     def _offsets_px(self) -> tuple[float, float]:
@@ -237,7 +232,10 @@ class KltFrontend:
         """Register in two rounds: over more levels of the pyramid, and from the result."""
         rough = self._register_from(prior, reference, current, "wide", is_step=True)
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
-            rough = self._register_descriptors(reference, current)
+            # Descriptors match corners that moved too far for a track.
+            described = self._describe(reference), self._describe(current)
+            rough = self._descriptors.register(*described)
+            self._forget_described()
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)
@@ -347,14 +345,6 @@ class KltFrontend:
         if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
             points = grid_points(first.depth, self.camera, self._config.depth)
             return check_depths(result, points, second.depth, self.camera, self._config.depth)
-        return result
-
-    def _register_descriptors(
-        self, reference: KltObservations, current: KltObservations
-    ) -> RelativePose | Failure:
-        """Register by descriptors, which match corners that moved too far for a track."""
-        result = self._descriptors.register(self._describe(reference), self._describe(current))
-        self._forget_described()
         return result
 
     def _forget_described(self) -> None:

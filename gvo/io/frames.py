@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -34,7 +35,8 @@ _Item: TypeAlias = Pair | FaultyFrame
 _Preparers: TypeAlias = tuple["ImagePreparer", "ImagePreparer"]
 Through: TypeAlias = Callable[[Iterator[_Item]], Iterator[_Item]]
 """What pairs go through before they are decoded."""
-_Started: TypeAlias = tuple[_Item, list[Future[NDArray[Any] | str]]]
+_Jobs: TypeAlias = Sequence[Callable[[], NDArray[Any] | str]]
+_Started: TypeAlias = tuple[_Item, _Jobs]
 
 
 def frames(
@@ -82,11 +84,7 @@ def frames(
     if through is not None:
         pairs = through(pairs)
     n_ahead = 0 if is_live else _N_AHEAD
-    made = (
-        _one_by_one(pairs, preparers, source.info)
-        if config.runtime.threads == 1
-        else _ahead(pairs, preparers, source.info, n_ahead)
-    )
+    made = _decoded(pairs, preparers, source.info, config.runtime.threads, n_ahead)
     if config.sync.repeated_images == "skip":
         made = refuse_repeats(made, source.info.stream_names)
     for item in made:
@@ -165,20 +163,10 @@ def pair_limit_key(sensor: Sensor) -> str:
     return "stereo_tolerance_ms" if sensor == "stereo" else "max_difference_ms"
 
 
-def _one_by_one(
-    items: Iterable[_Item], preparers: _Preparers, info: RecordingInfo
+def _decoded(
+    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo, n_threads: int, n_ahead: int
 ) -> Iterator[Frame | FaultyFrame]:
-    for item in items:
-        if isinstance(item, FaultyFrame):
-            yield item
-        else:
-            results = [_prepare(*job, info) for job in zip(item, preparers, strict=True)]
-            yield _make_frame(item, results, info.sensor)
-
-
-def _ahead(
-    items: Iterator[_Item], preparers: _Preparers, info: RecordingInfo, n_ahead: int
-) -> Iterator[Frame | FaultyFrame]:
+    """Yield the frames of pairs, decoded side by side and ahead where there is a second thread."""
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="decode") as pool:
         started: deque[_Started] = deque()
         fault: GvoError | None = None
@@ -190,31 +178,24 @@ def _ahead(
             except GvoError as error:
                 fault = error  # what was read before it counts
             else:
-                started.append(_start(pool.submit, item, preparers, info))
-                if len(started) > n_ahead:
-                    yield _finish(started.popleft(), info.sensor)
+                pair = () if isinstance(item, FaultyFrame) else zip(item, preparers, strict=True)
+                jobs = [partial(_prepare, *job, info) for job in pair]
+                is_alone = n_threads == 1
+                started.append(
+                    (item, jobs if is_alone else [pool.submit(job).result for job in jobs])
+                )
+                if len(started) > (0 if is_alone else n_ahead):
+                    yield _finish(*started.popleft(), info.sensor)
         while started:
-            yield _finish(started.popleft(), info.sensor)
+            yield _finish(*started.popleft(), info.sensor)
         if fault is not None:
             raise fault
 
 
-def _start(
-    submit: Callable[..., Future[NDArray[Any] | str]],
-    item: _Item,
-    preparers: _Preparers,
-    info: RecordingInfo,
-) -> _Started:
-    if isinstance(item, FaultyFrame):
-        return item, []
-    return item, [submit(_prepare, *job, info) for job in zip(item, preparers, strict=True)]
-
-
-def _finish(started: _Started, sensor: Sensor) -> Frame | FaultyFrame:
-    item, results = started
+def _finish(item: _Item, jobs: _Jobs, sensor: Sensor) -> Frame | FaultyFrame:
     if isinstance(item, FaultyFrame):
         return item
-    return _make_frame(item, [result.result() for result in results], sensor)
+    return _make_frame(item, [result() for result in jobs], sensor)
 
 
 def _prepare(

@@ -30,24 +30,20 @@ _TOPICS = ("left", "right", "color", "depth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingOptions:
+class RecordingOptions(TopicChoice):
     """What the user says about a recording.
 
     Parameters
     ----------
-    calibration : Path or sequence of Path
-        Files that replace the recording's own calibration: one or two, or a folder.
     left, right : str, optional
         Topics of a stereo pair in a bag.
     color, depth : str, optional
         Topics of an RGB-D camera in a bag.
+    calibration : Path or sequence of Path
+        Files that replace the recording's own calibration: one or two, or a folder.
     """
 
     calibration: CalibrationPaths = None
-    left: str | None = None
-    right: str | None = None
-    color: str | None = None
-    depth: str | None = None
 
 
 def open_recording(
@@ -92,10 +88,7 @@ def _open(paths: Sequence[Path], config: Config, options: RecordingOptions) -> S
         if not (one.is_file() or one.is_dir()):
             raise RecordingError(f"{one}: is a pipe, a socket or a device; {_KINDS}")
     if all(is_bag(one) for one in paths):
-        topics = TopicChoice(
-            left=options.left, right=options.right, color=options.color, depth=options.depth
-        )
-        return BagSource(paths, topics=topics, calibration=options.calibration, config=config)
+        return BagSource(paths, topics=options, calibration=options.calibration, config=config)
     if len(paths) > 1:
         other = next(one for one in paths if not is_bag(one))
         raise RecordingError(f"{other}: is no bag; only several bags can be one recording")

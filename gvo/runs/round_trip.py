@@ -171,15 +171,14 @@ class _Windowed:
 
     def images(self) -> Iterator[StampedImage]:
         """Yield all images; those outside of the window are faulty."""
+        first_ns, last_ns = self._window_ns
         for image in self._source.images():
-            yield image if self._holds(image.stamp_ns) else replace(image, load=_not_loaded)
+            is_in = first_ns <= image.stamp_ns <= last_ns
+            yield image if is_in else replace(image, load=_not_loaded)
 
     def ground_truth(self) -> Trajectory | None:
         """Return what the recording holds."""
         return self._source.ground_truth()
-
-    def _holds(self, stamp_ns: int) -> bool:
-        return self._window_ns[0] <= stamp_ns <= self._window_ns[1]
 
 
 def _not_loaded() -> NDArray[Any]:

@@ -442,11 +442,6 @@ def read_graph(source: EdgeSource, notes: SmoothingNotes) -> WholeGraph:
     return graph
 
 
-def robust_for(source: EdgeSource) -> Robust:
-    """Return "none" for a pose graph, which states its noise, else "huber"."""
-    return "none" if isinstance(source, PoseGraphSource) else "huber"
-
-
 def optimize_edges(
     source: EdgeSource,
     out: str | Path,
@@ -468,7 +463,8 @@ def optimize_edges(
         Folder for raw and smoothed poses, table of poses, summary and picture; of a pose graph
         also `smoothed.g2o`.
     robust : {"none", "huber", "gnc"}, optional
-        As of `optimize`; see `robust_for`.
+        As of `optimize`; where omitted "none" for a pose graph, which states its noise, else
+        "huber".
     covariances : bool
         As of `optimize`.
     ground_truth : Trajectory, optional
@@ -492,7 +488,7 @@ def optimize_edges(
     SmoothingError
         If GTSAM fails.
     """
-    robust = robust or robust_for(source)
+    robust = robust or ("none" if isinstance(source, PoseGraphSource) else "huber")
     notes = SmoothingNotes(decisions=source.decisions)
     graph = read_graph(source, notes)
     notes.warnings += source.faults.warnings()

@@ -54,14 +54,14 @@ def summarize(
     state : {"running", "interrupted", "complete"}
         How far the run is.
     """
-    info = loop.source.info
+    info, frame = loop.source.info, loop.base_frame
     return {
         "gvo_version": __version__,
         "state": state,
         "recording": info.name,
         "sensor": info.sensor,
         "decisions": list(info.decisions),
-        "base_frame": _frame_text(loop.base_frame),
+        "base_frame": ", ".join(filter(None, (frame.name or "camera", frame.origin))),
         **_truth_json(compared),
         **loop.statistics.as_json(),
         "peak_memory_mb": round(peak_memory_mb(), 1),
@@ -107,10 +107,6 @@ def peak_memory_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     unit = 1 if sys.platform == "darwin" else 1024
     return peak * unit / 1e6
-
-
-def _frame_text(base_frame: BaseFrame) -> str:
-    return ", ".join(text for text in (base_frame.name or "camera", base_frame.origin) if text)
 
 
 def run_identity(

@@ -71,8 +71,10 @@ class Trajectory:
         if self.covariances is not None:
             covariances = _checked_array("covariances", self.covariances, (n, 6, 6))
             object.__setattr__(self, "covariances", covariances)
-        if not self.has_rotations:
-            _check_positions_only(poses, self.covariances)
+        if self.has_rotations:
+            return
+        if self.covariances is not None or not np.all(poses[:, :3, :3] == np.eye(3)):
+            raise ValueError("without rotations the poses hold identities and no covariances")
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> Trajectory:
@@ -282,11 +284,6 @@ def _check_rigid(poses: FloatArray) -> None:
 
 def _unrotated(positions: FloatArray) -> FloatArray:
     return se3.make_transform(np.tile(np.eye(3), (len(positions), 1, 1)), positions)
-
-
-def _check_positions_only(poses: FloatArray, covariances: FloatArray | None) -> None:
-    if covariances is not None or not np.all(poses[:, :3, :3] == np.eye(3)):
-        raise ValueError("without rotations the poses hold identities and no covariances")
 
 
 def _between(T_before: FloatArray, T_after: FloatArray, shares: FloatArray) -> FloatArray:

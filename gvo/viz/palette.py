@@ -46,6 +46,12 @@ COUNTS = {"keypoints": "#999999", "points": "#0072B2", "matches": "#CC79A7", "in
 _LINE_STYLES = ("-", "-.", ":")
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return the channels of "#RRGGBB"."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Style:
     """Properties of the lines of one trajectory, named as in matplotlib."""

@@ -17,7 +17,7 @@ from gvo.io.bag.messages import (
 from gvo.io.bag.reader import TF_TYPE, BagMessage, typestore
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
 from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
-from gvo.io.poses.tf_buffer import TfBuffer
+from gvo.io.poses.tf import TfBuffer
 from tests.fuzz.target import Choices, Target
 
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"

@@ -20,15 +20,19 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
-from gvo.viz.canvas import HEIGHT_PX, DepthScale, shortened, table, text_width
 from gvo.viz.overlay import (
+    FOOTER_PX,
     HEADER_PX,
     INLIER_COLOUR,
     OUTLIER_COLOUR,
+    DepthScale,
     compose_faulty,
     compose_overlay,
     draw_matches,
     loop_text,
+    shortened,
+    table,
+    text_width,
 )
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
@@ -199,7 +203,7 @@ def test_depth_has_the_colours_of_the_bar_and_what_is_unknown_is_dark() -> None:
     picture = compose_overlay(frame, _result([(600.0, 60.0)], [2.0]), _RGBD, max_width=1280)
     panel = picture[HEADER_PX : HEADER_PX + 480, 640:]
     assert panel[300, 100].max() < 32
-    middle = picture[-HEIGHT_PX + 6, 640:]
+    middle = picture[-FOOTER_PX + 6, 640:]
     far, near = panel[120, 500], panel[400, 500]
     places = [int(np.flatnonzero((middle == colour).all(axis=1))[0]) for colour in (near, far)]
     # the bar is logarithmic from 0.4 m to 8 m

@@ -92,7 +92,7 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
         Failure if there are too few steps of depth, or no peak stands out.
     """
     axes = [_collect(frames, axis) for axis in (1, 0)]
-    has_enough = [_has_enough(pair) for pair in axes]
+    has_enough = [min(len(each.offsets) for each in pair) >= _MIN_POINTS for pair in axes]
     if not any(has_enough):
         return Failure(reason="too few steps of depth")
     scores = {
@@ -193,10 +193,6 @@ def _joined(parts: Sequence[_Strips]) -> _Strips:
         values=np.concatenate([part.values for part in parts]),
         offsets=np.concatenate([part.offsets for part in parts]),
     )
-
-
-def _has_enough(pair: _Axis) -> bool:
-    return min(len(strips.offsets) for strips in pair) >= _MIN_POINTS
 
 
 def _score(pair: _Axis, zoom: float) -> FloatArray:

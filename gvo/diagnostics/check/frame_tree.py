@@ -47,7 +47,7 @@ def check_frame_tree(
     if len(frames) < _MIN_FRAMES:
         yield Finding(name="tf: frames", value=", ".join(sorted(buffer.frames)) or "none")
         return
-    roots = _roots(edges)
+    roots = {parent for parent, _ in edges} - {child for _, child in edges}
     yield _check_trees(len(frames), roots)
     camera, base_frame = bare(camera_frame), bare(base_frame)
     if not camera:
@@ -66,11 +66,6 @@ def check_frame_tree(
     root = next((root for root in sorted(roots) if buffer.chain(root, camera)), None)
     if root is not None and root != camera:
         yield from _check_gaps(buffer.edge_stamps_ns(root, camera), root, camera, stamps_ns, check)
-
-
-def _roots(edges: Collection[tuple[str, str]]) -> set[str]:
-    """Return the frames that are no child of another."""
-    return {parent for parent, _ in edges} - {child for _, child in edges}
 
 
 def _check_trees(n_frames: int, roots: Collection[str]) -> Finding:

@@ -42,7 +42,8 @@ _MIN_TORN_ROWS = 4
 
 def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Finding]:
     """Yield the share of the sampled frames that odometry cannot use, with the first reason."""
-    looked_at = [frame for sample in samples for frame in _frames_of(sample)]
+    frames = [frame for sample in samples for frame in (sample.first, sample.second)]
+    looked_at = [frame for frame in frames if frame is not None]
     faulty = [frame for frame in looked_at if isinstance(frame, FaultyFrame)]
     if not looked_at:
         yield unknown("frames that cannot be used", "no frame to look at")
@@ -285,7 +286,3 @@ def _grey_images(frame: Frame | FaultyFrame | None) -> tuple[ImageArray, ...]:
     if isinstance(frame, StereoFrame):
         return (frame.left, frame.right)
     return (frame.image,) if isinstance(frame, RgbdFrame) else ()
-
-
-def _frames_of(sample: Sample) -> list[Frame | FaultyFrame]:
-    return [frame for frame in (sample.first, sample.second) if frame is not None]

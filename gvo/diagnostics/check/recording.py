@@ -145,10 +145,8 @@ def _describe_camera(camera: PinholeCamera | Failure) -> Iterator[Finding]:
             fix="give the right one by --calibration FILE",
         )
         return
-    yield Finding(
-        name="focal length",
-        value=f"{camera.fx:.1f} px, view of {_view_deg(camera.fx, camera.width):.0f} deg",
-    )
+    view_deg = np.degrees(2.0 * np.arctan(0.5 * camera.width / camera.fx))
+    yield Finding(name="focal length", value=f"{camera.fx:.1f} px, view of {view_deg:.0f} deg")
     if isinstance(camera, StereoCamera):
         low, high = _BASELINES_M
         yield measured(
@@ -158,7 +156,3 @@ def _describe_camera(camera: PinholeCamera | Failure) -> Iterator[Finding]:
             unit="m",
             fix="P[3] of the right CameraInfo is -fx * baseline in metres",
         )
-
-
-def _view_deg(focal_px: float, size_px: int) -> float:
-    return float(np.degrees(2.0 * np.arctan(0.5 * size_px / focal_px)))

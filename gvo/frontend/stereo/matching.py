@@ -105,7 +105,11 @@ def refine_disparities(
     radius, reach = config.patch_radius_px, config.search_radius_px
     columns = np.rint(pixels_right[:, 0]).astype(np.int64)
     column_left, row = np.rint(pixels_left).astype(np.int64).T
-    is_valid = _have_room(images[0].shape, row, column_left, columns, radius, reach)
+    # Patches, and the strips to search them in, lie in the images.
+    (height, width), margin = images[0].shape, radius + reach
+    is_valid = (row >= radius) & (row < height - radius)
+    is_valid &= (column_left >= radius) & (column_left < width - radius)
+    is_valid &= (columns >= margin) & (columns < width - margin)
     chosen = np.flatnonzero(is_valid)
     places = row[chosen], column_left[chosen], columns[chosen]
     offsets, is_minimum = parabola_minimum(_patch_ssd(images, *places, radius=radius, reach=reach))
@@ -113,22 +117,6 @@ def refine_disparities(
     disparities[chosen] = column_left[chosen] - columns[chosen] - (offsets - reach)
     is_valid[chosen] = is_minimum
     return disparities, is_valid
-
-
-def _have_room(
-    shape: tuple[int, ...],
-    row: IntArray,
-    column_left: IntArray,
-    column_right: IntArray,
-    radius: int,
-    reach: int,
-) -> BoolArray:
-    """Tell which patches, and the strips to search them in, lie in the images."""
-    height, width = shape
-    margin = radius + reach
-    is_inside = (row >= radius) & (row < height - radius)
-    is_inside &= (column_left >= radius) & (column_left < width - radius)
-    return np.asarray(is_inside & (column_right >= margin) & (column_right < width - margin))
 
 
 def is_in_depth_range(

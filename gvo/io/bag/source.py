@@ -111,12 +111,7 @@ class BagSource:
             found = calibrations_of_messages(reader, self._topics, where)
         self._scale = config.depth.scale or found.depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
-        self._info = self._describe(found)
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._info
+        self.info = self._describe(found)
 
     @property
     def image_topics(self) -> tuple[str, str]:
@@ -207,7 +202,7 @@ class BagSource:
             buffer=whole if whole.is_whole else None,
             where=self._where,
             base_frame=base_frame,
-            camera_frame=self._info.frame_id,
+            camera_frame=self.info.frame_id,
             T_base_cam=T_base_cam,
         )
 

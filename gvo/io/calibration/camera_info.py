@@ -220,9 +220,9 @@ def check_camera(calibration: Calibration, where: str) -> None:
 def _matrices(fields: CameraFields) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return K, R and P of the full image, checked; for those not set what they then mean."""
     where = fields.where
-    K = _matrix(fields.K, (3, 3), f"{where}: K")
-    P = _matrix(fields.P, (3, 4), f"{where}: P")
-    R = _matrix(fields.R, (3, 3), f"{where}: R")
+    K = read_array(fields.K, (3, 3), f"{where}: K")
+    P = read_array(fields.P, (3, 4), f"{where}: P")
+    R = read_array(fields.R, (3, 3), f"{where}: R")
     if not np.any(K):
         K = P[:, :3].copy()
     if not np.any(K):
@@ -252,12 +252,17 @@ def _check_matrices(K: FloatArray, R: FloatArray, P: FloatArray, where: str) -> 
         )
 
 
-def _matrix(values: ArrayLike, shape: tuple[int, int], what: str) -> FloatArray:
-    numbers = read_numbers(values, what)
-    if numbers.size != shape[0] * shape[1]:
-        raise CalibrationError(
-            f"{what} must hold {shape[0] * shape[1]} numbers, got {numbers.size}"
-        )
+def read_array(values: object, shape: tuple[int, ...], what: str) -> FloatArray:
+    """Read the numbers of an array, in rows; as `read_numbers`.
+
+    Raises
+    ------
+    CalibrationError
+        Also when there are more or less.
+    """
+    numbers, n_expected = read_numbers(values, what), int(np.prod(shape))
+    if numbers.size != n_expected:
+        raise CalibrationError(f"{what} must hold {n_expected} numbers, got {numbers.size}")
     return numbers.reshape(shape)
 
 

@@ -21,6 +21,7 @@ from gvo.io.calibration.camera_info import (
     RegionOfInterest,
     make_calibration,
     make_rgbd_calibration,
+    read_array,
     read_numbers,
 )
 from gvo.io.calibration.stereo_pair import pair_of_extrinsics, stereo_baseline
@@ -405,14 +406,11 @@ def _transform(content: Mapping[Any, Any], key: str, where: str) -> FloatArray |
 
 
 def _array(content: Mapping[Any, Any], key: str, shape: tuple[int, ...], where: str) -> FloatArray:
-    n_expected = int(np.prod(shape))
     value = _data(content.get(key))
     if value is None:
+        n_expected = int(np.prod(shape))
         raise CalibrationError(f"{where}: {key} must hold {n_expected} numbers, it is missing")
-    numbers = read_numbers(value, f"{where}: {key}")
-    if numbers.size != n_expected:
-        raise CalibrationError(f"{where}: {key} must hold {n_expected} numbers, got {numbers.size}")
-    return numbers.reshape(shape)
+    return read_array(value, shape, f"{where}: {key}")
 
 
 def read_yaml(path: Path) -> dict[Any, Any]:

@@ -6,7 +6,6 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -187,13 +186,8 @@ class BagWriter(MessageWriter):
         self._writer.open()
         return self
 
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(error_type, error, traceback)
+    def __exit__(self, *exception: Any) -> None:  # noqa: ANN401 - its type, itself, its traceback
+        self._writer.__exit__(*exception)
 
     def write(
         self, topic: str, type_: str, message: object, stamp_ns: int, *, is_latched: bool = False

@@ -54,7 +54,7 @@ class FolderSource:
         self._first, self._second = streams.values()
         sensor: Sensor = "stereo" if len(cameras.calibrations) == 2 else "rgbd"
         n_images = f"({len(self._first)} + {len(self._second)} images)"
-        self._info = RecordingInfo(
+        self.info = RecordingInfo(
             name=folder.resolve().name,
             sensor=sensor,
             calibrations=cameras.calibrations,
@@ -64,11 +64,6 @@ class FolderSource:
         )
         self._load = partial(read_image, grey_range=grey_range)
         self._load_second = load_second or self._load
-
-    @property
-    def info(self) -> RecordingInfo:
-        """What is known before the first image."""
-        return self._info
 
     def images(self) -> Iterator[StampedImage]:
         """Yield the images of both streams in the order of their stamps, not decoded yet."""

@@ -86,7 +86,7 @@ class KittiSource(FolderSource):
         RecordingError
             When it does not have a row per row of `times.txt`.
         """
-        official = self._folder.resolve().parents[1] / "poses" / f"{self._info.name}.txt"
+        official = self._folder.resolve().parents[1] / "poses" / f"{self.info.name}.txt"
         for path in (self._folder / "poses.txt", official):
             if path.is_file():
                 return self._read_truth(path)

@@ -132,16 +132,22 @@ class PoseGraphSource:
             if tag not in TAGS:
                 self._note_foreign(tag, number)
             elif tag == "FIX":
-                fixed_ids += _ids_of(self._parsed(number, text))
+                line = self._parsed(number, text)
+                fixed_ids += line.frame_ids if isinstance(line, Fix) else ()
             elif tag in MEASUREMENT_TAGS:
-                first_edge = first_edge or _as_edge(self._parsed(number, text))
+                if first_edge is None:
+                    line = self._parsed(number, text)
+                    first_edge = line if isinstance(line, Measurement) else None
             else:
                 self._n_vertices += 1
-                first_vertex = first_vertex or _as_vertex(self._parsed(number, text))
+                if first_vertex is None:
+                    line = self._parsed(number, text)
+                    first_vertex = line if isinstance(line, Vertex) else None
         if first_edge is None:
+            foreign = "".join(f" ({warning})" for warning in self.faults.warnings())
             raise TrajectoryError(
                 f"{self._path}: holds no edge between poses in 3-D; expected lines of "
-                f"{' or '.join(MEASUREMENT_TAGS)}{self._foreign()}"
+                f"{' or '.join(MEASUREMENT_TAGS)}{foreign}"
             )
         self._choose_anchor(fixed_ids, first_vertex, first_edge)
 
@@ -169,9 +175,6 @@ class PoseGraphSource:
             )
         if not tag.startswith("PARAMS"):
             self.faults.add("lines are of tags that are not read", f"{tag} in line {number}")
-
-    def _foreign(self) -> str:
-        return "".join(f" ({warning})" for warning in self.faults.warnings())
 
     def _lines(self) -> Iterator[Line]:
         numbered = self._texts()
@@ -210,18 +213,6 @@ class PoseGraphSource:
                 f"{graph.n_known} of {self._n_vertices} are connected",
                 n=n_missing,
             )
-
-
-def _ids_of(line: Line | None) -> tuple[int, ...]:
-    return line.frame_ids if isinstance(line, Fix) else ()
-
-
-def _as_edge(line: Line | None) -> Measurement | None:
-    return line if isinstance(line, Measurement) else None
-
-
-def _as_vertex(line: Line | None) -> Vertex | None:
-    return line if isinstance(line, Vertex) else None
 
 
 class _Connector:

@@ -69,8 +69,8 @@ class BaseFrame:
         self.name = name
         self.origin = ""
         self.first_stamp_ns: int | None = None
-        self._is_camera = T_base_cam is None
-        self._T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
+        self.is_camera = T_base_cam is None
+        self.T_initial = None if T_initial is None else _rigid("T_initial", T_initial)
         self._guessed_stamps_ns: set[int] = set()
         self._mount_low = np.full(3, np.inf)
         self._mount_high = np.full(3, -np.inf)
@@ -130,24 +130,14 @@ class BaseFrame:
         return cls(frame, mount, T_initial=T_initial)
 
     @property
-    def is_camera(self) -> bool:
-        """Tell whether it is the camera itself."""
-        return self._is_camera
-
-    @property
     def is_placed(self) -> bool:
         """Tell whether an initial pose was asked for."""
-        return self._T_initial is not None
-
-    @property
-    def T_initial(self) -> FloatArray | None:  # noqa: N802 - the field's name
-        """T_world_base of the first frame, where asked for, shape (4, 4), metres."""
-        return self._T_initial
+        return self.T_initial is not None
 
     @property
     def fixed_mount(self) -> FloatArray | None:
         """T_base_cam, shape (4, 4), metres; None for the camera, and where it moves."""
-        return None if self._is_camera else self._T_base_cam
+        return None if self.is_camera else self._T_base_cam
 
     @property
     def n_guessed(self) -> int:
@@ -162,7 +152,7 @@ class BaseFrame:
     def restarted(self) -> BaseFrame:
         """Return the same frame before a first frame."""
         mount = self._mount if self._T_base_cam is None else self._T_base_cam
-        again = BaseFrame(self.name, None if self._is_camera else mount, T_initial=self._T_initial)
+        again = BaseFrame(self.name, None if self.is_camera else mount, T_initial=self.T_initial)
         again.origin = self.origin
         return again
 
@@ -184,10 +174,10 @@ class BaseFrame:
         if self.first_stamp_ns is not None:
             raise ValueError(f"the first frame is that of {self.first_stamp_ns} ns already")
         if T_initial is not None:
-            self._T_initial = _rigid("T_initial", T_initial)
+            self.T_initial = _rigid("T_initial", T_initial)
         self.first_stamp_ns = stamp_ns
         T_base_cam = self.T_base_cam(stamp_ns)
-        T_initial = np.eye(4) if self._T_initial is None else self._T_initial
+        T_initial = np.eye(4) if self.T_initial is None else self.T_initial
         self._T_world_cam_first = T_initial @ T_base_cam
 
     def T_base_cam(self, stamp_ns: int) -> FloatArray:  # noqa: N802 - the field's name
@@ -214,7 +204,7 @@ class BaseFrame:
         """
         if self.first_stamp_ns is None:
             self.start(estimate.stamp_ns)
-        if self._is_camera and self._T_initial is None:
+        if self.is_camera and self.T_initial is None:
             return estimate
         T_base_cam = self.T_base_cam(estimate.stamp_ns)
         T_camera = self._T_world_cam_first @ estimate.T_world_frame
@@ -229,7 +219,7 @@ class BaseFrame:
 
     def apply_to_step(self, start_ns: int, stamp_ns: int, T_start_end: FloatArray) -> FloatArray:
         """Return a motion of the camera between two stamps, (4, 4), as one of the base frame."""
-        if self._is_camera:
+        if self.is_camera:
             return T_start_end
         T_end = se3.invert(self.T_base_cam(stamp_ns))
         return np.asarray(self.T_base_cam(start_ns) @ T_start_end @ T_end)
@@ -241,7 +231,7 @@ class BaseFrame:
 
     def apply_to_edge(self, stamp_ns: int, edge: Edge) -> Edge:
         """Return an edge between two stamps, the later one given, as one of the base frame."""
-        if self._is_camera:
+        if self.is_camera:
             return edge
         start_ns = int(edge.reference_id)  # type: ignore[call-overload]
         Ad = se3.adjoint(self.T_base_cam(stamp_ns))
@@ -278,7 +268,7 @@ class BaseFrame:
         TrajectoryError
             When the trajectory holds positions alone, and the frame is not the camera.
         """
-        if self._is_camera:
+        if self.is_camera:
             return trajectory
         if not trajectory.has_rotations:
             raise TrajectoryError(

@@ -426,7 +426,8 @@ def _segment_words(segments: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _how_good(summary: Mapping[str, Any]) -> str:
     errors = {row["name"]: row for row in summary.get("errors", ())}
-    is_closed = GLOBAL in errors and _n_closed(summary) > 0
+    loops = (summary.get(GLOBAL) or {}).get("loops") or {}
+    is_closed = GLOBAL in errors and loops.get("counted", 0) > 0
     best = errors.get(GLOBAL if is_closed else "smoothed")
     if best is not None:
         n, n_true = summary["frames"], best["n"]
@@ -437,10 +438,6 @@ def _how_good(summary: Mapping[str, Any]) -> str:
         return "not compared with the truth"
     is_over = summary.get("state", "complete") == "complete"
     return "no truth to compare with" if is_over else ""
-
-
-def _n_closed(summary: Mapping[str, Any]) -> int:
-    return int(((summary.get(GLOBAL) or {}).get("loops") or {}).get("counted", 0))
 
 
 def loop_words(summary: Mapping[str, Any]) -> str:

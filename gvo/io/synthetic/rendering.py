@@ -213,6 +213,7 @@ def look(
         point, normal = R @ beyond[0] + T_cam_map[..., :3, 3], R @ beyond[1]
         offset = _dots(normal, point)[..., np.newaxis, np.newaxis]
         inside.append((normal @ K_inverse)[..., np.newaxis, :] - offset * inverse_depth)
+    T_middle = T_cam_map if T_cam_map.ndim == 2 else np.asarray(T_cam_map[len(T_cam_map) // 2])
     return View(
         scene=scene,
         camera=camera,
@@ -221,13 +222,8 @@ def look(
         texels_s=scene.texels_per_m[keep, :1] * s + scene.texel_offsets[keep, :1] * inverse_depth,
         texels_t=scene.texels_per_m[keep, 1:] * t + scene.texel_offsets[keep, 1:] * inverse_depth,
         inside=np.stack(inside, axis=-2),
-        corners=_corners(scene, keep, _of_middle_row(T_cam_map)),
+        corners=_corners(scene, keep, T_middle),
     )
-
-
-def _of_middle_row(T: FloatArray) -> FloatArray:
-    """Return the transform (4, 4) of the image, or of its middle row."""
-    return T if T.ndim == 2 else np.asarray(T[len(T) // 2])
 
 
 def _in_view(scene: Scene, T_cam_map: FloatArray, camera: PinholeCamera) -> IntArray:

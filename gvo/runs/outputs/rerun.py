@@ -102,8 +102,7 @@ class RunRerun(AbstractContextManager["RunRerun"]):
             self._writer = self._open(camera, frames or RunFrames(), text)
 
     def _open(self, camera: PinholeCamera, frames: RunFrames, text: str) -> RerunWriter:
-        from gvo.runs.outputs.rerun_stream import RerunStream
-        from gvo.runs.outputs.rerun_writer import RerunWriter
+        from gvo.runs.outputs.rerun_writer import RerunStream, RerunWriter
 
         stream = RerunStream(self._file.part, self.path.stem)
         if not stream.is_enabled:

@@ -1,23 +1,25 @@
-"""What of a run goes into a Rerun file."""
+"""An open Rerun file, and what of a run goes into it."""
 
 from __future__ import annotations
 
+import os
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from threading import Thread
 from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.convert.bag_messages import pose_numbers
 from gvo.io.images import encode_image
-from gvo.runs.outputs import rerun_stream as place
 from gvo.runs.outputs.frames import ESTIMATES, GLOBAL, RunFrames, Track
-from gvo.runs.outputs.rerun_stream import RerunStream
 from gvo.types import (
     Estimate,
     FloatArray,
@@ -32,6 +34,219 @@ from gvo.types import (
 )
 from gvo.viz import palette
 from gvo.viz.overlay import NOTHING, caption, compose_overlay
+
+_N_BYTES: Final = 2**20
+
+
+class FilePipe:
+    """A pipe into a file that never fails: what does not fit on the disk is dropped.
+
+    rerun's writer may wait for ever where a write fails, as on a full disk.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        When it cannot be made.
+
+    Attributes
+    ----------
+    error : OSError or None
+        Why the file could not be written, once it could not.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.error: OSError | None = None
+        self._file = path.open("wb", buffering=0)
+        self._reader, self._writer = os.pipe()
+        self._thread = Thread(target=self._copy, name="gvo-file-pipe", daemon=True)
+        self._thread.start()
+
+    @property
+    def entrance(self) -> Path:
+        """The path to open for writing, once."""
+        return Path(f"/dev/fd/{self._writer}")
+
+    def leave(self) -> None:
+        """Close this end: the file ends when the writer closes its own."""
+        os.close(self._writer)
+
+    def join(self) -> None:
+        """Wait for the end of the file."""
+        self._thread.join()
+
+    def _copy(self) -> None:
+        with self._file, os.fdopen(self._reader, "rb", buffering=0) as pipe:
+            while data := pipe.read(_N_BYTES):
+                self._keep(data)
+
+    def _keep(self, data: bytes) -> None:
+        if self.error is not None:
+            return
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            self.error = error
+
+
+CLOUD: Final = "world/cloud"
+LOOPS: Final = "world/loops"
+OVERLAY: Final = "overlay"
+COUNTS: Final = "counts"
+MILLISECONDS: Final = "milliseconds"
+CHI2: Final = "chi2"
+STATUS: Final = "status"
+CONFIGURATION: Final = "configuration"
+
+STAMP: Final = "stamp"
+FRAME: Final = "frame"
+
+
+def make_layout() -> rrb.Blueprint:
+    """Return the scene, and beside it the overlay, the numbers and the log."""
+    pictures = rrb.Tabs(
+        rrb.Spatial2DView(origin=OVERLAY, name="Matches"),
+        rrb.TextDocumentView(origin=CONFIGURATION, name="Configuration"),
+    )
+    beside = rrb.Vertical(
+        pictures,
+        rrb.TimeSeriesView(origin=COUNTS, name="Counts"),
+        rrb.Tabs(
+            rrb.TimeSeriesView(origin=MILLISECONDS, name="Milliseconds"),
+            rrb.TimeSeriesView(origin=CHI2, name="Chi-square of the edges"),
+        ),
+        rrb.TextLogView(origin=STATUS, name="Status"),
+        row_shares=[4, 3, 3, 2],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(_scene(), beside, column_shares=[3, 2]),
+        rrb.TimePanel(timeline=STAMP, state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _scene() -> rrb.Spatial3DView:
+    """Return the view of the world; points of keyframes and loops are those that came so far."""
+    so_far = rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange(
+                timeline,
+                start=rrb.TimeRangeBoundary.infinite(),
+                end=rrb.TimeRangeBoundary.cursor_relative(),
+            )
+            for timeline in (STAMP, FRAME)
+        ]
+    )
+    return rrb.Spatial3DView(origin="world", name="Scene", overrides={CLOUD: so_far, LOOPS: so_far})
+
+
+APPLICATION: Final = "gvo"
+EARLIEST_DATE_NS: Final = 946_684_800 * 10**9
+"""1 January 2000: stamps before that are no dates but durations since a start."""
+
+_N_BATCHED_BYTES: Final = 2**23
+_TICK_S: Final = 3600.0
+
+
+class RerunStream:
+    """Archetypes at the stamps of frames, on the timelines `stamp` and `frame`.
+
+    Nothing is written by the clock: what belongs together is cut into chunks by `flush` alone,
+    or where it grows large.
+
+    Parameters
+    ----------
+    path : Path
+        Must end in `.rrd`.
+    name : str
+        Of the recording in the viewer.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        When the file cannot be made.
+
+    Attributes
+    ----------
+    is_enabled : bool
+        False where the environment variable RERUN switches rerun off.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        batches = rr.ChunkBatcherConfig(flush_tick=_TICK_S, flush_num_bytes=_N_BATCHED_BYTES)
+        self._recording = rr.RecordingStream(
+            APPLICATION, send_properties=False, batcher_config=batches
+        )
+        self._is_dated: bool | None = None
+        self.is_enabled = rr.is_enabled(self._recording)
+        if not self.is_enabled:
+            return
+        self._recording.set_log_time_enabled(False)
+        self._pipe = FilePipe(path)
+        try:
+            self._recording.save(self._pipe.entrance, default_blueprint=make_layout())
+        finally:
+            self._pipe.leave()
+        self._recording.send_recording_name(name)
+
+    def set_frame(self, stamp_ns: int, index: int) -> None:
+        """Set the frame of what is logged next.
+
+        The first stamp decides whether the timeline shows dates or durations.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Nanoseconds.
+        index : int
+            Of the frame, from 0.
+        """
+        if self._is_dated is None:
+            self._is_dated = stamp_ns >= EARLIEST_DATE_NS
+        self._recording.set_time(FRAME, sequence=index)
+        if self._is_dated:
+            self._recording.set_time(STAMP, timestamp=np.datetime64(stamp_ns, "ns"))
+        else:
+            self._recording.set_time(STAMP, duration=np.timedelta64(stamp_ns, "ns"))
+
+    def log(self, path: str, *archetypes: rr.AsComponents, is_static: bool = False) -> None:
+        """Log to an entity, at the frame that was set or for all frames."""
+        self._recording.log(path, *archetypes, static=is_static, strict=True)
+
+    def flush(self) -> None:
+        """Flush what was logged, so that it is not held in memory.
+
+        Raises
+        ------
+        OSError
+            When some of what was handed over before could not be written.
+        """
+        self._recording.flush()
+        self._check()
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises
+        ------
+        OSError
+            When it could not be written.
+        """
+        self._recording.flush()
+        self._recording.disconnect()
+        self._pipe.join()
+        self._check()
+
+    def _check(self) -> None:
+        if self._pipe.error is not None:
+            raise self._pipe.error
+
 
 N_SHOWN_POSES: Final = 500
 """Most poses of a path while the run goes."""
@@ -74,7 +289,7 @@ class RerunWriter:
             stream.log(f"world/{name}/frame", make_marker(name), is_static=True)
         if text:
             document = rr.TextDocument(text)
-            stream.log(place.CONFIGURATION, document, is_static=True)
+            stream.log(CONFIGURATION, document, is_static=True)
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Log the result of a frame."""
@@ -95,7 +310,7 @@ class RerunWriter:
         """Log the status line of a new frame."""
         self.stream.set_frame(stamp_ns, self._n_seen)
         self._n_seen += 1
-        self.stream.log(place.STATUS, make_status(status, text))
+        self.stream.log(STATUS, rr.TextLog(text, level=_LEVELS[status]))
 
     def add_smoothed(self, estimates: Iterable[Estimate]) -> None:
         """Log poses at their own stamps."""
@@ -134,7 +349,8 @@ class RerunWriter:
             # A camera in a world of its recording: one with y down, or one with z up.
             self._frames.is_camera and result.causal.T_world_frame[1, 1] > np.cos(np.pi / 4)
         )
-        self.stream.log("world", make_axes(is_optical=is_optical), is_static=True)
+        axes = rr.ViewCoordinates.RDF if is_optical else rr.ViewCoordinates.FLU
+        self.stream.log("world", axes, is_static=True)
         if not callable(self._frames.T_base_cam):
             mount = make_transform(self._frames.mount(result.stamp_ns))
             self.stream.log(_CAMERA, mount, is_static=True)
@@ -156,7 +372,7 @@ class RerunWriter:
 
     def _add_picture(self, frame: Frame, image: ImageArray, result: FrameResult) -> None:
         overlay = compose_overlay(frame, result, self._camera, index=self._n_seen - 1)
-        self.stream.log(place.OVERLAY, make_image(overlay))
+        self.stream.log(OVERLAY, make_image(overlay))
         self.stream.log(f"{_CAMERA}/image", make_image(halve(image)))
 
     def _add_points(self, image: ImageArray, result: FrameResult) -> None:
@@ -164,14 +380,15 @@ class RerunWriter:
         self.stream.log(f"{_CAMERA}/points", make_matches(found))
         if result.stamp_ns in result.keyframes_ns and len(found.points_current) > 0:
             T_world_cam = result.causal.T_world_frame @ self._frames.mount(result.stamp_ns)
-            self.stream.log(place.CLOUD, make_cloud(found, image, T_world_cam))
+            self.stream.log(CLOUD, make_cloud(found, image, T_world_cam))
 
     def _add_links(self, result: FrameResult) -> None:
         """Log the window's keyframes and the edges that came with the frame."""
         known = {**self._keyframes, result.stamp_ns: result.causal}
         self._keyframes = {ns: known[ns] for ns in result.keyframes_ns if ns in known}
         kept = list(self._keyframes.values())
-        self.stream.log("world/keyframes", make_keyframes(kept))
+        dots = rr.Points3D(_positions(kept), colors=COLOURS[KEYFRAMES], radii=_DOT)
+        self.stream.log("world/keyframes", dots)
         ellipsoids = make_ellipsoids(KEYFRAMES, kept)
         self.stream.log("world/keyframes/covariance", ellipsoids)
         here = result.causal.T_world_frame[:3, 3]
@@ -181,27 +398,28 @@ class RerunWriter:
         segments = np.array([segment for _, segment in placed]).reshape(-1, 2, 3)
         self.stream.log("world/links", make_links([link for link, _ in placed], segments))
         if result.loops:
-            self.stream.log(place.LOOPS, make_loops(track.segments(result.loops)))
+            self.stream.log(LOOPS, make_loops(track.segments(result.loops)))
 
     def _add_numbers(self, result: FrameResult) -> None:
         counts = (result.n_matches, result.n_inliers, result.n_points)
         for name, count in zip(COUNT_COLOURS, counts, strict=True):
-            self._add_number(f"{place.COUNTS}/{name}", name, count, COUNT_COLOURS[name])
+            self._add_number(f"{COUNTS}/{name}", name, count, COUNT_COLOURS[name])
         for stage, ms in result.stage_ms.items():
             colour = STAGE_COLOURS.get(stage)
-            self._add_number(f"{place.MILLISECONDS}/{stage}", f"{stage} [ms]", ms, colour)
+            self._add_number(f"{MILLISECONDS}/{stage}", f"{stage} [ms]", ms, colour)
         chi2: dict[str, list[float]] = {}
         for link in result.links:
             if link.is_accepted and link.chi2 is not None:
                 chi2.setdefault(link.kind, []).append(link.chi2)
         for kind, values in chi2.items():
             colour = LINK_COLOURS.get(kind)
-            self._add_number(f"{place.CHI2}/{kind}", kind, float(np.mean(values)), colour)
+            self._add_number(f"{CHI2}/{kind}", kind, float(np.mean(values)), colour)
 
     def _add_number(self, path: str, name: str, value: float, colour: Colour | None = None) -> None:
         if path not in self._series:
             self._series.add(path)
-            self.stream.log(path, make_series(name, colour), is_static=True)
+            series = rr.SeriesLines(names=name, colors=colour, widths=1.5)
+            self.stream.log(path, series, is_static=True)
         self.stream.log(path, rr.Scalars([value]))
 
     def _add_lines(self, stamp_ns: int) -> None:
@@ -242,22 +460,16 @@ _DOT: Final = rr.Radius.ui_points(4.0)
 _SMALL_DOT: Final = rr.Radius.ui_points(1.5)
 
 
-def colour_of(code: str) -> Colour:
-    """Return `#RRGGBB` as three numbers."""
-    red, green, blue = bytes.fromhex(code.removeprefix("#"))
-    return red, green, blue
-
-
 COLOURS: Final[Mapping[str, Colour]] = {
-    **{name: colour_of(code) for name, code in palette.ESTIMATES.items()},
-    KEYFRAMES: colour_of(palette.LINKS["keyframe"]),
+    **{name: palette.rgb(code) for name, code in palette.ESTIMATES.items()},
+    KEYFRAMES: palette.rgb(palette.LINKS["keyframe"]),
 }
 COUNT_COLOURS: Final = {
-    name: colour_of(palette.COUNTS[name]) for name in ("matches", "inliers", "points")
+    name: palette.rgb(palette.COUNTS[name]) for name in ("matches", "inliers", "points")
 }
-STAGE_COLOURS: Final = {name: colour_of(code) for name, code in palette.STAGES.items()}
-LINK_COLOURS: Final = {kind: colour_of(code) for kind, code in palette.LINKS.items()}
-_INLIER, _OUTLIER = colour_of(palette.INLIERS), colour_of(palette.OUTLIERS)
+STAGE_COLOURS: Final = {name: palette.rgb(code) for name, code in palette.STAGES.items()}
+LINK_COLOURS: Final = {kind: palette.rgb(code) for kind, code in palette.LINKS.items()}
+_INLIER, _OUTLIER = palette.rgb(palette.INLIERS), palette.rgb(palette.OUTLIERS)
 
 
 def make_transform(T_parent_child: FloatArray) -> rr.Transform3D:
@@ -277,11 +489,6 @@ def make_path(name: str, positions: FloatArray) -> rr.LineStrips3D:
     return rr.LineStrips3D(strips, colors=COLOURS[name], radii=_LINE)
 
 
-def make_keyframes(keyframes: Sequence[Estimate]) -> rr.Points3D:
-    """Return poses as dots."""
-    return rr.Points3D(_positions(keyframes), colors=COLOURS[KEYFRAMES], radii=_DOT)
-
-
 def make_links(links: Sequence[FrameLink], segments: FloatArray) -> rr.LineStrips3D:
     """Return edges as lines.
 
@@ -293,7 +500,7 @@ def make_links(links: Sequence[FrameLink], segments: FloatArray) -> rr.LineStrip
         Where each of them begins and ends, in the world, metres.
     """
     codes = [palette.LINKS[link.kind] if link.is_accepted else palette.REFUSED for link in links]
-    colours = [colour_of(code) for code in codes]
+    colours = [palette.rgb(code) for code in codes]
     return rr.LineStrips3D(list(segments), colors=colours or None, radii=_THIN_LINE)
 
 
@@ -409,18 +616,3 @@ def shrinkage(width: int) -> int:
     while width // n > SHOWN_WIDTH_PX:
         n *= 2
     return n
-
-
-def make_series(name: str, colour: Colour | None = None) -> rr.SeriesLines:
-    """Return how a number is drawn over time."""
-    return rr.SeriesLines(names=name, colors=None if colour is None else colour, widths=1.5)
-
-
-def make_status(status: Status, text: str) -> rr.TextLog:
-    """Return a line of the log."""
-    return rr.TextLog(text, level=_LEVELS[status])
-
-
-def make_axes(*, is_optical: bool) -> rr.AsComponents:
-    """Return the axes of the world: a camera's, or x forward, y left, z up."""
-    return rr.ViewCoordinates.RDF if is_optical else rr.ViewCoordinates.FLU

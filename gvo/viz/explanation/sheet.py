@@ -91,7 +91,8 @@ class Sheet:
     def __init__(self, name: str, caption: str, height_inches: float) -> None:
         from matplotlib.figure import Figure
 
-        self._name, self._caption, lines = name, caption, _wrap(caption)
+        self._name, self._caption = name, caption
+        lines = [line for paragraph in caption.split("\n") for line in _wrap(paragraph)]
         heights = [height_inches + _TITLE_INCHES, _LINE_INCHES * (len(lines) + 0.8)]
         self._figure = Figure(figsize=(_WIDTH_INCHES, sum(heights)), dpi=_DPI, layout="constrained")
         self.panels, self._footer = split(self._figure, heights)
@@ -138,12 +139,7 @@ def split(figure: Figure | SubFigure, heights: Sequence[float]) -> list[SubFigur
     return [row[0] for row in np.asarray(rows)]
 
 
-def _wrap(text: str) -> list[str]:
-    """Break a caption into lines; its own line breaks stay."""
-    return [line for paragraph in text.split("\n") for line in _wrap_paragraph(paragraph)]
-
-
-def _wrap_paragraph(paragraph: str) -> list[str]:
+def _wrap(paragraph: str) -> list[str]:
     # Letters differ in width: as many characters as fit in the widest line.
     n_characters = _CAPTION_CHARACTERS
     while True:

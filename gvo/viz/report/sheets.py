@@ -153,10 +153,6 @@ def write_plots(plots: Sequence[Plot], folder: Path) -> list[Path]:
     return paths
 
 
-def _rounded(number: re.Match[str]) -> str:
-    return f"{float(number[0]):.2f}"
-
-
 def _inlined(svg: str, slug: str, title: str) -> str:
     """Return SVG without prolog, metadata and namespaces, its ids prefixed by the slug."""
     svg = svg[svg.index("<svg") :]
@@ -167,7 +163,7 @@ def _inlined(svg: str, slug: str, title: str) -> str:
     used = set(_REFERENCE.findall(svg))
     svg = _ID.sub(lambda match: f' id="{slug}-{match[1]}"' if match[1] in used else "", svg)
     svg = re.sub(r"(url\(#|href=\"#)", rf"\g<1>{slug}-", svg)
-    svg = _TAG.sub(lambda tag: _NUMBER.sub(_rounded, tag[0]), svg)
+    svg = _TAG.sub(lambda tag: _NUMBER.sub(lambda number: f"{float(number[0]):.2f}", tag[0]), svg)
     svg = re.sub(r"\n\s*", "\n", svg)
     svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" @>', svg, count=1)
     return svg.replace("@", f'role="img" aria-label="{title}"', 1).strip()

@@ -75,7 +75,7 @@ class ParameterControls:
         apply: Callable[[Config], None],
         say: Callable[[str], None],
     ) -> None:
-        self._config = config
+        self.config = config
         self._apply = apply
         self._say = say
         self._refusal = ""
@@ -94,11 +94,6 @@ class ParameterControls:
             for handle in filter(None, (control.handle, control.empty)):
                 handle.on_update(self._on_update)
 
-    @property
-    def config(self) -> Config:
-        """The configuration that was applied last."""
-        return self._config
-
     def handle(self, section: str, key: str) -> Any:  # noqa: ANN401 - one of viser's handles
         """Return the handle of a parameter's value."""
         return self._controls[section, key].handle
@@ -115,10 +110,10 @@ class ParameterControls:
         """Apply values; skip a field being edited."""
         with self._lock:
             self._stop_timer()
-            values = self._config.model_dump()
+            values = self.config.model_dump()
             for (section, key), control in self._controls.items():
                 values[section][key] = _kept(values[section][key], control.value)
-            if values == self._config.model_dump():
+            if values == self.config.model_dump():
                 self._tell("")
                 return
             try:
@@ -130,7 +125,7 @@ class ParameterControls:
                     self._start_timer(PATIENCE_S, is_typing=False)
                     return
             else:
-                self._config = config
+                self.config = config
                 self._tell("")
             self._show()
 
@@ -146,7 +141,7 @@ class ParameterControls:
             self._say(refusal)
 
     def _show(self) -> None:
-        values = self._config.model_dump()
+        values = self.config.model_dump()
         for (section, key), control in self._controls.items():
             control.show(values[section][key])
 

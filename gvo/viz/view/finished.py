@@ -1,10 +1,8 @@
-"""The page of a finished run, and what plays it."""
+"""The page of a finished run."""
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from gvo.io.run_folder.reader import RunRecord, read_run
 from gvo.io.run_folder.writer import GLOBAL
 from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import FloatArray, IntArray
+from gvo.types import FloatArray
 from gvo.viz.view.layers import COLOURS
 from gvo.viz.view.panels import (
     UP,
@@ -31,6 +29,7 @@ from gvo.viz.view.panels import (
     numbers_html,
     pose_rows,
 )
+from gvo.viz.view.player import RunPlayer
 from gvo.viz.view.scene import Scene, Up
 from gvo.viz.view.server import ViewServer, open_server
 
@@ -145,11 +144,6 @@ class FinishedPage:
         self.player.close()
         self._painter.close()
 
-    @property
-    def numbers_text(self) -> str:
-        """The numbers of the frame as they are shown, HTML."""
-        return str(self._numbers.content)
-
     def settle(self) -> None:
         """Wait until the frame that was asked for last is drawn."""
         self._painter.settle()
@@ -160,7 +154,7 @@ class FinishedPage:
         stamp_ns = int(self._record.frames.stamps_ns[index])
         with self._server.atomic():
             self.playback.show(index)
-            self._numbers.content = numbers_html(self._rows(index, stamp_ns))
+            self.numbers.content = numbers_html(self._rows(index, stamp_ns))
             past = {
                 name: trajectory.select(trajectory.stamps_ns <= stamp_ns)
                 for name, trajectory in self._record.trajectories.items()
@@ -180,7 +174,7 @@ class FinishedPage:
 
     def _add_frame_panel(self) -> None:
         with add_frame_panel(self._server):
-            self._numbers = self._server.gui.add_html("")
+            self.numbers = self._server.gui.add_html("")
             shown = _DRAWN - self._absent
             self._server.gui.add_html(legend_html(name for name in COLOURS if name in shown))
 
@@ -236,108 +230,3 @@ class FinishedPage:
             self.scene.show_ellipsoids(
                 thinned.T_world_frame[is_past], thinned.covariances[is_past], self._sigmas.value
             )
-
-
-class RunPlayer:
-    """Plays frames by their stamps.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Of the frames, nanoseconds.
-    show : callable
-        Called with the index of each frame to be shown.
-    period_s : float
-        How often it looks whether the next frame is due.
-    """
-
-    def __init__(
-        self, stamps_ns: IntArray, show: Callable[[int], None], *, period_s: float = 0.02
-    ) -> None:
-        self._stamps_ns = stamps_ns
-        self._period_s = period_s
-        self._show = show
-        self._lock = threading.RLock()
-        self._index = 0
-        self._is_playing = False
-        self._speed: float | None = 1.0
-        self._ahead_ns = 0.0
-        self._is_closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="gvo run player", daemon=True)
-        self._thread.start()
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return len(self._stamps_ns)
-
-    @property
-    def index(self) -> int:
-        """Frame that is shown."""
-        return self._index
-
-    @property
-    def is_playing(self) -> bool:
-        """Whether frames follow by themselves."""
-        return self._is_playing
-
-    def play(self) -> None:
-        """Let frames follow by themselves; from the end, begin again."""
-        with self._lock:
-            if self._index >= self.n_frames - 1:
-                self.seek(0)
-            self._ahead_ns = 0.0
-            self._is_playing = True
-
-    def pause(self) -> None:
-        """Stay at the frame."""
-        self._is_playing = False
-
-    def step(self) -> None:
-        """Show the next frame and pause."""
-        self.pause()
-        self.seek(self._index + 1)
-
-    def seek(self, index: int) -> None:
-        """Show a frame; the index is clipped."""
-        with self._lock:
-            self._index = int(np.clip(index, 0, max(0, self.n_frames - 1)))
-            self._ahead_ns = 0.0
-            self._show(self._index)
-
-    def set_speed(self, factor: float | None) -> None:
-        """Play as recorded (1), faster, slower, or frame by frame without waiting (None)."""
-        self._speed = factor
-
-    def advance(self, elapsed_s: float) -> None:
-        """Play on by some time."""
-        with self._lock:
-            if not self._is_playing:
-                return
-            if self._speed is None:
-                self.seek(self._index + 1)
-            else:
-                self._advance_by(1e9 * elapsed_s * self._speed)
-            if self._index >= self.n_frames - 1:
-                self._is_playing = False
-
-    def _advance_by(self, span_ns: float) -> None:
-        ahead_ns = self._ahead_ns + span_ns
-        now_ns = int(self._stamps_ns[self._index]) + int(ahead_ns)
-        index = int(np.searchsorted(self._stamps_ns, now_ns, side="right")) - 1
-        if index > self._index:
-            self.seek(index)
-            ahead_ns = float(now_ns - int(self._stamps_ns[index]))
-        self._ahead_ns = ahead_ns
-
-    def close(self) -> None:
-        """End the thread."""
-        self._is_closing.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        before = time.monotonic()
-        while not self._is_closing.wait(self._period_s):
-            now = time.monotonic()
-            self.advance(now - before)
-            before = now

@@ -102,11 +102,16 @@ class History:
     ----------
     first_index : int
         Of the first frame in the recording.
+
+    Attributes
+    ----------
+    shown : int
+        Index of the frame that is shown, up to which the paths go.
     """
 
     def __init__(self, first_index: int = 0) -> None:
         self.first_index = first_index
-        self._shown = first_index - 1
+        self.shown = first_index - 1
         self._arrays = DiskList()
         self._lock = RLock()
         # Of each frame: stamp, result without registration, reason.
@@ -126,11 +131,6 @@ class History:
     def n_done(self) -> int:
         """Frames that are done: the index of the last one, and 1."""
         return self.first_index + len(self._told)
-
-    @property
-    def shown(self) -> int:
-        """Index of the frame that is shown, up to which the paths go."""
-        return self._shown
 
     def add(self, record: FrameRecord) -> None:
         """Keep the next frame; it is not shown yet."""
@@ -171,7 +171,7 @@ class History:
             When it is not done, or was before the first.
         """
         self._check(index)
-        self._shown = index
+        self.shown = index
 
     def stamp_ns(self, index: int) -> int:
         """Return the stamp of a frame that is done, nanoseconds."""
@@ -194,7 +194,7 @@ class History:
             When it is not done.
         """
         with self._lock:
-            index = self._shown if index is None else index
+            index = self.shown if index is None else index
             record = self._record(index)
             n = self._n_tracked(index)
             return FrameView(
@@ -222,7 +222,7 @@ class History:
     def loop_lines(self) -> FloatArray:
         """Return both ends of the loops so far as of the frame shown, shape (n, 2, 3), metres."""
         with self._lock:
-            told = self._told[: self._shown + 1 - self.first_index]
+            told = self._told[: self.shown + 1 - self.first_index]
             loops = [loop for _, result, _ in told if result is not None for loop in result.loops]
             if not loops:
                 return np.zeros((0, 2, 3))
@@ -237,7 +237,7 @@ class History:
         """
         with self._lock:
             _, T_world_frame = self._smoothed()
-            keyframes = self._keyframes[: bisect_right(self._keyframes, self._shown)]
+            keyframes = self._keyframes[: bisect_right(self._keyframes, self.shown)]
             rows = np.searchsorted(self._tracked.rows[: len(T_world_frame), 0], keyframes)
             clouds = self._clouds.select(dict(zip(keyframes, T_world_frame[rows], strict=True)))
         return accumulate(clouds)
@@ -261,22 +261,22 @@ class History:
 
     def _path(self, poses: _Rows) -> Path:
         with self._lock:
-            n = self._n_tracked(self._shown)
+            n = self._n_tracked(self.shown)
             stamps_ns = self._tracked.rows[:n, 1].copy()
             return stamps_ns, poses.rows[:n].reshape(-1, 4, 4)[:, :3, 3].copy()
 
     def _smoothed(self) -> tuple[IntArray, FloatArray]:
         """Return stamps and the best poses as of the frame shown: final, window or causal."""
-        n = self._n_tracked(self._shown)
+        n = self._n_tracked(self.shown)
         stamps_ns = self._tracked.rows[:n, 1].copy()
         poses = self._causal.rows[:n].reshape(-1, 4, 4).copy()
         if n == 0:
             return stamps_ns, poses
-        window = self._record(self._shown).window_poses
+        window = self._record(self.shown).window_poses
         known = [stamp_ns for stamp_ns in window if stamp_ns <= stamps_ns[-1]]
         if known:
             poses[np.searchsorted(stamps_ns, known)] = [window[stamp_ns] for stamp_ns in known]
-        is_final = self._finishing.rows[:, 0] <= self._shown
+        is_final = self._finishing.rows[:, 0] <= self.shown
         final_ns = self._finishing.rows[is_final, 1]
         rows = np.searchsorted(stamps_ns, final_ns)
         poses[rows] = self._finished.rows[is_final].reshape(-1, 4, 4)

@@ -9,7 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from gvo.types import FloatArray
-from gvo.viz.palette import ESTIMATES, LINKS, LOOP_STYLES, OTHERS, REFERENCE, REFUSED
+from gvo.viz.palette import ESTIMATES, LINKS, LOOP_STYLES, OTHERS, REFERENCE, REFUSED, rgb
 
 COLOURS = {
     **ESTIMATES,
@@ -27,12 +27,6 @@ COLOURS = {
 
 _PATH_CHUNK = 256
 _CLOUD_CHUNK = 8192
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Return the channels of "#RRGGBB"."""
-    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
-    return red, green, blue
 
 
 def add_points(

@@ -54,7 +54,7 @@ def serve_player(
     player: Player, *, host: str, port: int, truth: Trajectory | None = None, name: str = ""
 ) -> ViewServer:
     """Serve a player's page, at its first frame or where it is; see `gvo.viz.view.serve`."""
-    view = open_server(host, port, title=f"gvo {name or player.info.name}".strip())
+    view = open_server(host, port, title=f"gvo {name or player.source.info.name}".strip())
     page = Page(view.viser, player, truth=truth)
     view.on_close(page.close)
     if player.frame_view is None:
@@ -98,16 +98,6 @@ class Page:
         self._painter.close()
         self.controls.close()
 
-    @property
-    def numbers_text(self) -> str:
-        """The numbers of the frame as they are shown, HTML."""
-        return str(self._numbers.content)
-
-    @property
-    def message_text(self) -> str:
-        """The line on what was refused, HTML."""
-        return str(self._message.content)
-
     def settle(self) -> None:
         """Wait until the last frame that the player showed is drawn."""
         self._painter.settle()
@@ -117,7 +107,7 @@ class Page:
         with self._server.atomic():
             self._place(frame)
             self.playback.show(frame.index)
-            self._numbers.content = numbers_html(self._rows(frame))
+            self.numbers.content = numbers_html(self._rows(frame))
             self._show_state()
             self._draw_images(frame)
             self._draw_paths()
@@ -134,9 +124,9 @@ class Page:
         with add_frame_panel(self._server):
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
-            self._message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
+            self.message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
             start = {"frame": f"the first of {self._player.n_frames} is coming"}
-            self._numbers = gui.add_html(numbers_html(start))
+            self.numbers = gui.add_html(numbers_html(start))
             hidden = {"standstill", *self._absent}
             gui.add_html(legend_html(name for name in COLOURS if name not in hidden))
 
@@ -175,7 +165,7 @@ class Page:
         """Show what the player is doing, and what went wrong."""
         self._state.content = state_html(player_state(self._player))
         problems = [problem for problem in (self._refusal, self._player.fault) if problem]
-        self._message.content = message_html("; ".join(problems))
+        self.message.content = message_html("; ".join(problems))
 
     def _on_restart(self, event: viser.GuiEvent[Any]) -> None:
         self.flush()
@@ -203,7 +193,7 @@ class Page:
         if self._placed_for == self._player.first_index:
             return
         self._placed_for = self._player.first_index
-        camera = self._player.camera
+        camera = self._player.source.info.camera
         depth = _depth_of(frame, camera)
         self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
         start = frame.T_world_frame[:3, 3]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import viser
@@ -14,6 +14,7 @@ from gvo._text import html_text
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import FloatArray, FrameResult
 from gvo.viz.view.layers import COLOURS
+from gvo.viz.view.player import Player, RunPlayer
 from gvo.viz.view.scene import LAYERS, Scene, Up, position_sigmas
 
 MAIN_WIDTH_PX = 330
@@ -280,33 +281,6 @@ def frame_rows(index: int, n_frames: int, stamp_ns: int, status: str) -> dict[st
     }
 
 
-class Playable(Protocol):
-    """What can be played."""
-
-    @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-
-    @property
-    def is_playing(self) -> bool:
-        """Whether frames follow by themselves."""
-
-    def play(self) -> None:
-        """Let frames follow by themselves."""
-
-    def pause(self) -> None:
-        """Stay at the frame."""
-
-    def step(self) -> None:
-        """Go to the next frame."""
-
-    def seek(self, index: int) -> None:
-        """Go to a frame."""
-
-    def set_speed(self, factor: float | None) -> None:
-        """Play as recorded (1), faster, slower, or as fast as possible (None)."""
-
-
 class Playback:
     """Buttons, keys, slider and speed of what can be played.
 
@@ -314,13 +288,13 @@ class Playback:
     ----------
     gui : viser.GuiApi
         Where they are added.
-    playable : Playable
+    playable : Player or RunPlayer
     before : callable
         Called before each command, so that changes until then count.
     """
 
     def __init__(
-        self, gui: viser.GuiApi, playable: Playable, *, before: Callable[[], None]
+        self, gui: viser.GuiApi, playable: Player | RunPlayer, *, before: Callable[[], None]
     ) -> None:
         self._playable = playable
         self._before = before
@@ -330,7 +304,7 @@ class Playback:
         self.speed: Any = gui.add_dropdown(
             "speed", tuple(SPEEDS), initial_value="1 x", hint="1 x: as fast as it was recorded"
         )
-        buttons.on_click(self._on_click)
+        buttons.on_click(lambda event: self.press(event.target.value))
         self.frame.on_update(self.on_seek)
         self.speed.on_update(self.on_speed)
         gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
@@ -351,9 +325,6 @@ class Playback:
         if self.frame.max != last:
             self.frame.max = last
         self.frame.value = max(0, index)
-
-    def _on_click(self, event: viser.GuiEvent[Any]) -> None:
-        self.press(event.target.value)
 
     def on_seek(self, event: viser.GuiEvent[Any]) -> None:
         """Go where a client moved the slider."""

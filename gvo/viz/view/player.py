@@ -1,4 +1,4 @@
-"""Plays odometry over a recording: forward as it is computed, backward as it was."""
+"""Plays odometry over a recording, forward as it is computed and backward as it was; or a run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from contextlib import AbstractContextManager
 from functools import partial
 from typing import TypeAlias
 
+import numpy as np
+
 from gvo.config import Config
 from gvo.errors import GvoError
-from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import one_opencv_thread
-from gvo.io.recording import RecordingInfo, Source
+from gvo.io.recording import Source
+from gvo.types import IntArray
 from gvo.viz.view.history import FrameView, History
 from gvo.viz.view.tracking import OpenSource, Tracking
 
@@ -43,6 +45,19 @@ class Player(AbstractContextManager["Player"]):
     excerpt : Excerpt, optional
         The part that is played; the whole recording where omitted.
 
+    Attributes
+    ----------
+    config : Config
+        Of the next frame.
+    history : History
+        The frames since the start or the last restart.
+    is_playing : bool
+        Frames follow by themselves.
+    is_finished : bool
+        The recording is read to its end, or as far as it can be.
+    fault : str
+        The last error, in one line; empty after a restart or another configuration.
+
     Raises
     ------
     GvoError
@@ -64,19 +79,19 @@ class Player(AbstractContextManager["Player"]):
         self._open_source = open_source
         self._excerpt = excerpt or Excerpt()
         self._tracking = Tracking(open_source, config, self._excerpt)
-        self._history = History()
+        self.history = History()
         # Guards all below and wakes the thread.
         self._changed = threading.Condition()
-        self._config = config
+        self.config = config
         self._speed: float | None = 1.0
-        self._is_playing = False
+        self.is_playing = False
         self._is_stepping = False
         self._goal: int | None = None
         self._restart_index: int | None = None
         self._is_closed = False
         self._is_working = False
-        self._is_finished = False
-        self._fault = ""
+        self.is_finished = False
+        self.fault = ""
         self._due_s = -math.inf  # when the frame shown was due, by the clock of `monotonic`
         self._subscribers: list[Subscriber] = []
         self._thread = threading.Thread(target=self._work, name="player", daemon=True)
@@ -87,14 +102,14 @@ class Player(AbstractContextManager["Player"]):
     def play(self) -> None:
         """Go on from the frame shown, at the speed that is set."""
         with self._changed:
-            self._is_playing = True
+            self.is_playing = True
             self._due_s = -math.inf
             self._changed.notify_all()
 
     def pause(self) -> None:
         """Stop, also on the way to a frame."""
         with self._changed:
-            self._is_playing = self._is_stepping = False
+            self.is_playing = self._is_stepping = False
             self._goal = None
             self._changed.notify_all()
 
@@ -103,7 +118,7 @@ class Player(AbstractContextManager["Player"]):
         with self._changed:
             base = self._goal if self._is_stepping and self._goal is not None else self.index
             self._goal = base + 1
-            self._is_stepping, self._is_playing = True, False
+            self._is_stepping, self.is_playing = True, False
             self._changed.notify_all()
 
     def seek(self, index: int) -> None:
@@ -152,7 +167,7 @@ class Player(AbstractContextManager["Player"]):
         if not isinstance(config, Config):
             raise ValueError(f"config must be a gvo.Config, got {type(config).__name__}")
         with self._changed:
-            self._config, self._fault = config, ""
+            self.config, self.fault = config, ""
             self._changed.notify_all()
 
     def restart(self, index: int | None = None) -> None:
@@ -217,56 +232,31 @@ class Player(AbstractContextManager["Player"]):
     @property
     def n_frames(self) -> int:
         """Frames that the recording announces; those that were read, once it is finished."""
-        if self._is_finished:
+        if self.is_finished:
             return self.n_done
-        return max(self._excerpt.n_expected(self.info.n_images), self.n_done)
+        return max(self._excerpt.n_expected(self.source.info.n_images), self.n_done)
 
     @property
     def n_done(self) -> int:
         """Frames that are done: the index of the last one, and 1."""
-        return self._history.n_done
+        return self.history.n_done
 
     @property
     def index(self) -> int:
         """Index of the frame shown; one less than `first_index` before there is any."""
-        return self._history.shown
+        return self.history.shown
 
     @property
     def first_index(self) -> int:
         """Where odometry began."""
-        return self._history.first_index
-
-    @property
-    def is_playing(self) -> bool:
-        """Whether frames follow by themselves."""
-        return self._is_playing
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether the recording is read to its end, or as far as it can be."""
-        return self._is_finished
+        return self.history.first_index
 
     @property
     def is_busy(self) -> bool:
         """Whether something is under way or left to do."""
         if self._is_closed:
             return self._is_working
-        return self._is_playing or self._is_working or self._is_asked()
-
-    @property
-    def speed(self) -> float | None:
-        """Factor on the speed of the recording; None: as fast as possible."""
-        return self._speed
-
-    @property
-    def fault(self) -> str:
-        """The last error, in one line; empty after a restart or another configuration."""
-        return self._fault
-
-    @property
-    def config(self) -> Config:
-        """Of the next frame."""
-        return self._config
+        return self.is_playing or self._is_working or self._is_asked()
 
     @property
     def source(self) -> Source:
@@ -274,26 +264,11 @@ class Player(AbstractContextManager["Player"]):
         return self._tracking.source
 
     @property
-    def info(self) -> RecordingInfo:
-        """Of the recording."""
-        return self._tracking.info
-
-    @property
-    def camera(self) -> StereoCamera | PinholeCamera:
-        """The camera of the rectified frames."""
-        return self._tracking.camera
-
-    @property
-    def history(self) -> History:
-        """The frames since the start or the last restart."""
-        return self._history
-
-    @property
     def frame_view(self) -> FrameView | None:
         """The frame shown; None before there is any."""
-        history = self._history
+        history = self.history
         is_any = history.shown >= history.first_index
-        return history.frame_view(fault=self._fault) if is_any else None
+        return history.frame_view(fault=self.fault) if is_any else None
 
     # On the thread
 
@@ -319,17 +294,17 @@ class Player(AbstractContextManager["Player"]):
         try:
             work()
         except GvoError as error:
-            self._fault = str(error)
+            self.fault = str(error)
         except Exception as error:
             _LOGGER.exception("the player failed")
-            self._fault = f"{type(error).__name__}: {error}"
+            self.fault = f"{type(error).__name__}: {error}"
         else:
             return True
         return False
 
     def _forget_commands(self) -> None:
         with self._changed:
-            self._is_playing = self._is_stepping = False
+            self.is_playing = self._is_stepping = False
             self._goal = self._restart_index = None
 
     def _publish(self) -> None:
@@ -351,15 +326,15 @@ class Player(AbstractContextManager["Player"]):
             self._approach(goal)
         elif self._wait_until_due() and not self._show_next():
             with self._changed:
-                self._is_playing = False
+                self.is_playing = False
 
     def _start_anew(self, index: int) -> None:
-        from_ns = None if index == 0 else self._history.stamp_ns(index)
-        tracking = Tracking(self._open_source, self._config, self._excerpt, from_ns=from_ns)
+        from_ns = None if index == 0 else self.history.stamp_ns(index)
+        tracking = Tracking(self._open_source, self.config, self._excerpt, from_ns=from_ns)
         self._tracking.close()
         with self._changed:
-            self._tracking, self._history = tracking, History(index)
-            self._is_finished, self._fault = False, ""
+            self._tracking, self.history = tracking, History(index)
+            self.is_finished, self.fault = False, ""
             if self._restart_index == index:
                 self._restart_index = None
             if self._goal is None:
@@ -372,7 +347,7 @@ class Player(AbstractContextManager["Player"]):
         elif not self._advance() and self.index < self.n_done - 1:
             self._show(self.n_done - 1)
         with self._changed:
-            is_arrived = self.index == goal or self._is_finished
+            is_arrived = self.index == goal or self.is_finished
             if is_arrived and self._goal == goal:  # not another one by now
                 self._goal, self._is_stepping = None, False
             self._due_s = time.monotonic()
@@ -392,7 +367,7 @@ class Player(AbstractContextManager["Player"]):
         return False
 
     def _is_only_playing(self) -> bool:
-        return self._is_playing and not self._is_asked() and not self._is_closed
+        return self.is_playing and not self._is_asked() and not self._is_closed
 
     def _is_asked(self) -> bool:
         return self._goal is not None or self._restart_index is not None
@@ -402,12 +377,12 @@ class Player(AbstractContextManager["Player"]):
         if self.index < self.first_index:
             return 0.0
         if self.index + 1 < self.n_done:
-            next_ns = self._history.stamp_ns(self.index + 1)
+            next_ns = self.history.stamp_ns(self.index + 1)
         elif (item := self._tracking.peek()) is not None:
             next_ns = item.stamp_ns
         else:
             return 0.0
-        gap_s = 1e-9 * (next_ns - self._history.stamp_ns(self.index))
+        gap_s = 1e-9 * (next_ns - self.history.stamp_ns(self.index))
         return min(max(gap_s, 0.0), _MAX_GAP_S)
 
     def _show_next(self) -> bool:
@@ -417,18 +392,18 @@ class Player(AbstractContextManager["Player"]):
         return self._advance()
 
     def _show(self, index: int) -> None:
-        self._history.show(index)
+        self.history.show(index)
         self._publish()
 
     def _advance(self) -> bool:
         """Compute and show the next frame; return False at the end."""
-        if self._is_finished:
+        if self.is_finished:
             return False
         try:
             self._take_configuration()
             record = self._tracking.advance(self.n_done)
             if record is not None:
-                self._history.add(record)
+                self.history.add(record)
                 self._show(self.n_done - 1)
                 self._tracking.peek()  # is it the last one?
         finally:
@@ -437,20 +412,122 @@ class Player(AbstractContextManager["Player"]):
         return record is not None
 
     def _take_configuration(self) -> None:
-        config = self._config
+        config = self.config
         if config is self._tracking.config:
             return
         try:
             self._tracking.reconfigure(config)
         except GvoError as error:
             with self._changed:
-                self._fault = str(error)
-                if self._config is config:
-                    self._config = self._tracking.config
+                self.fault = str(error)
+                if self.config is config:
+                    self.config = self._tracking.config
 
     def _finish(self) -> None:
         """Add the smoothed poses of the frames that the window still holds."""
-        self._is_finished = True
+        self.is_finished = True
         if self.n_done > self.first_index:
-            self._history.finish(self._tracking.finish())
+            self.history.finish(self._tracking.finish())
             self._publish()
+
+
+class RunPlayer:
+    """Plays frames by their stamps.
+
+    Parameters
+    ----------
+    stamps_ns : ndarray of int64, shape (n,)
+        Of the frames, nanoseconds.
+    show : callable
+        Called with the index of each frame to be shown.
+    period_s : float
+        How often it looks whether the next frame is due.
+
+    Attributes
+    ----------
+    index : int
+        Frame that is shown.
+    is_playing : bool
+        Frames follow by themselves.
+    """
+
+    def __init__(
+        self, stamps_ns: IntArray, show: Callable[[int], None], *, period_s: float = 0.02
+    ) -> None:
+        self._stamps_ns = stamps_ns
+        self._period_s = period_s
+        self._show = show
+        self._lock = threading.RLock()
+        self.index = 0
+        self.is_playing = False
+        self._speed: float | None = 1.0
+        self._ahead_ns = 0.0
+        self._is_closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gvo run player", daemon=True)
+        self._thread.start()
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self._stamps_ns)
+
+    def play(self) -> None:
+        """Let frames follow by themselves; from the end, begin again."""
+        with self._lock:
+            if self.index >= self.n_frames - 1:
+                self.seek(0)
+            self._ahead_ns = 0.0
+            self.is_playing = True
+
+    def pause(self) -> None:
+        """Stay at the frame."""
+        self.is_playing = False
+
+    def step(self) -> None:
+        """Show the next frame and pause."""
+        self.pause()
+        self.seek(self.index + 1)
+
+    def seek(self, index: int) -> None:
+        """Show a frame; the index is clipped."""
+        with self._lock:
+            self.index = int(np.clip(index, 0, max(0, self.n_frames - 1)))
+            self._ahead_ns = 0.0
+            self._show(self.index)
+
+    def set_speed(self, factor: float | None) -> None:
+        """Play as recorded (1), faster, slower, or frame by frame without waiting (None)."""
+        self._speed = factor
+
+    def advance(self, elapsed_s: float) -> None:
+        """Play on by some time."""
+        with self._lock:
+            if not self.is_playing:
+                return
+            if self._speed is None:
+                self.seek(self.index + 1)
+            else:
+                self._advance_by(1e9 * elapsed_s * self._speed)
+            if self.index >= self.n_frames - 1:
+                self.is_playing = False
+
+    def _advance_by(self, span_ns: float) -> None:
+        ahead_ns = self._ahead_ns + span_ns
+        now_ns = int(self._stamps_ns[self.index]) + int(ahead_ns)
+        index = int(np.searchsorted(self._stamps_ns, now_ns, side="right")) - 1
+        if index > self.index:
+            self.seek(index)
+            ahead_ns = float(now_ns - int(self._stamps_ns[index]))
+        self._ahead_ns = ahead_ns
+
+    def close(self) -> None:
+        """End the thread."""
+        self._is_closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._is_closing.wait(self._period_s):
+            now = time.monotonic()
+            self.advance(now - before)
+            before = now

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvo.types import FloatArray, ImageArray, IntArray
-from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, add_points, rgb
+from gvo.viz.palette import rgb
+from gvo.viz.view.layers import COLOURS, Cloud, Path, Segments, add_points
 
 Up = Literal["-y", "+z"]
 _LINES = {

@@ -70,7 +70,6 @@ class Tracking:
         self.config = config
         self.is_finished = False
         source = self.source = open_source(config)
-        self.info = source.info
         self.camera = source.info.camera
         self._odometry = Odometry(self.camera, config)
         self._items: Iterator[Frame | FaultyFrame] = self._read(source, config, from_ns)

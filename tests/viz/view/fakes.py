@@ -116,12 +116,11 @@ class FakePlayer:
 
     n_frames = 40
     first_index = 0
-    camera = CAMERA
 
     def __init__(self) -> None:
         self.calls: list[tuple[Any, ...]] = []
         self.config = Config()
-        self.info = SimpleNamespace(name="drive")
+        self.source = SimpleNamespace(info=SimpleNamespace(name="drive", camera=CAMERA))
         self.history = FakeHistory()
         self.frame_view: FrameView | None = None
         self.is_playing = self.is_busy = self.is_finished = False

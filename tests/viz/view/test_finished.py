@@ -16,7 +16,8 @@ from gvo.io.run_folder.writer import RunFolder
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame
 from gvo.viz.view import serve
-from gvo.viz.view.finished import FinishedPage, RunPlayer, aligned_truth, start_sigmas, world_up
+from gvo.viz.view.finished import FinishedPage, aligned_truth, start_sigmas, world_up
+from gvo.viz.view.player import RunPlayer
 from gvo.viz.view.server import ViewServer
 from tests.viz.view.fakes import cells, pose_of, result_of, stamps_of
 
@@ -75,7 +76,7 @@ def test_every_frame_shows_its_row_of_the_table(page: FinishedPage, folder: Path
         row = dict(zip(header.split(","), lines[index].split(","), strict=True))
         page.player.seek(index)
         page.settle()
-        numbers = cells(page.numbers_text)
+        numbers = cells(page.numbers.content)
         assert numbers["frame"] == f"{index} of {N_FRAMES}"
         assert numbers["status"] == row["status"]
         assert numbers["matches"] == row["n_matches"]

@@ -59,7 +59,7 @@ def length(view: ViewServer, path: str) -> float:
 
 def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> None:
     show(page, player, 7)
-    numbers = cells(page.numbers_text)
+    numbers = cells(page.numbers.content)
     assert numbers["frame"] == "7 of 40"
     assert numbers["stamp"] == "0.700000000"
     assert (numbers["status"], numbers["matches"], numbers["inliers"]) == ("ok", "107", "97")
@@ -70,7 +70,7 @@ def test_the_numbers_are_those_of_the_frame(page: Page, player: FakePlayer) -> N
 
 def test_a_faulty_frame_tells_its_reason_and_no_counts(page: Page, player: FakePlayer) -> None:
     show(page, player, 3, is_faulty=True)
-    numbers = cells(page.numbers_text)
+    numbers = cells(page.numbers.content)
     assert (numbers["status"], numbers["reason"]) == ("skipped", "truncated image")
     assert "matches" not in numbers
 
@@ -146,7 +146,7 @@ def test_speeds_have_names(page: Page, player: FakePlayer) -> None:
 
 def test_a_fault_is_shown(page: Page, player: FakePlayer) -> None:
     show(page, player, 2, fault="the recording <breaks> off")
-    assert "the recording &lt;breaks&gt; off" in page.message_text
+    assert "the recording &lt;breaks&gt; off" in page.message.content
 
 
 def test_the_saved_yaml_is_the_configuration(page: Page, tmp_path: Any) -> None:
@@ -201,7 +201,7 @@ def test_the_painter_draws_the_last_frame(page: Page, player: FakePlayer, view: 
     for index in range(25):
         player.show(frame_view_of(index))
     page.settle()
-    assert cells(page.numbers_text)["frame"] == "24 of 40"
+    assert cells(page.numbers.content)["frame"] == "24 of 40"
 
 
 STEP_NS = 100_000_000

@@ -186,12 +186,9 @@ class Scan(ABC):
 
     def _damage_of(self, *texts: str) -> str:
         said = "; ".join(text for text in texts if text)
-        return describe_damage(self.path, said, self.tool) if said else ""
-
-
-def describe_damage(path: Path, said: str, tool: str) -> str:
-    """Return the damage of a file and its remedy, in one line."""
-    return f"{path}: {said}; copy the file anew, or mend a copy by `{tool}`"
+        if not said:
+            return ""
+        return f"{self.path}: {said}; copy the file anew, or mend a copy by `{self.tool}`"
 
 
 def share(n_bytes: int, n_bytes_all: int) -> str:
