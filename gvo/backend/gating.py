@@ -21,16 +21,7 @@ from gvo.backend.factors import ORIGIN, Measurement, find_faults, prior_fault
 from gvo.backend.motion_model import ConstantVelocity
 from gvo.backend.window_graph import NewPose, WindowGraph
 from gvo.geometry import se3
-from gvo.types import (
-    BoolArray,
-    Edge,
-    FloatArray,
-    FrameId,
-    IntArray,
-    PosePrior,
-    Prior,
-    Rejected,
-)
+from gvo.types import BoolArray, Edge, FloatArray, FrameId, IntArray, PosePrior, Prior, Rejected
 
 _Item = TypeVar("_Item")
 

@@ -168,10 +168,7 @@ def digest(values: object) -> str:
 
 
 def _run(
-    task: Task,
-    options: TaskOptions,
-    copies: Path,
-    on_progress: Callable[[Progress], None] | None,
+    task: Task, options: TaskOptions, copies: Path, on_progress: Callable[[Progress], None] | None
 ) -> tuple[RunResult, bool]:
     """Return the run, and whether it was found finished."""
     path = fetch(task.source, copies) if is_url(task.source) else Path(task.source)

@@ -24,15 +24,7 @@ from gvo.cli.options import (
     recording_options,
     with_loops,
 )
-from gvo.cli.terminal import (
-    Command,
-    at_work,
-    exit_code,
-    is_shown,
-    say,
-    told_where_it_stands,
-    warn,
-)
+from gvo.cli.terminal import Command, at_work, exit_code, is_shown, say, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:

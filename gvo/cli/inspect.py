@@ -61,8 +61,7 @@ def add_commands(app: typer.Typer) -> None:
 def explain(
     recordings: Recordings,
     frame: Annotated[
-        int,
-        typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0."),
+        int, typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0.")
     ],
     out: Out = None,
     force: Force = False,

@@ -130,8 +130,7 @@ def run(
     duration: Duration = None,
     every: Every = 1,
     frame: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Frame of tf whose poses are written."),
+        str | None, typer.Option(metavar="NAME", help="Frame of tf whose poses are written.")
     ] = None,
     initial_pose: Annotated[
         str | None,
@@ -383,12 +382,7 @@ def compare(
     lengths = None if segments is None else _parse_lengths(segments)
     evaluations = [
         evaluate(
-            truth,
-            trajectory,
-            name=name,
-            align=align,
-            segments=lengths,
-            segment_step=segment_step,
+            truth, trajectory, name=name, align=align, segments=lengths, segment_step=segment_step
         )
         for name, trajectory in trajectories.items()
     ]
@@ -413,8 +407,7 @@ def convert_(
     recordings: Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
-        _Layout | None,
-        typer.Option(help="Layout of the folder that is written."),
+        _Layout | None, typer.Option(help="Layout of the folder that is written.")
     ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,

@@ -11,13 +11,7 @@ import cv2
 import numpy as np
 
 from gvo.errors import CalibrationError
-from gvo.geometry.lens import (
-    DistortionModel,
-    Lens,
-    RectificationMaps,
-    bouguet,
-    bouguet_wide,
-)
+from gvo.geometry.lens import DistortionModel, Lens, RectificationMaps, bouguet, bouguet_wide
 from gvo.types import BoolArray, FloatArray
 
 

@@ -71,8 +71,7 @@ def ransac_rigid(
     n = len(correspondences)
     if n < max(3, config.min_inliers):
         return Failure(
-            reason=f"{n} matches, {config.min_inliers} are needed (ransac.min_inliers)",
-            n_matches=n,
+            reason=f"{n} matches, {config.min_inliers} are needed (ransac.min_inliers)", n_matches=n
         )
     near = _near(correspondences, config)
     samples = near[draw_samples(len(near), config.n_hypotheses, rng)]

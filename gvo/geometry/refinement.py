@@ -33,12 +33,7 @@ from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import (
-    Linearization,
-    StereoResiduals,
-    pose_jacobian,
-    whiten_in_place,
-)
+from gvo.geometry.residuals import Linearization, StereoResiduals, pose_jacobian, whiten_in_place
 from gvo.types import BoolArray, ConstantError, Failure, FloatArray
 
 # Squared length of a step, in sigmas, that no longer matters.

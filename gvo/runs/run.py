@@ -26,13 +26,7 @@ from gvo.io.poses.inputs import (
 from gvo.io.poses.truth import Truth, TruthComparison
 from gvo.io.recording import Source
 from gvo.io.run_folder.reader import read_run, trajectory_names
-from gvo.io.run_folder.writer import (
-    GLOBAL,
-    PICTURE,
-    REPORT,
-    RunFolder,
-    written_alone,
-)
+from gvo.io.run_folder.writer import GLOBAL, PICTURE, REPORT, RunFolder, written_alone
 from gvo.runs.loop import Output, RunLoop, motions_of_window
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.summary import RunningSummary, optimum_json, run_identity, summarize
@@ -229,10 +223,7 @@ def _conclude(
     summary |= _measure(folder, loop, compared)
     folder.write_summary(summary)
     return RunResult(
-        summary=summary,
-        evaluations=evaluations,
-        is_complete=is_complete,
-        warnings=tuple(warnings),
+        summary=summary, evaluations=evaluations, is_complete=is_complete, warnings=tuple(warnings)
     )
 
 

@@ -33,15 +33,7 @@ from gvo.runs.summary import peak_memory_mb
 from gvo.trajectory.evaluation import Evaluation, evaluate, evaluations_json
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import (
-    Edge,
-    Estimate,
-    FrameId,
-    PositionPrior,
-    Progress,
-    Rejected,
-    Status,
-)
+from gvo.types import Edge, Estimate, FrameId, PositionPrior, Progress, Rejected, Status
 from gvo.viz.plots import plot_trajectories
 
 POSES_HEADER = ("stamp_ns", "frame_id", "status", "n_edges", "n_rejected", "reason")
@@ -618,10 +610,7 @@ def smooth_lines(
 
 
 def _answer_all(
-    lines: Iterable[str],
-    answer: Callable[[str], None],
-    smoother: Smoother,
-    faults: InputFaults,
+    lines: Iterable[str], answer: Callable[[str], None], smoother: Smoother, faults: InputFaults
 ) -> None:
     line_format: LineFormat | None = None
     for number, line in enumerate(lines, start=1):

@@ -506,9 +506,7 @@ def evaluation_table(
     return _HEADER, [_cells(evaluation) for evaluation in evaluations]
 
 
-def evaluations_json(
-    evaluations: Sequence[Evaluation],
-) -> dict[str, list[dict[str, Any]]]:
+def evaluations_json(evaluations: Sequence[Evaluation]) -> dict[str, list[dict[str, Any]]]:
     """Return all columns of the table as plain values: `{"estimates": [{"name", ...}, ...]}`."""
     rows = [{name: getattr(each, name) for name in _JSON_NAMES} for each in evaluations]
     return {"estimates": rows}

@@ -13,16 +13,7 @@ from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
 
-_HEADER = (
-    "",
-    "error [m]",
-    "[%]",
-    "[deg]",
-    "[deg/100 m]",
-    "chi2",
-    "mean [m]",
-    "median [m]",
-)
+_HEADER = ("", "error [m]", "[%]", "[deg]", "[deg/100 m]", "chi2", "mean [m]", "median [m]")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

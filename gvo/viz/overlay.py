@@ -454,11 +454,7 @@ class Layout:
 
 
 def _draw_panels(
-    canvas: ImageArray,
-    layout: Layout,
-    frame: Frame,
-    found: RelativePose,
-    camera: PinholeCamera,
+    canvas: ImageArray, layout: Layout, frame: Frame, found: RelativePose, camera: PinholeCamera
 ) -> None:
     first, second = layout.panels(canvas)
     n_shown = min(len(found.pixels_current), len(found.points_current))

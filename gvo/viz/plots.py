@@ -286,10 +286,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
     suffix = path.suffix.lower()
     # the salt of the ids in SVG is random by default; the setting ends with the block
-    with (
-        write_faults(TrajectoryError, path),
-        rc_context({"svg.hashsalt": "gvo"}),
-    ):
+    with write_faults(TrajectoryError, path), rc_context({"svg.hashsalt": "gvo"}):
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, format=suffix[1:], dpi=150, metadata=METADATA[suffix])
 

@@ -10,13 +10,7 @@ from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
 from gvo._text import number_text, visible
 from gvo.batch.effects import COUNTS, span, value_medians
-from gvo.batch.report.values import (
-    N_LABEL,
-    Batch,
-    logarithmic_axis,
-    shown,
-    value_text,
-)
+from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown, value_text
 from gvo.viz.palette import ESTIMATES, REFUSED
 from gvo.viz.report.page import table_html
 from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure

@@ -19,12 +19,7 @@ _MIN_FRAMES = 3
 
 
 def check_frame_tree(
-    buffer: TfBuffer,
-    camera_frame: str,
-    stamps_ns: IntArray,
-    *,
-    base_frame: str,
-    check: CheckConfig,
+    buffer: TfBuffer, camera_frame: str, stamps_ns: IntArray, *, base_frame: str, check: CheckConfig
 ) -> Iterator[Finding]:
     """Yield what is missing between the camera, the robot's base and the root of their tree.
 

@@ -264,12 +264,7 @@ def _follow(
     first: ImageArray, second: ImageArray, start: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], BoolArray]:
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        start,
-        np.zeros_like(start),
-        winSize=_TRACK_WINDOW,
-        maxLevel=_N_TRACK_LEVELS,
+        first, second, start, np.zeros_like(start), winSize=_TRACK_WINDOW, maxLevel=_N_TRACK_LEVELS
     )
     return np.asarray(found), np.asarray(status)[:, 0] > 0
 

@@ -260,8 +260,7 @@ def row_error(matches: FreeMatches) -> RowError:
     sigma = 1.4826 * np.median(np.abs(rows - median))
     kept = rows[np.abs(rows - median) <= max(_OUTLIER_PX, _OUTLIER_SIGMAS * sigma)]
     return RowError(
-        median_px=float(np.median(kept)),
-        percentile_95_px=float(np.percentile(np.abs(kept), 95)),
+        median_px=float(np.median(kept)), percentile_95_px=float(np.percentile(np.abs(kept), 95))
     )
 
 

@@ -13,12 +13,7 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.bag.file import BagFile
-from gvo.io.bag.messages import (
-    camera_fields,
-    decode_compressed,
-    decode_compressed_depth,
-    stamp_of,
-)
+from gvo.io.bag.messages import camera_fields, decode_compressed, decode_compressed_depth, stamp_of
 from gvo.io.bag.reader import BagMessage, BagReader, MessageReader
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
@@ -267,11 +262,7 @@ def _bag_camera(
         )
         notes = (f"calibration: {name} leaves the size 0: {width}x{height} px as {image.name}",)
     return BagCamera(
-        image=image,
-        info_name=name,
-        fields=fields,
-        stamp_ns=stamp_of(message.header),
-        notes=notes,
+        image=image, info_name=name, fields=fields, stamp_ns=stamp_of(message.header), notes=notes
     )
 
 

@@ -97,11 +97,7 @@ IMAGES = {
 }
 """Encodings of grey and colour images."""
 
-DEPTHS = {
-    "16UC1": Encoding("u2", 1),
-    "mono16": Encoding("u2", 1),
-    "32FC1": Encoding("f4", 1),
-}
+DEPTHS = {"16UC1": Encoding("u2", 1), "mono16": Encoding("u2", 1), "32FC1": Encoding("f4", 1)}
 """Encodings of depth."""
 
 

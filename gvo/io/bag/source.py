@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
-from gvo.io.bag.calibration import (
-    BagCalibration,
-    calibrations_of_file,
-    calibrations_of_messages,
-)
+from gvo.io.bag.calibration import BagCalibration, calibrations_of_file, calibrations_of_messages
 from gvo.io.bag.cameras import CameraInfoWatch, find_contradiction
 from gvo.io.bag.messages import (
     decode_compressed,

@@ -160,10 +160,7 @@ def _stereo_set(
         pair = pair_of_extrinsics((raw[0], raw[1]), T_left_right, origin)
     stereo_baseline(pair, origin)
     return CameraSet(
-        calibrations=pair,
-        origin=origin,
-        baseline_from=key,
-        T_body_cam=_on_body(left, pair[0]),
+        calibrations=pair, origin=origin, baseline_from=key, T_body_cam=_on_body(left, pair[0])
     )
 
 
@@ -327,9 +324,7 @@ def _of_intrinsics(content: Mapping[Any, Any], where: str) -> DescribedCamera:
     if T_body_cam is None and T_cam_imu is not None:
         T_body_cam = se3.invert(T_cam_imu)
     return DescribedCamera(
-        fields=fields,
-        T_body_cam=T_body_cam,
-        T_cam_previous=_transform(content, "T_cn_cnm1", where),
+        fields=fields, T_body_cam=T_body_cam, T_cam_previous=_transform(content, "T_cn_cnm1", where)
     )
 
 

@@ -15,13 +15,7 @@ from gvo.config import SyncConfig
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.convert.common import (
-    LeftOut,
-    load_image,
-    plan_images,
-    pose_of_right,
-    pose_on_body,
-)
+from gvo.io.convert.common import LeftOut, load_image, plan_images, pose_of_right, pose_on_body
 from gvo.io.datasets.tum import DEFAULT_SCALE, published_calibration
 from gvo.io.frames import paired
 from gvo.io.images import MAX_COUNT, MILLIMETRES, encode_image, is_in_counts, to_counts

@@ -12,12 +12,7 @@ import numpy as np
 
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.io.calibration.files import (
-    CalibrationPaths,
-    CameraSet,
-    paths_of,
-    read_cameras,
-)
+from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
 from gvo.io.images import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
 from gvo.trajectory.formats import read_trajectory

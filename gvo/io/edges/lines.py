@@ -225,10 +225,7 @@ def _json_edges(content: Mapping[str, object]) -> list[dict[str, object]]:
     if not isinstance(edges, list):
         raise ValueError("edges must be a list of objects")
     own = {key: content[key] for key in _EDGE_KEYS if key in content}
-    return [
-        *([own] if own else []),
-        *(_object(edge, _EDGE_KEYS, "an edge") for edge in edges),
-    ]
+    return [*([own] if own else []), *(_object(edge, _EDGE_KEYS, "an edge") for edge in edges)]
 
 
 def _json_edge(content: Mapping[str, object]) -> Edge:
@@ -322,10 +319,7 @@ def _pose(numbers: FloatArray) -> FloatArray:
 
 
 def _edge(
-    reference_id: str | int,
-    numbers: FloatArray,
-    noise: FloatArray | None,
-    kernel: object = None,
+    reference_id: str | int, numbers: FloatArray, noise: FloatArray | None, kernel: object = None
 ) -> Edge:
     T = _pose(numbers)
     if noise is None:

@@ -19,10 +19,7 @@ _KINDS = "expected a pose graph of g2o, poses (TUM, KITTI, EuRoC), or a bag with
 
 
 def open_edges(
-    paths: Sequence[str | Path],
-    *,
-    topics: Sequence[str] = (),
-    sigmas: Sequence[StepSigma] = (),
+    paths: Sequence[str | Path], *, topics: Sequence[str] = (), sigmas: Sequence[StepSigma] = ()
 ) -> EdgeSource:
     """Open a pose graph, or one or more odometries of one moving frame.
 

@@ -216,10 +216,7 @@ class FusedChains:
             prior = anchor(sample.T_world_frame) if before is None else None
             before = sample
             yield PoseEvent(
-                frame_id=sample.stamp_ns,
-                stamp_ns=sample.stamp_ns,
-                edges=tuple(edges),
-                prior=prior,
+                frame_id=sample.stamp_ns, stamp_ns=sample.stamp_ns, edges=tuple(edges), prior=prior
             )
         for stream, follower in zip(self._streams[1:], followers, strict=True):
             if follower.n_edges == 0:

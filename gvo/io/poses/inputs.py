@@ -156,10 +156,7 @@ def _brought(found: PoseInput, truth: BagTruth, reader: BagReader, frame: str) -
         framed = in_frame(truth, tree, base_frame=frame)
         if not isinstance(framed, Failure):
             return replace(
-                found,
-                trajectory=framed.trajectory,
-                child_frame=frame,
-                decision=framed.decision,
+                found, trajectory=framed.trajectory, child_frame=frame, decision=framed.decision
             )
         reason = framed.reason
     apart = f"{found.name} is of {truth.child_frame}, the reference of {frame}: {reason}"

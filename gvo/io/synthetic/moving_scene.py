@@ -78,12 +78,7 @@ class MovingScene:
         return np.asarray(image + shares * render_image(virtual, T_map_cam, camera, beyond=plane))
 
     def render_depth(
-        self,
-        elapsed_s: float,
-        T_map_cam: FloatArray,
-        camera: PinholeCamera,
-        *,
-        is_reflected: bool,
+        self, elapsed_s: float, T_map_cam: FloatArray, camera: PinholeCamera, *, is_reflected: bool
     ) -> DepthArray:
         """Render the exact depth of a mirror's glass, or of what is seen in it, and of the rest.
 

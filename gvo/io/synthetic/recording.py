@@ -339,12 +339,7 @@ class SensorNoise:
 
 
 def expose(
-    grey: DepthArray,
-    noise: SensorNoise,
-    rng: np.random.Generator,
-    *,
-    stream: int,
-    elapsed_s: float,
+    grey: DepthArray, noise: SensorNoise, rng: np.random.Generator, *, stream: int, elapsed_s: float
 ) -> DepthArray:
     """Return grey values with the brightness of the moment, and noise.
 

@@ -65,11 +65,7 @@ class RunFrames:
     def __post_init__(self) -> None:
         """Fill in names; tf refuses a leading slash."""
         camera = bare(self.camera) or "camera_optical"
-        names = {
-            "world": bare(self.world),
-            "camera": camera,
-            "base": bare(self.base) or camera,
-        }
+        names = {"world": bare(self.world), "camera": camera, "base": bare(self.base) or camera}
         for key, name in names.items():
             object.__setattr__(self, key, name)
         if not self.world:
@@ -220,9 +216,7 @@ class Track:
 
 
 def twist_between(
-    estimate: Estimate,
-    previous: StampedPose | None,
-    step_covariance: FloatArray | None,
+    estimate: Estimate, previous: StampedPose | None, step_covariance: FloatArray | None
 ) -> Twist:
     """Return the velocity that leads from the pose before to this one.
 

@@ -9,20 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvo.trajectory.alignment import AlignMode
-from gvo.trajectory.evaluation import (
-    KITTI_SEGMENTS_M,
-    SHORT_SEGMENTS_M,
-    Consistency,
-)
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, SHORT_SEGMENTS_M, Consistency
 from gvo.types import FloatArray
 from gvo.viz.palette import ESTIMATES, Style, styles_of
 from gvo.viz.plots import plain
-from gvo.viz.report.measures import (
-    Comparison,
-    Drift,
-    drift,
-    drift_lengths,
-)
+from gvo.viz.report.measures import Comparison, Drift, drift, drift_lengths
 from gvo.viz.report.sheets import (
     WIDE,
     Plot,

@@ -10,11 +10,7 @@ import numpy as np
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.trajectory.alignment import AlignMode, alignment, pair
-from gvo.trajectory.evaluation import (
-    KITTI_SEGMENTS_M,
-    KITTI_STEP,
-    segment_errors,
-)
+from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, KITTI_STEP, segment_errors
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 

@@ -10,14 +10,7 @@ from typing import Any
 
 import viser
 
-from gvo.config import (
-    Config,
-    Parameter,
-    Value,
-    list_parameters,
-    sections,
-    validate_configuration,
-)
+from gvo.config import Config, Parameter, Value, list_parameters, sections, validate_configuration
 from gvo.errors import ConfigurationError
 
 DELAY_S = 0.4

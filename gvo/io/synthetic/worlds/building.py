@@ -59,10 +59,7 @@ def slab(
     aside = np.array([along[1], -along[0]]) / np.linalg.norm(along)
     corner = np.append(end - 0.5 * width * aside, height)
     return replace(
-        texture,
-        corner=corner,
-        edge_s=np.append(width * aside, 0.0),
-        edge_t=np.append(-along, 0.0),
+        texture, corner=corner, edge_s=np.append(width * aside, 0.0), edge_t=np.append(-along, 0.0)
     )
 
 

@@ -95,9 +95,7 @@ def traffic(seed: int) -> MovingScene:
     still = [*filter(_leaves_way, street_rectangles(seed))]
     textures = street_textures(seed) | {"bus": _bus_side(np.random.default_rng([seed, 4]))}
     return MovingScene(
-        scene=make_scene([*still, *_bus()], textures, DAYLIGHT),
-        n_still=len(still),
-        path=bus_path,
+        scene=make_scene([*still, *_bus()], textures, DAYLIGHT), n_still=len(still), path=bus_path
     )
 
 
