@@ -12,7 +12,8 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
-from gvo.types import Edge, Estimate, Failure, FloatArray, Loop, Optimum, RelativePose
+from gvo.types import Edge, Failure, FloatArray, Loop, Optimum, RelativePose
+from tests.results import estimate_at
 
 Rng: TypeAlias = np.random.Generator | None
 # Of the length of a motion, and of its turn: radians per metre.
@@ -90,12 +91,7 @@ class Drive:
                     sigmas = 1.5 * self.sigmas
                     edges.append(measured(self.truth, k, j, sigmas, self.rng, bias=self.bias))
         is_keyframe = j % self.every == 0
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS,
-            T_world_frame=self.T,
-            covariance=np.eye(6),
-            frame_id=j * PERIOD_NS,
-        )
+        estimate = estimate_at(j * PERIOD_NS, self.T, frame_id=j * PERIOD_NS)
         self.edges.append(edges)
         self.graph.add_frame(estimate, edges, is_keyframe=is_keyframe)
         if is_keyframe and j > 0:

@@ -1,5 +1,6 @@
 """The raw chain: first edges composed, whatever else is measured."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +15,14 @@ from gvo.io.run_folder.writer import RunFolder
 from gvo.odometry.chain import EdgeChain
 from gvo.runs.smooth import POSES_HEADER, Smoother
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, Status
+from tests.results import estimate_at
 
 SECOND = 1_000_000_000
 
 
 def causal(n: int, T: FloatArray | None = None) -> Estimate:
     """Return what the window says of pose n; of later poses the chain takes only the name."""
-    return Estimate(
-        stamp_ns=n * SECOND,
-        T_world_frame=np.eye(4) if T is None else T,
-        covariance=1e-10 * np.eye(6),
-        frame_id=n,
-    )
+    return estimate_at(n * SECOND, T, covariance=1e-10 * np.eye(6), frame_id=n)
 
 
 def edge(reference: int, T: FloatArray, sigma: float = 0.1) -> Edge:
@@ -76,12 +73,7 @@ def test_short_steps_without_an_edge_grow_as_unsure_as_a_long_one() -> None:
         chain.advance(causal(0), [], None)
         chain.advance(causal(1), [edge(0, np.eye(4))], None)
         for step in range(1, n_steps + 1):
-            late = Estimate(
-                stamp_ns=SECOND + step * SECOND // n_steps,
-                T_world_frame=np.eye(4),
-                covariance=1e-10 * np.eye(6),
-                frame_id=1 + step,
-            )
+            late = replace(causal(1 + step), stamp_ns=SECOND + step * SECOND // n_steps)
             raw = chain.advance(late, [], None)
         sigmas.append(np.sqrt(raw.covariance[0, 0]))
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.01)

@@ -14,7 +14,7 @@ from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
-from gvo.types import Edge, Estimate, FloatArray, Optimum, PosePrior, Status
+from gvo.types import Edge, FloatArray, Optimum, PosePrior, Status
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
@@ -26,6 +26,7 @@ from tests.odometry.drives import (
     poses,
     position_error,
 )
+from tests.results import estimate_at
 
 N_LAP = 100
 
@@ -102,10 +103,7 @@ def test_neither_the_world_nor_the_order_of_loops_matters(
     drive, moved = looped(1), RunGraph(WindowConfig())
     for j, edges in enumerate(drive.edges):
         T_world_frame = T @ drive.truth[j]
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS, T_world_frame=T_world_frame, covariance=np.eye(6)
-        )
-        moved.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+        moved.add_frame(estimate_at(j * PERIOD_NS, T_world_frame), edges, is_keyframe=j % 5 == 0)
     moved.loops = [drive.graph.loops[k] for k in order]
     expected = T @ poses(drive.graph.optimize(covariances=False))
     np.testing.assert_allclose(poses(moved.optimize(covariances=False)), expected, atol=1e-6)
@@ -117,7 +115,7 @@ def test_frames_between_keyframes_lie_between_both_ends() -> None:
     step = se3.make_transform(np.eye(3), np.array([0.9, 0.0, 0.0]))
     T, edges = np.eye(4), list[Edge]()
     for j in range(21):
-        estimate = Estimate(stamp_ns=j * PERIOD_NS, T_world_frame=T, covariance=np.eye(6))
+        estimate = estimate_at(j * PERIOD_NS, T)
         graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
         T = T @ step
         covariance = np.diag(np.full(6, 0.3) ** 2)
@@ -140,9 +138,7 @@ def test_frames_after_a_loss_go_with_what_comes_after_it() -> None:
         elif j > 0:
             edges = [measured(truth, j - 1, j, SIGMAS, None)]
         T = truth[j] if j < 8 else truth[j] @ se3.exp(np.array([0, 0.5, 0, 3.0, 0, 0]))
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS, T_world_frame=T, covariance=np.eye(6), status=status
-        )
+        estimate = estimate_at(j * PERIOD_NS, T, status=status)
         graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
     graph.loops = [drive.loop(0, 15)]
     optimum = graph.optimize()

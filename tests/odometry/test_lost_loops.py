@@ -9,7 +9,7 @@ from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
-from gvo.types import Edge, Estimate, FloatArray, Optimum, Status
+from gvo.types import Edge, FloatArray, Optimum, Status
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
@@ -20,6 +20,7 @@ from tests.odometry.drives import (
     poses,
     position_error,
 )
+from tests.results import estimate_at
 
 N_LAP = 100
 # Dark frames; the guess is wrong by far from the first one on.
@@ -38,9 +39,9 @@ def lit_again(
         if j > 0 and j not in dark and j != dark.stop:
             edges = [measured(truth, j - 1, j, SIGMAS, None)]
         is_dark = j in dark or j == dark.stop
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS,
-            T_world_frame=T if j < dark.start else T_guess_truth @ T,
+        estimate = estimate_at(
+            j * PERIOD_NS,
+            T if j < dark.start else T_guess_truth @ T,
             covariance=np.eye(6) if j < dark.start else 4.0 * np.eye(6),
             status=status if is_dark else Status.OK,
         )
@@ -99,12 +100,8 @@ def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
         edges = [] if j in (0, 50) else [measured(truth, j - 1, j, SIGMAS, None)]
         if j == 55:  # as by a keyframe that looks alike
             edges.append(drive.loop(10, 55, T=AWAY).edge)
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS,
-            T_world_frame=T,
-            covariance=np.eye(6),
-            status=Status.LOST if j == 50 else Status.OK,
-        )
+        status = Status.LOST if j == 50 else Status.OK
+        estimate = estimate_at(j * PERIOD_NS, T, status=status)
         drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
     optimum = drive.graph.optimize(covariances=False)
@@ -196,10 +193,7 @@ def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
         edges = [] if j in (0, 4) else [measured(drive.truth, j - 1, j, SIGMAS, None)]
         worlds = graph.world_of(edges)
         assert worlds == (0 if j < 4 else 1)
-        estimate = Estimate(
-            stamp_ns=j * PERIOD_NS, T_world_frame=drive.truth[j], covariance=np.eye(6)
-        )
-        graph.add_frame(estimate, edges, is_keyframe=j == 2)
+        graph.add_frame(estimate_at(j * PERIOD_NS, drive.truth[j]), edges, is_keyframe=j == 2)
     back = [measured(drive.truth, k, 9, SIGMAS, None) for k in (2, 8)]
     assert graph.world_of(back) == 0
     assert graph.world_of(back[1:]) == 1

@@ -1,10 +1,10 @@
 """Counts and warnings of a run."""
 
-import numpy as np
 import pytest
 
 from gvo.runs.statistics import RunStatistics
-from gvo.types import Estimate, FaultyFrame, FrameResult, SegmentJoin, Status
+from gvo.types import FaultyFrame, SegmentJoin, Status
+from tests.results import estimate_at, result_of
 
 
 def counted(n_ok: int, n_coasting: int) -> RunStatistics:
@@ -46,18 +46,9 @@ def test_images_without_partner_count_as_frames_only_where_they_are_a_loss() -> 
 def add(
     statistics: RunStatistics, stamp_ns: int, status: Status, segment: int, *joins: tuple[int, int]
 ) -> None:
-    pose = Estimate(stamp_ns=stamp_ns, T_world_frame=np.eye(4), covariance=np.eye(6))
-    result = FrameResult(
-        raw=pose,
-        causal=pose,
-        finished=(),
+    result = result_of(
+        estimate_at(stamp_ns),
         status=status,
-        reason="",
-        n_keypoints=9,
-        n_points=8,
-        n_matches=7,
-        n_inliers=6,
-        n_links=3,
         segment=segment,
         joins=tuple(
             SegmentJoin(segment=first, to_segment=second, stamp_ns=stamp_ns, reference_ns=0)

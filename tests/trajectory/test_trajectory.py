@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory, format_stamp
-from gvo.types import Estimate, FloatArray
+from gvo.types import FloatArray
+from tests.results import estimate_at
 from tests.trajectory.paths import random_trajectory, seeds, still, unturned
 
 
@@ -160,11 +161,7 @@ def test_selecting_keeps_stamps_poses_and_covariances_together() -> None:
 def test_estimates_in_any_order_become_a_trajectory_with_covariances() -> None:
     rng = np.random.default_rng(2)
     estimates = [
-        Estimate(
-            stamp_ns=stamp_ns,
-            T_world_frame=se3.exp(rng.normal(size=6)),
-            covariance=stamp_ns * np.eye(6),
-        )
+        estimate_at(stamp_ns, se3.exp(rng.normal(size=6)), covariance=stamp_ns * np.eye(6))
         for stamp_ns in (30, 10, 20)
     ]
     collected = Trajectory.of(estimates)

@@ -10,16 +10,7 @@ from hypothesis import strategies as st
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.images import encode_image
-from gvo.types import (
-    Estimate,
-    FaultyFrame,
-    FrameResult,
-    Loop,
-    RelativePose,
-    RgbdFrame,
-    Status,
-    StereoFrame,
-)
+from gvo.types import FaultyFrame, FrameResult, RelativePose, RgbdFrame, Status, StereoFrame
 from gvo.viz.overlay import (
     FOOTER_PX,
     HEADER_PX,
@@ -34,6 +25,7 @@ from gvo.viz.overlay import (
     table,
     text_width,
 )
+from tests.results import estimate_at, loop_of, result_of
 
 _GREY = np.random.default_rng(0).integers(60, 120, (80, 120), dtype=np.uint8)
 _pixels = st.tuples(st.floats(-30, 150), st.floats(-30, 110))
@@ -129,7 +121,6 @@ def _result(
     pixels: list[tuple[float, float]], depths_m: list[float], *, status: Status = Status.OK
 ) -> FrameResult:
     """Return what a frame gave whose points did not move in the image; all are inliers."""
-    estimate = Estimate(stamp_ns=10**18, T_world_frame=np.eye(4), covariance=np.eye(6))
     points = np.zeros((len(depths_m), 3))
     points[:, 2] = depths_m
     registration = RelativePose(
@@ -141,17 +132,11 @@ def _result(
         pixels_current=np.array(pixels).reshape(-1, 2),
         points_current=points,
     )
-    return FrameResult(
-        raw=estimate,
-        causal=estimate,
-        finished=(),
+    return result_of(
+        estimate_at(10**18),
         status=status,
-        reason="",
-        n_keypoints=9,
-        n_points=9,
         n_matches=len(pixels),
         n_inliers=len(pixels),
-        n_links=1,
         registration=registration,
         stage_ms={"read": 4.0, "window": 1.0},
     )
@@ -236,14 +221,7 @@ def test_each_status_has_a_badge_of_its_own() -> None:
 
 
 def test_a_loop_has_its_mark_in_the_upper_right_corner_and_leaves_the_stamp_readable() -> None:
-    loop = Loop(
-        stamp_ns=10**18,
-        reference_ns=10**18 - 98_765_400_000_000,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=90,
-        n_inliers=87,
-    )
+    loop = loop_of(10**18, 10**18 - 98_765_400_000_000)
     plain = _result([], [], status=Status.RESUMED)
     marked = replace(plain, loops=(loop,))
     assert loop_text(plain) == ""

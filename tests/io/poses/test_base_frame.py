@@ -14,7 +14,8 @@ from gvo.geometry import se3
 from gvo.io.poses.base_frame import BaseFrame, parse_initial_pose
 from gvo.io.poses.tf import TfBuffer
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, Estimate, FloatArray, Status
+from gvo.types import Edge, Estimate, FloatArray
+from tests.results import estimate_at
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STAMPS_NS = [1_700_000_000_000_000_000 + n * 100_000_000 for n in range(6)]
@@ -37,9 +38,7 @@ def camera_drive(rng: np.random.Generator) -> list[Estimate]:
     for _ in STAMPS_NS[1:]:
         poses.append(poses[-1] @ random_transform(rng))
     return [
-        Estimate(
-            stamp_ns=stamp_ns, T_world_frame=T, covariance=random_covariance(rng), status=Status.OK
-        )
+        estimate_at(stamp_ns, T, covariance=random_covariance(rng))
         for stamp_ns, T in zip(STAMPS_NS, poses, strict=True)
     ]
 
@@ -90,11 +89,7 @@ def test_a_camera_that_looks_forward_moves_the_base_along_its_x_axis() -> None:
     first, second = camera_drive(rng)[:2]
     forward = se3.make_transform(np.eye(3), np.array([0.0, 0.0, 2.0]))
     frame.apply(first)
-    moved = frame.apply(
-        Estimate(
-            stamp_ns=second.stamp_ns, T_world_frame=forward, covariance=np.eye(6), status=Status.OK
-        )
-    )
+    moved = frame.apply(estimate_at(second.stamp_ns, forward))
     np.testing.assert_allclose(moved.T_world_frame[:3, 3], [2.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(moved.T_world_frame[:3, :3], np.eye(3), atol=1e-12)
 
@@ -141,14 +136,7 @@ def test_a_base_that_stands_still_stands_still_under_a_camera_that_pans(seed: in
     buffer, T_base_cam = mounted(rng, STAMPS_NS)
     frame = BaseFrame.from_tf(buffer, "base", "cam", T_initial=random_transform(rng))
     outs = [
-        frame.apply(
-            Estimate(
-                stamp_ns=stamp_ns,
-                T_world_frame=np.linalg.inv(T_base_cam[0]) @ T_base_cam[n],
-                covariance=np.eye(6),
-                status=Status.OK,
-            )
-        )
+        frame.apply(estimate_at(stamp_ns, np.linalg.inv(T_base_cam[0]) @ T_base_cam[n]))
         for n, stamp_ns in enumerate(STAMPS_NS)
     ]
     for out in outs[1:]:
@@ -165,14 +153,7 @@ def test_the_covariance_is_that_of_sampled_poses(is_moving: bool) -> None:
     T, covariance = random_transform(rng), random_covariance(rng, scale=1e-4)
 
     def of(T_world_cam: FloatArray) -> Estimate:
-        return frame.apply(
-            Estimate(
-                stamp_ns=STAMPS_NS[3],
-                T_world_frame=T_world_cam,
-                covariance=covariance,
-                status=Status.OK,
-            )
-        )
+        return frame.apply(estimate_at(STAMPS_NS[3], T_world_cam, covariance=covariance))
 
     out = of(T)
     twists = rng.multivariate_normal(np.zeros(6), covariance, size=4000)

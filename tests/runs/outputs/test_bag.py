@@ -33,13 +33,12 @@ from gvo.types import (
     FloatArray,
     Frame,
     FrameResult,
-    Loop,
-    Optimum,
     RelativePose,
     RgbdFrame,
     Status,
     StereoFrame,
 )
+from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 _KINDS = pytest.mark.parametrize("name", ["run.mcap", "run.bag"])
 _N_FRAMES = 12
@@ -359,37 +358,12 @@ def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_correc
         np.testing.assert_allclose(found, T_world_base @ names.mount(stamp_ns), atol=1e-12)
 
 
-def _loop(stamp_ns: int, reference_ns: int, reason: str = "") -> Loop:
-    return Loop(
-        stamp_ns=stamp_ns,
-        reference_ns=reference_ns,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=90,
-        n_inliers=87,
-        reason=reason,
-    )
-
-
-def _optimum(estimates: list[Estimate], *loops: Loop) -> Optimum:
-    return Optimum(
-        estimates=tuple(estimates),
-        keyframes_ns=(),
-        edges=(),
-        loops=loops,
-        residuals=np.zeros(len(loops)),
-        error_before=1.0,
-        error=0.5,
-        n_iterations=3,
-    )
-
-
 @_KINDS
 def test_loops_are_drawn_when_they_are_confirmed_and_at_the_end_between_global_poses(
     tmp_path: Path, name: str
 ) -> None:
     stamps = [_START_NS + k * _SECOND_NS for k in range(4)]
-    loop = _loop(stamps[2], stamps[0])
+    loop = loop_of(stamps[2], stamps[0])
     aside = np.eye(4)
     aside[0, 3] = 1.0
     with RunBag(tmp_path / name) as bag:
@@ -399,7 +373,7 @@ def test_loops_are_drawn_when_they_are_confirmed_and_at_the_end_between_global_p
             loops = (loop,) if stamp_ns == stamps[2] else ()
             bag.add_frame(frame, replace(result, loops=loops))
             poses.append(replace(result.causal, T_world_frame=aside @ result.causal.T_world_frame))
-        bag.add_optimum(_optimum(poses[::-1], loop, _loop(stamps[3], stamps[0], "contradicts")))
+        bag.add_optimum(optimum_of(poses[::-1], loop, loop_of(stamps[3], stamps[0], "contradicts")))
     messages = _read(tmp_path / name)
     causal, last = messages["/gvo/loops"]
     assert [(m.stamp_ns, m.content.ns) for m in (causal, last)] == [
@@ -575,22 +549,12 @@ def _made_up(stamp_ns: int, status: Status = Status.OK) -> tuple[Frame, FrameRes
     """Return a small frame and a pose ten metres a second ahead."""
     T = np.eye(4)
     T[2, 3] = 10e-9 * (stamp_ns - _START_NS)
-    pose = Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=1e-4 * np.eye(6), status=status)
+    pose = estimate_at(stamp_ns, T, covariance=1e-4 * np.eye(6), status=status)
     registration = RelativePose(T_reference_current=np.eye(4), covariance=np.eye(6))
     is_tied = status in (Status.OK, Status.RESUMED)
-    result = FrameResult(
-        raw=pose,
-        causal=pose,
-        finished=(),
-        status=status,
-        reason="" if is_tied else "too dark",
-        n_keypoints=0,
-        n_points=0,
-        n_matches=0,
-        n_inliers=0,
-        n_links=0,
-        registration=registration if is_tied else None,
-    )
+    reason = "" if is_tied else "too dark"
+    registered = registration if is_tied else None
+    result = result_of(pose, status=status, reason=reason, registration=registered)
     image = np.zeros((8, 8), dtype=np.uint8)
     return RgbdFrame(stamp_ns=stamp_ns, image=image, depth=np.ones((8, 8), np.float32)), result
 

@@ -43,13 +43,11 @@ from gvo.types import (
     FloatArray,
     FrameLink,
     FrameResult,
-    Loop,
-    Optimum,
     RelativePose,
-    Status,
     StereoFrame,
 )
 from gvo.viz.palette import COUNTS, LINKS, STAGES
+from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 _N_FRAMES = 12
 _ESTIMATES = ("raw", "causal", "smoothed", "global")
@@ -418,21 +416,7 @@ def _made(
     stamp_ns: int, T_world_cam: FloatArray | None = None, *, links: tuple[FrameLink, ...] = ()
 ) -> FrameResult:
     """Make the result of a frame that was not tracked."""
-    T = np.eye(4) if T_world_cam is None else T_world_cam
-    estimate = Estimate(stamp_ns=stamp_ns, T_world_frame=T, covariance=np.eye(6))
-    return FrameResult(
-        raw=estimate,
-        causal=estimate,
-        finished=(),
-        status=Status.OK,
-        reason="",
-        n_keypoints=0,
-        n_points=0,
-        n_matches=0,
-        n_inliers=0,
-        n_links=0,
-        links=links,
-    )
+    return result_of(estimate_at(stamp_ns, T_world_cam), links=links)
 
 
 def _frame(stamp_ns: int) -> StereoFrame:
@@ -488,31 +472,11 @@ def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(
     def at(x: float) -> FloatArray:
         return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
 
-    def loop(stamp_ns: int, reference_ns: int, reason: str = "") -> Loop:
-        return Loop(
-            stamp_ns=stamp_ns,
-            reference_ns=reference_ns,
-            T_reference_frame=np.eye(4),
-            covariance=np.eye(6),
-            n_matches=9,
-            n_inliers=8,
-            reason=reason,
-        )
-
     results = [_made(10, at(1.0)), _made(20, at(2.0)), _made(30, at(3.0))]
     # The place of the second is not known.
-    results[2] = replace(results[2], loops=(loop(30, 10), loop(30, 15)))
+    results[2] = replace(results[2], loops=(loop_of(30, 10), loop_of(30, 15)))
     moved = [replace(each.causal, T_world_frame=at(0.5 * k)) for k, each in enumerate(results)]
-    optimum = Optimum(
-        estimates=tuple(moved),
-        keyframes_ns=(10, 20, 30),
-        edges=(),
-        loops=(loop(30, 10), loop(30, 20, "contradicts the others")),
-        residuals=np.zeros(2),
-        error_before=1.0,
-        error=0.5,
-        n_iterations=3,
-    )
+    optimum = optimum_of(moved, loop_of(30, 10), loop_of(30, 20, "contradicts the others"))
     path = tmp_path / "made.rrd"
     with RunRerun(path, _CAMERA) as file:
         for result in results:

@@ -20,8 +20,9 @@ from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.video import RunOverlay, film_width
-from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray, Loop
+from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
+from tests.results import loop_of
 
 _N_FRAMES = 11
 _Run = tuple[SyntheticRecording, list[tuple[Frame, FrameResult]]]
@@ -138,14 +139,7 @@ def test_frames_become_numbered_files_where_a_folder_is_named(room: _Run, tmp_pa
 def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
     recording, pairs = drive
     camera = recording.info.camera
-    loop = Loop(
-        stamp_ns=pairs[2][0].stamp_ns,
-        reference_ns=pairs[0][0].stamp_ns,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=90,
-        n_inliers=87,
-    )
+    loop = loop_of(pairs[2][0].stamp_ns, pairs[0][0].stamp_ns)
     ends_ns = loop.stamp_ns + 1_000_000_000
     late = [(_shifted(frame, ends_ns + n), result) for n, (frame, result) in enumerate(pairs[5:7])]
     shown = [*pairs[:4], *late]

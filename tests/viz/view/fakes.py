@@ -11,8 +11,10 @@ import numpy as np
 
 from gvo.config import Config
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import Estimate, FloatArray, FrameLink, FrameResult, IntArray, Status
+from gvo.types import FloatArray, FrameLink, FrameResult, IntArray
 from gvo.viz.view.history import FrameView
+from tests.results import estimate_at
+from tests.results import result_of as made_up
 
 PERIOD_NS = 100_000_000
 CAMERA = PinholeCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0)
@@ -34,17 +36,13 @@ def result_of(index: int) -> FrameResult:
     """What a frame gives: a link to the frame before and a refused one to the first."""
     stamp_ns = PERIOD_NS * index
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 4e-4, 9e-4]) * (index + 1)
-    estimate = Estimate(stamp_ns=stamp_ns, T_world_frame=pose_of(index), covariance=covariance)
+    estimate = estimate_at(stamp_ns, pose_of(index), covariance=covariance)
     links = (
         FrameLink(reference_ns=stamp_ns - PERIOD_NS, kind="step", chi2=6.0, is_accepted=True),
         FrameLink(reference_ns=0, kind="keyframe", chi2=None, is_accepted=False),
     )
-    return FrameResult(
-        raw=estimate,
-        causal=estimate,
-        finished=(),
-        status=Status.OK,
-        reason="",
+    return made_up(
+        estimate,
         n_keypoints=200,
         n_points=150,
         n_matches=100 + index,

@@ -13,19 +13,11 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from gvo.config import DepthConfig
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import (
-    Estimate,
-    FloatArray,
-    FrameResult,
-    Loop,
-    RelativePose,
-    RgbdFrame,
-    Status,
-    StereoFrame,
-)
+from gvo.types import Estimate, FloatArray, RelativePose, RgbdFrame, StereoFrame
 from gvo.viz.view import clouds
 from gvo.viz.view.clouds import Cloud, KeyframeClouds, accumulate, frame_cloud, thin
 from gvo.viz.view.history import DiskList, FrameRecord, History
+from tests.results import estimate_at, loop_of, result_of
 
 CAMERA = PinholeCamera(fx=100.0, fy=110.0, cx=79.5, cy=59.5, width=160, height=120)
 POINT: Cloud = (
@@ -41,24 +33,17 @@ def at(x_m: float) -> FloatArray:
 
 
 def estimate(frame: int, x_m: float) -> Estimate:
-    return Estimate(stamp_ns=frame * 10, T_world_frame=at(x_m), covariance=np.eye(6))
+    return estimate_at(frame * 10, at(x_m))
 
 
 def record(
     frame: int, *, finished: tuple[int, ...] = (), window: tuple[int, ...] = ()
 ) -> FrameRecord:
     """Return a frame whose raw, causal, window and final x tell where they come from."""
-    result = FrameResult(
-        raw=estimate(frame, frame + 0.1),
+    result = result_of(
+        estimate(frame, frame + 0.1),
         causal=estimate(frame, frame + 0.2),
         finished=tuple(estimate(done, done + 0.4) for done in finished),
-        status=Status.OK,
-        reason="",
-        n_keypoints=0,
-        n_points=0,
-        n_matches=0,
-        n_inliers=0,
-        n_links=0,
         keyframes_ns=(10 * (frame - frame % 3),),
     )
     return FrameRecord(
@@ -125,16 +110,8 @@ def test_loops_join_the_best_poses_as_of_the_frame_shown() -> None:
     history, last = History(2), record(5, finished=(2,), window=(5,))
     for each in (record(2), record(3)):
         history.add(each)
-    loop = Loop(
-        stamp_ns=50,
-        reference_ns=20,
-        T_reference_frame=np.eye(4),
-        covariance=np.eye(6),
-        n_matches=9,
-        n_inliers=8,
-    )
     assert last.result is not None
-    history.add(replace(last, result=replace(last.result, loops=(loop,))))
+    history.add(replace(last, result=replace(last.result, loops=(loop_of(50, 20),))))
     history.show(3)
     assert history.loop_lines().shape == (0, 2, 3)
     history.show(4)
