@@ -1,10 +1,13 @@
 """Fixtures that several test modules share."""
 
 import os
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -31,6 +34,12 @@ class Answer(NamedTuple):
 Command = Callable[..., Answer]
 GVO = [sys.executable, "-c", "from gvo.cli import main; main()"]
 """The command in a process of its own."""
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
+    "OMP_NUM_THREADS": "1",
+}
+"""Of a process that imports the same package as the tests do."""
 TABLES = (
     *(f"{name}.txt" for name in ("raw", "causal", "smoothed")),
     *(f"{name}_covariance.csv" for name in ("raw", "causal", "smoothed")),
@@ -43,6 +52,35 @@ TABLES = (
 def is_one_line(text: str) -> bool:
     """Tell whether a command said in one line what is wrong, and nothing else."""
     return text.startswith("gvo: error: ") and text.count("\n") == 1
+
+
+def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program, by the words that follow `python`, to its end; return what it said."""
+    command = [sys.executable, *map(str, words)]
+    asked: dict[str, Any] = {"capture_output": True, "text": True, "env": ENVIRONMENT}
+    return subprocess.run(command, check=False, **asked | options)
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """Begin a `gvo` command in a process of its own."""
+    options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    world = ENVIRONMENT | {"COLUMNS": "80"}
+    return subprocess.Popen(
+        [*GVO, *map(str, arguments)], **options, env=world, text=True, bufsize=1
+    )
+
+
+def interrupt(
+    process: subprocess.Popen[str], table: Path, number: signal.Signals = signal.SIGINT
+) -> tuple[int, str]:
+    """Send a signal when a run has three rows of a table; return its exit code and last words."""
+    deadline = time.monotonic() + 60
+    while not (table.exists() and table.read_text().count("\n") >= 4):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    return process.returncode, errors
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,11 @@
 """What is loaded, and when: drawing and serving bring their libraries only when they happen."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.conftest import python
 
 BATCHES = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")
 HEAVY = ("matplotlib", "viser", "rerun", "selenium", *BATCHES)
@@ -44,13 +44,7 @@ print(json.dumps(found))
 def loaded_by(*actions: str) -> list[list[object]]:
     """Return exit code and libraries loaded of each line of Python, in a process of their own."""
     program = _PROGRAM.format(heavy=HEAVY)
-    done = subprocess.run(
-        [sys.executable, "-c", program, *actions],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = python("-c", program, *actions)
     assert (done.returncode, done.stderr) == (0, "")
     found: list[list[object]] = json.loads(done.stdout)
     return found

@@ -6,13 +6,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 import gvo
 from gvo.config import load_configuration
-from gvo.io.convert.convert import Layout, convert
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.recording import Sensor
 
 pytestmark = pytest.mark.acceptance
 
@@ -56,25 +56,16 @@ def differing(a: dict[str, bytes], b: dict[str, bytes]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SyntheticRecording]:
-    return {
-        sensor: SyntheticRecording("handheld", sensor, n_frames=10, scale=0.3)
-        for sensor in ("stereo", "rgbd")
-    }
-
-
-@pytest.fixture(scope="module")
-def bags(
-    recordings: dict[str, SyntheticRecording], tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, str]:
-    folder = tmp_path_factory.mktemp("input")
-    for sensor, recording in recordings.items():
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[Sensor, str]:
+    folder, sensors = tmp_path_factory.mktemp("input"), get_args(Sensor)
+    for sensor in sensors:
+        recording = gvo.SyntheticRecording("handheld", sensor, n_frames=10, scale=0.3)
         gvo.convert(recording, folder / f"{sensor}.mcap")
-    return {sensor: str(folder / f"{sensor}.mcap") for sensor in recordings}
+    return {sensor: str(folder / f"{sensor}.mcap") for sensor in sensors}
 
 
 def run_all(
-    bags: dict[str, str],
+    bags: dict[Sensor, str],
     folder: Path,
     *,
     threads: int,
@@ -122,7 +113,7 @@ def limit_cores(cores: set[int]) -> None:
 
 
 def test_threads_cores_hashes_and_folders_change_no_bit(
-    bags: dict[str, str], tmp_path: Path
+    bags: dict[Sensor, str], tmp_path: Path
 ) -> None:
     one = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
     many = {"OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "4", "PYTHONHASHSEED": "4711"}
@@ -137,7 +128,7 @@ def test_threads_cores_hashes_and_folders_change_no_bit(
     assert differing(alone, together) == []
 
 
-def test_a_difference_is_seen(bags: dict[str, str], tmp_path: Path) -> None:
+def test_a_difference_is_seen(bags: dict[Sensor, str], tmp_path: Path) -> None:
     outputs = gvo.RunOutputs(report=False)
     for huber in (1.5, 1.5000001):
         config = load_configuration(None, [f"registration.huber={huber}"])
@@ -145,28 +136,3 @@ def test_a_difference_is_seen(bags: dict[str, str], tmp_path: Path) -> None:
         gvo.run_recording(source, tmp_path / str(huber), config=config, outputs=outputs)
     found = differing(results(tmp_path / "1.5"), results(tmp_path / "1.5000001"))
     assert {"raw.txt", "causal.txt", "smoothed.txt", "summary.json"} <= set(found)
-
-
-@pytest.mark.parametrize(("sensor", "layout"), [("stereo", "kitti"), ("rgbd", "tum")])
-def test_the_kind_of_file_changes_no_bit(
-    recordings: dict[str, SyntheticRecording], tmp_path: Path, sensor: str, layout: Layout
-) -> None:
-    folder = tmp_path / "folder" / "walk"
-    folder.parent.mkdir()
-    convert(recordings[sensor], folder, layout=layout)
-    found = {"folder": run(folder, tmp_path / "of_folder")}
-    for ending in ("bag", "mcap", "db3"):
-        bag = tmp_path / ending / f"walk.{ending}"
-        bag.parent.mkdir()
-        convert(gvo.open_recording(folder), bag)
-        found[ending] = run(bag, tmp_path / f"of_{ending}")
-    assert differing(found["bag"], found["mcap"]) == []
-    assert differing(found["db3"], found["mcap"]) == []
-    # The summary tells what was read.
-    assert set(differing(found["folder"], found["mcap"])) <= {"summary.json"}
-
-
-def run(path: Path, out: Path) -> dict[str, bytes]:
-    source = gvo.open_recording(path)
-    gvo.run_recording(source, out, outputs=gvo.RunOutputs(report=False))
-    return results(out)

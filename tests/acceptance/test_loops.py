@@ -1,9 +1,6 @@
 """The judgement of loop closure: what counts as a visit, as a wrong loop, as a blackout."""
 
 import importlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +11,19 @@ import gvo
 from gvo.geometry import se3
 from gvo.testing.faults import Black, FaultySource
 from gvo.trajectory.g2o import format_edge
+from tests.acceptance.conftest import SCRIPTS, Script
+from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
 SIGMAS = np.diag([0.01] * 3 + [0.1] * 3)  # rad, m
 
 
-@pytest.fixture(scope="module")
-def loops() -> Any:
+@pytest.fixture
+def loops(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The module of the script, which imports others beside it."""
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        return importlib.import_module("benchmark_loops")
-    finally:
-        sys.path.remove(str(SCRIPTS))
+    monkeypatch.syspath_prepend(SCRIPTS)
+    return importlib.import_module("benchmark_loops")
 
 
 def round_trip() -> gvo.Trajectory:
@@ -110,7 +105,7 @@ def test_what_is_magnified_moves_away_from_the_middle(loops: Any) -> None:
 
 def test_the_table_shows_the_errors_that_the_runs_tell(tmp_path: Path) -> None:
     options = ["--loops", "--seeds", "2-2", "--kind", "room", "--frames", "40", "--dark", "0.5-0.8"]
-    answer = benchmark(options)
+    answer = python(SCRIPTS / "benchmark.py", *options)
     assert answer.returncode == 0, answer.stderr
     table = [line for line in answer.stdout.splitlines() if line.startswith("|")]
     cells = [cell.strip() for cell in table[2].strip("| ").split("|")]
@@ -137,16 +132,6 @@ def test_the_table_shows_the_errors_that_the_runs_tell(tmp_path: Path) -> None:
     assert cells[13] == "1"
 
 
-def benchmark(options: list[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(SCRIPTS / "benchmark.py"), *options],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)},
-        check=False,
-    )
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -158,8 +143,7 @@ def benchmark(options: list[str]) -> subprocess.CompletedProcess[str]:
         (["--loops", "x.bag", "--set", "loops.enabled=false"], "expected loops.enabled"),
     ],
 )
-def test_what_cannot_be_judged_is_told_in_one_line(options: list[str], message: str) -> None:
-    answer = benchmark(options)
-    assert answer.returncode == 2
-    assert message in answer.stderr.splitlines()[-1]
-    assert "Traceback" not in answer.stderr
+def test_what_cannot_be_judged_is_told_in_one_line(
+    script: Script, options: list[str], message: str
+) -> None:
+    assert message in script("benchmark", options)

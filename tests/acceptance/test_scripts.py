@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import re
 import subprocess
 import sys
@@ -16,23 +15,16 @@ import pytest
 
 import gvo
 from gvo.geometry import se3
-from tests.conftest import GVO
+from tests.acceptance.conftest import Script
+from tests.conftest import ENVIRONMENT, GVO, python
 
 pytestmark = pytest.mark.acceptance
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
-# The scripts import the same package as the tests do.
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)}
 
 
 def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(SCRIPTS / f"{name}.py"), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=ENVIRONMENT,
-        check=False,
-    )
+    return python(SCRIPTS / f"{name}.py", *arguments)
 
 
 def output(name: str, *arguments: object) -> list[str]:
@@ -112,9 +104,11 @@ def test_the_ablation_leaves_out_what_its_rows_say(benchmark_lines: list[str]) -
     assert chain[:4] == chain[4:] != rows["as set"][4:]
 
 
-def test_the_ablation_knows_sensor_and_front_end(room_bag: Path) -> None:
+def test_the_ablation_knows_sensor_and_front_end(tmp_path: Path) -> None:
+    room = gvo.SyntheticRecording("handheld", "rgbd", n_frames=6, scale=0.4)
+    gvo.convert(room, tmp_path / "room.bag")
     options = ["--set", "frontend.kind=klt", "--rounds", 1, "--ablation"]
-    rows = table(output("benchmark", room_bag, *options), "settings")
+    rows = table(output("benchmark", tmp_path / "room.bag", *options), "settings")
     assert not any("disparity" in name for name in rows)
     assert [name for name in rows if "frontend" in name] == ["frontend.kind=descriptor"]
     # only the truth has no error: those of a trajectory are measured, not copied
@@ -191,10 +185,8 @@ def test_two_trajectories_are_fused_and_compared(tmp_path: Path) -> None:
     assert float(rows["smoothed"][3]) < float(rows["1.02"][3]) < float(rows["0.96"][3])
 
 
-def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(tmp_path: Path) -> None:
-    options = ["--world", "handheld", "--sensor", "rgbd", "--frames", 6]
-    assert run("make_demo_bag", tmp_path / "room.bag", *options).returncode == 0
-    answer = run("odometry_of_opencv", tmp_path / "room.bag")
+def test_opencvs_odometry_drives_the_window_or_is_said_to_be_missing(room_bag: Path) -> None:
+    answer = run("odometry_of_opencv", room_bag)
     if not hasattr(cv2, "Odometry"):
         assert answer.returncode == 2
         assert "has no cv2.Odometry" in answer.stderr
@@ -300,17 +292,14 @@ def test_an_rgbd_camera_of_ones_own_is_tracked_without_a_dropped_frame(tmp_path:
         ("make_demo_bag", ["x.bag", "--frames", "0"]),
     ],
 )
-def test_bad_input_is_told_without_a_traceback(name: str, arguments: list[str]) -> None:
-    answer = run(name, *arguments)
-    assert answer.returncode == 2
-    assert "Traceback" not in answer.stderr
-    assert "error" in answer.stderr
+def test_bad_input_is_told_in_one_line(script: Script, name: str, arguments: list[str]) -> None:
+    assert "error" in script(name, arguments)
 
 
 def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at() -> None:
     # Of ten seeds the means lie between 0.5 and 2.0 (docs/smoothing.md); of fewer they spread more.
     kinds = "descriptor", "klt"
-    measured = output("consistency", "--seeds", "6", "--frontends", *kinds)
+    measured = output("consistency", "--seeds", "3", "--frontends", *kinds)
     rows = [line.split() for line in measured[1:]]
     assert [row[:3] for row in rows] == [
         [world, kind, estimate]
@@ -321,8 +310,9 @@ def test_covariances_tell_the_errors_of_recordings_that_were_not_looked_at() -> 
     for row in rows:
         n_pairs, rotation, translation = int(row[3]), float(row[4]), float(row[5])
         assert n_pairs > 50
-        assert 0.2 < rotation < 2.5
-        assert 0.2 < translation < 2.5
+        assert min(rotation, translation) > 0.15
+        assert max(rotation, translation) < 3.5
+    assert 0.4 < np.median([float(number) for row in rows for number in row[4:6]]) < 1.5
 
 
 def test_a_recording_is_fed_to_a_live_run(drive_bag: Path, tmp_path: Path) -> None:
@@ -340,9 +330,7 @@ def test_a_recording_is_fed_to_a_live_run(drive_bag: Path, tmp_path: Path) -> No
     given = [f"--calibration={path}" for path in calibrations]
     options = ["--rectified", "--no-report", "--queue=1000", f"--out={tmp_path / 'out'}", *given]
     with subprocess.Popen(feeder, stdout=subprocess.PIPE, env=ENVIRONMENT) as sending:
-        live = [*GVO, "live", "-", *options]
-        answer = subprocess.run(
-            live, stdin=sending.stdout, capture_output=True, text=True, env=ENVIRONMENT, check=False
-        )
+        live = [*GVO[1:], "live", "-", *options]
+        answer = python(*live, stdin=sending.stdout)
     assert answer.returncode == 0, answer.stderr
     assert "20 frames, all tracked" in answer.stdout

@@ -1,8 +1,6 @@
 """The benchmark of rendered recordings prints the errors of each seed, and reads what it kept."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,26 +8,17 @@ import pytest
 
 import gvo
 from gvo.types import FaultyFrame
+from tests.acceptance.conftest import Script
+from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
 BENCHMARK = Path(__file__).parents[2] / "scripts/benchmark.py"
 N_FRAMES = 34  # just over a second, which the NEES needs
-ENVIRONMENT = {
-    **os.environ,
-    "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
-    "OMP_NUM_THREADS": "1",
-}
 
 
 def benchmark(*options: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(BENCHMARK), "--frames", str(N_FRAMES), *map(str, options)],
-        capture_output=True,
-        text=True,
-        env=ENVIRONMENT,
-        check=False,
-    )
+    return python(BENCHMARK, "--frames", N_FRAMES, *options)
 
 
 def rows_of(table: str) -> dict[str, list[str]]:
@@ -90,8 +79,7 @@ def test_the_table_shows_the_errors_of_each_seed_again_from_the_kept_bags(tmp_pa
         (["--seeds", "0"], "argument --seeds"),
     ],
 )
-def test_options_out_of_range_end_with_one_line_and_2(options: list[str], message: str) -> None:
-    answer = benchmark(*options)
-    assert answer.returncode == 2
-    assert message in answer.stderr.splitlines()[-1]
-    assert "Traceback" not in answer.stderr
+def test_options_out_of_range_end_with_one_line_and_2(
+    script: Script, options: list[str], message: str
+) -> None:
+    assert message in script("benchmark", ["--frames", N_FRAMES, *options])

@@ -1,10 +1,7 @@
 """A window lives long, and so does a run: soaks, a part of their length."""
 
 import gc
-import os
 import runpy
-import subprocess
-import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -16,29 +13,19 @@ import gvo
 from gvo.frontend.klt import KltFrontend
 from gvo.io.synthetic.worlds.motion import LAP_M
 from gvo.types import Progress
+from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
 ROOT = Path(__file__).parents[2]
 BENCHMARK = ROOT / "scripts/benchmark.py"
 SOAK = ROOT / "tests/quality/soak.py"
-ENVIRONMENT = {
-    **os.environ,
-    "PYTHONPATH": str(Path(gvo.__file__).parent.parent),
-    "OMP_NUM_THREADS": "1",
-}
 
 
 def test_a_short_life_ends_well() -> None:
     n = 2000
     # In a process of its own, as the memory of this one is that of other tests, too.
-    answer = subprocess.run(
-        [sys.executable, str(BENCHMARK), "--soak", str(n), "--untimed"],
-        capture_output=True,
-        text=True,
-        env=ENVIRONMENT,
-        check=False,
-    )
+    answer = python(BENCHMARK, "--soak", n, "--untimed")
     # It fails by itself where a pose was not handed over exactly once, an estimate is not
     # finite, or the memory of the last tenth is above that of the second.
     assert answer.returncode == 0, answer.stderr

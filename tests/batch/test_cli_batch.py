@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +25,7 @@ from tests.batch.conftest import (
     state_of,
     wait_until,
 )
-from tests.conftest import GVO, Answer, Command, is_one_line
+from tests.conftest import GVO, Answer, Command, is_one_line, python
 
 Batch = Callable[..., Answer]
 
@@ -187,8 +186,7 @@ def test_a_folder_that_cannot_be_written_is_a_line(
 def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, name: str) -> None:
     program = f"import sys; sys.modules[{name!r}] = None\n{GVO[-1]}"
     out = tmp_path / "out"
-    command = [sys.executable, "-c", program, "batch", str(bags), "--out", str(out)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    answer = python("-c", program, "batch", bags, "--out", out)
     assert answer.returncode == 2
     assert is_one_line(answer.stderr), answer.stderr
     assert f"batches need {name}; install it by: " in answer.stderr
@@ -200,8 +198,8 @@ def test_without_a_package_it_says_how_to_get_it(bags: Path, tmp_path: Path, nam
 def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
     bags: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
 ) -> None:
-    command = [*GVO, "batch", str(bags / "*.mcap"), "--out", str(tmp_path), "--workers", "2"]
-    answer = subprocess.run([*command, "--no-report"], capture_output=True, text=True, check=False)
+    options = ["--out", tmp_path, "--workers", "2", "--no-report"]
+    answer = python(*GVO[1:], "batch", bags / "*.mcap", *options)
     assert answer.returncode == 0, answer.stderr
     # Nothing of what the processes have to say to one another.
     assert all(line.startswith("[") for line in answer.stderr.splitlines()), answer.stderr
@@ -210,7 +208,7 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
     bags: Path, long_bag: Path, tmp_path: Path, batch: Batch, number: signal.Signals
 ) -> None:
@@ -241,7 +239,7 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
         process.wait()
         if process.stderr is not None:
             process.stderr.close()
-    codes = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
+    codes = {signal.SIGTERM: 143, signal.SIGKILL: -9}
     assert process.returncode == codes[number]
     if number != signal.SIGKILL:
         *rows, last = said.splitlines()

@@ -1,7 +1,5 @@
 """A worker tells how far it is, and stops where nobody wants the answer any more."""
 
-import subprocess
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +7,7 @@ import pytest
 
 from gvo.batch.worker import BatchStoppedError, _reporter
 from gvo.types import Progress
+from tests.conftest import python
 
 KEY = ("batch", 7)
 _PROGRAM = """
@@ -69,6 +68,5 @@ def test_a_task_that_nobody_wants_any_more_stops(
 
 
 def test_a_worker_goes_on_when_all_processes_are_asked_to_end() -> None:
-    command = [sys.executable, "-c", _PROGRAM]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    answer = python("-c", _PROGRAM)
     assert (answer.returncode, answer.stdout, answer.stderr) == (0, "goes on\n", "")

@@ -2,11 +2,7 @@
 
 import csv
 import json
-import os
 import shutil
-import signal
-import subprocess
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +18,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.recording import StampedImage
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray, IntArray
-from tests.conftest import GVO, Command, is_one_line
+from tests.conftest import Command, interrupt, is_one_line, start
 from tests.io.pose_bags import ODOMETRY, PoseBag
 from tests.rendered_walk import (
     CAMERA,
@@ -382,22 +378,10 @@ def matrix(pose: Any) -> FloatArray:
 
 def test_a_signal_leaves_a_bag_that_can_be_read(walk_bag: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "out"
-    process = subprocess.Popen(
-        [*GVO, "run", "--no-report", str(walk_bag), "--out", str(out), "--bag", str(path)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "COLUMNS": "80"},
-    )
-    raw = out / "raw.txt"
-    deadline = time.monotonic() + 60
-    while not (raw.exists() and raw.read_text().count("\n") >= 3):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert errors.count(b"\n") == 1
-    assert errors.startswith(b"gvo: interrupted; ")
+    process = start("run", "--no-report", walk_bag, "--out", out, "--bag", path)
+    code, errors = interrupt(process, out / "frames.csv")
+    assert (code, errors.count("\n")) == (130, 1)
+    assert errors.startswith("gvo: interrupted; ")
     messages = read_bag(path)
     for name in TRAJECTORIES:
         assert len(messages[f"/gvo/{name}/odometry"]) == len(poses(out, name))

@@ -6,9 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 import pytest
 
 import gvo
-from tests.conftest import GVO, TABLES, Command, is_one_line
+from tests.conftest import GVO, TABLES, Command, interrupt, is_one_line, python, start
 
 COMMANDS = (
     *("demo", "run", "check", "smooth", "compare", "convert", "config"),
@@ -73,10 +72,7 @@ def drawn(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         *("--rerun", out / "run.rrd"),
         *("--plots", out / "plots"),
     ]
-    arguments = ["run", drive_bag, "--out", out, "--duration", "0.6", *options]
-    done = subprocess.run(
-        [*GVO, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = python(*GVO[1:], "run", drive_bag, "--out", out, "--duration", "0.6", *options)
     # Standard error is a pipe: no bar, and there is nothing to warn of.
     assert (done.returncode, done.stderr) == (0, "")
     assert "m in 6 frames, all tracked; " in done.stdout
@@ -211,11 +207,8 @@ def test_a_film_that_is_broken_off_shows_all_frames_until_then(
     options = ["--overlay", tmp_path / "film.webm", "--rerun", tmp_path / "run.rrd"]
     process = start("run", drive_bag, "--out", tmp_path, *options)
     frames = tmp_path / "frames.csv"
-    wait_for(lambda: frames.exists() and count_rows(frames) >= 3)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == code
-    assert errors.count("\n") == 1
+    found, errors = interrupt(process, frames, number)
+    assert (found, errors.count("\n")) == (code, 1)
     assert errors.startswith("gvo: interrupted; ")
     assert len(film_frames(tmp_path / "film.webm")) == count_rows(frames) < 20
     assert starts_rightly(tmp_path / "run.rrd")
@@ -327,22 +320,6 @@ def test_a_recording_that_breaks_off_is_driven_back_from_there(
 
 
 # gvo view
-
-
-def start(*arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*GVO, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 @contextmanager

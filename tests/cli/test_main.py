@@ -1,12 +1,8 @@
 """The command line: what it prints, its exit codes, one line for bad input."""
 
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,7 +11,7 @@ import yaml
 import gvo
 from gvo.frontend.calibration import describe_offsets
 from gvo.io.bag.source import BagSource
-from tests.conftest import GVO, Command, is_one_line
+from tests.conftest import Command, interrupt, is_one_line, python, start
 
 
 def test_help_fits_a_screen(command: Command) -> None:
@@ -361,22 +357,9 @@ def test_a_broken_bag_gets_one_line_and_exit_code_2(
 def test_a_signal_ends_the_run_with_its_code_and_complete_files(
     drive_bag: Path, tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
-    process = subprocess.Popen(
-        [*GVO, "run", str(drive_bag), "--out", str(tmp_path)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "COLUMNS": "80"},
-    )
-    raw = tmp_path / "raw.txt"
-    deadline = time.monotonic() + 60
-    while not (raw.exists() and raw.read_text().count("\n") >= 3):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == code
+    process = start("run", drive_bag, "--out", tmp_path)
     said = f"gvo: interrupted; the poses so far are in {tmp_path}; --force begins anew\n"
-    assert errors.decode() == said
+    assert interrupt(process, tmp_path / "frames.csv", number) == (code, said)
     assert json.loads((tmp_path / "summary.json").read_text())["state"] == "interrupted"
     n_poses = {len(gvo.read_trajectory(tmp_path / f"{name}.txt")) for name in ("raw", "smoothed")}
     assert len(n_poses) == 1
@@ -465,19 +448,8 @@ def test_bad_input_to_smooth_gets_one_line_and_exit_code_2(
         assert word in answer.err
 
 
-def pipe(out: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*GVO, "smooth", "-", "--out", str(out)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        bufsize=1,
-    )
-
-
 def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:
-    process = pipe(tmp_path)
+    process = start("smooth", "-", "--out", tmp_path)
     assert process.stdin is not None
     assert process.stdout is not None
     answers = []
@@ -499,7 +471,7 @@ def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:
 def test_a_signal_ends_a_waiting_pipe_with_complete_files(
     tmp_path: Path, number: signal.Signals, code: int
 ) -> None:
-    process = pipe(tmp_path)
+    process = start("smooth", "-", "--out", tmp_path)
     assert process.stdin is not None
     assert process.stdout is not None
     for line in ("a,0", "b,100000000,a,0,0,1,0,0,0,1"):
@@ -539,8 +511,6 @@ def test_what_libraries_write_is_counted_and_what_gvo_writes_is_shown(
         "print('after', file=sys.stderr)\n"
         "os.write(2, b'last')\n"
     )
-    answer = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
+    answer = python("-c", program)
     words = f"gvo: warning: {told}\n" if told else ""
     assert re.fullmatch(f"own\n{words}after\nlast", answer.stderr)

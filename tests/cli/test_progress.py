@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from tests.conftest import GVO
+from tests.conftest import GVO, python
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 # `12/20  10.5 frames/s,  92% tracked, 0:00:01 left`, however it is spaced.
@@ -107,12 +107,8 @@ def test_a_round_trip_counts_the_way_there_and_the_way_back(room_bag: Path, tmp_
 
 
 def test_a_pipe_gets_no_bar(room_bag: Path, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [*GVO, "run", room_bag, "--out", tmp_path, "--duration", "0.2", "--no-report"],
-        capture_output=True,
-        timeout=120,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert b"\x1b" not in done.stdout
-    assert b"frames/s" not in done.stdout
+    options = ["--out", tmp_path, "--duration", "0.2", "--no-report"]
+    done = python(*GVO[1:], "run", room_bag, *options)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "\x1b" not in done.stdout
+    assert "frames/s" not in done.stdout

@@ -2,8 +2,6 @@
 
 import json
 import struct
-import subprocess
-import sys
 import tracemalloc
 import zlib
 from collections.abc import Iterator
@@ -44,6 +42,7 @@ from gvo.trajectory.formats import read_rows, read_table, read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.types import Failure
+from tests.conftest import python
 from tests.fuzz.bags import TARGETS as BAG_TARGETS
 
 CAMERA = "image_width: 8\nimage_height: 6\ncamera_matrix: [8, 0, 4, 0, 8, 3, 0, 0, 1]\n"
@@ -243,9 +242,7 @@ def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
         "decode_rvl(data, 'x')\n"
         f"{used}"
     )
-    answer = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    answer = python("-c", code)
     before, after = (int(line) // 1024 for line in answer.stdout.split())
     assert after - before < 200
 
@@ -379,9 +376,7 @@ def test_an_mcap_chunk_inflates_to_no_more_than_it_claims(tmp_path: Path) -> Non
         f"before = used()\nreader = BagReader(Path({str(path)!r}))\n"
         "n = len(list(reader.messages(['/a'])))\nprint(n, used() - before)"
     )
-    answer = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
+    answer = python("-c", code)
     n_messages, megabytes = map(int, answer.stdout.split()) if answer.stdout else (0, 0)
     assert n_messages == 0
     assert megabytes < 40

@@ -1,18 +1,14 @@
 """The mutants of a small module, and what tests of known strength make of them."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-import gvo
+from tests.conftest import python
 
 pytestmark = pytest.mark.acceptance
 
 HERE = Path(__file__).parent
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(gvo.__file__).parent.parent)}
 
 MODULE = '''
 """A module."""
@@ -59,17 +55,8 @@ def test_faults_that_no_test_sees_survive_and_others_do_not(tmp_path: Path) -> N
     (tmp_path / "module.py").write_text(MODULE)
     (tmp_path / "test_module.py").write_text(TESTS)
     options = ["--paths", tmp_path / "module.py", "--tests", tmp_path / "test_module.py"]
-    command = [sys.executable, HERE / "assurance.py", "--mutation", *options]
-    first, second = (
-        subprocess.run(
-            [*map(str, command), "--results", str(tmp_path / "results.json"), "--spare-s", "1"],
-            capture_output=True,
-            text=True,
-            env=ENVIRONMENT,
-            check=False,
-        )
-        for _ in range(2)
-    )
+    options += ["--results", tmp_path / "results.json", "--spare-s", "1"]
+    first, second = (python(HERE / "assurance.py", "--mutation", *options) for _ in range(2))
     assert first.returncode == 1, first.stderr  # less than the aim
     *survivors, _heading, _row, total = first.stdout.splitlines()
     changes = {line.partition(" ")[2] for line in survivors}

@@ -3,8 +3,6 @@
 import json
 import resource
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import FileIO
@@ -22,7 +20,7 @@ from gvo.io.run_folder.reader import read_run
 from gvo.runs.round_trip import run_round_trip
 from gvo.runs.smooth import optimize_edges, smooth_edges, smooth_lines
 from gvo.types import Progress
-from tests.conftest import TABLES
+from tests.conftest import GVO, TABLES, python
 
 N = 12
 NO_REPORT = gvo.RunOutputs(report=False)
@@ -279,16 +277,8 @@ def test_a_file_that_may_not_grow_ends_the_command_partly(drive: Reference, tmp_
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (4_000, 4_000))
 
-    ended = subprocess.run(
-        [
-            *(sys.executable, "-c", "import gvo.cli.main; gvo.cli.main()"),
-            *("run", str(drive.bag), "--out", str(tmp_path), "--no-report"),
-        ],
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ("run", drive.bag, "--out", tmp_path, "--no-report")
+    ended = python(*GVO[1:], *words, preexec_fn=limit)
     assert ended.returncode == 3, ended.stderr
     assert f"frames stand whole in {tmp_path}\n" in ended.stderr
     assert ended.stderr.count("\n") == 1

@@ -1,9 +1,7 @@
 """Films, decoded again, and what stands in for them."""
 
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import features
 
-import gvo
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.types import ImageArray
 from gvo.viz.video import Film, PngFolder, open_sink
+from tests.conftest import ENVIRONMENT, python
 from tests.viz.browser import Browser
 
 _SUFFIXES = pytest.mark.parametrize("suffix", [".webm", ".mp4"])
@@ -192,15 +190,9 @@ def test_where_no_encoder_is_there_pictures_are_written_and_told(
 def _in_a_process(
     code: str, folder: Path, *arguments: str, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    package = Path(gvo.__file__).parent.parent
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(package), **environment},
-        check=True,
-    )
+    answer = python("-c", code, *arguments, cwd=folder, env=ENVIRONMENT | environment)
+    assert answer.returncode == 0, answer.stderr
+    return answer
 
 
 _PROGRAM = """

@@ -28,6 +28,7 @@ class Held:
     items: Sequence[StampedImage]
     damage: str = ""
     loaded: list[int] = field(default_factory=list)
+    truth: Trajectory | None = None
 
     def images(self) -> Iterator[StampedImage]:
         yield from self.items
@@ -35,7 +36,7 @@ class Held:
             raise RecordingError(self.damage)
 
     def ground_truth(self) -> Trajectory | None:
-        return None
+        return self.truth
 
     def stream(self, number: int) -> list[StampedImage]:
         return [image for image in self.items if image.stream == number]

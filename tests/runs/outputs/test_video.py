@@ -1,9 +1,6 @@
 """Films of runs, decoded again."""
 
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-import gvo
 from gvo.config import Config
 from gvo.errors import ConfigurationError, RecordingError
 from gvo.io.frames import frames
@@ -22,6 +18,7 @@ from gvo.odometry.odometry import Odometry
 from gvo.runs.outputs.video import RunOverlay, film_width
 from gvo.types import FaultyFrame, Frame, FrameResult, ImageArray
 from gvo.viz.overlay import compose_faulty, compose_overlay
+from tests.conftest import python
 from tests.results import loop_of
 
 _N_FRAMES = 11
@@ -184,25 +181,14 @@ def test_other_names_are_refused_before_anything_is_read(drive: _Run, tmp_path: 
 
 @pytest.mark.acceptance
 def test_the_overlay_benchmark_prints_a_table(drive_bag: Path, tmp_path: Path) -> None:
-    package = Path(gvo.__file__).parent.parent
     script = Path(__file__).parents[3] / "scripts" / "benchmark_overlay.py"
-
-    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, str(script), *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            env={**os.environ, "PYTHONPATH": str(package)},
-            check=False,
-        )
-
-    answer = run(drive_bag, "--rounds", 1, "--duration", 1)
+    answer = python(script, drive_bag, "--rounds", 1, "--duration", 1)
     assert answer.returncode == 0, answer.stderr
     cells = re.split(r" *\| *", answer.stdout.splitlines()[-1].strip("| "))
     assert cells[0] in ("drive.mcap", "drive")
     assert all(float(cell) > 0.0 for cell in cells[3:7])
     for wrong in ([tmp_path / "missing.bag"], ["x.bag", "--rounds", 0], ["x.bag", "--duration", 0]):
-        refused = run(*wrong)
+        refused = python(script, *wrong)
         assert refused.returncode == 2
         assert "error" in refused.stderr
         assert "Traceback" not in refused.stderr
