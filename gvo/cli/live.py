@@ -147,9 +147,10 @@ class _End:
 def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack) -> list[Sink]:
     """Join the network that the images come from, if any, and serve viewers."""
     kind, *rest = words
-    if kind not in _KINDS or (kind == "camera") != bool(rest):
+    is_right = {"camera": bool(rest), "ros1": all(":=" in word for word in rest)}
+    if kind not in _KINDS or not is_right.get(kind, not rest):
         raise ConfigurationError(
-            f"expected ros1, ros2, - or camera DEVICE [DEVICE], got {' '.join(words)}"
+            f"expected ros1 [FROM:=TO...], ros2, - or camera DEVICE [DEVICE], got {' '.join(words)}"
         )
     sinks: list[Sink] = []
 
@@ -158,9 +159,9 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
         sinks.append(sink)
 
     if kind == "ros1":
-        from gvo.live.ros1 import Ros1  # type: ignore[import-not-found]
+        from gvo.live.ros1 import Ros1
 
-        join(Ros1())
+        join(Ros1(rest))
     elif kind == "ros2":
         from gvo.live.dds import Dds  # type: ignore[import-not-found]
 

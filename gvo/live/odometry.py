@@ -165,7 +165,8 @@ class LiveOdometry:
     def stop(self) -> None:
         """Take no more images; what waits is tracked. May be called by another thread."""
         self._is_stopped = True
-        self._waiting.close()
+        # Where the images can be ended, the pair that was made last comes too.
+        getattr(self._source, "close", self._waiting.close)()
 
     @property
     def _is_over(self) -> bool:

@@ -1,0 +1,159 @@
+"""A master of ROS 1 on the loopback, and programs that talk through it, for tests."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from xmlrpc.client import ServerProxy
+
+import pytest
+
+from tests.viz.browser import give_up
+
+DEBIAN = Path("/usr/lib/python3/dist-packages")
+PACKAGES = ("rospy", "rosmaster", "sensor_msgs", "std_srvs", "dynamic_reconfigure", "nav_msgs")
+INSTALL = "apt-get install " + " ".join(
+    f"python3-{package.replace('_', '-')}" for package in (*PACKAGES, "tf2_msgs")
+)
+PATIENCE_S = 60.0
+
+
+class Program:
+    """A process whose lines of standard output can be waited for; killed where none come."""
+
+    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
+        self.process = subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.lines: list[str] = []
+        self.errors: list[str] = []
+        self._come = threading.Condition()
+        self._threads = [
+            threading.Thread(target=self._read, args=(self.process.stdout, self.lines)),
+            threading.Thread(target=self._read, args=(self.process.stderr, self.errors)),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _read(self, stream: Any, lines: list[str]) -> None:
+        with stream:
+            for line in stream:
+                with self._come:
+                    lines.append(line)
+                    self._come.notify_all()
+
+    def wait_for(self, text: str, *, n: int = 1) -> str:
+        """Return the n-th line that holds a text, of either stream."""
+        found: list[str] = []
+
+        def has_come() -> bool:
+            found[:] = [line for line in (*self.lines, *self.errors) if text in line]
+            return len(found) >= n
+
+        with self._come:
+            is_come = self._come.wait_for(has_come, PATIENCE_S)
+        assert is_come, (text, self.lines, self.errors)
+        return found[n - 1]
+
+    def tell(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def end(self) -> int:
+        """End its standard input, and return the exit code."""
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
+        code = self.process.wait(PATIENCE_S)
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+        return code
+
+
+class Ros:
+    """A master, and the environment in which its nodes run."""
+
+    def __init__(self, folder: Path, port: int) -> None:
+        self.environment = os.environ | {
+            "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
+            "ROS_HOME": str(folder),
+            "ROS_LOG_DIR": str(folder / "log"),
+            "PYTHONWARNINGS": "ignore",
+        }
+        for name in ("ROS_IP", "ROS_HOSTNAME"):
+            self.environment.pop(name, None)
+        self._programs: list[Program] = []
+
+    def use_simulated_clock(self) -> None:
+        """Have nodes that start take their time from `/clock`."""
+        with ServerProxy(self.environment["ROS_MASTER_URI"]) as server:
+            assert server.setParam("/test", "/use_sim_time", True)[0] == 1  # type: ignore[index]
+
+    def start(self, *command: object) -> Program:
+        """Start a program in Python."""
+        program = Program([sys.executable, *map(str, command)], self.environment)
+        self._programs.append(program)
+        return program
+
+    def ask(self, *command: object) -> Any:
+        """Run a program to its end and return what it prints, of JSON."""
+        program = self.start(*command)
+        code = program.end()
+        assert code == 0, program.errors
+        return json.loads("".join(program.lines) or "null")
+
+    def kill(self) -> None:
+        """Kill what still runs."""
+        for program in self._programs:
+            program.process.kill()
+            program.end()
+
+
+@contextmanager
+def master(folder: Path) -> Iterator[Ros]:
+    """Run a master on a free port of the loopback."""
+    missing = [package for package in PACKAGES if not (DEBIAN / package).is_dir()]
+    rosmaster = shutil.which("rosmaster")
+    if missing or rosmaster is None:
+        give_up(f"no {', '.join(missing) or 'rosmaster'}: {INSTALL}")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    ros = Ros(folder, port)
+    command = [rosmaster, "--core", "-p", str(port)]
+    environment = ros.environment | {"ROS_IP": "127.0.0.1", "PYTHONPATH": ""}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            while True:
+                assert process.poll() is None, "rosmaster ended"
+                with socket.socket() as probe:
+                    if probe.connect_ex(("127.0.0.1", port)) == 0:
+                        break
+            yield ros
+        finally:
+            ros.kill()
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
+    """Return a master of ROS 1; its nodes use a simulated clock."""
+    with master(tmp_path_factory.mktemp("ros")) as running:
+        running.use_simulated_clock()
+        yield running
