@@ -30,17 +30,8 @@ N_DOF = 6
 _MIN_PATH_M = 1e-6
 _MIN_POSES = 3  # a rigid transform maps any two positions onto any other two
 _HEADER = (
-    "estimate",
-    "poses",
-    "of reference [%]",
-    "ATE RMSE [m]",
-    "ATE max [m]",
-    "RPE [m]",
-    "RPE [deg]",
-    "segments [m]",
-    "t_err [%]",
-    "r_err [deg/100 m]",
-    "path ratio",
+    *("estimate", "poses", "of reference [%]", "ATE RMSE [m]", "ATE max [m]"),
+    *("RPE [m]", "RPE [deg]", "segments [m]", "t_err [%]", "r_err [deg/100 m]", "path ratio"),
 )
 _JSON_NAMES = (
     *("name", "n", "reference_share", "ate_m", "ate_max_m", "rpe_m", "rpe_deg"),

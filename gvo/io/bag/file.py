@@ -53,22 +53,12 @@ def _storage_faults() -> Iterator[type[Exception]]:
             yield getattr(import_module(module), name)
 
 
-# The readers check the structure of a file by assertions and by what happens to fail.
+# The readers check the structure of a file by assertions and by what happens to fail; a damaged
+# size ends in a MemoryError.
 FAULTS: tuple[type[Exception], ...] = (
-    ReaderError1,
-    ReaderError2,
-    SerdeError,
-    AssertionError,
-    LookupError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    MemoryError,  # a damaged size
-    struct.error,
+    *(ReaderError1, ReaderError2, SerdeError, struct.error),
+    *(AssertionError, LookupError, ValueError, TypeError, AttributeError, OverflowError),
+    *(EOFError, OSError, RuntimeError, MemoryError),
     *_storage_faults(),
 )
 """What rosbags raises where a file or a message is not what it should be."""

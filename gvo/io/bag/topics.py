@@ -15,17 +15,11 @@ COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 
 _COMPRESSED_SUFFIXES = ("/compressed", "/compressedDepth")
+_NUMBERED = ("image_", "image_0", "image", "cam", "cam_", "camera", "camera_")
 _SIDES = (
     ("left", "right"),
-    ("image_0", "image_1"),
-    ("image_00", "image_01"),
-    ("image0", "image1"),
-    ("cam0", "cam1"),
-    ("cam_0", "cam_1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("infra1", "infra2"),
-    ("fisheye1", "fisheye2"),
+    *((f"{name}0", f"{name}1") for name in _NUMBERED),
+    *((f"{name}1", f"{name}2") for name in ("infra", "fisheye")),
 )
 _COLOR = re.compile(r"rgb|colou?r")
 _DEPTH = re.compile(r"depth")

@@ -23,15 +23,10 @@ ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R R^T from the identity that is the rounding of a file."""
 # As ROS, Kalibr, EuRoC and librealsense call them, in lower case, words joined by _.
 _MODELS: dict[str, DistortionModel] = {
-    "plumb_bob": "plumb_bob",
-    "radtan": "plumb_bob",
-    "radial_tangential": "plumb_bob",
-    "brown_conrady": "plumb_bob",
+    **dict.fromkeys(("plumb_bob", "radtan", "radial_tangential", "brown_conrady"), "plumb_bob"),
     "rational_polynomial": "rational_polynomial",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-    "kannala_brandt4": "equidistant",
+    **dict.fromkeys(("equidistant", "fisheye"), "equidistant"),
+    **dict.fromkeys(("kannala_brandt", "kannala_brandt4"), "equidistant"),
 }
 
 

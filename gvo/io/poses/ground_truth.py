@@ -251,15 +251,8 @@ def _describe(topic: Topic, what: str, child: str, notes: Sequence[str]) -> str:
 
 # Motion-capture systems, and usual names of ground truth. Odometry is not ground truth.
 _WORDS = (
-    "ground[_-]?truth",
-    "true_?(pose|odom|odometry|state)",
-    "gt",
-    "vicon",
-    "mocap",
-    "qualisys",
-    "optitrack",
-    "leica",
-    "vrpn",
+    *("ground[_-]?truth", "true_?(pose|odom|odometry|state)", "gt"),
+    *("vicon", "mocap", "qualisys", "optitrack", "leica", "vrpn"),
 )
 # as a whole word
 _IS_TRUTH = re.compile(rf"(?<![a-z])({'|'.join(_WORDS)})(?![a-z])")

@@ -44,49 +44,22 @@ GLOBAL = "global"
 GRAPH = "graph.g2o"
 LOOPS = "loops.csv"
 LOOPS_HEADER = (
-    "stamp_ns",
-    "reference_ns",
-    "n_matches",
-    "n_inliers",
+    *("stamp_ns", "reference_ns", "n_matches", "n_inliers"),
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
-    "residual",
-    "weight",
-    "reason",
+    *("residual", "weight", "reason"),
 )
 FRAMES_HEADER = (
-    "stamp_ns",
-    "status",
-    "segment",
-    "n_keypoints",
-    "n_points",
-    "n_matches",
-    "n_inliers",
-    "n_links",
+    *("stamp_ns", "status", "segment"),
+    *("n_keypoints", "n_points", "n_matches", "n_inliers", "n_links"),
     "reason",
 )
 EDGES_HEADER = ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2")
-TIMINGS_HEADER = (
-    "stamp_ns",
-    "read_ms",
-    "extract_ms",
-    "register_ms",
-    "links_ms",
-    "window_ms",
-    "loops_ms",
-)
+_STAGES = ("read", "extract", "register", "links", "window", "loops")
+TIMINGS_HEADER = ("stamp_ns", *(f"{stage}_ms" for stage in _STAGES))
 
 _OF_EARLIER_RUNS = (
-    SUMMARY,
-    "edges.csv",
-    "timings.csv",
-    PICTURE,
-    REPORT,
-    ROUND_TRIP_PICTURE,
-    TRUTH,
-    TRUE_POSITIONS,
-    GRAPH,
-    LOOPS,
-    f"{GLOBAL}.txt",
+    *(SUMMARY, "edges.csv", "timings.csv", PICTURE, REPORT, ROUND_TRIP_PICTURE),
+    *(TRUTH, TRUE_POSITIONS, GRAPH, LOOPS, f"{GLOBAL}.txt"),
 )
 
 
@@ -258,17 +231,7 @@ class RunFolder(AbstractContextManager["RunFolder"]):
 
     def add_frame(self, frame: object, result: FrameResult) -> None:
         """Write the result of a frame."""
-        row = (
-            result.stamp_ns,
-            result.status,
-            result.segment,
-            result.n_keypoints,
-            result.n_points,
-            result.n_matches,
-            result.n_inliers,
-            result.n_links,
-            result.reason,
-        )
+        row = [getattr(result, name) for name in FRAMES_HEADER]
         self.add_poses(result.raw, result.causal, row)
         self._write("edges.csv", "".join(map(_csv_line, _link_rows(result))))
         self._write("timings.csv", _csv_line((result.stamp_ns, *_times(result))))
@@ -409,8 +372,8 @@ def _loop_rows(optimum: Optimum) -> Iterator[Sequence[object]]:
 
 
 def _times(result: FrameResult) -> Iterator[str]:
-    for name in TIMINGS_HEADER[1:]:
-        elapsed_ms = result.stage_ms.get(name.removesuffix("_ms"))
+    for stage in _STAGES:
+        elapsed_ms = result.stage_ms.get(stage)
         yield "" if elapsed_ms is None else f"{elapsed_ms:.3f}"
 
 

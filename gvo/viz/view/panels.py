@@ -44,14 +44,8 @@ _MEANINGS = {
     "ellipsoids": "position covariances",
 }
 
-SPEEDS: dict[str, float | None] = {
-    "0.25 x": 0.25,
-    "0.5 x": 0.5,
-    "1 x": 1.0,
-    "2 x": 2.0,
-    "4 x": 4.0,
-    "fastest": None,
-}
+SPEEDS: dict[str, float | None] = {f"{speed:g} x": speed for speed in (0.25, 0.5, 1.0, 2.0, 4.0)}
+SPEEDS["fastest"] = None
 
 _PERIOD_S = 1.0 / 15.0  # at least, from drawing to drawing
 _IDLE_S = 0.25
