@@ -163,7 +163,7 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
 
         join(Ros1(rest))
     elif kind == "ros2":
-        from gvo.live.dds import Dds  # type: ignore[import-not-found]
+        from gvo.live.dds import Dds
 
         join(Dds(qos=qos))
     if foxglove is not None:

@@ -1,0 +1,458 @@
+"""ROS 2 without a ROS installation: its topics, services and parameters over CycloneDDS.
+
+The topic `/a/b` of ROS 2 is `rt/a/b` on a DDS network, its type `package::msg::dds_::Name_`, and
+its bytes are CDR as in a bag. The classes that CycloneDDS wants for them are made from the
+definitions that rosbags has: peers compare them, the bytes pass through as they are.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from gvo._text import cut
+from gvo.config import list_parameters
+from gvo.errors import ConfigurationError, GvoError, missing_extra
+from gvo.io.bag.reader import typestore
+from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
+from gvo.live.transport import Parameters, Service, ServiceType, decode
+
+try:
+    from cyclonedds import builtin, core, domain, pub, sub, topic, util
+    from cyclonedds.idl import make_idl_struct, types
+    from cyclonedds.qos import Policy, Qos
+except ImportError as error:
+    raise missing_extra("gvo live ros2 needs CycloneDDS", "dds") from error
+
+ImageQos: TypeAlias = Literal["sensor", "reliable", "system"]
+_Fields: TypeAlias = Mapping[str, Any]
+Receive: TypeAlias = Callable[[Any], None]
+
+_LOGGER = logging.getLogger(__name__)
+# Discovery by multicast and at the first ports of this machine, so that any way to look is met.
+_LOOPBACK = """<General><AllowMulticast>spdp</AllowMulticast>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>"""
+_SETTINGS = """<CycloneDDS><Domain>{}
+<Internal><MaxSampleSize>268435456B</MaxSampleSize></Internal></Domain></CycloneDDS>"""
+_MAX_DOMAIN = 232
+_N_IMAGES, _N_OTHERS = 10, 100
+_N_PUBLICATIONS = 10_000
+_CLOCK = Topic(name="/clock", type="rosgraph_msgs/msg/Clock", n_messages=1)
+_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
+# A request: how it is coded, who asks and its number, its fields. The answer repeats the second.
+_CODING, _ASKED = slice(0, 4), slice(4, 20)
+_ANSWERED_WITHIN_S = 2.0
+
+_BASES: Final = {"bool": bool, "string": str, "byte": types.uint8, "char": types.uint8}
+_VALUES: Final[dict[type, str]] = {  # of rcl_interfaces, in the order of their numbers
+    type(None): "not set",
+    bool: "bool_value",
+    int: "integer_value",
+    float: "double_value",
+    str: "string_value",
+}
+_LIST = "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth"
+_NAMES, _NEW = "string[] names", "Parameter[] parameters"
+
+
+class Dds:
+    """The DDS network of ROS 2, on this machine alone unless asked otherwise.
+
+    The domain is `ROS_DOMAIN_ID`. `ROS_LOCALHOST_ONLY=0` or `ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET`
+    ask for the whole network, and so does `CYCLONEDDS_URI`, which then says which.
+
+    Parameters
+    ----------
+    qos : {"sensor", "reliable", "system"}
+        How images are received: best effort, as is the custom with sensors; reliably; or as all
+        who write them offer, which is how the rest is received.
+
+    Raises
+    ------
+    ConfigurationError
+        When the domain cannot be joined.
+    """
+
+    is_ros1 = False
+    name = "ROS 2"
+
+    def __init__(self, *, qos: ImageQos = "sensor") -> None:
+        self._qos = qos
+        self._domain, self._participant = _join()
+        self._publications = builtin.BuiltinDataReader(
+            self._participant, builtin.BuiltinTopicDcpsPublication
+        )
+        self._readings: list[_Reading] = []
+        self._clock_ns: int | None = None
+        self._has_clock = False
+
+    def topics(self) -> Sequence[Topic]:
+        """Return what others write now, by topic."""
+        found = {
+            endpoint.topic_name.removeprefix("rt"): _TYPE.fullmatch(endpoint.type_name)
+            for endpoint in self._writers()
+            if endpoint.topic_name.startswith("rt/")
+        }
+        topics = [
+            Topic(name=name, type=f"{match[1]}/msg/{match[2]}", n_messages=1)
+            for name, match in sorted(found.items())
+            if match is not None
+        ]
+        if _CLOCK in topics and not self._has_clock:
+            self._has_clock = True
+            self.subscribe(_CLOCK.name, _CLOCK.type, self._set_clock)
+        return topics
+
+    def subscribe(
+        self, topic: str, type_: str, callback: Callable[[bytes, int], None]
+    ) -> Callable[[], None]:
+        """Receive the messages of a topic; see `Transport`."""
+        is_image = type_ in (IMAGE_TYPE, COMPRESSED_TYPE)
+        offers = [each.qos for each in self._writers() if each.topic_name == f"rt{topic}"]
+        is_reliable, is_held = (
+            bool(offers) and all(offer[policy] not in (None, least) for offer in offers)
+            for policy, least in (
+                (Policy.Reliability, Policy.Reliability.BestEffort),
+                (Policy.Durability, Policy.Durability.Volatile),
+            )
+        )
+        if is_image and self._qos != "system":
+            is_reliable = self._qos == "reliable"
+        n_kept = _N_IMAGES if is_image else _N_OTHERS
+        qos = _qos(n_kept, is_reliable=is_reliable, is_held=is_held)
+        reader = sub.DataReader(self._participant, self._topic(f"rt{topic}", type_), qos)
+        return self._read(reader, lambda sample: callback(sample.payload, self._now_ns()))
+
+    def advertise(self, topic: str, type_: str, *, is_latched: bool = False) -> DdsPublisher:
+        """Open a topic for writing; see `Sink`."""
+        qos = _qos(1 if is_latched else _N_OTHERS, is_held=is_latched)
+        made = self._topic(f"rt{topic}", type_)
+        return DdsPublisher(pub.DataWriter(self._participant, made, qos))
+
+    def serve(self, service: Service) -> None:
+        """Answer requests as the RMW of CycloneDDS sends them, see `_CODING`."""
+        type_, qos = service.type, _qos(_N_OTHERS)
+        request = self._topic(f"rq{service.name}Request", type_.request_type, kind="srv")
+        answer = self._topic(f"rr{service.name}Reply", type_.response_type, kind="srv")
+        reader = sub.DataReader(self._participant, request, qos)
+        writer = pub.DataWriter(self._participant, answer, qos)
+        self._read(reader, partial(_answer, service, reader, writer))
+
+    def offer(self, parameters: Parameters) -> None:
+        """Serve the parameter services of a node `/gvo`."""
+        for service in _ParameterServices(parameters).all():
+            self.serve(service)
+
+    def close(self) -> None:
+        """Leave the network."""
+        for reading in self._readings:
+            reading.close()
+        self._domain.__del__()  # with all that belongs to it; a second time nothing
+
+    def _topic(self, name: str, type_: str, kind: str = "msg") -> topic.Topic[Any]:
+        return topic.Topic(self._participant, name, message_class(type_, kind))
+
+    def _read(self, reader: sub.DataReader[Any], receive: Receive) -> Callable[[], None]:
+        self._readings.append(_Reading(self._participant, reader, receive))
+        return self._readings[-1].close
+
+    def _writers(self) -> list[builtin.DcpsEndpoint]:
+        """Return what others write with."""
+        own = self._participant.guid
+        return [
+            endpoint
+            for endpoint in self._publications.read(_N_PUBLICATIONS)
+            if endpoint.sample_info.instance_state == core.InstanceState.Alive
+            and endpoint.participant_key != own
+        ]
+
+    def _now_ns(self) -> int:
+        return time.time_ns() if self._clock_ns is None else self._clock_ns
+
+    def _set_clock(self, data: bytes, _: int) -> None:
+        with suppress(GvoError):
+            clock = decode(data, _CLOCK.type, is_ros1=False).clock
+            self._clock_ns = clock.sec * 1_000_000_000 + clock.nanosec
+
+
+class DdsPublisher:
+    """A topic that messages are written to."""
+
+    def __init__(self, writer: pub.DataWriter[Any]) -> None:
+        self._writer = writer
+
+    def publish(self, data: bytes, stamp_ns: int) -> None:
+        """Send a message, which has its stamp; lost where who reads it is too far behind."""
+        with suppress(core.DDSException):
+            self._writer.write(_of_bytes(self._writer.data_type, data))
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._writer.matched_sub)
+
+
+class _Reading:
+    """Messages taken in a thread of their own."""
+
+    def __init__(
+        self,
+        participant: domain.DomainParticipant,
+        reader: sub.DataReader[Any],
+        receive: Receive,
+    ) -> None:
+        self._reader, self._receive = reader, receive
+        self._end = core.GuardCondition(participant)
+        self._waitset = core.WaitSet(participant)
+        state = core.ViewState.Any | core.SampleState.NotRead | core.InstanceState.Any
+        for condition in (self._end, core.ReadCondition(reader, state)):
+            self._waitset.attach(condition)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Receive nothing more."""
+        if self._thread.is_alive():
+            self._end.set(True)
+            if self._thread is not threading.current_thread():
+                self._thread.join()
+
+    def _run(self) -> None:
+        while not self._end.read():
+            for sample in self._reader.take(_N_OTHERS):
+                if sample.sample_info.valid_data:
+                    self._receive(sample)
+            self._waitset.wait(util.duration(infinite=True))
+
+
+class _ParameterServices:
+    """The services by which parameters of a node of ROS 2 are seen and changed."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._known = {
+            f"{section}.{each.key}": each
+            for section, members in list_parameters().items()
+            for each in members
+        }
+
+    def all(self) -> list[Service]:
+        """Return them."""
+        return [
+            Service(
+                name=f"/gvo/{re.sub('(?<!^)(?=[A-Z])', '_', name).lower()}",
+                type=ServiceType(name=f"rcl_interfaces/srv/{name}", request=asked, response=given),
+                answer=answer,
+            )
+            for name, asked, given, answer in (
+                ("ListParameters", _LIST, "ListParametersResult result", self._list),
+                ("GetParameters", _NAMES, "ParameterValue[] values", self._get),
+                ("GetParameterTypes", _NAMES, "uint8[] types", self._get_types),
+                ("DescribeParameters", _NAMES, "ParameterDescriptor[] descriptors", self._describe),
+                ("SetParameters", _NEW, "SetParametersResult[] results", self._set_each),
+                ("SetParametersAtomically", _NEW, "SetParametersResult result", self._set_all),
+            )
+        ]
+
+    def _list(self, asked: Any) -> _Fields:  # noqa: ANN401 - made at run time
+        names = [name for name in self._known if _is_below(name, asked.prefixes, asked.depth)]
+        sections = sorted({name.partition(".")[0] for name in names})
+        return {"result": _made("ListParametersResult", names=names, prefixes=sections)}
+
+    def _get(self, asked: Any) -> _Fields:  # noqa: ANN401
+        return {"values": [_value_message(self._value(name)) for name in asked.names]}
+
+    def _get_types(self, asked: Any) -> _Fields:  # noqa: ANN401
+        return {"types": np.array([_kind(self._value(name)) for name in asked.names], np.uint8)}
+
+    def _describe(self, asked: Any) -> _Fields:  # noqa: ANN401
+        return {"descriptors": [self._descriptor(name) for name in asked.names]}
+
+    def _set_each(self, asked: Any) -> _Fields:  # noqa: ANN401
+        return {"results": [self._set([each]) for each in asked.parameters]}
+
+    def _set_all(self, asked: Any) -> _Fields:  # noqa: ANN401
+        return {"result": self._set(asked.parameters)}
+
+    def _set(self, changes: Sequence[Any]) -> Any:  # noqa: ANN401
+        reason = ""
+        try:
+            self._parameters.set({each.name: _value_of(each.value) for each in changes})
+        except GvoError as error:
+            reason = str(error)
+        return _made("SetParametersResult", successful=not reason, reason=reason)
+
+    def _value(self, name: str) -> object:
+        if name not in self._known:
+            return None
+        section, _, key = name.partition(".")
+        return getattr(getattr(self._parameters.config, section), key)
+
+    def _descriptor(self, name: str) -> Any:  # noqa: ANN401
+        known, whole, real = self._known.get(name), [], []
+        if known and known.minimum is not None and known.maximum is not None:
+            low, high = known.minimum, known.maximum
+            if known.kind == "integer":
+                whole = [_made("IntegerRange", from_value=int(low), to_value=int(high), step=1)]
+            else:
+                real = [_made("FloatingPointRange", from_value=low, to_value=high, step=0.0)]
+        return _made(
+            "ParameterDescriptor",
+            **{"name": name, "type": _kind(self._value(name)), "read_only": False},
+            description=known.hint if known else "",
+            additional_constraints=", ".join(known.choices) if known else "",
+            dynamic_typing=bool(known and known.is_optional),
+            integer_range=whole,
+            floating_point_range=real,
+        )
+
+
+@cache
+def message_class(type_: str, kind: str = "msg") -> type[Any]:
+    """Return the class of `package/msg/Name`; what is said of services is who asks."""
+    package, _, name = type_.split("/")
+    fields = {"guid": types.uint64, "sequence": types.int64}
+    if kind == "msg":
+        definitions = typestore(is_ros1=False).fielddefs[type_][1]
+        fields = {key: _field(definition) for key, definition in definitions}
+    full = f"{package}::{kind}::dds_::{name}_"
+    made: Any = make_idl_struct(name, full, fields, dataclassify=False)
+    made.serialize = lambda sample, **_: sample.payload
+    made.deserialize = made.deserialize_key = classmethod(_of_bytes)
+    return made  # type: ignore[no-any-return]
+
+
+def _of_bytes(class_: type[Any], data: bytes, /, **_: Any) -> Any:  # noqa: ANN401
+    """Return a message as bytes, of a class that serialises none otherwise."""
+    sample = class_()
+    sample.payload = data
+    return sample
+
+
+def _field(definition: Any) -> Any:  # noqa: ANN401 - types made at run time
+    kind, what = definition
+    if kind == Nodetype.NAME:
+        return message_class(what)
+    element, size = what
+    if kind == Nodetype.BASE:
+        return _BASES.get(element) or getattr(types, element)
+    made: Any = types.array if kind == Nodetype.ARRAY else types.sequence
+    return made[(_field(element), size) if size else _field(element)]
+
+
+def _join() -> tuple[domain.Domain, domain.DomainParticipant]:
+    """Join the domain, by the loopback interface unless the environment asks for more."""
+    get = os.environ.get
+    number, settings = get("ROS_DOMAIN_ID") or "0", get("CYCLONEDDS_URI")
+    if not (number.isdecimal() and int(number) <= _MAX_DOMAIN):
+        expected = f"expected a number from 0 to {_MAX_DOMAIN}"
+        raise ConfigurationError(f"ROS_DOMAIN_ID: {expected}, got {cut(number, 40)}")
+    is_wide = get("ROS_LOCALHOST_ONLY") == "0" or get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "SUBNET"
+    before = sockets()
+    try:
+        joined = domain.Domain(
+            int(number), settings or _SETTINGS.format("" if is_wide else _LOOPBACK)
+        )
+        participant = domain.DomainParticipant(int(number))
+    except core.DDSException as error:
+        raise ConfigurationError(f"ROS_DOMAIN_ID={number} cannot be joined: {error}") from error
+    if not (settings or is_wide):
+        _confine(sockets() - before)
+    return joined, participant
+
+
+def sockets() -> set[int]:
+    """Return the sockets that are open, where the system tells."""
+    return {int(link.name) for link in Path("/proc/self/fd").glob("*") if link.is_socket()}
+
+
+def _confine(numbers: set[int]) -> None:
+    """Let in nothing from beyond loopback: CycloneDDS listens on all addresses of the machine."""
+    for number in numbers:
+        with socket.socket(fileno=os.dup(number)) as made, suppress(OSError):
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+
+
+def _qos(n_kept: int, *, is_reliable: bool = True, is_held: bool = False) -> Qos:
+    reliable = Policy.Reliability.Reliable(util.duration(milliseconds=10))
+    return Qos(
+        reliable if is_reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if is_held else Policy.Durability.Volatile,
+        Policy.History.KeepLast(n_kept),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+
+
+def _answer(
+    service: Service,
+    reader: sub.DataReader[Any],
+    writer: pub.DataWriter[Any],
+    sample: Any,  # noqa: ANN401
+) -> None:
+    """Answer a request; one that is damaged is left out."""
+    coding, asked = sample.payload[_CODING], sample.payload[_ASKED]
+    try:
+        answer = service.call(coding + sample.payload[_ASKED.stop :], is_ros1=False)
+    except GvoError as error:
+        _LOGGER.warning("%s: a request is left out: %s", service.name, error)
+        return
+    client = reader.get_matched_publication_data(sample.sample_info.publication_handle)
+    _wait_for_reader(writer, client)
+    with suppress(core.DDSException):
+        data = answer[_CODING] + asked + answer[_CODING.stop :]
+        writer.write(_of_bytes(writer.data_type, data))
+
+
+def _wait_for_reader(writer: pub.DataWriter[Any], client: builtin.DcpsEndpoint | None) -> None:
+    """Wait until who asked is known to read the answers, which may take longer than to ask."""
+    end_s = time.monotonic() + _ANSWERED_WITHIN_S
+    while client is not None and time.monotonic() < end_s:
+        readers = map(writer.get_matched_subscription_data, writer.matched_sub)
+        if any(each and each.participant_key == client.participant_key for each in readers):
+            return
+        time.sleep(0.005)
+
+
+def _is_below(name: str, prefixes: Sequence[str], depth: int) -> bool:
+    """Tell whether a name is below one of the prefixes, at most so deep; 0 is any depth."""
+    within = [prefix for prefix in prefixes if f"{name}.".startswith(f"{prefix}.")]
+    below = [name.removeprefix(f"{prefix}.") for prefix in within] if prefixes else [name]
+    return any(depth == 0 or rest.count(".") < depth for rest in below)
+
+
+def _made(type_: str, **fields: Any) -> Any:  # noqa: ANN401
+    return typestore(is_ros1=False).types[f"rcl_interfaces/msg/{type_}"](**fields)
+
+
+def _kind(value: object) -> int:
+    return list(_VALUES).index(type(value))
+
+
+def _value_message(value: object) -> Any:  # noqa: ANN401
+    fields = {field: kind() for kind, field in list(_VALUES.items())[1:]}
+    arrays = ("byte", "bool", "integer", "double", "string")
+    fields |= {f"{element}_array_value": np.zeros(0) for element in arrays}
+    if value is not None:
+        fields[_VALUES[type(value)]] = value
+    return _made("ParameterValue", type=_kind(value), **fields)
+
+
+def _value_of(message: Any) -> object:  # noqa: ANN401
+    if message.type >= len(_VALUES):
+        raise ConfigurationError("no parameter is an array")
+    return getattr(message, list(_VALUES.values())[message.type], None)

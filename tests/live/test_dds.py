@@ -1,0 +1,691 @@
+"""ROS 2's topics, services and parameters over DDS, against plain CycloneDDS in another process."""
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gvo
+from gvo.errors import ConfigurationError
+from gvo.io.bag.reader import typestore
+from gvo.io.bag.topics import Topic
+from gvo.live.transport import Parameters, Service, ServiceType, decode
+
+pytest.importorskip("cyclonedds")
+
+from gvo.live.dds import Dds, message_class, sockets
+from tests.conftest import GVO, TABLES, Command, is_one_line
+
+HOLD_S = 60.0
+STRING = "std_msgs/msg/String"
+IMAGE = "sensor_msgs/msg/Image"
+
+# Types as an IDL file declares them, and what a program of another maker does with them.
+PEER = '''
+import queue, sys, threading
+from dataclasses import dataclass
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl.types import array, float64, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+@dataclass
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    data: str
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    sec: int32
+    nanosec: uint32
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    stamp: Time
+    frame_id: str
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+    data: sequence[uint8]
+
+@dataclass
+class Region(IdlStruct, typename="sensor_msgs::msg::dds_::RegionOfInterest_"):
+    x_offset: uint32
+    y_offset: uint32
+    height: uint32
+    width: uint32
+    do_rectify: bool
+
+@dataclass
+class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
+    header: Header
+    height: uint32
+    width: uint32
+    distortion_model: str
+    d: sequence[float64]
+    k: array[float64, 9]
+    r: array[float64, 9]
+    p: array[float64, 12]
+    binning_x: uint32
+    binning_y: uint32
+    roi: Region
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    x: float64
+    y: float64
+    z: float64
+
+@dataclass
+class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
+    x: float64
+    y: float64
+    z: float64
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
+    position: Point
+    orientation: Quaternion
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
+    linear: Vector3
+    angular: Vector3
+
+@dataclass
+class CovariantPose(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
+    pose: Pose
+    covariance: array[float64, 36]
+
+@dataclass
+class CovariantTwist(IdlStruct, typename="geometry_msgs::msg::dds_::TwistWithCovariance_"):
+    twist: Twist
+    covariance: array[float64, 36]
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
+    header: Header
+    child_frame_id: str
+    pose: CovariantPose
+    twist: CovariantTwist
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
+    translation: Vector3
+    rotation: Quaternion
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+@dataclass
+class Transforms(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
+    transforms: sequence[TransformStamped]
+
+@dataclass
+class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    clock: Time
+
+NETWORK = Domain(DOMAIN, '<CycloneDDS><Domain><General><Interfaces>'
+    '<NetworkInterface address="127.0.0.1"/></Interfaces></General></Domain></CycloneDDS>')
+PARTICIPANT = DomainParticipant(DOMAIN)
+RELIABLE = Policy.Reliability.Reliable(duration(seconds=10))
+HELD = Policy.Durability.TransientLocal
+KEPT = Policy.History.KeepLast(10)
+
+HEADER = {"guid": uint64, "sequence": int64}
+
+def writer(name, type_, *policies):
+    return DataWriter(PARTICIPANT, Topic(PARTICIPANT, name, type_), Qos(KEPT, *policies))
+
+def reader(name, type_, *policies):
+    return DataReader(PARTICIPANT, Topic(PARTICIPANT, name, type_), Qos(KEPT, *policies))
+
+END, LINES = threading.Event(), queue.Queue()
+
+def listen():
+    for line in sys.stdin:
+        LINES.put(line)
+    END.set()
+
+threading.Thread(target=listen, daemon=True).start()
+
+def wait(is_so):
+    while not is_so():
+        if END.wait(0.005):
+            sys.exit()
+
+def say(*words):
+    print(*words, flush=True)
+
+def client(name, package, type_, answered):
+    """Types of services are told by their header alone; `rmw_cyclonedds` tells nothing of them."""
+    request, response = (
+        make_idl_struct(end, f"{package}::srv::dds_::{type_}_{end}_", HEADER, dataclassify=False)
+        for end in ("Request", "Response"))
+    request.serialize = lambda self, **_: self.full.serialize()
+    response.deserialize = classmethod(lambda _, data, **__: answered.deserialize(data))
+    asks = writer(f"rq{name}Request", request, RELIABLE)
+    hears = reader(f"rr{name}Reply", response, RELIABLE)
+    wait(lambda: asks.matched_sub and hears.matched_pub)
+
+    def send(number, full):
+        sample = request()
+        sample.full = full
+        asks.write(sample)
+
+    def answer(number):
+        found = hears.take_one(timeout=duration(seconds=60))
+        assert (found.guid, found.sequence) == (77, number)
+        return found
+
+    return send, answer
+'''
+
+
+class Peer:
+    """A process of plain CycloneDDS; it ends where its standard input does."""
+
+    def __init__(self, domain: int, source: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"DOMAIN = {domain}\n{PEER}\n{source}\nEND.wait()\n"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def line(self) -> str:
+        return self._lines.get(timeout=HOLD_S)
+
+    def go_on(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(timeout=HOLD_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+            raise
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                self._lines.put(line.rstrip("\n"))
+        self._lines.put("(it has ended)")
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Return a domain of this process alone, as far as there are."""
+    number = 1 + os.getpid() % 100
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+    for name in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(name, raising=False)
+    return number
+
+
+@pytest.fixture
+def peer(domain: int) -> Iterator[Callable[[str], Peer]]:
+    peers = []
+
+    def start(source: str) -> Peer:
+        peers.append(Peer(domain, source))
+        return peers[-1]
+
+    yield start
+    for made in peers:
+        made.close()
+
+
+@pytest.fixture
+def dds(domain: int) -> Iterator[Dds]:
+    made = Dds(qos="reliable")
+    yield made
+    made.close()
+
+
+class Inbox:
+    """What came on a topic of a peer."""
+
+    def __init__(self, dds: Dds, topic: str) -> None:
+        hold, end_s = threading.Event(), time.monotonic() + HOLD_S
+        while not (found := [each for each in dds.topics() if each.name == topic]):
+            assert time.monotonic() < end_s, topic
+            hold.wait(0.005)
+        (self.topic,) = found
+        self._came: queue.Queue[tuple[bytes, int]] = queue.Queue()
+        self.stop = dds.subscribe(topic, self.topic.type, lambda *came: self._came.put(came))
+
+    def take(self) -> tuple[Any, int]:
+        data, stamp_ns = self._came.get(timeout=HOLD_S)
+        return decode(data, self.topic.type, is_ros1=False), stamp_ns
+
+    @property
+    def is_empty(self) -> bool:
+        return self._came.empty()
+
+
+def string(text: str) -> bytes:
+    store = typestore(is_ros1=False)
+    return bytes(store.serialize_cdr(store.types[STRING](data=text), STRING))
+
+
+@pytest.mark.acceptance
+def test_types_are_those_of_an_idl_file(domain: int, peer: Callable[[str], Peer]) -> None:
+    """Peers that compare types would not send to others."""
+    other = peer("for each in (Image, String): say(each.__idl__.get_type_id())")
+    for type_ in (IMAGE, STRING):
+        assert other.line() == str(message_class(type_).__idl__.get_type_id())
+
+
+@pytest.mark.acceptance
+def test_images_of_another_program_come_whole(dds: Dds, peer: Callable[[str], Peer]) -> None:
+    peer("""
+out = writer("rt/cam/image", Image, RELIABLE)
+wait(lambda: out.matched_sub)
+for i in range(5):
+    pixels = bytes([i]) * (1 << 21)
+    out.write(Image(Header(Time(7, i), "cam"), 1024, 2048, "mono8", 0, 2048, pixels))
+""")
+    inbox = Inbox(dds, "/cam/image")
+    assert inbox.topic == Topic(name="/cam/image", type=IMAGE, n_messages=1)
+    for i in range(5):
+        image, stamp_ns = inbox.take()
+        assert (image.header.stamp.sec, image.header.stamp.nanosec) == (7, i)
+        assert image.data.shape == (1 << 21,)
+        assert np.all(image.data == i)
+        assert abs(stamp_ns - time.time_ns()) < HOLD_S * 1e9
+    inbox.stop()
+
+
+@pytest.mark.acceptance
+def test_what_is_held_for_those_who_come_late_is_received(
+    dds: Dds, peer: Callable[[str], Peer]
+) -> None:
+    other = peer("""
+out = writer("rt/held", String, RELIABLE, HELD)
+out.write(String("early"))
+plain = writer("rt/plain", String, RELIABLE)
+plain.write(String("nobody hears it"))
+say("written")
+wait(lambda: plain.matched_sub)
+plain.write(String("heard"))
+""")
+    assert other.line() == "written"
+    assert Inbox(dds, "/held").take()[0].data == "early"
+    assert Inbox(dds, "/plain").take()[0].data == "heard"
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("qos", ["sensor", "system"])
+def test_best_effort_is_enough(domain: int, qos: Any, peer: Callable[[str], Peer]) -> None:
+    """A peer of best effort has no reliable readers: it is heard by those who ask for no more."""
+    peer("""
+out = writer("rt/cam/image", Image, Policy.Reliability.BestEffort)
+while not END.wait(0.02):
+    out.write(Image(Header(Time(7, 0), "cam"), 1, 1, "mono8", 0, 1, b"x"))
+""")
+    dds = Dds(qos=qos)
+    try:
+        assert Inbox(dds, "/cam/image").take()[0].header.frame_id == "cam"
+    finally:
+        dds.close()
+
+
+@pytest.mark.acceptance
+def test_the_clock_of_a_simulation_is_the_clock(dds: Dds, peer: Callable[[str], Peer]) -> None:
+    peer("""
+clock = writer("rt/clock", Clock, RELIABLE)
+out = writer("rt/a", String, RELIABLE)
+wait(lambda: clock.matched_sub and out.matched_sub)
+while not END.wait(0.02):
+    clock.write(Clock(Time(5, 7)))
+    out.write(String("a"))
+""")
+    inbox = Inbox(dds, "/a")
+    stamps_ns = iter(lambda: inbox.take()[1], 5_000_000_007)
+    assert all(stamp_ns > 5_000_000_007 for stamp_ns in stamps_ns)
+
+
+@pytest.mark.acceptance
+def test_what_is_sent_is_read_by_another_program(dds: Dds, peer: Callable[[str], Peer]) -> None:
+    held = dds.advertise("/held", STRING, is_latched=True)
+    for text in ("first", "last"):
+        held.publish(string(text), 0)
+    sent = dds.advertise("/sent", STRING)
+    assert not sent.is_heard
+    assert not dds.topics()
+    other = peer("""
+for name, policies in (("rt/held", [HELD]), ("rt/sent", [])):
+    say(reader(name, String, RELIABLE, *policies).take_one(timeout=duration(seconds=60)).data)
+""")
+    assert other.line() == "last"
+    hold = threading.Event()
+    while not sent.is_heard:
+        hold.wait(0.005)
+    sent.publish(string("heard"), 0)
+    assert other.line() == "heard"
+
+
+@pytest.mark.acceptance
+def test_a_service_answers_who_asked_and_survives_what_is_no_request(
+    dds: Dds, peer: Callable[[str], Peer], caplog: pytest.LogCaptureFixture
+) -> None:
+    type_ = ServiceType(name="gvo_test/srv/Echo", request="string text", response="string text")
+    dds.serve(Service(name="/gvo/echo", type=type_, answer=lambda asked: {"text": asked.text * 2}))
+    other = peer("""
+@dataclass
+class Text(IdlStruct):
+    guid: uint64
+    sequence: int64
+    text: str
+
+class Damaged:
+    def serialize(self, **_):
+        return Text(77, 1, "abc").serialize()[:20] + (1 << 31).to_bytes(4, "little") + b"ab"
+
+send, answer = client("/gvo/echo", "gvo_test", "Echo", Text)
+send(1, Damaged())
+send(2, Text(77, 2, "ab"))
+say(answer(2).text)
+""")
+    assert other.line() == "abab"
+    assert "/gvo/echo: a request is left out" in caplog.text
+
+
+@pytest.mark.acceptance
+def test_parameters_are_listed_described_and_set(dds: Dds, peer: Callable[[str], Peer]) -> None:
+    parameters = Parameters(gvo.Config())
+    dds.offer(parameters)
+    other = peer("""
+@dataclass
+class Value(IdlStruct):
+    type: uint8 = 0
+    bool_value: bool = False
+    integer_value: int64 = 0
+    double_value: float64 = 0.0
+    string_value: str = ""
+    byte_array_value: sequence[uint8] = ()
+    bool_array_value: sequence[bool] = ()
+    integer_array_value: sequence[int64] = ()
+    double_array_value: sequence[float64] = ()
+    string_array_value: sequence[str] = ()
+
+@dataclass
+class Parameter(IdlStruct):
+    name: str
+    value: Value
+
+@dataclass
+class Result(IdlStruct):
+    successful: bool
+    reason: str
+
+@dataclass
+class FloatRange(IdlStruct):
+    from_value: float64
+    to_value: float64
+    step: float64
+
+@dataclass
+class IntegerRange(IdlStruct):
+    from_value: int64
+    to_value: int64
+    step: uint64
+
+@dataclass
+class Descriptor(IdlStruct):
+    name: str
+    type: uint8
+    description: str
+    additional_constraints: str
+    read_only: bool
+    dynamic_typing: bool
+    floating_point_range: sequence[FloatRange, 1]
+    integer_range: sequence[IntegerRange, 1]
+
+@dataclass
+class Names(IdlStruct):
+    guid: uint64
+    sequence: int64
+    names: sequence[str]
+
+@dataclass
+class Under(IdlStruct):
+    guid: uint64
+    sequence: int64
+    prefixes: sequence[str]
+    depth: uint64
+
+@dataclass
+class Listed(IdlStruct):
+    guid: uint64
+    sequence: int64
+    names: sequence[str]
+    prefixes: sequence[str]
+
+@dataclass
+class Values(IdlStruct):
+    guid: uint64
+    sequence: int64
+    values: sequence[Value]
+
+@dataclass
+class Types(IdlStruct):
+    guid: uint64
+    sequence: int64
+    types: sequence[uint8]
+
+@dataclass
+class Descriptors(IdlStruct):
+    guid: uint64
+    sequence: int64
+    descriptors: sequence[Descriptor]
+
+@dataclass
+class New(IdlStruct):
+    guid: uint64
+    sequence: int64
+    parameters: sequence[Parameter]
+
+@dataclass
+class Results(IdlStruct):
+    guid: uint64
+    sequence: int64
+    results: sequence[Result]
+
+@dataclass
+class One(IdlStruct):
+    guid: uint64
+    sequence: int64
+    result: Result
+
+def call(name, type_, asked, answered):
+    send, answer = client(f"/gvo/{name}", "rcl_interfaces", type_, answered)
+    send(asked.sequence, asked)
+    return answer(asked.sequence)
+
+listed = call("list_parameters", "ListParameters", Under(77, 1, ["loops", "runtime"], 0), Listed)
+say(*listed.names, *listed.prefixes)
+names = ["klt.n_corners", "camera.readout_ms", "depth.icp", "klt.none"]
+values = call("get_parameters", "GetParameters", Names(77, 2, names), Values).values
+say(*((v.type, v.integer_value, v.string_value) for v in values))
+say(call("get_parameter_types", "GetParameterTypes", Names(77, 3, names), Types).types)
+known = call("describe_parameters", "DescribeParameters", Names(77, 4, names), Descriptors)
+for each in known.descriptors:
+    say(each.name, each.type, each.additional_constraints, each.dynamic_typing,
+        *((r.from_value, r.to_value) for r in (*each.integer_range, *each.floating_point_range)))
+new = [
+    Parameter("klt.n_corners", Value(type=2, integer_value=100)),
+    Parameter("camera.readout_ms", Value(type=3, double_value=12.5)),
+    Parameter("depth.icp", Value(type=4, string_value="perhaps")),
+    Parameter("klt.none", Value(type=1, bool_value=True)),
+    Parameter("klt.n_levels", Value(type=7, integer_array_value=[1])),
+]
+results = call("set_parameters", "SetParameters", New(77, 5, new), Results).results
+say(*(each.successful for each in results))
+for each in results[2:]:
+    say(each.reason)
+both = [
+    Parameter("camera.readout_ms", Value()),
+    Parameter("klt.n_corners", Value(type=2, integer_value=1)),
+]
+for changes in (both, both[:1]):
+    result = call("set_parameters_atomically", "SetParametersAtomically", New(77, 6, changes), One)
+    say(result.result.successful)
+    LINES.get()
+""")
+    assert other.line() == "loops.enabled runtime.threads loops runtime"
+    assert other.line() == "(2, 250, '') (0, 0, '') (4, 0, 'auto') (0, 0, '')"
+    assert other.line() == "[2, 0, 4, 0]"
+    assert other.line() == "klt.n_corners 2  False (50, 20000)"
+    assert other.line() == "camera.readout_ms 0  True (-100.0, 100.0)"
+    assert other.line() == "depth.icp 4 auto, always, never False"
+    assert other.line() == "klt.none 0  False"
+    assert other.line() == "True True False False False"
+    assert "depth.icp" in other.line()
+    assert other.line() == "there is no parameter klt.none"
+    assert other.line() == "no parameter is an array"
+    assert other.line() == "False"
+    assert (parameters.config.klt.n_corners, parameters.config.camera.readout_ms) == (100, 12.5)
+    other.go_on()
+    assert other.line() == "True"
+    assert parameters.config.camera.readout_ms is None
+    other.go_on()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_no_port_is_open_beyond_loopback(domain: int) -> None:
+    before = sockets()
+    dds = Dds()
+    try:
+        made = sockets() - before
+        assert made
+        for number in made:
+            with socket.socket(fileno=os.dup(number)) as each:
+                device = each.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+                assert device.rstrip(b"\0") == b"lo"
+    finally:
+        dds.close()
+    assert sockets() == before
+
+
+def test_a_domain_that_cannot_be_joined_is_told(
+    dds: Dds, domain: int, monkeypatch: pytest.MonkeyPatch, command: Command, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigurationError, match=f"ROS_DOMAIN_ID={domain} cannot be joined"):
+        Dds()
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    answer = command("live", "ros2", "--out", tmp_path / "run")
+    assert answer.code == 2
+    assert is_one_line(answer.err)
+    assert "expected a number from 0 to 232, got 233" in answer.err
+
+
+# Plays a bag: each pair once the pose of the last has come, with all transforms of its stamp.
+PLAYER = """
+from pathlib import Path
+from gvo.io.bag.reader import BagReader
+
+def raw(type_, data):
+    sample = type_.__new__(type_)
+    sample.serialize = lambda **_: data
+    return sample
+
+types = {"Image": Image, "CameraInfo": CameraInfo}
+bag = BagReader(Path(BAG))
+kinds = {topic.name: types[topic.type.rpartition("/")[2]] for topic in bag.topics if
+         topic.type.startswith("sensor_msgs")}
+writers = {name: writer("rt" + name, type_, RELIABLE, *([HELD] if type_ is CameraInfo else []))
+           for name, type_ in kinds.items()}
+messages = [*bag.messages(kinds)]
+for name, type_ in kinds.items():
+    if type_ is CameraInfo:
+        first = next(each for each in messages if each.topic.name == name)
+        writers[name].write(raw(type_, first.data))
+answers = reader("rt/gvo/odom/odometry", Odometry, RELIABLE)
+moves = DataReader(PARTICIPANT, Topic(PARTICIPANT, "rt/tf", Transforms),
+    Qos(RELIABLE, Policy.History.KeepLast(1000)))
+images = [each for each in messages if kinds[each.topic.name] is Image]
+outs = [writers[name] for name in {each.topic.name for each in images}]
+wait(lambda: all(out.matched_sub for out in outs) and answers.matched_pub and moves.matched_pub)
+stamps = []
+for first, second in zip(images[::2], images[1::2], strict=True):
+    for each in (first, second):
+        writers[each.topic.name].write(raw(Image, each.data))
+    answer = answers.take_one(timeout=duration(seconds=60))
+    stamps.append((answer.header.stamp.sec, answer.header.stamp.nanosec))
+say(len(stamps), answer.header.frame_id, answer.child_frame_id)
+moved = [(each.header.stamp.sec, each.header.stamp.nanosec) for each in
+    (each for message in moves.take(1000) for each in message.transforms)
+    if each.child_frame_id == answer.child_frame_id]
+say(moved == stamps)
+"""
+
+
+@pytest.mark.recorded
+@pytest.mark.acceptance
+def test_a_drive_that_another_program_plays_is_tracked_as_in_its_bag(
+    gvo_data: Path, domain: int, tmp_path: Path, peer: Callable[[str], Peer]
+) -> None:
+    bag = tmp_path / "drive.mcap"
+    gvo.convert(gvo.open_recording(gvo_data / "kitti_06_start"), bag)
+    gvo.run_recording(
+        gvo.open_recording(bag), tmp_path / "run", outputs=gvo.RunOutputs(report=False)
+    )
+    arguments = [
+        "live",
+        "ros2",
+        "--qos",
+        "reliable",
+        "--out",
+        str(tmp_path / "live"),
+        "--no-report",
+    ]
+    with subprocess.Popen([*GVO, *arguments], stderr=subprocess.PIPE, text=True) as live:
+        try:
+            player = peer(f"BAG = {str(bag)!r}\n{PLAYER}")
+            assert player.line() == "51 gvo/odom gvo/odom/camera_left_optical"
+            assert player.line() == "True"
+        finally:
+            live.send_signal(signal.SIGINT)
+            _, errors = live.communicate(timeout=HOLD_S)
+    assert live.returncode == 0, errors
+    for name in TABLES:
+        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
