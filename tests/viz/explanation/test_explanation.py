@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from base64 import b64decode
 from collections.abc import Callable
 from functools import cache, partial
@@ -21,6 +22,7 @@ from gvo.viz.explanation import write_explanation
 from gvo.viz.explanation.motion import draw_residuals
 from gvo.viz.explanation.pose import position_covariance
 from gvo.viz.explanation.sheet import Sheet
+from tests.viz.browser import Browser
 
 STEREO = [
     "01_keypoints",
@@ -42,6 +44,7 @@ def explained(sensor: Sensor, index: int) -> FrameExplanation:
     return explain_frame(source, index)
 
 
+@cache
 def explained_descriptors() -> FrameExplanation:
     source = SyntheticRecording("driving", "stereo", n_frames=5, scale=0.4)
     return explain_frame(
@@ -147,3 +150,26 @@ def test_the_ellipse_is_turned_into_the_frame_of_the_picture() -> None:
     steps = np.random.default_rng(0).normal(size=(200_000, 3)) * [2.0, 3.0, 4.0]
     spread = np.cov((steps @ T[:3, :3].T).T)
     assert np.allclose(position_covariance(T, covariance), spread, atol=0.2)
+
+
+_PICTURES = "return [...document.images].map(i => [i.alt, i.naturalWidth, i.clientWidth])"
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("explain", [explained_descriptors, partial(explained, "rgbd", 2)])
+def test_an_explained_frame_opens_from_disk_in_a_browser_with_every_picture(
+    browser: Browser, tmp_path: Path, explain: Callable[[], FrameExplanation]
+) -> None:
+    paths = write_explanation(explain(), tmp_path / "out")
+    n_pictures = sum(path.suffix == ".png" for path in paths)
+    # alone: moved away from the pictures beside it
+    page = Path(shutil.move(tmp_path / "out" / "explanation.html", tmp_path / "alone.html"))
+    browser.open_file(page)
+    pictures = browser.run(_PICTURES)
+    assert isinstance(pictures, list)
+    assert len(pictures) == n_pictures > 5
+    assert [name for name, width, shown in pictures if not (name and width and shown)] == []
+    others = [url for url in browser.requests() if not url.startswith("data:")]
+    assert others == [page.as_uri()]
+    assert browser.requests_leaving() == []
+    assert browser.console_errors() == []
