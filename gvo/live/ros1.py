@@ -10,11 +10,12 @@ import hashlib
 import logging
 import math
 import os
+import signal
 import socket
 import sys
+import threading
 import time
 import xmlrpc.client
-from _thread import interrupt_main
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -145,7 +146,7 @@ class Ros1:
         """End the program as Ctrl-C does where the master ends the node: rosnode kill."""
         if not self._is_closed:
             _LOGGER.warning("ROS 1: the master ends the node: %s", reason)
-            interrupt_main()
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
 
 class _Publisher:

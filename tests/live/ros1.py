@@ -1,8 +1,8 @@
 """A master of ROS 1 on the loopback, and programs that talk through it, for tests."""
 
 import json
-import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -15,6 +15,7 @@ from xmlrpc.client import ServerProxy
 
 import pytest
 
+from tests.conftest import ENVIRONMENT
 from tests.viz.browser import give_up
 
 DEBIAN = Path("/usr/lib/python3/dist-packages")
@@ -73,6 +74,11 @@ class Program:
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
 
+    def send(self, number: signal.Signals) -> int:
+        """Send a signal, and return the exit code."""
+        self.process.send_signal(number)
+        return self.end()
+
     def end(self) -> int:
         """End its standard input, and return the exit code."""
         assert self.process.stdin is not None
@@ -88,7 +94,7 @@ class Ros:
     """A master, and the environment in which its nodes run."""
 
     def __init__(self, folder: Path, port: int) -> None:
-        self.environment = os.environ | {
+        self.environment = ENVIRONMENT | {
             "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
             "ROS_HOME": str(folder),
             "ROS_LOG_DIR": str(folder / "log"),
@@ -102,6 +108,13 @@ class Ros:
         """Have nodes that start take their time from `/clock`."""
         with ServerProxy(self.environment["ROS_MASTER_URI"]) as server:
             assert server.setParam("/test", "/use_sim_time", True)[0] == 1  # type: ignore[index]
+
+    def end_node(self, name: str) -> None:
+        """End a node as rosnode kill does."""
+        with ServerProxy(self.environment["ROS_MASTER_URI"]) as server:
+            uri = server.lookupNode("/test", name)[2]  # type: ignore[index]
+        with ServerProxy(str(uri)) as node, suppress(ConnectionError):  # it may not answer
+            node.shutdown("/test", "a test")
 
     def start(self, *command: object) -> Program:
         """Start a program in Python."""

@@ -2,17 +2,25 @@
 
 import ast
 import json
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import gvo
 from gvo.config import list_parameters
+from gvo.types import FloatArray
+from tests.conftest import GVO, TABLES
 from tests.live.ros1 import Program, Ros, ros  # noqa: F401 - the fixture
 
 FOLDER = Path(__file__).parent
-PEER = FOLDER / "ros1_peer.py"
+PEER, DRIVER = FOLDER / "ros1_peer.py", FOLDER / "ros1_driver.py"
+PLAYER = FOLDER.parents[1] / "scripts" / "ros" / "play.py"
+NO_REPORT = gvo.RunOutputs(report=False)
 STAMP_NS = 1_700_000_000_123_456_789
 CLOCK_NS = 5_000_000_006
 
@@ -96,3 +104,119 @@ def test_a_hostile_node_is_survived(ros: Ros, node: Program) -> None:  # noqa: F
     (image,) = events(node, "image")
     assert image["digest"] == json.loads(peer.lines[0])["image"]
     assert len(events(node, "fault")) == 4
+
+
+def pose(values: list[float]) -> FloatArray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+    return T
+
+
+class Transforms:
+    """What `/tf` and `/tf_static` held, by stamp."""
+
+    def __init__(self, noted: dict[str, Any]) -> None:
+        self._fixed = {child: (parent, pose(q)) for _, parent, child, q in noted["static"]}
+        moving = {
+            (stamp_ns, child): (parent, pose(q)) for stamp_ns, parent, child, q in noted["tf"]
+        }
+        self._moving = moving
+
+    def to_map(self, frame: str, stamp_ns: int) -> FloatArray:
+        """Return T_map_frame at exactly this stamp."""
+        T_map_frame = np.eye(4)
+        while frame != "map":
+            moving = self._moving.get((stamp_ns, frame))
+            frame, T = self._fixed[frame] if moving is None else moving
+            T_map_frame = T @ T_map_frame
+        return T_map_frame
+
+
+def assert_same(out: Path, run: Path) -> None:
+    for table in TABLES:
+        assert (out / table).read_bytes() == (run / table).read_bytes(), table
+
+
+def live(ros: Ros, out: Path, *options: str) -> Program:  # noqa: F811
+    return ros.start(*GVO[1:], "live", "ros1", "--no-report", "--out", out, *options)
+
+
+@pytest.mark.acceptance
+@pytest.mark.recorded
+@pytest.mark.parametrize("name", ["kitti_06_start", "rgbd_dataset_freiburg1_xyz_start"])
+def test_what_is_played_is_tracked_as_from_its_files(
+    name: str,
+    ros: Ros,  # noqa: F811
+    gvo_data: Path,
+    tmp_path: Path,
+) -> None:
+    gvo.run_recording(gvo.open_recording(gvo_data / name), tmp_path / "run", outputs=NO_REPORT)
+    expected = gvo.read_trajectory(tmp_path / "run" / "causal.txt")
+    odometry = live(ros, tmp_path / "out")
+    watcher = ros.start(DRIVER)
+    watcher.wait_for("watching")
+    player = ros.start(PLAYER, gvo_data / name)
+    player.wait_for("pairs sent")
+    assert player.end() == 0
+    assert odometry.send(signal.SIGINT) == 0, odometry.errors
+    assert_same(tmp_path / "out", tmp_path / "run")
+    watcher.tell(str(expected.stamps_ns[-1]))
+    assert watcher.end() == 0, watcher.errors
+    noted = json.loads(watcher.lines[-1])
+    transforms = Transforms(noted)
+    # Who listens is not connected to all topics at once.
+    first_ns = max(noted[kind][0][0] for kind in ("odometry", "tf", "clouds"))
+    poses = dict(zip(expected.stamps_ns.tolist(), expected.T_world_frame, strict=True))
+    checked = [one for one in noted["odometry"] if one[0] >= first_ns]
+    assert len(checked) > len(poses) // 2
+    for stamp_ns, frame, child, values in checked:
+        T_map_base = transforms.to_map(frame, stamp_ns) @ pose(values)
+        np.testing.assert_allclose(transforms.to_map(child, stamp_ns), T_map_base, atol=1e-9)
+        np.testing.assert_allclose(T_map_base, poses[stamp_ns], atol=1e-6)
+    clouds = [one for one in noted["clouds"] if one[0] >= first_ns]
+    assert len(clouds) == len(checked)
+    for stamp_ns, frame, step, offsets, text in clouds:
+        assert offsets == [0, 4, 8]
+        rows = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, step)
+        points_cam = rows[:, :12].copy().view("<f4")
+        assert np.all(points_cam[:, 2] > 0.1)  # the camera looks along z
+        np.testing.assert_allclose(transforms.to_map(frame, stamp_ns), poses[stamp_ns], atol=1e-6)
+
+
+@pytest.mark.acceptance
+@pytest.mark.recorded
+def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Path) -> None:  # noqa: F811
+    recording = gvo_data / "kitti_06_start"
+    odometry = live(ros, tmp_path / "out")
+    driver = ros.start(DRIVER, recording)
+    driver.wait_for("driven")
+    driver.send(signal.SIGKILL)
+    odometry.wait_for("no images for")
+    player = ros.start(PLAYER, recording, "--ahead", "0")
+    player.wait_for("pairs sent")
+    assert player.end() == 0
+    ros.end_node("/gvo")
+    assert odometry.end() == 3, odometry.errors  # some frames are faulty
+    # The parameter that was set after ten frames; the one out of its range was not.
+    rows = [
+        line.split(",") for line in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
+    ]
+    counts = [int(row[3]) for row in rows if row[1] == "ok"]
+    assert (counts[:10], counts[10:]) == ([250] * 10, [120] * 20)
+    assert len(rows) == 30 + 5  # and five messages that were no images
+    assert (tmp_path / "out-2" / "causal.txt").read_text().count("\n") == 10
+    config = gvo.Config(klt={"n_corners": 120})
+    gvo.run_recording(
+        gvo.open_recording(recording), tmp_path / "run", config=config, outputs=NO_REPORT
+    )
+    assert_same(tmp_path / "out-3", tmp_path / "run")
+    said = "".join(odometry.errors)
+    for words in (
+        "dynamic_reconfigure: klt.n_corners=-1",
+        f"a new run begins in {tmp_path / 'out-2'}: it was reset",
+        f"a new run begins in {tmp_path / 'out-3'}: the stamps go back",
+        "the master ends the node",
+        "5 of 35 frames are faulty",
+    ):
+        assert said.count(words) == 1, (words, said)
+    assert "Traceback" not in said
