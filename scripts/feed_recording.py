@@ -8,13 +8,18 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+from numpy.typing import NDArray
 
 import gvo
-from gvo.io.recording import StampedImage
 
-_ENCODINGS = {("u", 2): "mono8", ("u", 3): "bgr8", ("f", 2): "32FC1"}
+_ENCODINGS = {
+    ("uint8", 2): "mono8",
+    ("uint8", 3): "bgr8",
+    ("uint16", 2): "16UC1",
+    ("float32", 2): "32FC1",
+}
 
 
 def main() -> None:
@@ -31,21 +36,20 @@ def main() -> None:
         if arguments.rate > 0:
             due_s = started_s + 1e-9 * (image.stamp_ns - first_ns) / arguments.rate
             time.sleep(max(due_s - time.monotonic(), 0.0))
-        send(image, names[image.stream])
+        send(names[image.stream], image.stamp_ns, image.load())
 
 
-def send(image: StampedImage, stream: str) -> None:
+def send(stream: str, stamp_ns: int, pixels: NDArray[Any]) -> None:
     """Write one image."""
-    pixels = np.ascontiguousarray(image.load())
     height, width = pixels.shape[:2]
     header = {
         "stream": stream,
-        "stamp_ns": image.stamp_ns,
-        "encoding": _ENCODINGS[pixels.dtype.kind, pixels.ndim],
+        "stamp_ns": stamp_ns,
+        "encoding": _ENCODINGS[pixels.dtype.name, pixels.ndim],
         "width": width,
         "height": height,
     }
-    sys.stdout.buffer.write(json.dumps(header).encode() + b"\n" + pixels.tobytes())
+    sys.stdout.buffer.write(json.dumps(header).encode() + b"\n" + pixels.tobytes())  # row by row
     sys.stdout.buffer.flush()
 
 

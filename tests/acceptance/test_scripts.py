@@ -1,6 +1,5 @@
 """The scripts run as programs, as a reader would copy them."""
 
-import importlib
 import json
 import re
 import subprocess
@@ -204,54 +203,6 @@ def ate_of(poses: Path, source: gvo.SyntheticRecording) -> float:
     return gvo.evaluate(truth, replace(estimate, stamps_ns=stamps_ns), name=poses.name).ate_m
 
 
-@pytest.fixture(scope="module")
-def side_by_side(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gvo.SyntheticRecording]:
-    """Return a video of a rendered room, beside it `stereo.yaml`, and the recording of it."""
-    source = gvo.SyntheticRecording("handheld", "stereo", n_frames=10, scale=0.5)
-    video = tmp_path_factory.mktemp("videos") / "pairs.avi"
-    camera, period_s = source.info.camera, 1e-9 * np.diff(source.ground_truth().stamps_ns)[0]
-    codec = cv2.VideoWriter.fourcc(*"MJPG")
-    writer = cv2.VideoWriter(str(video), codec, 1.0 / period_s, (2 * camera.width, camera.height))
-    for frame in gvo.frames(source):
-        assert isinstance(frame, gvo.StereoFrame)
-        pair = np.hstack([frame.left, frame.right])
-        writer.write(cv2.cvtColor(pair, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    cameras = {}
-    for side, calibration in zip(("left", "right"), source.info.calibrations, strict=True):
-        fields = {"width": camera.width, "height": camera.height, "distortion_model": "plumb_bob"}
-        matrices = {name: getattr(calibration, name).ravel().tolist() for name in "DKRP"}
-        cameras[side] = fields | matrices
-    (video.parent / "stereo.yaml").write_text(json.dumps(cameras))
-    return video, source
-
-
-def test_a_stereo_camera_of_ones_own_is_tracked(
-    side_by_side: tuple[Path, gvo.SyntheticRecording], tmp_path: Path
-) -> None:
-    video, source = side_by_side
-    options = ["--calibration", video.parent / "stereo.yaml", "--rectified"]
-    lines = output("own_stereo_camera", video, *options, "--out", tmp_path / "poses.txt")
-    assert [line.split()[2] for line in lines[:-1]] == ["ok"] * 10
-    assert lines[-1] == f"wrote {tmp_path / 'poses.txt'}: 10 poses"
-    assert ate_of(tmp_path / "poses.txt", source) < 0.03
-
-
-def test_of_a_device_the_newest_pair_is_taken(
-    side_by_side: tuple[Path, gvo.SyntheticRecording], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    video, _ = side_by_side
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("own_stereo_camera")
-    taken = list(script.pairs_of_device(cv2.VideoCapture(str(video))))
-    stamps_ns = [stamp_ns for stamp_ns, _ in taken]
-    assert stamps_ns == sorted(set(stamps_ns))
-    capture = cv2.VideoCapture(str(video))
-    for _ in range(10):
-        last = capture.read()[1]
-    np.testing.assert_array_equal(taken[-1][1], last)
-
-
 def test_an_rgbd_camera_of_ones_own_is_tracked_without_a_dropped_frame(tmp_path: Path) -> None:
     source = gvo.SyntheticRecording("handheld", "rgbd", n_frames=10, scale=0.5)
     for n, frame in enumerate(gvo.frames(source)):
@@ -272,7 +223,6 @@ def test_an_rgbd_camera_of_ones_own_is_tracked_without_a_dropped_frame(tmp_path:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("own_stereo_camera", ["missing.avi", "--calibration", "missing.yaml"]),
         ("own_rgbd_camera", ["missing", "--intrinsics", "1", "1", "1", "1"]),
         ("own_rgbd_camera", ["x", "--intrinsics", "1", "1", "1", "1", "--rate", "0"]),
         ("smooth_edges", ["missing.csv"]),
@@ -286,6 +236,8 @@ def test_an_rgbd_camera_of_ones_own_is_tracked_without_a_dropped_frame(tmp_path:
         ("benchmark", []),
         ("benchmark", ["--soak", "10"]),
         ("benchmark", ["x.bag", "--rounds", "0"]),
+        ("benchmark", ["missing.bag", "--live"]),
+        ("benchmark", ["--live"]),
         ("benchmark_reading", ["missing.bag"]),
         ("benchmark_reading", ["x.bag", "--rounds", "0"]),
         ("make_demo_bag", ["missing/folder/that/is.a.txt"]),
