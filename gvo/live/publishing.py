@@ -34,6 +34,8 @@ _EVERY_S: Final = 1.0
 _SILENT_S: Final = 3.0
 # Over which rates and latencies are told.
 _N_RECENT: Final = 50
+# Pairs that may wait for their pose at once, and more.
+_N_WAITING: Final = 1000
 
 
 class LiveMessages:
@@ -146,7 +148,7 @@ class Arrivals(AbstractContextManager["Arrivals"]):
             deque(maxlen=_N_RECENT),
             deque(maxlen=_N_RECENT),
         )
-        self._waiting_s: dict[int, float] = {}
+        self._waiting_s: deque[tuple[int, float]] = deque(maxlen=_N_WAITING)
         self._newest_ns = 0
         self._text = ""
         self.latencies_ms: deque[float] = deque(maxlen=_N_RECENT)
@@ -173,13 +175,15 @@ class Arrivals(AbstractContextManager["Arrivals"]):
 
     def note_pair(self, stamp_ns: int) -> None:
         """Note that a pair is complete."""
-        self._waiting_s[stamp_ns] = time.monotonic()
+        self._waiting_s.append((stamp_ns, time.monotonic()))
 
     def note_sent(self, stamp_ns: int) -> None:
-        """Note that the pose of a pair was sent."""
-        came_s = self._waiting_s.pop(stamp_ns, None)
-        if came_s is not None:
-            self.latencies_ms.append(1e3 * (time.monotonic() - came_s))
+        """Note that the pose of a pair was sent; those before it have none."""
+        while self._waiting_s:
+            pair_ns, came_s = self._waiting_s.popleft()
+            if pair_ns == stamp_ns:
+                self.latencies_ms.append(1e3 * (time.monotonic() - came_s))
+                return
 
     def state(self) -> str:
         """Return what is wrong with the images in a line; empty where they come."""

@@ -160,6 +160,61 @@ def test_the_frames_are_those_of_a_robot_where_it_says_where_its_camera_is(
     )
 
 
+def test_each_drop_is_told_with_its_reason_and_the_newest_are_tracked(
+    drive_bag: Path, tmp_path: Path
+) -> None:
+    def script(play: Play) -> None:
+        middle = half(play)
+        n_before = min(
+            sum(side in each.topic.name for each in play.messages[:middle])
+            for side in ("left/image", "right/image")
+        )
+        play.send(0, middle)
+        play.network.wait_for(ODOMETRY, n_before)
+        waiting, n_received = play.live._waiting, threading.Semaphore(0)
+        note, hold = waiting.on_pair, threading.Event()
+
+        def count(stamp_ns: int) -> None:
+            note(stamp_ns)
+            n_received.release()
+
+        waiting.on_pair = count
+        waiting.do(hold.wait)  # tracking is behind
+        play.send(middle, len(play.messages))
+        for _ in range(20 - n_before):
+            assert n_received.acquire(timeout=60)
+        hold.set()
+        before.append(n_before)
+
+    before: list[int] = []
+    play = Play(drive_bag, script, max_waiting=2)
+    ((folder, result),) = play.run(tmp_path / "out")
+    stamps = [stamp_of(each.header) for each in recorded_left(play)]
+    n_dropped = 20 - before[0] - 2
+    dropped = stamps[before[0] : -2]
+    assert play.live.n_dropped == n_dropped == len(dropped)
+    assert [stamp_of(each.header) for each in play.sent(ODOMETRY)] == [
+        stamp for stamp in stamps if stamp not in dropped
+    ]
+    reason = "dropped, tracking is behind: 2 pairs wait (--queue)"
+    told = [
+        stamp_of(message.header)
+        for message in play.sent("/diagnostics")
+        for status in message.status
+        if status.message == f"skipped: {reason}"
+    ]
+    assert told == dropped
+    assert (folder / "frames.csv").read_text().count(reason) == n_dropped
+    assert result.summary["frames"] == 20
+    assert result.summary["status_counts"]["skipped"] == n_dropped
+    assert not play.live.arrivals._waiting_s
+
+
+def recorded_left(play: Play) -> list[Any]:
+    """Return the left images, decoded."""
+    return [each.decode() for each in play.messages if "left/image" in each.topic.name]
+
+
 def test_where_the_stamps_go_back_another_run_begins(drive_bag: Path, tmp_path: Path) -> None:
     def script(play: Play) -> None:
         play.send_all()

@@ -298,8 +298,9 @@ class RunMessages:
         """Write the paths so far, of at most so many poses each; of all without a number."""
         header = Header(self._newest_ns, self._frames.world)
         for name, track in self._tracks.items():
-            if len(track) > 0:
-                write_path(self._writer, f"/gvo/{name}/path", header, *track.poses(n_most))
+            topic = f"/gvo/{name}/path"
+            if len(track) > 0 and self._writer.is_wanted(topic):
+                write_path(self._writer, topic, header, *track.poses(n_most))
 
 
 class RunBag(AbstractContextManager["RunBag"]):

@@ -211,8 +211,8 @@ class Track:
             stride *= 2
         is_shown = np.arange(len(self)) % stride == 0
         is_shown[-1:] = True
-        stamps_ns = np.array(self._stamps_ns, dtype=np.int64)
-        return stamps_ns[is_shown], np.array(self._poses).reshape(-1, _N_NUMBERS)[is_shown]
+        stamps_ns = np.frombuffer(self._stamps_ns, dtype=np.int64)
+        return stamps_ns[is_shown], np.frombuffer(self._poses).reshape(-1, _N_NUMBERS)[is_shown]
 
 
 def twist_between(
