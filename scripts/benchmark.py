@@ -15,6 +15,8 @@ hovers, stereo), `block` (a lap and more by car, stereo), `rooms` (alike, RGB-D)
 shutter by `--readout`. `--keep DIR` keeps what is rendered.
 `--loops` judges loop closure on recordings with ground truth, named or of seeds, also with
 `--drift` or with the light going out (`--dark`; see benchmark_loops.py).
+`--live` measures how late poses of a running camera are, and what is dropped where its frames come
+too fast (see benchmark_live.py).
 `--window` and `--soak` measure the sliding window alone, on a simulated stream of edges: what
 it costs beside GTSAM alone, and whether it ages (see benchmark_window.py).
 `--graphs` optimizes whole pose graphs, those named, GTSAM's and generated ones, beside GTSAM used
@@ -31,6 +33,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import benchmark_graphs  # type: ignore[import-not-found]  # beside this one
+import benchmark_live  # type: ignore[import-not-found]
 import benchmark_loops  # type: ignore[import-not-found]
 import benchmark_map  # type: ignore[import-not-found]
 import benchmark_passes as passes  # type: ignore[import-not-found]
@@ -56,13 +59,7 @@ def main() -> None:
         benchmark_graphs.measure(arguments.graphs)
     if arguments.map is not None:
         benchmark_map.measure(arguments.map)
-    if arguments.loops:
-        spoiling = benchmark_loops.Spoiling(dark_s=arguments.dark, drift=arguments.drift)
-        benchmark_loops.measure(sources_of(arguments), arguments.set, spoiling)
-        return
-    if arguments.seeds:
-        benchmark_seeds.measure(recordings_of(arguments), arguments.seeds, arguments.set)
-    measure_all(arguments)
+    measure_recordings(arguments)
 
 
 def parse() -> argparse.Namespace:
@@ -86,6 +83,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--untimed", action="store_true", help="let the soak ignore times")
     parser.add_argument("--loops", action="store_true", help="judge loop closure")
+    parser.add_argument("--live", action="store_true", help="judge a running camera")
     parser.add_argument("--drift", type=float, default=0.0, metavar="PERCENT", help="of a lap")
     parser.add_argument("--dark", type=span, metavar="A-B", help="seconds without light")
     add_seeds(parser)
@@ -150,6 +148,21 @@ def recordings_of(arguments: argparse.Namespace) -> benchmark_seeds.Recordings:
         readout_ms=arguments.readout,
         folder=arguments.keep,
     )
+
+
+def measure_recordings(arguments: argparse.Namespace) -> None:
+    """Measure what is asked for of the recordings."""
+    if arguments.loops:
+        spoiling = benchmark_loops.Spoiling(dark_s=arguments.dark, drift=arguments.drift)
+        benchmark_loops.measure(sources_of(arguments), arguments.set, spoiling)
+        return
+    if arguments.live:
+        for path in arguments.recordings:
+            passes.in_child(benchmark_live.measure, path, arguments.set, n_rounds=arguments.rounds)
+        return
+    if arguments.seeds:
+        benchmark_seeds.measure(recordings_of(arguments), arguments.seeds, arguments.set)
+    measure_all(arguments)
 
 
 def measure_all(arguments: argparse.Namespace) -> None:
