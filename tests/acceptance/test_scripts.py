@@ -65,6 +65,14 @@ def table(lines: list[str], first: str) -> dict[str, list[str]]:
     return {name: numbers for name, *numbers in cells}
 
 
+def test_frames_that_come_too_fast_are_accounted_for(drive_bag: Path) -> None:
+    lines = output("benchmark", drive_bag, "--live", "--rounds", 1)
+    assert any(line.startswith("ratio of the medians: ") for line in lines)
+    (n_sent,) = (int(line.split()[0]) for line in lines if "--max-lag" in line)
+    (counts,) = (line for line in lines if line.endswith(" faulty"))
+    assert sum(map(int, re.findall(r"\d+", counts))) == n_sent
+
+
 @pytest.fixture(scope="module")
 def benchmark_lines(drive_bag: Path) -> list[str]:
     """Return what the benchmark prints about a rendered drive."""

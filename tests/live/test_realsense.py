@@ -98,8 +98,9 @@ def test_the_calibration_is_that_of_the_device(camera: Camera, script: Any, tmp_
     rig = gvo.Rig(tmp_path / "camera.yaml", sensor=info.sensor)
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(rig.camera, name) == pytest.approx(getattr(info.camera, name))
-    if info.sensor == "stereo":
-        assert rig.camera.baseline == pytest.approx(info.camera.baseline)  # type: ignore[union-attr]
+    if isinstance(info.camera, gvo.StereoCamera):
+        assert isinstance(rig.camera, gvo.StereoCamera)
+        assert rig.camera.baseline == pytest.approx(info.camera.baseline)
     else:
         assert rig.depth_scale == pytest.approx(1.0 / UNITS_M)
 

@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
@@ -344,7 +344,7 @@ class Done:
         return max(self._n_lines - 1, 0)
 
 
-def send(image: StampedImage, stream: BinaryIO) -> None:
+def send(image: StampedImage, stream: IO[bytes]) -> None:
     """Write an image as `gvo live -` reads it."""
     names = {"stream": ("left", "right")[image.stream], "stamp_ns": image.stamp_ns}
     header = names | SIZE | {"encoding": "mono8"}
