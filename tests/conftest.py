@@ -83,6 +83,13 @@ def interrupt(
     return process.returncode, errors
 
 
+def refused(answer: Answer) -> str:
+    """Check that a command refused in one line; return it."""
+    assert answer.code == 2
+    assert is_one_line(answer.err), answer.err
+    return answer.err
+
+
 @pytest.fixture(scope="session")
 def gvo_data() -> Path:
     """Return the folder of real recordings; skip without it, fail where it is missing."""

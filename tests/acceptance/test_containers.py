@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
 from scipy.spatial.transform import Rotation
 
 import gvo
@@ -225,53 +222,6 @@ def test_every_container_gives_the_same_frames_and_cameras_bit_by_bit(
     n_compressed = suffixes.count("compressed") + suffixes.count("compressedDepth")
     # Depth that is not of whole millimetres stays as it is.
     assert n_compressed == ((1 if source is _RGBD else 2) if is_png else 0)
-
-
-def _rewrite(path: Path, writer: Writer1 | Writer2) -> None:
-    """Copy all messages into a bag, as they are."""
-    with AnyReader([path]) as reader, writer:
-        connections: dict[str, Any] = {}
-        for connection, log_time_ns, data in reader.messages():
-            topic = connection.topic
-            if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, connection.msgtype, typestore=reader.typestore
-                )
-            writer.write(connections[topic], log_time_ns, data)
-
-
-@pytest.mark.parametrize("compression", list(Writer1.CompressionFormat))
-def test_chunks_of_ros1_may_be_compressed(
-    tmp_path: Path, compression: Writer1.CompressionFormat
-) -> None:
-    convert(_STEREO, tmp_path / "a.bag")
-    writer = Writer1(tmp_path / "b.bag")
-    writer.set_compression(compression)
-    _rewrite(tmp_path / "a.bag", writer)
-    assert (tmp_path / "b.bag").stat().st_size < (tmp_path / "a.bag").stat().st_size
-    assert _frames(gvo.open_recording(tmp_path / "b.bag")) == _frames(_STEREO)
-
-
-@pytest.mark.parametrize(
-    ("storage", "mode"),
-    [
-        (StoragePlugin.SQLITE3, CompressionMode.FILE),
-        (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-        (StoragePlugin.MCAP, CompressionMode.FILE),
-        (StoragePlugin.MCAP, CompressionMode.MESSAGE),
-        (StoragePlugin.MCAP, CompressionMode.STORAGE),
-    ],
-)
-def test_ros2_may_be_compressed_by_zstd(
-    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode
-) -> None:
-    convert(_STEREO, tmp_path / "a")
-    writer = Writer2(tmp_path / "b", version=8, storage_plugin=storage)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    _rewrite(tmp_path / "a", writer)
-    sizes = [sum(path.stat().st_size for path in (tmp_path / name).iterdir()) for name in "ab"]
-    assert sizes[1] < sizes[0]
-    assert _frames(gvo.open_recording(tmp_path / "b")) == _frames(_STEREO)
 
 
 @pytest.mark.parametrize("model", sorted(_LENSES))

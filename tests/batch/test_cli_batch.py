@@ -25,7 +25,7 @@ from tests.batch.conftest import (
     state_of,
     wait_until,
 )
-from tests.conftest import GVO, Answer, Command, is_one_line, python
+from tests.conftest import GVO, Answer, Command, is_one_line, python, refused
 
 Batch = Callable[..., Answer]
 
@@ -153,27 +153,21 @@ def test_no_scheduler_is_a_line(
     bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, address: str
 ) -> None:
     monkeypatch.setattr("gvo.batch.engine._CONNECT_S", "1s")
-    answer = command("batch", bags, "--out", tmp_path / "out", "--scheduler", address)
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert f"{address}: no scheduler of Dask answers" in answer.err
+    said = refused(command("batch", bags, "--out", tmp_path / "out", "--scheduler", address))
+    assert f"{address}: no scheduler of Dask answers" in said
 
 
 def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").touch()
-    answer = command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out")
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert "expected a recording" in answer.err
+    said = refused(command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out"))
+    assert "expected a recording" in said
 
 
 def test_a_folder_that_cannot_be_written_is_a_line(
     batch: Batch, bags: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
-    answer = batch(bags, "--out", tmp_path / "file")
-    assert answer.code == 2
-    assert is_one_line(answer.err)
+    refused(batch(bags, "--out", tmp_path / "file"))
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,7 @@ import yaml
 import gvo
 from gvo.frontend.calibration import describe_offsets
 from gvo.io.bag.source import BagSource
-from tests.conftest import Command, interrupt, is_one_line, python, start
-
-
-def test_help_fits_a_screen(command: Command) -> None:
-    answer = command("--help")
-    assert answer.code == 0
-    assert len(answer.out.splitlines()) <= 24
-    for name in ("demo", "run", "smooth", "compare", "convert", "config"):
-        assert name in answer.out
+from tests.conftest import Command, interrupt, is_one_line, python, refused, start
 
 
 def test_version_is_printed(command: Command) -> None:
@@ -102,10 +94,8 @@ def test_what_is_there_is_refused_before_a_recording_is_opened(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "summary.json").write_text("mine")
-    answer = command(*arguments)
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert "error: taken" in answer.err
+    said = refused(command(*arguments))
+    assert "error: taken" in said
     assert (tmp_path / "taken" / "summary.json").read_text() == "mine"
     assert [path.name for path in tmp_path.rglob("*")] == ["taken", "summary.json"]
 
@@ -192,23 +182,6 @@ def test_compare_agrees_with_the_run(command: Command, room_bag: Path, tmp_path:
     }
 
 
-def test_compare_draws(command: Command, tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(20)))
-    answer = command("compare", path, path, "--plot", tmp_path / "plot.png", "--align", "none")
-    assert answer.code == 0
-    assert (tmp_path / "plot.png").stat().st_size > 0
-
-
-def test_estimates_of_one_name_are_told_apart(command: Command, tmp_path: Path) -> None:
-    paths = [tmp_path / folder / "raw.txt" for folder in "ab"]
-    for path in paths:
-        path.parent.mkdir()
-        path.write_text("".join(f"{i} {i * i} 0 {i} 0 0 0 1\n" for i in range(20)))
-    estimates = json.loads(command("compare", paths[0], *paths, "--json").out)["estimates"]
-    assert [entry["name"] for entry in estimates] == ["a/raw", "b/raw"]
-
-
 def test_compare_counts_rows_that_come_again_and_needs_three_poses(
     command: Command, tmp_path: Path
 ) -> None:
@@ -259,19 +232,15 @@ def test_bad_input_gets_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     Path("text.bag").write_text("no bag at all\n")
     Path("poses.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n2 0 0 3 0 0 0 1\n")
-    answer = command(*(argument.format(bag=room_bag) for argument in arguments))
-    assert answer.code == 2
-    assert is_one_line(answer.err), answer.err
+    said = refused(command(*(argument.format(bag=room_bag) for argument in arguments)))
     for word in words:
-        assert word in answer.err
+        assert word in said
 
 
 def test_a_long_value_is_shortened(command: Command) -> None:
     for arguments in (["run", "9" * 5000], ["compare", "a", "b", "--segments", "9" * 5000]):
-        answer = command(*arguments, *(["--out", "out"] if arguments[0] == "run" else []))
-        assert answer.code == 2
-        assert is_one_line(answer.err)
-        assert len(answer.err) < 700
+        said = refused(command(*arguments, *(["--out", "out"] if arguments[0] == "run" else [])))
+        assert len(said) < 700
 
 
 def test_without_a_command_all_are_listed(command: Command) -> None:
@@ -321,34 +290,6 @@ def test_a_shell_completes_options(monkeypatch: pytest.MonkeyPatch, command: Com
     monkeypatch.setenv("COMP_WORDS", "gvo run --grou")
     monkeypatch.setenv("COMP_CWORD", "2")
     assert command().out == "--ground-truth\n"
-
-
-@pytest.mark.recorded
-@pytest.mark.parametrize(
-    "name",
-    [
-        "assertion_in_reader.bag",
-        "damaged.bag",
-        "empty-file.bag",
-        "empty_message_definition.bag",
-        "no-messages.bag",
-        "not_a_bag.mcap",
-        "old_type_names.db3",
-        "silent_zero_messages_mcap",
-        "silent_zero_messages_sqlite3",
-        "truncated.bag",
-        "truncated.mcap",
-        "unindexed.bag",
-        "version1.bag",
-    ],
-)
-def test_a_broken_bag_gets_one_line_and_exit_code_2(
-    command: Command, gvo_data: Path, tmp_path: Path, name: str
-) -> None:
-    answer = command("run", gvo_data / "bags/bad" / name, "--out", tmp_path)
-    assert answer.code == 2
-    assert is_one_line(answer.err), answer.err
-    assert name in answer.err
 
 
 @pytest.mark.parametrize(
@@ -441,11 +382,9 @@ def test_bad_input_to_smooth_gets_one_line_and_exit_code_2(
     Path("graph.g2o").write_text("EDGE3 0 1 1 0 0 0 0 0\n")
     write_poses(Path("poses.txt"))
     given = [argument.format(room=room_bag) for argument in arguments]
-    answer = command("smooth", *given, "--out", "out")
-    assert answer.code == 2
-    assert is_one_line(answer.err), answer.err
+    said = refused(command("smooth", *given, "--out", "out"))
     for word in words:
-        assert word in answer.err
+        assert word in said
 
 
 def test_smooth_answers_a_pipe_line_by_line_at_once(tmp_path: Path) -> None:

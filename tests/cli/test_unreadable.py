@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import GVO, Command, is_one_line
+from tests.conftest import GVO, Command, is_one_line, refused
 
 POSES = "".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(9))
 # The most memory of a child is no less than that of the process that started it: a small one.
@@ -92,10 +92,8 @@ def test_what_is_no_file_is_refused(
         os.mkfifo(path)
     elif name.startswith("socket"):
         make_socket(path)
-    answer = command(*filled(words, path, poses))
-    assert answer.code == 2
-    assert is_one_line(answer.err), answer.err
-    assert said in answer.err
+    said = refused(command(*filled(words, path, poses)))
+    assert said in said
 
 
 @pytest.mark.parametrize("words", POSE_COMMANDS)
@@ -119,10 +117,8 @@ def test_a_line_of_a_pose_graph_without_an_end_is_refused(command: Command, pose
     with graph.open("wb") as file:
         file.write(b"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n")
         file.truncate(1 << 33)  # a hole in the file takes no room on the disk
-    answer = command("smooth", graph, "--out", poses.with_name("out"))
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert "a line has more than" in answer.err
+    said = refused(command("smooth", graph, "--out", poses.with_name("out")))
+    assert "a line has more than" in said
 
 
 @pytest.mark.parametrize(

@@ -41,12 +41,9 @@ class Rendered:
         self.images_read = [replace(image, load=_kept(image)) for image in images]
         self.faulty: set[int] = set()
         self.is_black = False
-        self.breaks_off_after = _N_FRAMES
 
     def images(self) -> Iterator[StampedImage]:
         for number, image in enumerate(self.images_read):
-            if number // 2 == self.breaks_off_after:
-                raise RecordingError("the file ends")
             if number // 2 in self.faulty:
                 yield replace(image, load=_refuse)
             elif self.is_black:
@@ -79,7 +76,7 @@ def rendered(drive_bag: Path) -> Rendered:
 @pytest.fixture
 def drive(rendered: Rendered) -> Iterator[Rendered]:
     yield rendered
-    rendered.faulty, rendered.is_black, rendered.breaks_off_after = set(), False, _N_FRAMES
+    rendered.faulty, rendered.is_black = set(), False
 
 
 @pytest.fixture(scope="module")
@@ -151,17 +148,6 @@ def test_faulty_frames_are_faulty_both_ways(drive: Rendered, tmp_path: Path) -> 
     assert result.summary["status_counts"]["skipped"] == 3
     assert len(result.errors["raw"].forward) == _N_FRAMES - 2
     assert result.turn_ns == drive.truth.stamps_ns[-2]
-
-
-def test_a_recording_that_breaks_off_is_driven_back_from_there(
-    drive: Rendered, tmp_path: Path
-) -> None:
-    drive.breaks_off_after = 4
-    result = run_round_trip(drive, tmp_path)
-    assert not result.is_complete
-    assert "the file ends" in result.warnings[0]
-    assert result.turn_ns == drive.truth.stamps_ns[3]
-    assert len(result.errors["raw"].forward) == 4
 
 
 def test_black_images_give_no_error_to_trust(drive: Rendered, tmp_path: Path) -> None:

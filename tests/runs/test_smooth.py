@@ -15,7 +15,7 @@ import gvo
 from gvo.config import Config, WindowConfig
 from gvo.errors import RecordingError
 from gvo.geometry import se3
-from gvo.io.edges.events import EdgeSource, Event, InputFaults, PoseEvent
+from gvo.io.edges.events import Event, InputFaults, PoseEvent
 from gvo.io.edges.opening import open_edges
 from gvo.io.run_folder.reader import read_run
 from gvo.runs.run import RunResult
@@ -23,7 +23,7 @@ from gvo.runs.smooth import optimize_edges, smooth_edges
 from gvo.trajectory.formats import read_covariances, write_tum
 from gvo.trajectory.g2o import format_edge, format_vertex
 from gvo.trajectory.trajectory import Trajectory
-from gvo.types import Edge, FloatArray, Progress
+from gvo.types import Edge, FloatArray
 
 TRAJECTORIES = ("raw", "causal", "smoothed")
 SECOND = 1_000_000_000
@@ -246,19 +246,6 @@ def test_what_was_computed_stays_where_the_run_is_interrupted(tmp_path: Path) ->
         smooth_edges(ListSource(chain(8), KeyboardInterrupt()), tmp_path)
     for name in TRAJECTORIES:
         assert len(gvo.read_trajectory(tmp_path / f"{name}.txt")) == 8
-
-
-def test_an_interrupted_graph_is_written_too(tmp_path: Path) -> None:
-    source: EdgeSource = open_edges([example("pose3example-grid.txt")])
-
-    def interrupt(progress: Progress) -> None:
-        if progress.n_done == 10:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        smooth_edges(source, tmp_path, on_progress=interrupt)
-    text = (tmp_path / "smoothed.g2o").read_text()
-    assert text.count("VERTEX") == 10
 
 
 def test_an_input_without_poses_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from gvo.io.bag.calibration import (
     calibrations_of_file,
     calibrations_of_messages,
 )
-from gvo.io.bag.cameras import CameraInfoWatch
 from gvo.io.bag.reader import TF_TYPE, BagReader
 from gvo.io.bag.topics import (
     COMPRESSED_TYPE,
@@ -28,7 +27,7 @@ from gvo.io.bag.topics import (
 )
 from gvo.io.calibration.stereo_pair import stereo_baseline
 from gvo.types import FloatArray
-from tests.io.camera_bags import K, Message, camera_info, header, image, make, write
+from tests.io.camera_bags import Message, camera_info, header, image, make, write
 
 _P = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _D = [-0.2, 0.05, 0.001, -0.002, 0.0]
@@ -164,25 +163,6 @@ def test_without_any_baseline_the_message_says_what_was_looked_for(tmp_path: Pat
     assert str(caught.value).startswith("the bag: the baseline must be positive")
 
 
-def test_binning_and_region_of_the_message_describe_the_recorded_image(tmp_path: Path) -> None:
-    changes: dict[str, Any] = {
-        "width": 200,
-        "height": 100,
-        "K": [180.0, 0, 99, 0, 180, 49, 0, 0, 1],
-        "binning_x": 2,
-        "binning_y": 2,
-        "roi": {"x_offset": 20, "y_offset": 10, "width": 96, "height": 64, "do_rectify": True},
-        "P": [180.0, 0, 99, 0, 0, 180, 49, 0, 0, 0, 1, 0],
-    }
-    messages = _pair(**changes)
-    changes["P"][3] = -36.0
-    messages[3] = camera_info("/s/right/camera_info", **changes)
-    left, right = _found(tmp_path / "a.bag", messages).calibrations
-    assert (left.width, left.height) == (48, 32)
-    np.testing.assert_allclose(left.K.ravel(), [90, 0, 39.5, 0, 90, 19.5, 0, 0, 1])
-    assert stereo_baseline((left, right), "") == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool) -> None:
     messages = _pair(width=0, height=0)
@@ -197,22 +177,6 @@ def test_a_size_of_zero_is_that_of_the_image(tmp_path: Path, is_compressed: bool
     found = _found(tmp_path / "a.bag", [*messages, *_mounts()])
     assert (found.calibrations[0].width, found.calibrations[0].height) == (64, 40)
     assert any("left/camera_info leaves the size 0: 64x40 px" in line for line in found.decisions)
-
-
-def test_camera_info_that_changes_is_counted_and_the_first_one_used(tmp_path: Path) -> None:
-    zoomed = [90.0, 0, 23.5, 0, 90.0, 15.5, 0, 0, 1]
-    name = "/c/rgb/camera_info"
-    messages = [
-        _image("/c/rgb/image_raw"),
-        _image("/c/depth/image_raw"),
-        *(camera_info(name, stamp_ns=n, K=K if n < 3 else zoomed) for n in range(5)),
-        *(camera_info("/c/depth/camera_info", stamp_ns=n) for n in range(5)),
-    ]
-    assert _found(tmp_path / "a.bag", messages).calibrations[0].K[0, 0] == 50.0
-    watch = CameraInfoWatch()
-    for message in BagReader(tmp_path / "a.bag").messages([name, "/c/depth/camera_info"]):
-        watch.take(message)
-    assert watch.counts == {name: 2}
 
 
 def _rgbd(depth_name: str = "/c/depth/image_raw", **depth: Any) -> list[Message]:

@@ -11,7 +11,6 @@ import yaml
 from gvo.config import Config
 from gvo.errors import CalibrationError, GvoError, RecordingError
 from gvo.io.bag.cameras import find_contradiction
-from gvo.io.bag.reader import TF_TYPE
 from gvo.io.bag.recovery.scan import Channel
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import IMAGE_TYPE, TopicChoice
@@ -19,7 +18,7 @@ from gvo.io.frames import frames
 from gvo.io.opening import open_recording
 from gvo.io.poses.inputs import describe_camera_changes
 from gvo.types import FaultyFrame, RgbdFrame, StereoFrame
-from tests.io.camera_bags import K, Message, camera_info, header, image, make, write
+from tests.io.camera_bags import K, Message, camera_info, image, write
 
 _P_LEFT = [50.0, 0, 23.5, 0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
 _P_RIGHT = [50.0, 0, 23.5, -25.0, 0, 50.0, 15.5, 0, 0, 0, 1, 0]
@@ -141,14 +140,6 @@ def test_a_calibration_file_replaces_camera_info(tmp_path: Path, tiny: Any) -> N
     np.testing.assert_allclose(frame.depth, tiny.depth(1), rtol=1e-6)
 
 
-def test_a_stereo_calibration_file_holds_both_cameras(tmp_path: Path, tiny: Any) -> None:
-    bag = write(tmp_path / "a.bag", _stereo(tiny))
-    right = tiny.ros_camera(projection_matrix={"data": [50.0, 0, 23.5, -50.0, *_P_RIGHT[4:]]})
-    path = tmp_path / "pair.yaml"
-    path.write_text(yaml.safe_dump({"left": tiny.ros_camera(), "right": right}))
-    assert getattr(BagSource(bag, calibration=path).info.camera, "baseline", None) == 1.0
-
-
 @pytest.mark.parametrize(
     ("info", "text"),
     [
@@ -181,64 +172,6 @@ def test_depth_of_a_camera_that_rectification_turns_is_refused(tmp_path: Path, t
     bag = write(tmp_path / "b.bag", _rgbd(tiny, tiny.depth(0), "32FC1"))
     with pytest.raises(CalibrationError, match=r"turned\.yaml: R turns the camera"):
         BagSource(bag, calibration=file)
-
-
-def test_topics_can_be_chosen(tmp_path: Path, tiny: Any) -> None:
-    bag = write(tmp_path / "a.bag", _stereo(tiny))
-    choice = TopicChoice(left="/s/right/image_rect", right="/s/left/image_rect")
-    with pytest.raises(CalibrationError, match="exchanged"):
-        BagSource(bag, topics=choice)
-
-
-def _transform(parent: str, child: str, stamp_ns: int, t: float, w: float = 1.0) -> Any:
-    return make(
-        "geometry_msgs/msg/TransformStamped",
-        header=header(parent, stamp_ns),
-        child_frame_id=child,
-        transform=make(
-            "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=t, y=0.0, z=0.0),
-            rotation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=w),
-        ),
-    )
-
-
-def test_the_truth_is_world_to_ground_truth_and_nothing_else(tmp_path: Path, tiny: Any) -> None:
-    transforms = [
-        _transform("world", "ground_truth", 7, 2.0),
-        _transform("world", "base_link", 6, 3.0),
-        _transform("/world", "/ground_truth", 5, 1.0),
-        _transform("map", "ground_truth", 8, 4.0),
-    ]
-    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms))
-    truth = BagSource(write(tmp_path / "a.bag", [*_stereo(tiny), message])).ground_truth()
-    assert truth is not None
-    assert truth.stamps_ns.tolist() == [5, 7]
-    np.testing.assert_array_equal(truth.positions[:, 0], [1.0, 2.0])
-    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms[1:2]))
-    assert BagSource(write(tmp_path / "b.bag", [*_stereo(tiny), message])).ground_truth() is None
-    assert BagSource(write(tmp_path / "c.bag", _stereo(tiny))).ground_truth() is None
-
-
-def test_a_truth_that_is_no_transform_is_none(tmp_path: Path, tiny: Any) -> None:
-    transforms = [_transform("world", "ground_truth", 7, 2.0, w=0.0)]
-    message = ("/tf", TF_TYPE, 9, make(TF_TYPE, transforms=transforms))
-    source = BagSource(write(tmp_path / "a.bag", [*_stereo(tiny), message]))
-    assert source.ground_truth() is None
-    assert source.transforms().notes
-
-
-def test_several_bags_are_one_recording(tmp_path: Path, tiny: Any) -> None:
-    messages = _stereo(tiny)
-    whole = BagSource(write(tmp_path / "whole.bag", messages))
-    names = sorted({topic for topic, *_ in messages})
-    parts = [
-        write(tmp_path / f"{number}.bag", [m for m in messages if m[0] == name])
-        for number, name in enumerate(names)
-    ]
-    found = [tiny.fingerprint(frame) for frame in frames(BagSource(parts), Config())]
-    assert found == [tiny.fingerprint(frame) for frame in frames(whole, Config())]
-    assert len(found) == whole.info.n_images > 1
 
 
 def test_bags_of_two_cameras_are_not_one_recording(tmp_path: Path, tiny: Any) -> None:
@@ -299,17 +232,6 @@ def test_images_without_stamps_take_those_of_the_recording(tmp_path: Path, tiny:
     assert [type(item) for item in stamped] == [StereoFrame] * len(read)
     left = [stamp for name, _, stamp, _ in plain if name == "/s/left/image_rect"]
     assert [item.stamp_ns for item in stamped] == left
-
-
-def test_of_a_cut_bag_the_start_is_read_and_the_loss_told(tmp_path: Path, tiny: Any) -> None:
-    path = write(tmp_path / "a.bag", _stereo(tiny))
-    data = path.read_bytes()
-    path.write_bytes(data[: int(0.7 * len(data))])
-    read = frames(BagSource(path), Config())
-    first = next(read)
-    assert isinstance(first, StereoFrame)
-    with pytest.raises(RecordingError, match=r"cannot be read|missing|cut"):
-        list(read)
 
 
 _RECORDED = (

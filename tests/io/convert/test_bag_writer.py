@@ -19,8 +19,7 @@ from gvo.geometry.se3 import make_transform
 from gvo.io.convert.bag_writer import write_bag
 from gvo.io.frames import frames
 from gvo.io.opening import open_recording
-from gvo.io.recording import Sensor, Source
-from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.io.recording import Source
 from gvo.trajectory.trajectory import Trajectory
 from tests.io.conftest import Item, ListSource, Tiny
 
@@ -221,13 +220,6 @@ def test_other_suffixes_and_missing_folders_are_refused(tmp_path: Path) -> None:
         write_bag(_stereo(), tmp_path / "a.zip")
     with pytest.raises(RecordingError, match="none is no folder"):
         write_bag(_stereo(), tmp_path / "none" / "a.bag")
-
-
-@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
-def test_rendered_recordings_are_written_as_they_are(tmp_path: Path, sensor: Sensor) -> None:
-    source = SyntheticRecording("handheld", sensor, n_frames=3, scale=0.25)
-    write_bag(source, tmp_path / "a.mcap")
-    _assert_same(source, open_recording(tmp_path / "a.mcap"))
 
 
 def _transforms(path: Path, topic: str) -> list[tuple[int, str, str, NDArray[np.float64]]]:

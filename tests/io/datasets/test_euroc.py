@@ -42,20 +42,6 @@ def test_the_folder_and_its_mav0_are_the_same_recording(tmp_path: Path, tiny: An
         np.testing.assert_array_equal(images[3].load(), tiny.texture(11))
 
 
-def test_points_lie_on_one_row_of_the_rectified_pair(tmp_path: Path, tiny: Any) -> None:
-    left, right = EurocSource(_write(tmp_path / "m", tiny)).info.calibrations
-    T_body_left, T_body_right = _poses()
-    points_body = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + T_body_left[:3, 2] * 5
-    rows = []
-    for calibration, T_body_cam in ((left, T_body_left), (right, T_body_right)):
-        T_cam_body = np.linalg.inv(T_body_cam)
-        points_raw = points_body @ T_cam_body[:3, :3].T + T_cam_body[:3, 3]
-        homogeneous = points_raw @ calibration.R.T @ calibration.P[:, :3].T
-        rows.append(homogeneous[:, 1] / homogeneous[:, 2])
-    np.testing.assert_allclose(rows[0], rows[1], atol=1e-6)
-    assert getattr(EurocSource(tmp_path / "m").info.camera, "baseline", 0) == pytest.approx(0.5)
-
-
 def test_the_truth_is_that_of_the_rectified_left_camera(tmp_path: Path, tiny: Any) -> None:
     folder = _write(tmp_path / "m", tiny)
     assert EurocSource(folder).ground_truth() is None

@@ -23,7 +23,7 @@ from gvo.io.recording import Source
 from gvo.trajectory.formats import write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure
-from tests.io.pose_bags import ODOMETRY, STAMPED, TRANSFORM, WITH_COVARIANCE, PoseBag
+from tests.io.pose_bags import ODOMETRY, TRANSFORM, PoseBag
 from tests.rendered_walk import (
     CAMERA,
     STAMPS_NS,
@@ -101,20 +101,6 @@ def test_poses_of_the_base_are_brought_to_the_frame_asked_for(
         np.testing.assert_allclose(truth.T_world_frame, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("type_", [STAMPED, WITH_COVARIANCE])
-def test_poses_that_name_no_frame_are_of_the_frame_asked_for(
-    walk_bag: Path, tmp_path: Path, type_: str
-) -> None:
-    bag = on_a_robot(tmp_path / "truth.mcap")
-    poses = true_poses(STAMPS_NS)
-    for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
-        bag.pose("/true/base", type_, stamp_ns, T)
-    source = gvo.open_recording([walk_bag, bag.write()])
-    truth = read_truth(source, "/true/base", base_frame=find_base_frame(source, "base_link"))
-    np.testing.assert_allclose(truth.trajectory.T_world_frame, poses, atol=1e-12)
-    assert "taken for base_link" in truth.decision
-
-
 def test_poses_of_a_frame_that_nothing_connects_are_refused_where_asked_for(
     walk_bag: Path, tmp_path: Path
 ) -> None:
@@ -139,18 +125,6 @@ def test_the_truth_of_a_folder_follows_the_frame_asked_for() -> None:
     expected = true_poses(STAMPS_NS) @ np.linalg.inv(T_BASE_CAM)
     np.testing.assert_allclose(found.trajectory.T_world_frame, expected, atol=1e-12)
     assert not recorded_truth(Walk())
-
-
-def test_a_name_decides_what_is_the_named_truth(walk_bag: Path, tmp_path: Path) -> None:
-    poses = true_poses(STAMPS_NS)
-    for topic, is_truth in (("/mocap/pose", True), ("/odom", False), ("/wheel/odometry", False)):
-        bag = PoseBag(tmp_path / f"{topic.replace('/', '_')}.mcap")
-        for stamp_ns, T in zip(STAMPS_NS.tolist(), poses, strict=True):
-            bag.pose(topic, ODOMETRY, stamp_ns, T, child=CAMERA)
-        found = recorded_truth(gvo.open_recording([walk_bag, bag.write()]))
-        assert isinstance(found, Truth) is is_truth
-        if isinstance(found, Truth):
-            np.testing.assert_allclose(found.trajectory.T_world_frame, poses, atol=1e-12)
 
 
 def framed(trajectory: Trajectory) -> Truth:

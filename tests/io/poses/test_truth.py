@@ -15,7 +15,7 @@ from gvo.io.poses.truth import Truth, find_truth, in_frame
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FloatArray
-from tests.io.pose_bags import ODOMETRY, STAMPED, PoseBag
+from tests.io.pose_bags import ODOMETRY, PoseBag
 
 SECOND = 10**9
 T_BASE_CAM = se3.exp(np.array([-1.2, 1.1, -1.3, 0.3, 0.1, 0.5]))
@@ -204,18 +204,3 @@ def test_what_is_asked_for_or_named_comes_in_the_frame_of_the_camera(
     as_it_is = find_truth(reader, spec, where=name, base_frame="base", camera_frame="cam")
     assert isinstance(as_it_is, Truth)
     np.testing.assert_allclose(as_it_is.trajectory.T_world_frame, motion(), atol=1e-9)
-
-
-def test_odometry_has_to_be_asked_for(tmp_path: Path) -> None:
-    reader = robot(tmp_path / "a.bag", truth="/odom")
-    assert not find_truth(reader, where="a.bag", camera_frame="cam")
-    spec = TopicTruth(name="/odom")
-    assert find_truth(reader, spec, where="a.bag", camera_frame="cam")
-
-
-def test_a_bag_without_frames_is_compared_as_far_as_it_goes(tmp_path: Path) -> None:
-    bag = PoseBag(tmp_path / "a.bag")
-    bag.pose("/gt", STAMPED, 1, np.eye(4))
-    found = find_truth(BagReader(bag.write()), where="a.bag")
-    assert isinstance(found, Truth)
-    assert found.decision.endswith("1 poses; it names no frame, taken for the camera")

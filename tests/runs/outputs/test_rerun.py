@@ -3,7 +3,6 @@
 import csv
 import os
 import resource
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -25,7 +24,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError, GvoError, RecordingError
+from gvo.errors import GvoError, RecordingError
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.se3 import exp, make_transform
 from gvo.io.poses.base_frame import BaseFrame
@@ -617,26 +616,6 @@ def test_what_exists_is_kept(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="exists already"):
         RunRerun(path, _CAMERA)
     assert path.read_bytes() == b"mine"
-
-
-def test_another_ending_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"ending in \.rrd"):
-        RunRerun(tmp_path / "made.mcap", _CAMERA)
-
-
-def test_a_folder_that_cannot_be_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(RecordingError, match="cannot be written"):
-        RunRerun(tmp_path / "file" / "made.rrd", _CAMERA)
-
-
-def test_without_rerun_the_run_does_not_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ConfigurationError, match=r"pip install \S+\[rerun\]'"):
-        RunRerun(tmp_path / "made.rrd", _CAMERA)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_rerun_switched_off_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gvo.config import Config
-from gvo.errors import ConfigurationError, RecordingError
+from gvo.errors import RecordingError
 from gvo.io.frames import frames
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
@@ -169,14 +169,6 @@ def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) 
 
     with pytest.raises(RecordingError, match="frames: cannot be written"):
         run()
-
-
-def test_other_names_are_refused_before_anything_is_read(drive: _Run, tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match=r"\.webm"):
-        RunOverlay(tmp_path / "film.gif", drive[0].info.camera)
-    (tmp_path / "film.webm").touch()
-    with pytest.raises(RecordingError, match="exists already"):
-        RunOverlay(tmp_path / "film.webm", drive[0].info.camera)
 
 
 @pytest.mark.acceptance
