@@ -5,7 +5,7 @@ Pixel (0, 0) is the centre of the first pixel; x right, y down, z forward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -118,15 +118,8 @@ class StereoCamera(PinholeCamera):
     @classmethod
     def from_pinhole(cls, pinhole: PinholeCamera, baseline: float) -> StereoCamera:
         """Return the stereo camera of this left camera and a baseline in metres."""
-        return cls(
-            fx=pinhole.fx,
-            fy=pinhole.fy,
-            cx=pinhole.cx,
-            cy=pinhole.cy,
-            width=pinhole.width,
-            height=pinhole.height,
-            baseline=baseline,
-        )
+        intrinsics = {each.name: getattr(pinhole, each.name) for each in fields(PinholeCamera)}
+        return cls(**intrinsics, baseline=baseline)
 
     def depth_to_disparity(self, depths: FloatArray | float) -> FloatArray:
         """Return the disparity in pixels of depths in metres, any shape."""

@@ -46,15 +46,12 @@ class Misregistration:
         (u, v) from depth to colour; NaN along an axis without evidence.
     zoom : float
         Size of colour over size of depth, about the middle of the image.
-    contrast : float
-        Gain in strength of the colour edges there over the typical shift.
     rms_px : float
         RMS of the offset over the image.
     """
 
     shift_px: tuple[float, float]
     zoom: float
-    contrast: float
     rms_px: float
 
 
@@ -113,10 +110,7 @@ def estimate_misregistration(frames: Sequence[RgbdFrame]) -> Misregistration | F
     height, width = frames[0].depth.shape
     variance = np.nansum(np.square(shift)) + zoom**2 * (width**2 + height**2) / 12.0
     return Misregistration(
-        shift_px=(shift[0], shift[1]),
-        zoom=1.0 + zoom,
-        contrast=contrasts[zoom],
-        rms_px=math.sqrt(float(variance)),
+        shift_px=(shift[0], shift[1]), zoom=1.0 + zoom, rms_px=math.sqrt(float(variance))
     )
 
 

@@ -211,9 +211,11 @@ def judged(
     )
 
 
-def lost_limits(check: CheckConfig) -> Limits:
-    """Return the limits of the share of frames that are lost, for whatever reason."""
-    return Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)
+def lost(name: str, n: int, n_frames: int, check: CheckConfig, fix: str, how: str = "") -> Finding:
+    """Compare the share of frames that are lost, for whatever reason, with its limits."""
+    limits = Limits(high=check.max_lost_share, fault_high=check.fault_lost_share)
+    text = f"{n} of {n_frames}{how}"
+    return measured(name, n / n_frames, limits, unit="%", text=text, fix=fix)
 
 
 def unknown(name: str, reason: str) -> Finding:

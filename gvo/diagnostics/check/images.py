@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
+from gvo.diagnostics.check.findings import Finding, Limits, lost, measured, unknown
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.tracking import detect_corners
 from gvo.types import (
@@ -33,7 +35,7 @@ _MIN_EDGES = 20
 # Share of the local maxima of the gradient that are taken for edges of things.
 _STRONG_SHARE = 0.3
 _MAX_RETURN_PX = 0.5
-_TRACK_WINDOW = (15, 15)
+_WINDOW = (15, 15)
 _N_TRACK_LEVELS = 4
 # Share and number of last rows of one value that make an image torn.
 _MIN_TORN_SHARE = 0.05
@@ -48,14 +50,8 @@ def check_usable(samples: Sequence[Sample], check: CheckConfig) -> Iterator[Find
     if not looked_at:
         yield unknown("frames that cannot be used", "no frame to look at")
         return
-    yield measured(
-        "frames that cannot be used",
-        len(faulty) / len(looked_at),
-        lost_limits(check),
-        unit="%",
-        text=f"{len(faulty)} of {len(looked_at)}",
-        fix=faulty[0].reason if faulty else "",
-    )
+    fix = faulty[0].reason if faulty else ""
+    yield lost("frames that cannot be used", len(faulty), len(looked_at), check, fix)
 
 
 def check_images(samples: Sequence[Sample], config: Config) -> Iterator[Finding]:
@@ -127,10 +123,25 @@ def followed_share(first: ImageArray, second: ImageArray, corners: FloatArray) -
     if len(corners) == 0:
         return 0.0
     start = corners.astype(np.float32)
-    there, is_there = _follow(first, second, start)
-    back, is_back = _follow(second, first, there)
-    is_followed = is_there & is_back & (np.linalg.norm(back - start, axis=1) <= _MAX_RETURN_PX)
+    _, is_followed = follow(first, second, start, start, _MAX_RETURN_PX, maxLevel=_N_TRACK_LEVELS)
     return float(np.mean(is_followed))
+
+
+def follow(
+    first: ImageArray,
+    second: ImageArray,
+    start: NDArray[np.float32],
+    guess: NDArray[np.float32],
+    max_return_px: float,
+    **options: Any,  # noqa: ANN401 - of cv2.calcOpticalFlowPyrLK
+) -> tuple[NDArray[np.float32], BoolArray]:
+    """Track pixels by Lucas-Kanade; tell which are found, and again on the way back."""
+    track = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW, **options)
+    there, is_there, _ = track(first, second, start, guess.copy())
+    back, is_back, _ = track(second, first, there, start.copy())
+    is_found = (is_there[:, 0] > 0) & (is_back[:, 0] > 0)
+    is_found &= np.linalg.norm(back - start, axis=1) <= max_return_px
+    return np.asarray(there), is_found
 
 
 def n_torn_rows(image: ImageArray) -> int:
@@ -145,14 +156,9 @@ def check_frozen(
 ) -> Finding:
     """Count the images that equal the one before."""
     n_frozen = sum(np.array_equal(before, now, equal_nan=True) for before, now in pairs)
-    return measured(
-        f"{name}: frozen images",
-        n_frozen / len(pairs),
-        lost_limits(check),
-        unit="%",
-        text=f"{n_frozen} of {len(pairs)} are the same as the one before",
-        fix=f"the driver repeats {name} images: record at the camera's own rate",
-    )
+    fix = f"the driver repeats {name} images: record at the camera's own rate"
+    how = " are the same as the one before"
+    return lost(f"{name}: frozen images", n_frozen, len(pairs), check, fix, how)
 
 
 def _check_exposure(
@@ -239,14 +245,9 @@ def _check_transfer(
     # Rectification leaves a border without pixels, the same in all images.
     limit = max(_MIN_TORN_ROWS, _MIN_TORN_SHARE * images[0].shape[0])
     n_torn = int(np.count_nonzero(torn - torn.min() > limit))
-    yield measured(
-        f"{name}: torn images",
-        n_torn / len(images),
-        lost_limits(check),
-        unit="%",
-        text=f"{n_torn} of {len(images)} end in rows of one value",
-        fix="transfers break off: lower rate or size, another cable or port",
-    )
+    fix = "transfers break off: lower rate or size, another cable or port"
+    how = " end in rows of one value"
+    yield lost(f"{name}: torn images", n_torn, len(images), check, fix, how)
 
 
 def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]], check: CheckConfig) -> Finding:
@@ -258,15 +259,6 @@ def _compare_exposures(pairs: Sequence[tuple[ImageArray, ...]], check: CheckConf
         Limits(low=1.0 / check.max_exposure_ratio, high=check.max_exposure_ratio),
         fix="let both cameras share exposure and gain",
     )
-
-
-def _follow(
-    first: ImageArray, second: ImageArray, start: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], BoolArray]:
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, start, np.zeros_like(start), winSize=_TRACK_WINDOW, maxLevel=_N_TRACK_LEVELS
-    )
-    return np.asarray(found), np.asarray(status)[:, 0] > 0
 
 
 def _gradients(image: ImageArray, sigma_px: float) -> FloatArray:

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gvo.config import CheckConfig, Config
 from gvo.diagnostics.check.findings import Finding, Limits, judged, measured, unknown
+from gvo.diagnostics.check.images import follow
 from gvo.diagnostics.check.sampling import Sample
 from gvo.frontend.features import FeatureExtractor, Features
 from gvo.frontend.matching import descriptor_distances, mutual_best
 from gvo.geometry.camera import PinholeCamera
-from gvo.types import BoolArray, Failure, FloatArray, ImageArray, IntArray, StereoFrame
+from gvo.types import Failure, FloatArray, ImageArray, IntArray, StereoFrame
 
 # A quarter of the front-end's features is enough for a percentile.
 _N_FEATURES = 600
@@ -26,10 +26,13 @@ _COLUMN_SHARE = 0.35
 # Lowe's ratio of the best distance to the best one elsewhere.
 _MAX_RATIO = 0.8
 _ELSEWHERE_PX = 3.0
-# Lucas-Kanade: window, limits of the forward-backward error and of the step from the match.
-_WINDOW = (15, 15)
+# Lucas-Kanade from the match, limits of the forward-backward error and of the step from there.
+_TRACKING = {
+    "maxLevel": 0,
+    "criteria": (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01),
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+}
 _MAX_RETURN_PX, _MAX_STEP_PX = 0.3, 3.0
-_Pixels = NDArray[np.float32]
 # Fit of the lens distortion: limit of the first residuals, rounds, limit of the others, and the
 # largest standard deviation of k1 that is of use.
 _MAX_ROW_PX = 8.0
@@ -143,30 +146,11 @@ def _refine(
         return FreeMatches(pixels_left=pixels_left, pixels_right=pixels_right)
     start = pixels_left.astype(np.float32)
     guess = pixels_right.astype(np.float32)
-    there, is_there = _follow(left, right, start, guess)
-    back, is_back = _follow(right, left, there, start)
-    is_kept = is_there & is_back
-    is_kept &= np.linalg.norm(back - start, axis=1) <= _MAX_RETURN_PX
+    there, is_kept = follow(left, right, start, guess, _MAX_RETURN_PX, **_TRACKING)
     is_kept &= np.linalg.norm(there - guess, axis=1) <= _MAX_STEP_PX
     return FreeMatches(
         pixels_left=pixels_left[is_kept], pixels_right=there[is_kept].astype(np.float64)
     )
-
-
-def _follow(
-    first: ImageArray, second: ImageArray, start: _Pixels, guess: _Pixels
-) -> tuple[_Pixels, BoolArray]:
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        start,
-        guess.copy(),
-        winSize=_WINDOW,
-        maxLevel=0,
-        criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    return np.asarray(found), np.asarray(status)[:, 0] > 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gvo.config import CheckConfig, Config
-from gvo.diagnostics.check.findings import Finding, Limits, lost_limits, measured, unknown
+from gvo.diagnostics.check.findings import Finding, Limits, lost, measured, unknown
 from gvo.diagnostics.check.sampling import StreamStamps, Survey
 from gvo.io.frames import pair_limit_key
 from gvo.io.recording import RecordingInfo
@@ -52,16 +52,11 @@ def _check_stream(name: str, stamps_ns: IntArray, config: Config) -> Iterator[Fi
         return
     steps_ns = np.diff(stamps_ns)
     n_bad = int(np.count_nonzero(steps_ns <= 0))
-    yield measured(
-        f"{name}: stamps",
-        n_bad / len(stamps_ns),
-        lost_limits(config.check),
-        unit="%",
-        text=f"{n_bad} of {len(stamps_ns)} repeat or go back",
-        fix="the driver stamps nothing: --set sync.stamps=recording takes the bag's clock"
-        if np.median(stamps_ns) == 0
-        else "record anew, or sort by header stamp; such frames are skipped",
-    )
+    fix = "record anew, or sort by header stamp; such frames are skipped"
+    if np.median(stamps_ns) == 0:
+        fix = "the driver stamps nothing: --set sync.stamps=recording takes the bag's clock"
+    how = " repeat or go back"
+    yield lost(f"{name}: stamps", n_bad, len(stamps_ns), config.check, fix, how)
     forward = steps_ns[steps_ns > 0]
     if len(forward) < 2:
         yield unknown(f"{name}: period", f"{len(stamps_ns)} images")
@@ -108,14 +103,8 @@ def _check_gaps(name: str, steps_s: FloatArray, n: int, config: Config) -> Itera
         fix="find what stalled the recording (disk, bandwidth); odometry coasts over it",
     )
     n_dropped = int(np.sum(np.maximum(np.rint(steps_s / period_s) - 1, 0)))
-    yield measured(
-        f"{name}: dropped frames",
-        n_dropped / (n + n_dropped),
-        lost_limits(config.check),
-        unit="%",
-        text=f"{n_dropped} of {n + n_dropped}",
-        fix="record with more bandwidth or a smaller rate; every dropped frame widens the motion",
-    )
+    fix = "record with more bandwidth or a smaller rate; every dropped frame widens the motion"
+    yield lost(f"{name}: dropped frames", n_dropped, n + n_dropped, config.check, fix)
 
 
 def _check_pairs(survey: Survey, info: RecordingInfo, config: Config) -> Iterator[Finding]:
@@ -162,14 +151,8 @@ def _check_partners(
         fix = "the two are not taken together: trigger both by one signal; no tolerance pairs them"
     else:
         fix = f"images of one stream are missing: see dropped frames and gaps of {name}"
-    return measured(
-        f"{name}: frames without partner",
-        n_alone / n_frames,
-        lost_limits(config.check),
-        unit="%",
-        text=f"{n_alone} of {n_frames} at sync.{key}={limit_ms:g}",
-        fix=fix,
-    )
+    how = f" at sync.{key}={limit_ms:g}"
+    return lost(f"{name}: frames without partner", n_alone, n_frames, config.check, fix, how)
 
 
 def _period_ms(stamps_ns: IntArray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Protocol
@@ -15,7 +15,7 @@ from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.events import Event, InputFaults, PoseEvent, anchor
 from gvo.trajectory.formats import read_trajectory
-from gvo.trajectory.trajectory import StampsFrom, Trajectory
+from gvo.trajectory.trajectory import StampsFrom
 from gvo.types import Edge, FloatArray
 
 MAX_GAP = 5.0
@@ -113,7 +113,6 @@ class StepSigma:
         return f"{floor} and {100 * self.share:g} % of the motion and {turn}"
 
 
-@dataclass(slots=True, kw_only=True)
 class TrajectoryStream:
     """The poses of a TUM, KITTI or EuRoC file.
 
@@ -122,27 +121,19 @@ class TrajectoryStream:
     Parameters
     ----------
     path : Path
+
+    Raises
+    ------
+    TrajectoryError
+        Where it is missing, empty or malformed.
     """
 
-    path: Path
-    name: str = field(init=False)
-    decisions: list[str] = field(init=False, default_factory=list)
-    n_poses: int = field(init=False)
-    stamps_from: StampsFrom = field(init=False)
-    _trajectory: Trajectory = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Read the file.
-
-        Raises
-        ------
-        TrajectoryError
-            Where it is missing, empty or malformed.
-        """
-        self._trajectory = read_trajectory(self.path)
-        self.name = self.path.stem
+    def __init__(self, path: Path) -> None:
+        self._trajectory = read_trajectory(path)
+        self.name = path.stem
         self.n_poses = len(self._trajectory)
-        self.stamps_from = self._trajectory.stamps_from
+        self.stamps_from: StampsFrom = self._trajectory.stamps_from
+        self.decisions: list[str] = []
         if self._trajectory.covariances is not None:
             self.decisions.append(f"{self.name}: covariances of {self.name}_covariance.csv")
 

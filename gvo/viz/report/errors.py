@@ -63,7 +63,9 @@ def error_plots(comparisons: Sequence[Comparison], align: AlignMode) -> list[Plo
             slug="errors_over_distance",
             text="The same errors over the distance along the true path: a steady slope is drift "
             "in metres per metre; while the camera stands still, so must the curve.",
-            figure=_curves(comparisons, _distances, "distance travelled [m]"),
+            figure=_curves(
+                comparisons, lambda c: c.reference.distances(), "distance travelled [m]"
+            ),
         ),
     ]
 
@@ -73,10 +75,6 @@ def _curves_over_time(comparisons: Sequence[Comparison]) -> Figure:
     is_by_row = any(c.reference.stamps_from == "rows" for c in comparisons)
     label = "row" if is_by_row else "elapsed [s]"
     return _curves(comparisons, lambda c: elapsed(c.reference.stamps_ns, first_ns), label)
-
-
-def _distances(comparison: Comparison) -> FloatArray:
-    return comparison.reference.distances()
 
 
 def _curves(
