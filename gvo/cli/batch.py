@@ -10,20 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from gvo.cli.options import (
-    CalibrationFiles,
-    Color,
-    Depth,
-    Duration,
-    Every,
-    Left,
-    Loops,
-    Right,
-    Settings,
-    Start,
-    recording_options,
-    with_loops,
-)
+from gvo.cli import options as opt
 from gvo.cli.terminal import Command, at_work, exit_code, is_shown, say, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
@@ -59,8 +46,8 @@ def batch(
             "--configs", "--config", metavar="FILE...", help="YAML files, each a configuration."
         ),
     ] = None,
-    set_: Settings = None,
-    loops: Loops = None,
+    set_: opt.Settings = None,
+    loops: opt.Loops = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Worker processes here; one a core if omitted."),
@@ -70,20 +57,20 @@ def batch(
         typer.Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Run finished runs again.")] = False,
-    start: Start = 0.0,
-    duration: Duration = None,
-    every: Every = 1,
+    start: opt.Start = 0.0,
+    duration: opt.Duration = None,
+    every: opt.Every = 1,
     with_report: Annotated[
         bool, typer.Option("--report/--no-report", help="Draw the picture and page of each run.")
     ] = True,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
     ] = None,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
 ) -> None:
     """Run many recordings or configurations: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
@@ -95,10 +82,10 @@ def batch(
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
     excerpt = make_excerpt(start, duration, every)
     asked, files = _sort_arguments(recordings, configs)
-    variants = make_variants(files, with_loops(set_, loops), sweep or [])
+    variants = make_variants(files, opt.with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
     options = BatchOptions(
-        recording=recording_options(
+        recording=opt.recording_options(
             [path.absolute() for path in calibration or ()], left, right, color, depth
         ),
         excerpt=excerpt,

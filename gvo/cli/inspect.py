@@ -10,25 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gvo.cli.options import (
-    CalibrationFiles,
-    Color,
-    ConfigFile,
-    Depth,
-    Duration,
-    Every,
-    Force,
-    Left,
-    Out,
-    Recordings,
-    Right,
-    Settings,
-    Start,
-    load,
-    new_folder,
-    open_source,
-    recording_options,
-)
+from gvo.cli import options as opt
 from gvo.cli.terminal import (
     Command,
     at_work,
@@ -59,32 +41,32 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def explain(
-    recordings: Recordings,
+    recordings: opt.Recordings,
     frame: Annotated[
         int, typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0.")
     ],
-    out: Out = None,
-    force: Force = False,
-    start: Start = 0.0,
-    every: Every = 1,
-    config: ConfigFile = None,
-    set_: Settings = None,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    out: opt.Out = None,
+    force: opt.Force = False,
+    start: opt.Start = 0.0,
+    every: opt.Every = 1,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
 ) -> None:
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.diagnostics.explain import explain_frame
     from gvo.io.excerpt import make_excerpt
     from gvo.viz.explanation import write_explanation
 
-    parameters = load(config, set_)
+    parameters = opt.load(config, set_)
     excerpt = make_excerpt(start, None, every)
-    options = recording_options(calibration, left, right, color, depth)
-    out = new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
-    source = open_source(recordings, parameters, options)
+    options = opt.recording_options(calibration, left, right, color, depth)
+    out = opt.new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
+    source = opt.open_source(recordings, parameters, options)
     with progress(source.info.name) as show:
         explanation = explain_frame(
             source, frame, config=parameters, excerpt=excerpt, on_progress=show
@@ -105,13 +87,13 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = (
         _DEFAULT_PORT
     ),
-    config: ConfigFile = None,
-    set_: Settings = None,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
 ) -> None:
     """Watch odometry in the browser, with its parameters as controls."""
     from gvo.viz.view import serve
@@ -120,13 +102,13 @@ def view(
     with interruptible() as check, ExitStack() as stack:
         shown: Player | Path = recordings[0]
         truth: Trajectory | None = None
-        options = recording_options(calibration, left, right, color, depth)
+        options = opt.recording_options(calibration, left, right, color, depth)
         if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
             given = {"config": config, "set": set_, **asdict(options)}
             _refuse_for_a_run(recordings[0], given)
         else:
-            reopen = partial(open_source, recordings, options=options)
-            player = stack.enter_context(Player(reopen, load(config, set_)))
+            reopen = partial(opt.open_source, recordings, options=options)
+            player = stack.enter_context(Player(reopen, opt.load(config, set_)))
             shown, truth = player, _find_truth(player.source)
         server = stack.enter_context(serve(shown, host=host, port=port, truth=truth))
         warn([server.note] if server.note else [])
@@ -158,30 +140,30 @@ def _find_truth(source: Source) -> Trajectory | None:
 
 
 def round_trip(
-    recordings: Recordings,
-    out: Out = None,
-    force: Force = False,
-    start: Start = 0.0,
-    duration: Duration = None,
-    every: Every = 1,
-    config: ConfigFile = None,
-    set_: Settings = None,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    recordings: opt.Recordings,
+    out: opt.Out = None,
+    force: opt.Force = False,
+    start: opt.Start = 0.0,
+    duration: opt.Duration = None,
+    every: opt.Every = 1,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
 ) -> None:
     """Run forward, then backward: the drift without a ground truth."""
     from gvo.io.excerpt import make_excerpt
     from gvo.runs.round_trip import run_round_trip
     from gvo.trajectory.round_trip import format_round_trip_errors
 
-    parameters = load(config, set_)
+    parameters = opt.load(config, set_)
     excerpt = make_excerpt(start, duration, every)
-    out = new_folder(out, recordings[0], what="-round-trip", force=force)
-    options = recording_options(calibration, left, right, color, depth)
-    source = open_source(recordings, parameters, options)
+    out = opt.new_folder(out, recordings[0], what="-round-trip", force=force)
+    options = opt.recording_options(calibration, left, right, color, depth)
+    source = opt.open_source(recordings, parameters, options)
     for line in source.info.decisions:
         say(line)
     with at_work(told_where_it_stands(out), progress(source.info.name)) as work:

@@ -18,29 +18,7 @@ from gvo._version import __version__
 from gvo.cli import batch as cli_batch
 from gvo.cli import inspect as cli_inspect
 from gvo.cli import live as cli_live
-from gvo.cli.options import (
-    Bag,
-    CalibrationFiles,
-    Color,
-    ConfigFile,
-    Depth,
-    Duration,
-    Every,
-    Force,
-    Left,
-    Loops,
-    Out,
-    Recordings,
-    Report,
-    Right,
-    Settings,
-    Start,
-    load,
-    new_folder,
-    open_source,
-    recording_options,
-    with_loops,
-)
+from gvo.cli import options as opt
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
@@ -121,14 +99,14 @@ def demo(
 
 @_command()
 def run(
-    recordings: Recordings,
-    out: Out = None,
-    force: Force = False,
-    config: ConfigFile = None,
-    set_: Settings = None,
-    start: Start = 0.0,
-    duration: Duration = None,
-    every: Every = 1,
+    recordings: opt.Recordings,
+    out: opt.Out = None,
+    force: opt.Force = False,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
+    start: opt.Start = 0.0,
+    duration: opt.Duration = None,
+    every: opt.Every = 1,
     frame: Annotated[
         str | None, typer.Option(metavar="NAME", help="Frame of tf whose poses are written.")
     ] = None,
@@ -142,7 +120,7 @@ def run(
         str | None,
         typer.Option(metavar="WHAT", help="File of poses, or in the bag: tf:PARENT:CHILD, /TOPIC."),
     ] = None,
-    bag: Bag = None,
+    bag: opt.Bag = None,
     world: Annotated[
         str, typer.Option(metavar="NAME", help="The fixed frame in that bag, such as odom or map.")
     ] = "world",
@@ -153,16 +131,16 @@ def run(
     rerun: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
     ] = None,
-    loops: Loops = None,
-    with_report: Report = True,
+    loops: opt.Loops = None,
+    with_report: opt.Report = True,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
     ] = None,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
     from gvo.io.excerpt import make_excerpt
@@ -171,16 +149,16 @@ def run(
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
-    parameters = load(config, with_loops(set_, loops))
+    parameters = opt.load(config, opt.with_loops(set_, loops))
     excerpt = make_excerpt(start, duration, every)
     pose = None if initial_pose is None else parse_initial_pose(initial_pose)
     outputs = RunOutputs(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
-    out = new_folder(out, recordings[0], force=force)
+    out = opt.new_folder(out, recordings[0], force=force)
     outputs.check(force=force)
-    options = recording_options(calibration, left, right, color, depth)
-    source = open_source(recordings, parameters, options)
+    options = opt.recording_options(calibration, left, right, color, depth)
+    source = opt.open_source(recordings, parameters, options)
     base_frame = find_base_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
     truth = (
         None if ground_truth is None else read_truth(source, ground_truth, base_frame=base_frame)
@@ -206,26 +184,26 @@ def run(
 
 @_command("check")
 def check_(
-    recordings: Recordings,
-    config: ConfigFile = None,
-    set_: Settings = None,
+    recordings: opt.Recordings,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
     frame: Annotated[
         str, typer.Option(metavar="NAME", help="The robot's base frame in tf.")
     ] = "base_link",
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
     as_json: _AsJson = False,
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.diagnostics.check import check_recording, format_check
     from gvo.io.poses.inputs import read_transforms
 
-    parameters = load(config, set_)
-    options = recording_options(calibration, left, right, color, depth)
-    source = open_source(recordings, parameters, options)
+    parameters = opt.load(config, set_)
+    options = opt.recording_options(calibration, left, right, color, depth)
+    source = opt.open_source(recordings, parameters, options)
     result = check_recording(
         source,
         parameters,
@@ -247,8 +225,8 @@ def smooth(
             metavar="INPUT...", help="g2o pose graph, files of poses, bag; - for lines of stdin."
         ),
     ],
-    out: Out = None,
-    force: Force = False,
+    out: opt.Out = None,
+    force: opt.Force = False,
     topic: Annotated[
         list[str] | None,
         typer.Option("--topic", metavar="TOPIC", help="Poses in a bag; repeatable: fused."),
@@ -275,8 +253,8 @@ def smooth(
     keyframes: Annotated[
         _KeyframePolicy | None, typer.Option(help="Which poses stay in the window.")
     ] = None,
-    config: ConfigFile = None,
-    set_: Settings = None,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
 ) -> None:
     """Optimize edges or poses of any front-end, a graph or a stream."""
     from gvo.io.edges.opening import open_edges, parse_sigma
@@ -292,8 +270,8 @@ def smooth(
         _refuse(why, robust=robust, covariances=covariances)
     else:
         _refuse("is of the window; add --window", config=config, set=set_, keyframes=keyframes)
-    parameters = load(config, set_)
-    out = new_folder(out, "lines" if is_stream else inputs[0], force=force)
+    parameters = opt.load(config, set_)
+    out = opt.new_folder(out, "lines" if is_stream else inputs[0], force=force)
     truth = None if ground_truth is None else read_ground_truth(ground_truth)
     source = None
     if not is_stream:
@@ -367,7 +345,7 @@ def compare(
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write its plots as PNG and PDF too.")
     ] = None,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> None:
     """Measure trajectories against a reference: ATE, RPE, segments."""
     from gvo.io.poses.inputs import read_compared
@@ -404,29 +382,29 @@ def compare(
 
 @_command("convert")
 def convert_(
-    recordings: Recordings,
+    recordings: opt.Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
     layout: Annotated[
         _Layout | None, typer.Option(help="Layout of the folder that is written.")
     ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
-    calibration: CalibrationFiles = None,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
-    config: ConfigFile = None,
-    set_: Settings = None,
+    calibration: opt.CalibrationFiles = None,
+    left: opt.Left = None,
+    right: opt.Right = None,
+    color: opt.Color = None,
+    depth: opt.Depth = None,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.io.convert.common import check_new
     from gvo.io.convert.convert import convert
 
     check_new(target)
-    options = recording_options(calibration, left, right, color, depth)
-    settings = load(config, set_)
-    source = open_source(recordings, settings, options)
+    options = opt.recording_options(calibration, left, right, color, depth)
+    settings = opt.load(config, set_)
+    source = opt.open_source(recordings, settings, options)
     with (
         interruptible() as check,
         told_what_stands(f"{target} is not written; the same command begins anew"),
@@ -450,13 +428,13 @@ def config_(
     everything: Annotated[
         bool, typer.Option("--all", help="Print the parameters for experts too.")
     ] = False,
-    config: ConfigFile = None,
-    set_: Settings = None,
+    config: opt.ConfigFile = None,
+    set_: opt.Settings = None,
 ) -> None:
     """Print the parameters that matter most, or all."""
     from gvo.config import describe_configuration
 
-    parameters = load(config, set_)
+    parameters = opt.load(config, set_)
     typer.echo(describe_configuration(parameters, for_experts=everything), nl=False)
     if not everything:
         say("# The others, for experts: gvo config --all")

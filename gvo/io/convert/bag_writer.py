@@ -16,6 +16,7 @@ from rosbags.rosbag2 import WriterError as WriterError2
 
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
+from gvo.io.convert import common
 from gvo.io.convert.bag_messages import (
     BagWriter,
     FramePose,
@@ -26,19 +27,6 @@ from gvo.io.convert.bag_messages import (
     write_image,
     write_transforms,
     write_truth,
-)
-from gvo.io.convert.common import (
-    BODY_FRAME,
-    Conversion,
-    LeftOut,
-    check_images,
-    check_new,
-    load_image,
-    plan_images,
-    pose_of_right,
-    pose_on_body,
-    readable_images,
-    true_poses,
 )
 from gvo.io.frames import ImagePreparer
 from gvo.io.images import MILLIMETRES, exact_counts
@@ -57,7 +45,7 @@ def write_bag(
     rectify: bool = False,
     compress: bool = False,
     progress: _Progress | None = None,
-) -> Conversion:
+) -> common.Conversion:
     """Write a recording as a bag.
 
     The frames read back from it are those of the source, bit by bit. A stereo pair becomes
@@ -100,7 +88,7 @@ def write_bag(
             bag.result.rename(path)
     except (OSError, WriterError1, WriterError2) as error:
         raise RecordingError(f"{path}: cannot be written: {error}") from error
-    return Conversion(
+    return common.Conversion(
         path=path,
         n_images=sum(writer.n_images),
         n_poses=writer.n_poses,
@@ -109,7 +97,7 @@ def write_bag(
 
 
 def _check_target(path: Path) -> None:
-    check_new(path)
+    common.check_new(path)
     if path.suffix not in _SUFFIXES:
         raise RecordingError(
             f"{path}: expected a name ending in .bag, .mcap or .db3, or a folder name without "
@@ -123,8 +111,8 @@ class _Writer:
     def __init__(self, source: Source, streams: BagStreams) -> None:
         self._source = source
         self._streams = streams
-        self.left_out = LeftOut()
-        truth = true_poses(source, self.left_out)
+        self.left_out = common.LeftOut()
+        truth = common.true_poses(source, self.left_out)
         self._poses: deque[tuple[int, FloatArray]] = deque()
         if truth is not None:
             self._poses.extend(zip(truth.stamps_ns.tolist(), truth.T_world_frame, strict=True))
@@ -133,7 +121,7 @@ class _Writer:
 
     def write(self, bag: BagWriter, progress: _Progress | None) -> None:
         is_first = True
-        for image in readable_images(self._source, self.left_out):
+        for image in common.readable_images(self._source, self.left_out):
             if is_first:
                 self._write_static(bag, image.stamp_ns)
                 is_first = False
@@ -141,7 +129,7 @@ class _Writer:
             self.n_images[image.stream] += self._write_image(bag, image)
             if progress is not None:
                 progress(sum(self.n_images))
-        check_images((self.n_images[0], self.n_images[1]), self._source, self.left_out)
+        common.check_images((self.n_images[0], self.n_images[1]), self._source, self.left_out)
         self._write_poses(bag)
 
     def _write_static(self, bag: BagWriter, stamp_ns: int) -> None:
@@ -159,7 +147,7 @@ class _Writer:
     def _write_image(self, bag: BagWriter, image: StampedImage) -> bool:
         """Write an image; False, with a note, where it cannot be read."""
         stream = self._streams[image.stream]
-        pixels = load_image(image, stream.prepare, stream.topic, self.left_out)
+        pixels = common.load_image(image, stream.prepare, stream.topic, self.left_out)
         if pixels is None:
             return False
         header = Header(image.stamp_ns, stream.frame_id)
@@ -220,7 +208,7 @@ def plan_streams(source: Source, *, rectify: bool, compress: bool) -> BagStreams
         Write images as PNG; depth only where it is in whole millimetres.
     """
     info = source.info
-    calibrations, preparers = plan_images(info, rectify=rectify)
+    calibrations, preparers = common.plan_images(info, rectify=rectify)
     is_rectified, is_compressed = calibrations[0].is_rectified, (compress, compress)
     if info.sensor == "rgbd":
         name = "image_rect_color" if is_rectified else "image_color"
@@ -243,7 +231,7 @@ def _frame_ids(info: RecordingInfo) -> tuple[str, str]:
 
 def _is_in_millimetres(source: Source) -> bool:
     """Tell whether the first depth image that can be read is of whole millimetres."""
-    for image in readable_images(source, LeftOut()):
+    for image in common.readable_images(source, common.LeftOut()):
         if image.stream == 1:
             try:
                 return exact_counts(image.load(), MILLIMETRES) is not None
@@ -270,8 +258,8 @@ def static_poses(source: Source, frame_ids: tuple[str, str], stamp_ns: int) -> I
         T_body_cam where the recording knows it, T_left_right of a stereo pair.
     """
     first, second = frame_ids
-    T_body_cam = pose_on_body(source)
-    if T_body_cam is not None and first != BODY_FRAME:
-        yield FramePose(stamp_ns, BODY_FRAME, first, T_body_cam)
+    T_body_cam = common.pose_on_body(source)
+    if T_body_cam is not None and first != common.BODY_FRAME:
+        yield FramePose(stamp_ns, common.BODY_FRAME, first, T_body_cam)
     if source.info.sensor == "stereo":
-        yield FramePose(stamp_ns, first, second, pose_of_right(source.info))
+        yield FramePose(stamp_ns, first, second, common.pose_of_right(source.info))

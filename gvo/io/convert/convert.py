@@ -10,15 +10,8 @@ from typing import Literal, TypeAlias
 from gvo.config import Config
 from gvo.errors import RecordingError, write_faults
 from gvo.io.bag.source import BagSource
+from gvo.io.convert import common
 from gvo.io.convert.bag_writer import write_bag
-from gvo.io.convert.common import (
-    Conversion,
-    LeftOut,
-    check_images,
-    check_new,
-    readable_images,
-    true_poses,
-)
 from gvo.io.convert.folders import EurocFolder, FolderStreams, KittiFolder, TumFolder
 from gvo.io.opening import BAG_SUFFIXES
 from gvo.io.recording import RecordingInfo, Source
@@ -36,7 +29,7 @@ def convert(
     compress: bool = False,
     config: Config | None = None,
     progress: _Progress | None = None,
-) -> Conversion:
+) -> common.Conversion:
     """Write a recording as a bag or as a data-set folder.
 
     Parameters
@@ -92,7 +85,7 @@ def write_folder(
     rectify: bool = False,
     config: Config | None = None,
     progress: _Progress | None = None,
-) -> Conversion:
+) -> common.Conversion:
     """Write a recording as the folder of a data set, its images as PNG without loss.
 
     Where a recording cannot be read on, what was read is kept, and the reason is in `skipped`.
@@ -125,14 +118,14 @@ def write_folder(
     EuRoC does not keep R and P: its readers rectify anew, by K, D and the places of the cameras.
     """
     path = Path(path)
-    check_new(path)
+    common.check_new(path)
     layout = _choose(source.info, layout, rectify=rectify)
     with (
         write_faults(RecordingError, path),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".convert-") as parent,
     ):
         folder = Path(parent) / path.name
-        left_out = LeftOut()
+        left_out = common.LeftOut()
         writer: FolderStreams
         if layout == "kitti":
             writer = KittiFolder(folder, source, left_out, (config or Config()).sync)
@@ -141,7 +134,9 @@ def write_folder(
             writer = make(folder, source, left_out, rectify=rectify)
         n_images, n_poses = _write(writer, source, progress)
         folder.rename(path)
-    return Conversion(path=path, n_images=n_images, n_poses=n_poses, skipped=left_out.lines())
+    return common.Conversion(
+        path=path, n_images=n_images, n_poses=n_poses, skipped=left_out.lines()
+    )
 
 
 def _choose(info: RecordingInfo, layout: Layout | None, *, rectify: bool) -> Layout:
@@ -164,12 +159,12 @@ def _choose(info: RecordingInfo, layout: Layout | None, *, rectify: bool) -> Lay
 def _write(writer: FolderStreams, source: Source, progress: _Progress | None) -> tuple[int, int]:
     """Return the number of images, and of true poses."""
     n_images = [0, 0]
-    for image in writer.select(readable_images(source, writer.left_out)):
+    for image in writer.select(common.readable_images(source, writer.left_out)):
         n_images[image.stream] += writer.add(image)
         if progress is not None:
             progress(sum(n_images))
-    check_images((n_images[0], n_images[1]), source, writer.left_out)
-    truth = true_poses(source, writer.left_out)
+    common.check_images((n_images[0], n_images[1]), source, writer.left_out)
+    truth = common.true_poses(source, writer.left_out)
     n_poses = 0 if truth is None else writer.add_truth(truth)
     writer.close()
     return sum(n_images), n_poses

@@ -15,20 +15,8 @@ from gvo.io.run_folder.writer import GLOBAL
 from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
+from gvo.viz.view import panels
 from gvo.viz.view.layers import COLOURS
-from gvo.viz.view.panels import (
-    UP,
-    Painter,
-    Playback,
-    ViewPoint,
-    add_frame_panel,
-    add_scene_controls,
-    frame_rows,
-    grid_cell,
-    legend_html,
-    numbers_html,
-    pose_rows,
-)
 from gvo.viz.view.player import RunPlayer
 from gvo.viz.view.scene import Scene, Up
 from gvo.viz.view.server import ViewServer, open_server
@@ -125,10 +113,10 @@ class FinishedPage:
         self.scene = Scene(server.scene, up=up)
         self._add_frame_panel()
         self.player = RunPlayer(record.frames.stamps_ns, lambda index: self._painter.offer())
-        self.playback = Playback(server.gui, self.player, before=lambda: None)
-        self._view = ViewPoint(server, up, is_following=False)
-        self._painter = Painter(self.draw)
-        self._sigmas = add_scene_controls(
+        self.playback = panels.Playback(server.gui, self.player, before=lambda: None)
+        self._view = panels.ViewPoint(server, up, is_following=False)
+        self._painter = panels.Painter(self.draw)
+        self._sigmas = panels.add_scene_controls(
             server.gui,
             self.scene,
             without=self._absent,
@@ -154,7 +142,7 @@ class FinishedPage:
         stamp_ns = int(self._record.frames.stamps_ns[index])
         with self._server.atomic():
             self.playback.show(index)
-            self.numbers.content = numbers_html(self._rows(index, stamp_ns))
+            self.numbers.content = panels.numbers_html(self._rows(index, stamp_ns))
             past = {
                 name: trajectory.select(trajectory.stamps_ns <= stamp_ns)
                 for name, trajectory in self._record.trajectories.items()
@@ -173,10 +161,10 @@ class FinishedPage:
                 self._view.show_pose(T_world_frame)
 
     def _add_frame_panel(self) -> None:
-        with add_frame_panel(self._server):
+        with panels.add_frame_panel(self._server):
             self.numbers = self._server.gui.add_html("")
             shown = _DRAWN - self._absent
-            self._server.gui.add_html(legend_html(name for name in COLOURS if name in shown))
+            self._server.gui.add_html(panels.legend_html(name for name in COLOURS if name in shown))
 
     def _show_all(self) -> None:
         """Choose sizes and the view by the whole path."""
@@ -186,13 +174,15 @@ class FinishedPage:
         points = np.concatenate(positions)
         reach = max(0.1, float(np.linalg.norm(np.ptp(points, axis=0))))
         self.scene.set_camera(4, 3, 3.0, size_m=0.04 * reach)
-        lowest = points[np.argmin(points @ UP[self.scene.up])]
-        self.scene.show_ground(lowest - 0.02 * reach * UP[self.scene.up], grid_cell(0.1 * reach))
+        lowest = points[np.argmin(points @ panels.UP[self.scene.up])]
+        self.scene.show_ground(
+            lowest - 0.02 * reach * panels.UP[self.scene.up], panels.grid_cell(0.1 * reach)
+        )
         self._view.look_down(points)
 
     def _rows(self, index: int, stamp_ns: int) -> dict[str, str]:
         frames = self._record.frames
-        rows = frame_rows(index, self.player.n_frames, stamp_ns, frames.statuses[index])
+        rows = panels.frame_rows(index, self.player.n_frames, stamp_ns, frames.statuses[index])
         if frames.reasons[index]:
             rows["reason"] = frames.reasons[index]
         rows |= {name: f"{counts[index]}" for name, counts in frames.counts.items()}
@@ -201,7 +191,7 @@ class FinishedPage:
         row = int(np.searchsorted(poses.stamps_ns, stamp_ns))
         if row < len(poses) and poses.stamps_ns[row] == stamp_ns:
             covariance = None if poses.covariances is None else poses.covariances[row]
-            rows |= pose_rows(poses.T_world_frame[row], covariance)
+            rows |= panels.pose_rows(poses.T_world_frame[row], covariance)
         return rows
 
     def _milliseconds(self, stamp_ns: int) -> dict[str, str]:

@@ -15,24 +15,10 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.trajectory.alignment import alignment, associate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, ImageArray, IntArray
+from gvo.viz.view import panels
 from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.history import FrameView
 from gvo.viz.view.layers import COLOURS
-from gvo.viz.view.panels import (
-    UP,
-    Painter,
-    Playback,
-    ViewPoint,
-    add_frame_panel,
-    add_scene_controls,
-    frame_rows,
-    grid_cell,
-    legend_html,
-    message_html,
-    numbers_html,
-    result_rows,
-    state_html,
-)
 from gvo.viz.view.player import Player
 from gvo.viz.view.scene import Scene
 from gvo.viz.view.server import ViewServer, open_server
@@ -87,7 +73,7 @@ class Page:
         self.scene = Scene(server.scene)
         self._add_frame_panel()
         self._add_main_panel()
-        self._painter = Painter(self._draw_newest, idle=self._show_state)
+        self._painter = panels.Painter(self._draw_newest, idle=self._show_state)
         self._unsubscribe = player.subscribe(lambda frame: self._painter.offer())
         if player.frame_view is not None:
             self._painter.offer()
@@ -107,7 +93,7 @@ class Page:
         with self._server.atomic():
             self._place(frame)
             self.playback.show(frame.index)
-            self.numbers.content = numbers_html(self._rows(frame))
+            self.numbers.content = panels.numbers_html(self._rows(frame))
             self._show_state()
             self._draw_images(frame)
             self._draw_paths()
@@ -121,27 +107,27 @@ class Page:
 
     def _add_frame_panel(self) -> None:
         gui = self._server.gui
-        with add_frame_panel(self._server):
+        with panels.add_frame_panel(self._server):
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
-            self.message = gui.add_html(message_html(""))  # in sight, whatever is unfolded
+            self.message = gui.add_html(panels.message_html(""))  # in sight, whatever is unfolded
             start = {"frame": f"the first of {self._player.n_frames} is coming"}
-            self.numbers = gui.add_html(numbers_html(start))
+            self.numbers = gui.add_html(panels.numbers_html(start))
             hidden = {"standstill", *self._absent}
-            gui.add_html(legend_html(name for name in COLOURS if name not in hidden))
+            gui.add_html(panels.legend_html(name for name in COLOURS if name not in hidden))
 
     def _add_main_panel(self) -> None:
         gui = self._server.gui
-        self.playback = Playback(gui, self._player, before=self.flush)
-        self._view = ViewPoint(self._server, "-y", is_following=True)
+        self.playback = panels.Playback(gui, self._player, before=self.flush)
+        self._view = panels.ViewPoint(self._server, "-y", is_following=True)
         gui.add_button(
             "restart from here", hint="Begin anew at this frame, with the parameters as they are"
         ).on_click(self._on_restart)
         gui.add_button(
             "save as YAML", hint="For gvo run --config; the browser saves the file"
         ).on_click(self._on_save)
-        self._state = gui.add_html(state_html(player_state(self._player)))
-        self._sigmas = add_scene_controls(
+        self._state = gui.add_html(panels.state_html(player_state(self._player)))
+        self._sigmas = panels.add_scene_controls(
             gui,
             self.scene,
             without=self._absent,
@@ -163,9 +149,9 @@ class Page:
 
     def _show_state(self) -> None:
         """Show what the player is doing, and what went wrong."""
-        self._state.content = state_html(player_state(self._player))
+        self._state.content = panels.state_html(player_state(self._player))
         problems = [problem for problem in (self._refusal, self._player.fault) if problem]
-        self.message.content = message_html("; ".join(problems))
+        self.message.content = panels.message_html("; ".join(problems))
 
     def _on_restart(self, event: viser.GuiEvent[Any]) -> None:
         self.flush()
@@ -183,10 +169,10 @@ class Page:
 
     def _rows(self, frame: FrameView) -> dict[str, str]:
         status = frame.status or "skipped"
-        rows = frame_rows(frame.index, self._player.n_frames, frame.stamp_ns, status)
+        rows = panels.frame_rows(frame.index, self._player.n_frames, frame.stamp_ns, status)
         if frame.reason:
             rows["reason"] = frame.reason
-        return rows if frame.result is None else rows | result_rows(frame.result)
+        return rows if frame.result is None else rows | panels.result_rows(frame.result)
 
     def _place(self, frame: FrameView) -> None:
         """Choose sizes and view by what the first frame sees."""
@@ -197,7 +183,9 @@ class Page:
         depth = _depth_of(frame, camera)
         self.scene.set_camera(camera.width, camera.height, camera.fy, size_m=_CAMERA_SHARE * depth)
         start = frame.T_world_frame[:3, 3]
-        self.scene.show_ground(start - _GROUND_SHARE * depth * UP["-y"], grid_cell(0.1 * depth))
+        self.scene.show_ground(
+            start - _GROUND_SHARE * depth * panels.UP["-y"], panels.grid_cell(0.1 * depth)
+        )
         self._view.look_along(frame.T_world_frame, _VIEW_SHARE * depth)
 
     def _draw_images(self, frame: FrameView) -> None:
