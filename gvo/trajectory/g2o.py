@@ -158,7 +158,7 @@ def _lines_of(tag: str, rows: Sequence[tuple[int, list[int], list[float]]]) -> I
     """Yield the values of lines of one tag, from their ids and numbers."""
     numbers = np.array([row for _, _, row in rows])
     n_pose = 7 if tag in _QUATERNION_TAGS else 6
-    transforms = _transforms(numbers[:, :n_pose])
+    transforms = transforms_of(numbers[:, :n_pose])
     if tag not in MEASUREMENT_TAGS:
         for (_, ids, _), T in zip(rows, transforms, strict=True):
             yield Vertex(frame_id=ids[0], T_world_frame=T)
@@ -177,8 +177,14 @@ def _id(text: str) -> int:
         raise ValueError(f"the id {text!r} is no whole number") from None
 
 
-def _transforms(numbers: FloatArray) -> FloatArray:
-    """Return the poses of rows of x, y, z and a quaternion (x, y, z, w), or roll, pitch, yaw."""
+def transforms_of(numbers: FloatArray) -> FloatArray:
+    """Return the poses of rows of x, y, z and a quaternion (x, y, z, w), or roll, pitch, yaw.
+
+    Raises
+    ------
+    ValueError
+        If a number is beyond `MAX_POSITION_M`, or a quaternion not of length one.
+    """
     if np.any(np.abs(numbers) > MAX_POSITION_M):
         raise ValueError(f"a number of the pose is beyond {MAX_POSITION_M:g}")
     if numbers.shape[1] == 6:

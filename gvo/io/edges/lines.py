@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import os
 import select
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -13,24 +12,18 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gvo._text import MAX_LINE, plain_number, shortened
 from gvo.errors import TrajectoryError
 from gvo.geometry import se3
 from gvo.io.edges.pose_streams import StepSigma
-from gvo.trajectory.formats import (
-    COVARIANCE_HEADER,
-    MAX_POSITION_M,
-    from_upper_triangle,
-    upper_triangle,
-)
+from gvo.trajectory.formats import COVARIANCE_HEADER, from_upper_triangle, upper_triangle
+from gvo.trajectory.g2o import transforms_of
 from gvo.types import Edge, Estimate, FloatArray, PosePrior, PositionPrior, Prior, Rejected
 
 LineFormat: TypeAlias = Literal["csv", "json"]
 
 _MAX_ID = 1000  # characters
-_NORM_TOLERANCE = 1e-2
 # Of a measurement in the world without a stated noise: radians and metres.
 _PRIOR_SIGMAS = np.repeat([0.01, 0.1], 3)
 _STAMP_LIMIT_NS = 2**63 - 1
@@ -310,12 +303,7 @@ def _noise(numbers: FloatArray, size: int) -> FloatArray | None:
 def _pose(numbers: FloatArray) -> FloatArray:
     if len(numbers) != 7:
         raise ValueError(f"a pose needs x y z qx qy qz qw, got {len(numbers)} numbers")
-    if np.any(np.abs(numbers) > MAX_POSITION_M):
-        raise ValueError(f"a number of the pose is beyond {MAX_POSITION_M:g}")
-    norm = math.hypot(*numbers[3:])
-    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
-        raise ValueError(f"the quaternion is of length {norm:.4g}, expected 1")
-    return se3.make_transform(np.asarray(Rotation.from_quat(numbers[3:]).as_matrix()), numbers[:3])
+    return np.asarray(transforms_of(numbers[np.newaxis])[0])
 
 
 def _edge(
