@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gvo.config import Config
 from gvo.diagnostics.check import CheckResult, Finding, check_recording
 from gvo.errors import RecordingError
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording, WorldName
 from gvo.trajectory.trajectory import Trajectory
 
@@ -81,7 +81,7 @@ def render(world: WorldName, sensor: Sensor, seed: int = 0) -> Held:
     return Held(info=source.info, items=items)
 
 
-def check(recording: Held, *, n_samples: int = 4, **options: Any) -> CheckResult:
+def check(recording: Source, *, n_samples: int = 4, **options: Any) -> CheckResult:
     return check_recording(recording, Config(), n_samples=n_samples, **options)
 
 

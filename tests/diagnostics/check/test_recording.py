@@ -15,14 +15,21 @@ from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.diagnostics.check import check_recording
-from gvo.errors import RecordingError
 from gvo.io.bag.source import BagSource
 from gvo.io.opening import open_recording
-from tests.diagnostics.check.planted import check, complaints, find, render
+from gvo.testing import faults as made
+from gvo.testing.faults import FaultySource
+from tests.diagnostics.check.planted import Held, check, complaints, find, render
 
-Fault = Callable[[Any], Any]
+Fault = made.Fault | Callable[[Held], Held]
 _RNG = np.random.default_rng(5)
 WORLDS = [pytest.param("driving", marks=pytest.mark.acceptance), "handheld"]
+
+
+def planted(fault: Fault, recording: Held) -> FaultySource | Held:
+    if isinstance(fault, made.Fault):
+        return FaultySource(recording, fault)
+    return fault(recording)
 
 
 @pytest.mark.parametrize(
@@ -59,11 +66,7 @@ def rotated(recording: Any) -> Any:
     return recording.with_pixels(turn, stream=1)
 
 
-def swapped(recording: Any) -> Any:
-    return recording.mapped(lambda image, _: replace(image, stream=1 - image.stream))
-
-
-def out_of_step(n_frames: int) -> Fault:
+def out_of_step(n_frames: int) -> Callable[[Held], Held]:
     """Return the fault that right images show what left ones showed so many frames before."""
 
     def delay(recording: Any) -> Any:
@@ -79,14 +82,6 @@ def out_of_step(n_frames: int) -> Fault:
     return delay
 
 
-def of_another_place(recording: Any) -> Any:
-    return recording.with_pixels(lambda image: image[::-1, ::-1].copy(), stream=1)
-
-
-def darker_right(recording: Any) -> Any:
-    return recording.with_pixels(lambda image: (0.6 * image).astype(np.uint8), stream=1)
-
-
 def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
     M = np.array([[1.0, 0.0, du], [0.0, 1.0, dv]])
     return np.asarray(cv2.warpAffine(image, M, image.shape[::-1], borderMode=cv2.BORDER_REFLECT))
@@ -97,20 +92,20 @@ def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
     [
         (shifted_rows, {"left/right: row offset"}),
         (rotated, {"left/right: row spread"}),
-        (swapped, {"left/right: order"}),
-        (of_another_place, {"left/right: matches"}),
-        (darker_right, {"left/right: brightness ratio"}),
+        (made.Exchanged(), {"left/right: order"}),
+        (made.Turned(how="half turn", streams=(1,)), {"left/right: matches"}),
+        (made.Exposed(factor=0.6, streams=(1,)), {"left/right: brightness ratio"}),
     ],
 )
 @pytest.mark.parametrize("world", WORLDS)
 def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
     world: str, fault: Fault, expected: set[str]
 ) -> None:
-    result = check(fault(render(world, "stereo")))
+    result = check(planted(fault, render(world, "stereo")))
     found = complaints(result)
     # A turn of the image moves its rows at the middle hardly, but not by exactly nothing.
     assert expected <= found <= expected | {"left/right: row offset"}
-    if fault is swapped:
+    if isinstance(fault, made.Exchanged):
         assert find(result, "left/right: order").fix == "exchange --left and --right"
         assert not result.is_healthy
 
@@ -166,28 +161,6 @@ def through_lens(image: NDArray[Any], K: NDArray[Any], k1: float) -> NDArray[Any
     return np.asarray(cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR))
 
 
-def nothing_known(share: float) -> Fault:
-    def lose(depth: NDArray[Any]) -> NDArray[Any]:
-        field = np.random.default_rng(1).random((depth.shape[0] // 8 + 1, depth.shape[1] // 8 + 1))
-        is_lost = np.kron(field, np.ones((8, 8)))[: depth.shape[0], : depth.shape[1]] < share
-        return np.where(is_lost, np.float32(np.nan), depth)
-
-    return lambda recording: recording.with_pixels(lose, stream=1)
-
-
-def scaled_depth(factor: float) -> Fault:
-    return lambda recording: recording.with_pixels(
-        lambda depth: (depth * np.float32(factor)).astype(np.float32), stream=1
-    )
-
-
-def shifted_depth(du: int, dv: int) -> Fault:
-    def shift(depth: NDArray[Any]) -> NDArray[Any]:
-        return np.roll(depth, (dv, du), axis=(0, 1))
-
-    return lambda recording: recording.with_pixels(shift, stream=1)
-
-
 def zoomed_depth(recording: Any) -> Any:
     def zoom(depth: NDArray[Any]) -> NDArray[Any]:
         height, width = depth.shape
@@ -197,55 +170,43 @@ def zoomed_depth(recording: Any) -> Any:
     return recording.with_pixels(zoom, stream=1)
 
 
-def coarse_depth(recording: Any) -> Any:
-    return recording.with_pixels(
-        lambda depth: (np.rint(4.0 * depth) / np.float32(4.0)).astype(np.float32), stream=1
-    )
+def shifted(columns: int, rows: int) -> made.Shifted:
+    return made.Shifted(columns=columns, rows=rows, streams=(1,))
 
 
 _SCALE = {"depth: scale", "depth: within limits", "depth: corners with depth"}
+_PLACE = {"depth: misregistration"}
 
 
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (scaled_depth(1000.0), _SCALE),
-        (scaled_depth(0.001), _SCALE),
-        (nothing_known(0.7), {"depth: unknown"}),
-        (shifted_depth(5, 0), {"depth: misregistration"}),
-        pytest.param(
-            shifted_depth(-4, 0), {"depth: misregistration"}, marks=pytest.mark.acceptance
-        ),
-        pytest.param(shifted_depth(0, 4), {"depth: misregistration"}, marks=pytest.mark.acceptance),
-        (shifted_depth(4, -5), {"depth: misregistration"}),
-        (zoomed_depth, {"depth: misregistration"}),
+        (made.DepthScaled(factor=1000.0), _SCALE),
+        (made.DepthScaled(factor=0.001), _SCALE),
+        (made.DepthHoles(part=0.6), {"depth: unknown"}),
+        (shifted(5, 0), _PLACE),
+        pytest.param(shifted(-4, 0), _PLACE, marks=pytest.mark.acceptance),
+        pytest.param(shifted(0, 4), _PLACE, marks=pytest.mark.acceptance),
+        (shifted(4, -5), _PLACE),
+        (zoomed_depth, _PLACE),
     ],
 )
 def test_faults_of_depth_are_found_and_nothing_else(fault: Fault, expected: set[str]) -> None:
-    assert complaints(check(fault(render("handheld", "rgbd")))) == expected
+    assert complaints(check(planted(fault, render("handheld", "rgbd")))) == expected
 
 
 def test_depth_of_a_few_values_is_found() -> None:
-    found = complaints(check(coarse_depth(render("handheld", "rgbd"))))
+    found = complaints(check(FaultySource(render("handheld", "rgbd"), made.DepthQuantized())))
     # Its own steps are edges that colour does not have.
     assert {"depth: levels"} <= found <= {"depth: levels", "depth: misregistration"}
 
 
-def darkness(image: NDArray[Any]) -> NDArray[Any]:
-    return (0.05 * image).astype(np.uint8)
+def noise_alone(recording: Held) -> Held:
+    def noise(image: NDArray[Any]) -> NDArray[Any]:
+        rng = np.random.default_rng(int(image.astype(np.int64).sum()))
+        return np.asarray(np.rint(rng.normal(110, 2, image.shape)), dtype=np.uint8)
 
-
-def glare(image: NDArray[Any]) -> NDArray[Any]:
-    return np.clip(image.astype(np.float64) * 3.0, 0, 255).astype(np.uint8)
-
-
-def out_of_focus(image: NDArray[Any]) -> NDArray[Any]:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 2.5))
-
-
-def noise_alone(image: NDArray[Any]) -> NDArray[Any]:
-    noise = np.random.default_rng(int(image.astype(np.int64).sum())).normal(110, 2, image.shape)
-    return np.asarray(np.rint(noise), dtype=np.uint8)
+    return recording.with_pixels(noise, stream=0)
 
 
 WITH_DEPTH = "depth: corners with depth"
@@ -254,17 +215,20 @@ WITH_DEPTH = "depth: corners with depth"
 @pytest.mark.parametrize(
     ("fault", "expected", "tolerated"),
     [
-        (darkness, {"colour: brightness"}, {"colour: corners", WITH_DEPTH}),
-        (glare, {"colour: clipped pixels"}, {"colour: brightness", "colour: corners", WITH_DEPTH}),
-        (out_of_focus, {"colour: blur"}, set()),
+        (made.Exposed(factor=0.05), {"colour: brightness"}, {"colour: corners", WITH_DEPTH}),
+        (
+            made.Exposed(factor=3.0),
+            {"colour: clipped pixels"},
+            {"colour: brightness", "colour: corners", WITH_DEPTH},
+        ),
+        (made.Blurred(sigma_px=2.5), {"colour: blur"}, set()),
         (noise_alone, {"colour: corners"}, {"colour: corners found again", WITH_DEPTH}),
     ],
 )
 def test_faults_of_images_are_found_and_nothing_else(
-    fault: Callable[..., Any], expected: set[str], tolerated: set[str]
+    fault: Fault, expected: set[str], tolerated: set[str]
 ) -> None:
-    recording = render("handheld", "rgbd").with_pixels(fault, stream=0)
-    found = complaints(check(recording))
+    found = complaints(check(planted(fault, render("handheld", "rgbd"))))
     assert expected <= found <= expected | tolerated
 
 
@@ -281,43 +245,28 @@ def test_images_in_another_order_are_not_found_again() -> None:
 
 
 def test_frozen_images_are_found() -> None:
-    recording = render("handheld", "rgbd")
-    firsts = {stream: recording.stream(stream)[0].load for stream in (0, 1)}
-    frozen = recording.mapped(lambda image, _: replace(image, load=firsts[image.stream]))
+    frozen = FaultySource(render("handheld", "rgbd"), made.Frozen(first=1))
     found = complaints(check(frozen))
     assert {"colour: frozen images", "depth: frozen images"} == found
 
 
 def test_torn_images_are_found() -> None:
-    def tear(image: Any, number: int) -> Any:
-        def load() -> NDArray[Any]:
-            pixels: NDArray[Any] = image.load().copy()
-            pixels[2 * len(pixels) // 3 :] = 128
-            return pixels
-
-        return replace(image, load=load) if image.stream == 0 and number < 12 else image
-
-    result = check(render("handheld", "rgbd").mapped(tear))
+    torn = made.HalfWritten(part=2.0 / 3.0, end=12, streams=(0,))
+    result = check(FaultySource(render("handheld", "rgbd"), torn))
     assert "colour: torn images" in complaints(result)
 
 
 def test_images_that_do_not_decode_are_counted_and_quoted() -> None:
-    def fail() -> NDArray[Any]:
-        raise RecordingError("/camera: the JPEG image is truncated")
-
-    def break_some(image: Any, number: int) -> Any:
-        return replace(image, load=fail) if image.stream == 1 and number < 12 else image
-
-    result = check(render("handheld", "rgbd").mapped(break_some))
+    fault = made.Unloadable(end=12, streams=(1,), message="/camera: the JPEG image is truncated")
+    result = check(FaultySource(render("handheld", "rgbd"), fault))
     assert complaints(result) == {"frames that cannot be used"}
     fix = find(result, "frames that cannot be used").fix
     assert fix == "depth image: /camera: the JPEG image is truncated"
 
 
 def test_damage_ends_the_reading_but_not_the_check() -> None:
-    recording = render("handheld", "rgbd")
-    damaged = replace(recording, items=recording.items[:50], damage="a.bag: truncated at 61 %")
-    result = check(damaged)
+    fault = made.BrokenOff(first=25, message="a.bag: truncated at 61 %")
+    result = check(FaultySource(render("handheld", "rgbd"), fault))
     assert complaints(result) == {"reading"}
     assert find(result, "reading").value == "a.bag: truncated at 61 %"
     assert find(result, "depth: scale").verdict == "ok"
@@ -347,11 +296,8 @@ def test_hardly_any_images_are_reported_and_nothing_breaks(sensor: str, n_items:
 
 
 def test_a_recording_without_a_single_usable_image_is_no_crash() -> None:
-    def fail() -> NDArray[Any]:
-        raise RecordingError("no image")
-
     for sensor in ("stereo", "rgbd"):
-        broken = render("handheld", sensor).mapped(lambda image, _: replace(image, load=fail))
+        broken = FaultySource(render("handheld", sensor), made.Unloadable())
         assert complaints(check(broken)) == {"frames that cannot be used"}
 
 
