@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.config import list_parameters
 from gvo.types import FloatArray
-from tests.conftest import GVO, TABLES
-from tests.live.ros1 import Program, Ros, ros  # noqa: F401 - the fixture
+from tests.conftest import GVO, TABLES, is_one_line, python
+from tests.live.ros1 import PATIENCE_S, Program, Ros, ros  # noqa: F401 - the fixture
 
 FOLDER = Path(__file__).parent
 PEER, DRIVER = FOLDER / "ros1_peer.py", FOLDER / "ros1_driver.py"
@@ -220,3 +220,39 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
     ):
         assert said.count(words) == 1, (words, said)
     assert "Traceback" not in said
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize(
+    ("uri", "words", "fault"),
+    [
+        ("http://127.0.0.1:9", [], "no master answers at http://127.0.0.1:9"),
+        ("nowhere", [], "no master answers at nowhere"),
+        ("", ["_x:=["], "invalid command-line parameters"),
+        ("", ["left"], "expected ros1 [FROM:=TO...]"),
+    ],
+)
+def test_what_cannot_begin_ends_in_one_line(
+    uri: str,
+    words: list[str],
+    fault: str,
+    ros: Ros,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    world = ros.environment | ({"ROS_MASTER_URI": uri} if uri else {})
+    command = [*GVO[1:], "live", "ros1", *words, "--out", tmp_path / "out"]
+    answer = python(*command, env=world, timeout=PATIENCE_S)
+    assert answer.returncode == 2
+    assert is_one_line(answer.stderr), answer.stderr
+    assert fault in answer.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.acceptance
+def test_without_rospy_a_line_says_what_to_install(tmp_path: Path) -> None:
+    elsewhere = "import gvo.live.ros1; gvo.live.ros1._DEBIAN = '/nowhere'"
+    program = f"{elsewhere}; from gvo.cli import main; main()"
+    answer = python("-c", program, "live", "ros1", "--out", tmp_path / "out", timeout=PATIENCE_S)
+    assert answer.returncode == 2
+    assert is_one_line(answer.stderr), answer.stderr
+    assert "apt-get install python3-rospy" in answer.stderr
