@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
 import typer
 
@@ -37,6 +37,7 @@ from gvo.cli.terminal import (
     say,
     tell,
     told_where_it_stands,
+    warn,
 )
 from gvo.errors import ConfigurationError
 
@@ -49,7 +50,14 @@ if TYPE_CHECKING:
     from gvo.live.transport import Sink, Transport
     from gvo.types import Progress
 
+
+class _Address(TypedDict):
+    host: str
+    port: int
+
+
 _EVERY_S = 5.0
+_MAX_PORT = 65535
 _KINDS = ("ros1", "ros2", "camera", "-")
 _Sensor = Literal["stereo", "rgbd"]
 _Qos = Literal["sensor", "reliable", "system"]
@@ -88,6 +96,9 @@ def live(
     foxglove: Annotated[
         str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove there, too.")
     ] = None,
+    view: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Serve the page in the browser there.")
+    ] = None,
     out: Out = None,
     force: Force = False,
     config: ConfigFile = None,
@@ -125,6 +136,8 @@ def live(
             )
         except ValueError as error:
             raise ConfigurationError(f"--queue, --max-lag: {error}") from error
+        if view is not None:
+            _show(odometry, source, view, stack)
         end.stop = odometry.stop
         runs = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
     for folder, result in runs:
@@ -169,11 +182,28 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
     if foxglove is not None:
         from gvo.live.foxglove import Foxglove
 
-        host, _, port = foxglove.rpartition(":")
-        if not port.isdecimal():
-            raise ConfigurationError(f"--foxglove {foxglove}: expected [HOST:]PORT")
-        join(Foxglove(host=host or "127.0.0.1", port=int(port)))
+        server = Foxglove(**_address("--foxglove", foxglove))
+        _say(f"{server.url} serves Foxglove")
+        join(server)
     return sinks
+
+
+def _address(option: str, text: str) -> _Address:
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or len(port) > 5 or int(port) > _MAX_PORT:
+        raise ConfigurationError(f"{option} {text}: expected [HOST:]PORT")
+    return {"host": host.strip("[]") or "127.0.0.1", "port": int(port)}
+
+
+def _show(odometry: LiveOdometry, source: Source, view: str, stack: ExitStack) -> None:
+    """Serve the page of a run until it ends."""
+    from gvo.viz.view import serve
+    from gvo.viz.view.live import LivePlayer
+
+    odometry.viewer = LivePlayer(source, odometry.parameters)
+    server = stack.enter_context(serve(odometry.viewer, **_address("--view", view)))
+    warn([server.note] if server.note else [])
+    _say(f"{server.url} shows the run")
 
 
 def _open(

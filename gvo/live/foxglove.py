@@ -33,6 +33,7 @@ _ENCODING, _SCHEMA_ENCODING = "cdr", "ros2msg"
 _N_WAITING = 256
 # CDR has a byte for a message without fields, which not all clients send.
 _N_BYTES_EMPTY = 5
+_PATIENCE_S = 2.0
 _NULL = "null"
 _STATUS = "parameters"
 _PROTOCOL = Subprotocol("foxglove.sdk.v1")
@@ -73,7 +74,7 @@ class Foxglove:
                 context=self._context,
                 message_backlog_size=_N_WAITING,
             )
-        except RuntimeError as error:
+        except (RuntimeError, OverflowError) as error:
             reason = str(error).rpartition("port: ")[2]
             raise ConfigurationError(
                 f"--foxglove: cannot listen on {host}:{port}: {reason}; give another port, 0 for "
@@ -136,11 +137,16 @@ class Foxglove:
                 client.send('{"op": "setParameters", "parameters": []}')
 
     def close(self) -> None:
-        """Disconnect the clients and listen no more."""
+        """Disconnect the clients and listen no more; a second call does nothing."""
+        if self._is_closed:
+            return
         self._is_closed = True
         self._changed.set()
-        self._teller.join()
-        self._server.stop()
+        self._teller.join(_PATIENCE_S)
+        # It waits, without end, for those who connected and said nothing.
+        stopping = threading.Thread(target=self._server.stop, daemon=True)
+        stopping.start()
+        stopping.join(_PATIENCE_S)
         for publisher in self._listener.channels.values():
             publisher.channel.close()
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from gvo.runs.outputs.options import RunOutputs, name_frames
 from gvo.runs.run import RunResult, drawn, run_recording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Failure, FaultyFrame, Progress, RgbdFrame, StereoFrame
+
+if TYPE_CHECKING:
+    from gvo.viz.view.live import LivePlayer
 
 _Item: TypeAlias = Pair | FaultyFrame
 # Frames that are tied to one another before any is dropped, and what waits for them at most.
@@ -82,6 +85,10 @@ class LiveOdometry:
     ----------
     arrivals : Arrivals
         How images come, and how long their poses take.
+    parameters : Parameters
+        Changed by sinks and viewers.
+    viewer : LivePlayer or None
+        Is shown each frame, see `gvo.viz.view.serve`.
     """
 
     def __init__(
@@ -104,8 +111,8 @@ class LiveOdometry:
         self._waiting = self._make_queue()
         self._n_dropped = 0
         self._is_stopped = False
-        self._parameters = Parameters(config or Config())
-        self._parameters.follow(self._reconfigure)
+        self.parameters = Parameters(config or Config())
+        self.parameters.follow(self._reconfigure)
         left_out = () if with_tf else ("/tf", "/tf_static")
         self._writers = [NetworkWriter(sink, source.info.name, left_out) for sink in sinks]
         places = getattr(source, "image_topics", source.info.stream_names)
@@ -116,8 +123,9 @@ class LiveOdometry:
         self._loop: RunLoop | None = None
         self._save: Callable[[], None] | None = None
         self._messages: LiveMessages | None = None
+        self.viewer: LivePlayer | None = None
         for sink in sinks:
-            sink.offer(self._parameters)
+            sink.offer(self.parameters)
             for service in self._services():
                 sink.serve(service)
 
@@ -144,7 +152,7 @@ class LiveOdometry:
         list of LiveRun
         """
         outputs = outputs or RunOutputs()
-        _warm(self._source.info.camera, self._parameters.config)
+        _warm(self._source.info.camera, self.parameters.config)
         for writer in self._writers:
             writer.announce(TOPICS)
         runs: list[LiveRun] = []
@@ -198,7 +206,7 @@ class LiveOdometry:
         result = run_recording(
             _Stretch(self._source.info, self._stretches),
             folder,
-            config=self._parameters.config,
+            config=self.parameters.config,
             base_frame=self._base_frame,
             outputs=replace(outputs, report=False, world=self._world),
             force=force and number == 1,
@@ -218,6 +226,9 @@ class LiveOdometry:
             is_robot=not base_frame.is_camera and not base_frame.origin,
         )
         self._loop, self._save = loop, save
+        if self.viewer is not None:
+            self.viewer.begin(loop.window)
+            loop.on_tracked = self.viewer.add
         self._messages = LiveMessages(self._writers, frames, self.arrivals.note_sent)
         return [self._messages]
 

@@ -73,6 +73,9 @@ class RunLoop:
         window as it was then; of the base frame.
     output_faults : list of str
         Why outputs were not written to their end.
+    on_tracked : callable or None
+        Called after the outputs with each frame and what it gave, poses of the camera; with a
+        faulty one and None.
     """
 
     def __init__(
@@ -100,8 +103,14 @@ class RunLoop:
         self._outputs: list[Output] = []
         self.edges: list[tuple[int, Edge]] = []
         self.output_faults: list[str] = []
+        self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
         self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
+
+    @property
+    def window(self) -> SlidingWindow:
+        """The window of the odometry; to be read in `on_tracked`."""
+        return self._odometry.window
 
     @property
     def is_placed(self) -> bool:
@@ -227,12 +236,15 @@ class RunLoop:
         if self._first_pose is not None and self.base_frame.first_stamp_ns is None:
             self.base_frame.start(item.stamp_ns, self._first_pose(item.stamp_ns))
         result = self._odometry.track(item)
+        result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
         placed = self._placed_result(result)
         text = f"{result.n_matches} matches, {result.n_inliers} inliers, {result.n_links} links"
         _LOGGER.debug("frame at %d: %s, %s %s", item.stamp_ns, result.status, text, result.reason)
         self.statistics.add_result(placed)
         self._ask_window(item.stamp_ns)
         self._give(lambda output: output.add_frame(item, placed))
+        if self.on_tracked is not None:
+            self.on_tracked(item, result)
 
     def _give(self, write: Callable[[Output], None]) -> None:
         for output in tuple(self._outputs):
@@ -262,6 +274,8 @@ class RunLoop:
         self.statistics.add_faulty(item, is_loss=is_loss)
         if is_loss:
             self._give(lambda output: output.add_faulty(item))
+            if self.on_tracked is not None:
+                self.on_tracked(item, None)
 
     def _placed_result(self, result: FrameResult) -> FrameResult:
         """Return a result as one of the base frame."""
@@ -277,7 +291,6 @@ class RunLoop:
             loops=tuple(map(self.base_frame.apply_to_loop, result.loops)),
             T_previous_frame=step,
             T_map_world=self.base_frame.apply_to_world(result.T_map_world),
-            stage_ms={"read": self._read_ms, **result.stage_ms},
         )
 
     def _placed(self, estimates: tuple[Estimate, ...]) -> tuple[Estimate, ...]:

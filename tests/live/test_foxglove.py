@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+import gvo
 from gvo.config import Config
 from gvo.errors import ConfigurationError
 from gvo.live.foxglove import Foxglove
@@ -27,6 +28,7 @@ from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Ser
 from gvo.runs.outputs.bag import RunMessages
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import FrameResult, StereoFrame
+from tests.live.pipe import LiveCommand, sent
 from tests.viz.view.fakes import result_of
 
 # Between lines of JSON, a text or bytes in base 64, and a WebSocket.
@@ -133,6 +135,11 @@ class Client:
             pass
         return values(message)
 
+    def receive(self, n: int) -> None:
+        """Wait for messages until there are n."""
+        while len(self.data) < n:
+            self.next(_DATA)
+
     def call(self, name: str, request: bytes, encoding: bytes = b"cdr") -> bytes | str:
         head = struct.pack("<BIII", _CALL, self.services[name]["id"], 7, len(encoding))
         self.send_bytes(head + encoding + request)
@@ -178,7 +185,7 @@ def test_a_client_gets_the_messages_of_a_run_and_nothing_is_drawn_for_nobody(
     server: Foxglove,
 ) -> None:
     writer = Noting(server)
-    messages = RunMessages(writer, RunFrames())
+    messages = RunMessages(writer, RunFrames(is_world_optical=True))
     for index in (0, 6, 12):
         messages.add_frame(*tracked(index))
     unheard = "/gvo/matches/compressed"
@@ -186,8 +193,9 @@ def test_a_client_gets_the_messages_of_a_run_and_nothing_is_drawn_for_nobody(
         client.next("advertise")
         assert {topic for topic, *_ in writer.noted} == {*client.channels}
         heard = {*client.channels} - {unheard}
-        assert heard >= {"/tf", "/gvo/points", "/gvo/raw/path", "/gvo/odom/odometry"}
+        assert heard >= {"/tf", "/tf_static", "/gvo/points", "/gvo/raw/path", "/gvo/odom/odometry"}
         client.subscribe(*heard)
+        client.receive(1)
         latched = [each for each in writer.noted if each[0] == "/tf_static"]
         assert [each[:2] for each in client.data] == [each[:2] for each in latched]
         writer.noted.clear()
@@ -196,8 +204,7 @@ def test_a_client_gets_the_messages_of_a_run_and_nothing_is_drawn_for_nobody(
             messages.add_frame(*tracked(index))
         assert unheard not in {topic for topic, *_ in writer.noted}
         noted = [each for each in writer.noted if each[0] in heard]
-        while len(client.data) < len(noted):
-            client.next(_DATA)
+        client.receive(len(noted))
         assert client.data == [(topic, stamp_ns, data) for topic, stamp_ns, _, data in noted]
         for topic, _, type_, data in noted:
             assert client.channels[topic]["schemaName"] == type_
@@ -370,8 +377,48 @@ def test_a_hostile_client_is_survived(server: Foxglove, capfd: pytest.CaptureFix
             "klt.n_corners": parameters.config.klt.n_corners
         }
         client.subscribe("/gvo/note")
+        client.receive(1)
         assert client.data == [("/gvo/note", 0, b"\0\1\0\0")]
         assert isinstance(client.call("/gvo/set_pose", pose_request(0.0)), bytes)
+    server.close()  # while some have said nothing yet
     for connection in mute:
         connection.close()
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.acceptance
+def test_the_command_serves_its_run_to_foxglove(drive_bag: Path, tmp_path: Path) -> None:
+    source = gvo.open_recording(drive_bag)
+    odometry, causal, state = "/gvo/odom/odometry", "/gvo/causal/odometry", "/diagnostics"
+    with LiveCommand(source.info, tmp_path, "--foxglove=0") as run:
+        with Client(run.said("serves Foxglove")) as client:
+            while not {odometry, causal, state} <= {*client.channels}:
+                client.next("advertise")
+            client.subscribe(odometry, causal, state)
+            assert client.assign(**{"klt.n_corners": 150}) == {"klt.n_corners": 150}
+            run.send(sent(source))
+            while sum(topic == odometry for topic, *_ in client.data) < 20:
+                client.next(_DATA)
+            TRIGGER.register(is_ros1=False)
+            saved = client.call("/gvo/save", b"\0\1\0\0")
+            assert isinstance(saved, bytes)
+            answer = decode(saved, TRIGGER.response_type, is_ros1=False)
+            assert (answer.success, answer.message) == (True, "20 frames are written")
+        code, out, err = run.end()
+    assert code == 0, err
+    assert "20 frames, all tracked" in out
+    assert "foxglove" not in err.lower()
+    poses = [each for topic, _, each in decoded(client) if topic == causal]
+    positions = [(p.x, p.y, p.z) for p in (each.pose.pose.position for each in poses)]
+    written = gvo.read_trajectory(run.out / "causal.txt")
+    np.testing.assert_allclose(positions, written.positions, atol=1e-8)
+    told = [each.status[0] for topic, _, each in decoded(client) if topic == state]
+    counts = [{v.key: v.value for v in each.values}.get("keypoints", "") for each in told]
+    found = [int(count) for count in counts if count]
+    assert 0 < max(found) <= 150
+
+
+def decoded(client: Client) -> Iterator[tuple[str, int, Any]]:
+    for topic, stamp_ns, data in client.data:
+        type_ = client.channels[topic]["schemaName"]
+        yield topic, stamp_ns, decode(data, type_, is_ros1=False)

@@ -14,12 +14,13 @@ import pytest
 
 import gvo
 from gvo.errors import RecordingError
-from gvo.io.recording import Source, StampedImage
+from gvo.io.recording import StampedImage
 from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
 from gvo.live.sources import Device, StandardInput
 from gvo.types import FaultyFrame, Progress
 from tests.conftest import GVO, TABLES, Command, is_one_line
+from tests.live.pipe import sent, write_calibration
 
 TIED = Progress(n_done=3, n_total=0, n_tracked=2)
 NO_REPORT = gvo.RunOutputs(report=False)
@@ -110,32 +111,6 @@ def test_a_fault_of_the_stream_comes_after_what_was_received() -> None:
         next(through)
 
 
-def names_of(source: Source) -> tuple[str, str]:
-    return ("left", "right") if source.info.sensor == "stereo" else ("color", "depth")
-
-
-def sent(source: Source, *, compressed: str = "") -> bytes:
-    """Return the images of a recording as a program would write them into a pipe."""
-    parts: list[bytes] = []
-    for image in source.images():
-        pixels = image.load()
-        header: dict[str, object] = {"stream": names_of(source)[image.stream]}
-        header["stamp_ns"] = image.stamp_ns
-        if pixels.dtype == np.float32:
-            pixels = np.nan_to_num(pixels)
-        if compressed and pixels.dtype == np.uint8:
-            data = cv2.imencode(f".{compressed}", pixels)[1].tobytes()
-            header |= {"format": compressed, "size": len(data)}
-        else:
-            encoding = {(2, "u"): "mono8", (3, "u"): "bgr8", (2, "f"): "32FC1"}
-            height, width = pixels.shape[:2]
-            header["encoding"] = encoding[pixels.ndim, pixels.dtype.kind]
-            header |= {"width": width, "height": height}
-            data = pixels.tobytes()
-        parts += [json.dumps(header).encode(), b"\n", data]
-    return b"".join(parts)
-
-
 @pytest.mark.parametrize("compressed", ["", "png"])
 @pytest.mark.parametrize("bag", ["drive_bag", "room_bag"])
 def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
@@ -157,18 +132,9 @@ def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
 @pytest.fixture(scope="session")
 def calibration(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Return the calibration files of the rendered stereo camera."""
-    folder = tmp_path_factory.mktemp("calibration")
-    paths = []
-    for side, camera in zip("lr", gvo.open_recording(drive_bag).info.calibrations, strict=True):
-        content = {
-            "image_width": camera.width,
-            "image_height": camera.height,
-            "camera_matrix": {"rows": 3, "cols": 3, "data": camera.P[:, :3].ravel().tolist()},
-            "projection_matrix": {"rows": 3, "cols": 4, "data": camera.P.ravel().tolist()},
-        }
-        paths.append(folder / f"{side}.yaml")
-        paths[-1].write_text(json.dumps(content))
-    return paths
+    return write_calibration(
+        gvo.open_recording(drive_bag).info, tmp_path_factory.mktemp("calibration")
+    )
 
 
 def n_poses(out: Path) -> int:

@@ -1,4 +1,4 @@
-"""The page in the browser: a recording that is tracked live, or a finished run.
+"""The page in the browser: a recording that is tracked live, a running camera, or a finished run.
 
 It needs viser (the extra `view`), which is imported when a page is served.
 """
@@ -12,6 +12,7 @@ from gvo.errors import missing_extra
 
 if TYPE_CHECKING:
     from gvo.trajectory.trajectory import Trajectory
+    from gvo.viz.view.live import LivePlayer
     from gvo.viz.view.player import Player
     from gvo.viz.view.server import ViewServer
 
@@ -19,18 +20,18 @@ __all__ = ["serve"]
 
 
 def serve(
-    source: Player | Path,
+    source: Player | LivePlayer | Path,
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
     truth: Trajectory | None = None,
     name: str = "",
 ) -> ViewServer:
-    """Serve the page of a recording that is tracked, or of a finished run.
+    """Serve the page of a recording that is tracked, of a run that goes on, or of a finished one.
 
     Parameters
     ----------
-    source : Player or Path
+    source : Player, LivePlayer or Path
         A player, which closing the page does not close, or a run folder.
     host : str
         Address to bind to; 0.0.0.0 lets everyone on the network steer the page.
@@ -51,7 +52,7 @@ def serve(
     try:
         import viser  # noqa: F401 - only whether it is there
     except ImportError as error:
-        raise missing_extra("gvo view needs viser", "view") from error
+        raise missing_extra("the page in the browser needs viser", "view") from error
     if isinstance(source, str | Path):
         from gvo.viz.view.finished import serve_record
 

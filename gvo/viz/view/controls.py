@@ -99,6 +99,16 @@ class ParameterControls:
         """Apply what the controls show; where it is refused, say why and show what is valid."""
         self._apply_values(is_typing=False)
 
+    def follow(self, config: Config) -> None:
+        """Show what was changed elsewhere, and leave the fields of all else."""
+        with self._lock:
+            before, self.config = self.config, config
+            for (section, key), control in self._controls.items():
+                value = getattr(getattr(config, section), key)
+                is_changed = value != getattr(getattr(before, section), key)
+                if is_changed and not self._is_closed:
+                    control.show(value)
+
     def _apply_values(self, *, is_typing: bool) -> None:
         """Apply values; skip a field being edited."""
         with self._lock:

@@ -76,6 +76,14 @@ class FrameView(FrameRecord):
     T_world_frame: FloatArray
     fault: str = ""
 
+    @classmethod
+    def of(
+        cls, record: FrameRecord, *, index: int, n_done: int, T_world_frame: FloatArray, fault: str
+    ) -> FrameView:
+        """Return a record with what was known with it."""
+        kept = {field.name: getattr(record, field.name) for field in fields(record)}
+        return cls(**kept, index=index, n_done=n_done, T_world_frame=T_world_frame, fault=fault)
+
     @property
     def status(self) -> Status | None:
         """What ties the frame to earlier ones; None for a faulty frame."""
@@ -197,8 +205,8 @@ class History:
             index = self.shown if index is None else index
             record = self._record(index)
             n = self._n_tracked(index)
-            return FrameView(
-                **{field.name: getattr(record, field.name) for field in fields(record)},
+            return FrameView.of(
+                record,
                 index=index,
                 n_done=self.n_done,
                 T_world_frame=self._causal.rows[n - 1].reshape(4, 4) if n else np.eye(4),

@@ -19,6 +19,7 @@ from gvo.viz.view import panels
 from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.history import FrameView
 from gvo.viz.view.layers import COLOURS
+from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.player import Player
 from gvo.viz.view.scene import Scene
 from gvo.viz.view.server import ViewServer, open_server
@@ -37,13 +38,20 @@ _NOTHING = np.zeros((0, 3))
 
 
 def serve_player(
-    player: Player, *, host: str, port: int, truth: Trajectory | None = None, name: str = ""
+    player: Player | LivePlayer,
+    *,
+    host: str,
+    port: int,
+    truth: Trajectory | None = None,
+    name: str = "",
 ) -> ViewServer:
     """Serve a player's page, at its first frame or where it is; see `gvo.viz.view.serve`."""
     view = open_server(host, port, title=f"gvo {name or player.source.info.name}".strip())
     page = Page(view.viser, player, truth=truth)
     view.on_close(page.close)
-    if player.frame_view is None:
+    if isinstance(player, LivePlayer):
+        player.is_watched = lambda: bool(view.viser.get_clients())
+    elif player.frame_view is None:
         player.seek(player.first_index)
     return view
 
@@ -54,13 +62,17 @@ class Page:
     Parameters
     ----------
     server : viser.ViserServer
-    player : Player
+    player : Player or LivePlayer
     truth : Trajectory, optional
         Of the camera, in any world.
     """
 
     def __init__(
-        self, server: viser.ViserServer, player: Player, *, truth: Trajectory | None = None
+        self,
+        server: viser.ViserServer,
+        player: Player | LivePlayer,
+        *,
+        truth: Trajectory | None = None,
     ) -> None:
         self._server = server
         self._player = player
@@ -111,18 +123,24 @@ class Page:
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
             self.message = gui.add_html(panels.message_html(""))  # in sight, whatever is unfolded
-            start = {"frame": f"the first of {self._player.n_frames} is coming"}
+            start = {"frame": "the first is coming"}
             self.numbers = gui.add_html(panels.numbers_html(start))
             hidden = {"standstill", *self._absent}
             gui.add_html(panels.legend_html(name for name in COLOURS if name not in hidden))
 
     def _add_main_panel(self) -> None:
         gui = self._server.gui
-        self.playback = panels.Playback(gui, self._player, before=self.flush)
+        player = self._player
+        if isinstance(player, LivePlayer):
+            self.playback: Any = panels.PauseButtons(gui, player, before=self.flush)
+        else:
+            self.playback = panels.Playback(gui, player, before=self.flush)
         self._view = panels.ViewPoint(self._server, "-y", is_following=True)
-        gui.add_button(
-            "restart from here", hint="Begin anew at this frame, with the parameters as they are"
-        ).on_click(self._on_restart)
+        if not isinstance(player, LivePlayer):
+            gui.add_button(
+                "restart from here",
+                hint="Begin anew at this frame, with the parameters as they are",
+            ).on_click(lambda _: self._restart(player))
         gui.add_button(
             "save as YAML", hint="For gvo run --config; the browser saves the file"
         ).on_click(self._on_save)
@@ -138,6 +156,8 @@ class Page:
             self.controls = ParameterControls(
                 gui, self._player.config, apply=self._player.reconfigure, say=self._say
             )
+        if isinstance(player, LivePlayer):
+            player.parameters.follow(self.controls.follow)
 
     def flush(self) -> None:
         """Apply the parameters as they are shown."""
@@ -153,9 +173,9 @@ class Page:
         problems = [problem for problem in (self._refusal, self._player.fault) if problem]
         self.message.content = panels.message_html("; ".join(problems))
 
-    def _on_restart(self, event: viser.GuiEvent[Any]) -> None:
+    def _restart(self, player: Player) -> None:
         self.flush()
-        self._player.restart()
+        player.restart()
 
     def _on_save(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
@@ -224,7 +244,7 @@ class Page:
             self.scene.show_cloud(*self._player.history.accumulated_cloud())
 
 
-def player_state(player: Player) -> str:
+def player_state(player: Player | LivePlayer) -> str:
     """Return what a player is doing, in a word."""
     if player.is_playing:
         return "playing"

@@ -14,6 +14,7 @@ from gvo._text import html_text
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import FloatArray, FrameResult
 from gvo.viz.view.layers import COLOURS
+from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.player import Player, RunPlayer
 from gvo.viz.view.scene import LAYERS, Scene, Up, position_sigmas
 
@@ -275,43 +276,75 @@ def frame_rows(index: int, n_frames: int, stamp_ns: int, status: str) -> dict[st
     }
 
 
-class Playback:
-    """Buttons, keys, slider and speed of what can be played.
+class PauseButtons:
+    """Buttons and a key for what goes on by itself.
 
     Parameters
     ----------
     gui : viser.GuiApi
         Where they are added.
-    playable : Player or RunPlayer
+    playable : Player, RunPlayer or LivePlayer
     before : callable
         Called before each command, so that changes until then count.
     """
 
+    _LABEL = "picture"
+    _NAMES: tuple[str, ...] = ("play", "pause")
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        playable: Player | RunPlayer | LivePlayer,
+        *,
+        before: Callable[[], None],
+    ) -> None:
+        self._shown = playable
+        self._before = before
+        buttons = gui.add_button_group(self._LABEL, self._NAMES)
+        buttons.on_click(self._on_click)
+        gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
+
+    def press(self, name: str) -> None:
+        """Do what a button does."""
+        self._before()
+        getattr(self._shown, name)()
+
+    def toggle(self) -> None:
+        """Play, or pause where it plays."""
+        self.press("pause" if self._shown.is_playing else "play")
+
+    def show(self, index: int) -> None:
+        """Take the number of the frame that is shown."""
+
+    def _on_click(self, event: viser.GuiEvent[Any]) -> None:
+        self.press(event.target.value)
+
+
+class Playback(PauseButtons):
+    """Buttons, keys, slider and speed of what can be played.
+
+    Parameters
+    ----------
+    gui, playable, before
+        As of `PauseButtons`.
+    """
+
+    _LABEL = "recording"
+    _NAMES = ("play", "pause", "step")
+
     def __init__(
         self, gui: viser.GuiApi, playable: Player | RunPlayer, *, before: Callable[[], None]
     ) -> None:
+        super().__init__(gui, playable, before=before)
         self._playable = playable
-        self._before = before
-        buttons = gui.add_button_group("recording", ("play", "pause", "step"))
         last = max(1, playable.n_frames - 1)
         self.frame: Any = gui.add_slider("frame", 0, last, 1, 0, hint="Frame that is shown")
         self.speed: Any = gui.add_dropdown(
             "speed", tuple(SPEEDS), initial_value="1 x", hint="1 x: as fast as it was recorded"
         )
-        buttons.on_click(lambda event: self.press(event.target.value))
         self.frame.on_update(self.on_seek)
         self.speed.on_update(self.on_speed)
-        gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
         gui.add_command("step", hotkey="N").on_trigger(lambda _: self.press("step"))
-
-    def press(self, name: str) -> None:
-        """Do what a button does: play, pause or step."""
-        self._before()
-        getattr(self._playable, name)()
-
-    def toggle(self) -> None:
-        """Play, or pause where it plays."""
-        self.press("pause" if self._playable.is_playing else "play")
 
     def show(self, index: int) -> None:
         """Move the slider to the frame that is shown."""

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
-from gvo.config import Config
+from gvo.backend.window import SlidingWindow
+from gvo.config import Config, DepthConfig
 from gvo.geometry.camera import PinholeCamera
 from gvo.io.excerpt import Excerpt
 from gvo.io.frames import frames, paired
 from gvo.io.recording import Source
 from gvo.odometry.odometry import Odometry
-from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, ImageArray, StereoFrame
+from gvo.types import Estimate, FaultyFrame, Frame, FrameResult, ImageArray, StereoFrame
 from gvo.viz.overlay import compose_overlay, draw_matches
 from gvo.viz.view.clouds import empty_cloud, frame_cloud
 from gvo.viz.view.history import FrameRecord
@@ -77,9 +78,7 @@ class Tracking:
         self._last_ns: int | None = None
         self._next: Frame | FaultyFrame | None = None
         self._read_ms = 0.0
-        self._frame_ms: float | None = None
-        self._stamps_ns: deque[int] = deque(maxlen=_N_POSES)
-        self._keyframes_ns: tuple[int, ...] = ()
+        self._recorder = FrameRecorder(self.camera)
 
     def peek(self) -> Frame | FaultyFrame | None:
         """Return the next frame; None at the end.
@@ -147,7 +146,7 @@ class Tracking:
         if item is None:
             return None
         self.is_finished = True  # unless all goes well
-        record = self._faulty(item) if isinstance(item, FaultyFrame) else self._track(item, index)
+        record = self._record(item, index)
         self._last_ns, self._next, self.is_finished = item.stamp_ns, None, False
         return record
 
@@ -160,48 +159,69 @@ class Tracking:
         if isinstance(self._items, Generator):
             self._items.close()
 
-    def _faulty(self, frame: FaultyFrame) -> FrameRecord:
-        picture = _draw_fault(self.camera, frame.reason)
-        poses, covariances = self._window()
-        return FrameRecord(
-            stamp_ns=frame.stamp_ns,
-            result=None,
-            reason=frame.reason,
-            image=_small_picture(picture),
-            overlay=picture,
-            cloud=empty_cloud(),
-            window_poses=poses,
-            window_covariances=covariances,
-        )
+    def _record(self, frame: Frame | FaultyFrame, index: int) -> FrameRecord:
+        result = None
+        if not isinstance(frame, FaultyFrame):
+            result = self._odometry.track(frame)
+            result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
+            self._recorder.note(result)
+        poses = self._recorder.read(self._odometry.window)
+        return self._recorder.record(frame, result, poses, index=index, depth=self.config.depth)
 
-    def _track(self, frame: Frame, index: int) -> FrameRecord:
-        result = self._odometry.track(frame)
-        result = replace(result, stage_ms={"read": self._read_ms, **result.stage_ms})
-        self._stamps_ns.append(frame.stamp_ns)
+
+class FrameRecorder:
+    """Makes of frames what a page shows of them.
+
+    Parameters
+    ----------
+    camera : StereoCamera or PinholeCamera
+    """
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        self._camera = camera
+        self._frame_ms: float | None = None
+        self._stamps_ns: deque[int] = deque(maxlen=_N_POSES)
+        self._keyframes_ns: tuple[int, ...] = ()
+
+    def note(self, result: FrameResult) -> None:
+        """Note what a frame gave, in the order of the frames."""
+        self._stamps_ns.append(result.stamp_ns)
         self._keyframes_ns = result.keyframes_ns
-        poses, covariances = self._window()
-        image = frame.left if isinstance(frame, StereoFrame) else frame.image
+
+    def read(self, window: SlidingWindow) -> dict[int, Estimate]:
+        """Return the newest poses in the window, and those of its keyframes, by stamp."""
+        known = [ns for ns in sorted({*self._keyframes_ns, *self._stamps_ns}) if ns in window]
+        return {ns: window.estimate(ns) for ns in known}
+
+    def record(
+        self,
+        frame: Frame | FaultyFrame,
+        result: FrameResult | None,
+        poses: Mapping[int, Estimate],
+        *,
+        index: int,
+        depth: DepthConfig,
+    ) -> FrameRecord:
+        """Return the record of a frame; without a result where it is faulty."""
+        if isinstance(frame, FaultyFrame) or result is None:
+            reason = getattr(frame, "reason", "")
+            image = overlay = _draw_fault(self._camera, reason)
+            cloud = empty_cloud()
+        else:
+            reason = result.reason
+            image = frame.left if isinstance(frame, StereoFrame) else frame.image
+            rate_hz = self._rate_hz(result)
+            overlay = compose_overlay(frame, result, self._camera, index=index, rate_hz=rate_hz)
+            cloud = frame_cloud(frame, result.registration, self._camera, depth)
         return FrameRecord(
             stamp_ns=frame.stamp_ns,
             result=result,
-            reason=result.reason,
+            reason=reason,
             image=_small_picture(image),
-            overlay=compose_overlay(
-                frame, result, self.camera, index=index, rate_hz=self._rate_hz(result)
-            ),
-            cloud=frame_cloud(frame, result.registration, self.camera, self.config.depth),
-            window_poses=poses,
-            window_covariances=covariances,
-        )
-
-    def _window(self) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
-        """Return poses and covariances of the newest frames in the window and of keyframes."""
-        window = self._odometry.window
-        known = [ns for ns in sorted({*self._keyframes_ns, *self._stamps_ns}) if ns in window]
-        estimates = {ns: window.estimate(ns) for ns in known}
-        return (
-            {ns: estimate.T_world_frame for ns, estimate in estimates.items()},
-            {ns: estimate.covariance for ns, estimate in estimates.items()},
+            overlay=overlay,
+            cloud=cloud,
+            window_poses={ns: estimate.T_world_frame for ns, estimate in poses.items()},
+            window_covariances={ns: estimate.covariance for ns, estimate in poses.items()},
         )
 
     def _rate_hz(self, result: FrameResult) -> float:

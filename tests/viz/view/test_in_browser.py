@@ -11,6 +11,7 @@ from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
+from tests.live.pipe import LiveCommand, names_of, sent_image
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, n_colours
 from tests.viz.view.page_driver import ViewPage
@@ -120,3 +121,46 @@ def test_the_page_of_a_finished_run_plays_and_seeks(browser: Browser, tmp_path: 
         page.wait_for_frame(N_FRAMES - 1)
         assert browser.requests_leaving() == []
         assert browser.console_errors() == []
+
+
+def test_the_page_of_a_running_camera_shows_what_comes_and_sets_parameters(
+    browser: Browser, drive_bag: Path, tmp_path: Path
+) -> None:
+    source = gvo.open_recording(drive_bag)
+    names = names_of(source)
+    images = [sent_image(image, names[image.stream]) for image in source.images()]
+    pairs = [images[index] + images[index + 1] for index in range(0, len(images), 2)]
+    with LiveCommand(source.info, tmp_path, "--view=0") as run:
+        page = ViewPage(browser, run.said("shows the run"))
+        coming = iter(range(N_FRAMES))
+
+        def show_next() -> None:
+            index = next(coming)
+            run.send(pairs[index])
+            page.wait_for_frame(index)
+
+        for _ in range(3):
+            show_next()
+        before = page.number("keypoints")
+        assert page.cell("status") == "ok"
+        assert n_colours(page.scene()) > 20
+
+        page.unfold("Parameters", "klt")
+        page.type_number("n_corners", "1")  # below its range
+        browser.wait(lambda: "n_corners" in page.cell("message"), message="1 is not refused")
+        page.type_number("n_corners", str(before // 2))
+        browser.wait(lambda: page.cell("message") == "", message="the parameter is not taken")
+        show_next()
+        assert 0 < page.number("keypoints") <= 0.6 * before
+
+        page.press("pause")
+        browser.wait(lambda: page.cell("player") == "paused", message="it does not pause")
+        run.send(pairs[next(coming)])
+        page.press("play")
+        browser.wait(lambda: page.cell("player") == "playing", message="it does not play")
+        show_next()
+        assert browser.requests_leaving() == []
+        assert browser.console_errors() == []
+        code, out, err = run.end()
+    assert code == 0, err
+    assert "6 frames, all tracked" in out
