@@ -60,9 +60,16 @@ class FolderStreams(ABC):
             last_ns[image.stream] = image.stamp_ns
             yield image
 
-    @abstractmethod
     def add(self, image: StampedImage) -> bool:
         """Write an image; False, with a note, where it cannot be read."""
+        name, prepare = self.name_of(image.stream), self._preparers[image.stream]
+        pixels = load_image(image, prepare, name, self.left_out)
+        if pixels is not None:
+            self._write(image, pixels)
+        return pixels is not None
+
+    @abstractmethod
+    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None: ...
 
     @abstractmethod
     def add_truth(self, truth: Trajectory) -> int:
@@ -71,11 +78,6 @@ class FolderStreams(ABC):
     @abstractmethod
     def close(self) -> None:
         """Write what is known at the end."""
-
-    def load(self, image: StampedImage) -> NDArray[Any] | None:
-        """Return the pixels to write; None, with a note, where they cannot be read."""
-        prepare = self._preparers[image.stream]
-        return load_image(image, prepare, self.name_of(image.stream), self.left_out)
 
     def name_of(self, stream: int) -> str:
         """Return what an image of a stream is called in notes."""
@@ -106,20 +108,15 @@ class KittiFolder(FolderStreams):
         folder.mkdir()
 
     def select(self, images: Iterator[StampedImage]) -> Iterator[StampedImage]:
-        """Yield the images of pairs, left before right."""
+        """Yield the images of pairs, left before right; what cannot be read keeps its number."""
         for pair in paired(images, self.info.sensor, self._sync):
             if isinstance(pair, FaultyFrame):
                 self.left_out.add_image(self.name_of(0), pair.stamp_ns, pair.reason)
             else:
+                self._stamps_ns.append(pair[0].stamp_ns)
                 yield from pair
 
-    def add(self, image: StampedImage) -> bool:
-        """Write an image; False, with a note, where it cannot be read: its number stays free."""
-        if image.stream == 0:
-            self._stamps_ns.append(image.stamp_ns)
-        pixels = self.load(image)
-        if pixels is None:
-            return False
+    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
         if self._folders is None:
             self._folders = ("image_2", "image_3") if pixels.ndim == 3 else ("image_0", "image_1")
             for name in self._folders:
@@ -127,7 +124,6 @@ class KittiFolder(FolderStreams):
         number = len(self._stamps_ns) - 1
         path = self._folder / self._folders[image.stream] / f"{number:06d}.png"
         path.write_bytes(encode_image(pixels, ".png"))
-        return True
 
     def add_truth(self, truth: Trajectory) -> int:
         """Write a pose for each pair, where there is one for all of them."""
@@ -178,16 +174,11 @@ class EurocFolder(FolderStreams):
         for name in ("cam0", "cam1"):
             (self._root / name / "data").mkdir(parents=True)
 
-    def add(self, image: StampedImage) -> bool:
-        """Write an image; False, with a note, where it cannot be read."""
-        pixels = self.load(image)
-        if pixels is None:
-            return False
+    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
         name = f"{image.stamp_ns}.png"
         path = self._root / f"cam{image.stream}" / "data" / name
         path.write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{image.stamp_ns},{name}\n")
-        return True
 
     def add_truth(self, truth: Trajectory) -> int:
         """Write the poses of the body."""
@@ -238,11 +229,7 @@ class TumFolder(FolderStreams):
         for name in ("rgb", "depth"):
             (folder / name).mkdir(parents=True)
 
-    def add(self, image: StampedImage) -> bool:
-        """Write an image; False, with a note, where it cannot be read."""
-        pixels = self.load(image)
-        if pixels is None:
-            return False
+    def _write(self, image: StampedImage, pixels: NDArray[Any]) -> None:
         name = f"{('rgb', 'depth')[image.stream]}/{format_stamp(image.stamp_ns)}.png"
         if image.stream == 1:
             if self._scale is None:
@@ -251,7 +238,6 @@ class TumFolder(FolderStreams):
             self._n_cut += n_cut
         (self._folder / name).write_bytes(encode_image(pixels, ".png"))
         self._tables[image.stream].append(f"{format_stamp(image.stamp_ns)} {name}\n")
-        return True
 
     def add_truth(self, truth: Trajectory) -> int:
         """Write the poses as they are."""

@@ -50,24 +50,11 @@ class TopicTruth:
     name: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FileTruth:
-    """The poses of a file or of another recording.
-
-    Parameters
-    ----------
-    path : Path
-    """
-
-    path: Path
-
-
 BagTruthSpec: TypeAlias = TfTruth | TopicTruth
-TruthSpec: TypeAlias = BagTruthSpec | FileTruth
 
 
-def parse_truth(text: str) -> TruthSpec:
-    """Read what `--ground-truth` names.
+def parse_truth(text: str) -> BagTruthSpec | Path:
+    """Read what `--ground-truth` names: poses in the bag, or of a file or another recording.
 
     Parameters
     ----------
@@ -87,7 +74,7 @@ def parse_truth(text: str) -> TruthSpec:
     TopicTruth(name='/vicon/drone')
     """
     if exists(Path(text)):
-        return FileTruth(path=Path(text))
+        return Path(text)
     spec = parse_bag_truth(text) if text.startswith(("tf:", "topic:", "/")) else None
     if spec is None:
         raise TrajectoryError(f"{text}: there is no such file; expected {_KINDS}")

@@ -18,7 +18,6 @@ from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.poses.ground_truth import (
     TRUTH_TYPES,
     BagTruth,
-    FileTruth,
     find_named_truth,
     parse_bag_truth,
     parse_truth,
@@ -223,10 +222,9 @@ def read_truth(source: Source, text: str, *, base_frame: BaseFrame | None = None
     """
     base_frame = base_frame or BaseFrame()
     spec = parse_truth(text)
-    if isinstance(spec, FileTruth):
-        trajectory = read_ground_truth(spec.path)
-        repeats = _repeats(str(spec.path), trajectory)
-        return Truth(trajectory=trajectory, decision=repeats or str(spec.path))
+    if isinstance(spec, Path):
+        trajectory = read_ground_truth(spec)
+        return Truth(trajectory=trajectory, decision=_repeats(str(spec), trajectory) or str(spec))
     if not isinstance(source, BagSource):
         raise TrajectoryError(
             f"{text}: names what is in a bag, and {source.info.name} is none; give a file"

@@ -15,7 +15,6 @@ from gvo.io.poses.ground_truth import (
     TRUTH_FRAMES,
     BagTruth,
     BagTruthSpec,
-    FileTruth,
     TfTruth,
     TopicTruth,
     find_named_truth,
@@ -324,9 +323,9 @@ def test_a_topic_has_a_slash_or_is_called_one(name: str) -> None:
 def test_a_file_that_exists_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "tf:map:base"
     path.touch()
-    assert parse_truth(str(path)) == FileTruth(path=path)
+    assert parse_truth(str(path)) == path
     monkeypatch.chdir(tmp_path)
-    assert parse_truth("tf:map:base") == FileTruth(path=Path("tf:map:base"))
+    assert parse_truth("tf:map:base") == Path("tf:map:base")
     path.unlink()
     assert parse_truth("tf:map:base") == TfTruth(parent="map", child="base")
 
