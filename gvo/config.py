@@ -307,9 +307,6 @@ class WindowConfig(Section):
     lost_after_s: float = _parameter(
         2.0, "time without a registration until the camera is lost and a segment begins", "s", gt=0
     )
-    relocalize: bool = _parameter(
-        True, "after that, search the keyframes of earlier segments to join them"
-    )
     zero_motion: bool = _parameter(
         False, "at standstill, add a zero-motion edge to the previous frame"
     )
@@ -325,7 +322,9 @@ class WindowConfig(Section):
 class LoopsConfig(Section):
     """Places seen again, and the global poses."""
 
-    enabled: bool = _common(True, "look for loops, and write the global poses")
+    enabled: bool = _common(
+        True, "look for places seen before: join segments, close loops, write global poses"
+    )
 
 
 class RuntimeConfig(Section):

@@ -42,6 +42,8 @@ from gvo.types import FloatArray, IntArray
 VISIT_M, VISIT_RAD, VISIT_S = 2.0, np.radians(20.0), 10.0
 WRONG_M, WRONG_RAD, UNLIKELY_SIGMAS = 0.5, np.radians(5.0), 5.0
 BREATH_S = 40.0
+# Poses that a trajectory is aligned by.
+MIN_TRACKED = 3
 HEADER = (
     "recording",
     "ATE smoothed [m]",
@@ -156,8 +158,10 @@ def judge(source: Source, config: gvo.Config, spoiling: Spoiling) -> list[float]
         truth = source.ground_truth()
         if truth is None:
             raise gvo.GvoError(f"{source.info.name}: expected a ground truth, found none")
-        if "global" not in record.trajectories:
-            print("; ".join(record.summary["warnings"]))
+        estimates = [tracked(record, each) for each in record.comparable().values()]
+        n_tracked = min(map(len, estimates))
+        if "global" not in record.trajectories or n_tracked < MIN_TRACKED:
+            print(f"{source.info.name}, {n_tracked} frames tracked:", *record.summary["warnings"])
             return [np.nan] * (len(HEADER) + 1 + (len(UNBROKEN_HEADER) if spoiling.dark_s else 0))
         estimates = [tracked(record, record.comparable()[name]) for name in ("smoothed", "global")]
         ates = [gvo.evaluate(truth, estimate, name="").ate_m for estimate in estimates]

@@ -89,6 +89,7 @@ class Frontend:
             slopes=np.zeros((N_POINTS, 2), np.float32),
             patches=np.zeros((N_POINTS, 11, 11), np.uint8),
             descriptors_left=words ^ flipped,
+            descriptors_wide=np.zeros_like(words),
         )
 
     def describe(self, place: KltPlace) -> KltPlace:

@@ -12,7 +12,7 @@ from gvo.config import Config
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.features import FeatureExtractor, Features, thin
 from gvo.frontend.matching import match_temporal, predict_pixels
-from gvo.frontend.registration import check_view, relocalize_observations
+from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import sample_depth
 from gvo.frontend.stereo.matching import is_in_depth_range, match_stereo, refine_disparities
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -161,15 +161,6 @@ class DescriptorFrontend:
         # Nothing predicted it: what else it predicts must be there too.
         return self._check_view(reference, current, rough)
 
-    def relocalize(self, reference: Observations, current: Observations) -> RelativePose | Failure:
-        """Estimate the motion between frames that may be far apart, see `match_anywhere`."""
-        rough = relocalize_observations(
-            reference, current, self.camera, self._config, offset_px=self._offset_px()
-        )
-        if isinstance(rough, Failure):
-            return rough
-        return self._check_view(reference, current, rough)
-
     def describe(self, observations: Observations) -> Observations:
         """Return a frame as a place: fewer points, without what only neighbours need."""
         chosen = thin(len(observations))
@@ -187,7 +178,15 @@ class DescriptorFrontend:
         self, reference: Observations, current: Observations, observations: Observations
     ) -> RelativePose | Failure:
         """Estimate the motion from a place to a frame, given with its own place."""
-        return self.relocalize(reference, observations)
+        first, second = reference.descriptors_left, observations.descriptors_left
+        rough = register_anywhere(
+            *(reference, observations, match_anywhere([first], [second])),
+            *(self.camera, self._config),
+            offset_px=self._offset_px(),
+        )
+        if isinstance(rough, Failure):
+            return rough
+        return self._check_view(reference, observations, rough)
 
     def _check_view(
         self, reference: Observations, current: Observations, rough: RelativePose

@@ -23,6 +23,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gvo._trace import note
@@ -38,9 +39,8 @@ _BORDER_PX = 19
 _N_CANDIDATES = 8
 # Points of a place, spread over those of its frame.
 _MAX_POINTS = 400
-# Size of the patches that are described, and the border that they need.
+# Size of the patches that are described.
 _PATCH_PX = 31
-_BORDER_PX = 19
 _N_VALUES = 1 << 16
 # Words in more than this share of the places tell nothing, beyond so many places.
 _COMMON_SHARE = 0.1
@@ -242,39 +242,51 @@ def _typed(descriptors: NDArray[Any], kind: str) -> Descriptors:
     return np.asarray(descriptors, dtype=np.uint8)
 
 
-def describe_pixels(image: ImageArray, pixels: FloatArray) -> tuple[IntArray, NDArray[np.uint8]]:
-    """Describe pixels by ORB, upright and of one size.
+def describe_pixels(image: ImageArray, pixels: FloatArray, scale: float = 1.0) -> NDArray[np.uint8]:
+    """Describe pixels by ORB, turned as the patches around them are, beyond the border mirrored.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width)
     pixels : ndarray of float64, shape (n, 2)
+    scale : float
+        Of the patches, 31 pixels wide at 1.
 
     Returns
     -------
-    chosen : ndarray of int64, shape (m,)
-        Indices of the pixels that are far enough from the border, at most 400 of them.
-    descriptors : ndarray of uint8, shape (m, 32)
+    ndarray of uint8, shape (n, 32)
 
     References
     ----------
     E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011,
     doi:10.1109/ICCV.2011.6126544.
     """
-    height, width = image.shape
-    inside = np.all(pixels >= _BORDER_PX, axis=1)
-    inside &= np.all(pixels < [width - _BORDER_PX, height - _BORDER_PX], axis=1)
-    chosen = np.flatnonzero(inside)
-    chosen = chosen[thin(len(chosen))]
+    if len(pixels) == 0:
+        return np.zeros((0, 32), dtype=np.uint8)
+    size = np.maximum(np.rint(np.array(image.shape[::-1]) / scale), 1.0).astype(np.int64)
+    small = cv2.resize(image, size.tolist())
+    padded: ImageArray = np.asarray(
+        cv2.copyMakeBorder(small, *(_BORDER_PX,) * 4, cv2.BORDER_REFLECT_101), dtype=np.uint8
+    )
+    places = np.clip((pixels + 0.5) / scale - 0.5, 0.0, size - 1.01) + _BORDER_PX
     points = [
-        cv2.KeyPoint(u, v, float(_PATCH_PX), 0.0, 0.0, 0, index)
-        for index, (u, v) in zip(chosen.tolist(), pixels[chosen].tolist(), strict=True)
+        cv2.KeyPoint(u, v, float(_PATCH_PX), angle, 0.0, 0)
+        for (u, v), angle in zip(places.tolist(), _directions(padded, places), strict=True)
     ]
-    orb = cv2.ORB_create(edgeThreshold=_BORDER_PX, patchSize=_PATCH_PX)  # type: ignore[attr-defined]
-    found, descriptors = orb.compute(image, points)
-    if descriptors is None:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 32), dtype=np.uint8)
-    return np.array([point.class_id for point in found], dtype=np.int64), descriptors
+    orb = cv2.ORB_create(edgeThreshold=_BORDER_PX, patchSize=_PATCH_PX, nlevels=1)  # type: ignore[attr-defined]
+    return np.asarray(orb.compute(padded, points)[1], dtype=np.uint8)
+
+
+def _directions(image: ImageArray, pixels: FloatArray) -> list[float]:
+    """Return where the centroid of the grey values around each pixel lies, degrees."""
+    reach = np.arange(-(_PATCH_PX // 2), _PATCH_PX // 2 + 1, dtype=np.float32)
+    offsets = np.stack(np.meshgrid(reach, reach), axis=2)
+    offsets[np.hypot(offsets[..., 0], offsets[..., 1]) > reach[-1]] = 0.0
+    u, v = np.rint(pixels).astype(np.int64).T - _PATCH_PX // 2
+    patches = sliding_window_view(image, offsets.shape[:2])[v, u].astype(np.float32)
+    x, y = (patches.reshape(len(pixels), -1) @ offsets.reshape(-1, 2)).T
+    angles: list[float] = (np.degrees(np.arctan2(y, x)) % 360.0).tolist()
+    return angles
 
 
 def thin(n: int) -> IntArray:

@@ -16,9 +16,9 @@ from gvo.config import Config
 from gvo.frontend.alignment import Templates, cut_patches, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
-from gvo.frontend.descriptor import DescriptorFrontend, as_stereo
-from gvo.frontend.features import describe_pixels
-from gvo.frontend.registration import check_view, relocalize_observations
+from gvo.frontend.descriptor import as_stereo
+from gvo.frontend.features import describe_pixels, thin
+from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
 from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
 from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
@@ -57,8 +57,8 @@ _MIN_SHARE_ALIGNED = 0.1
 # than 0.35; of keyframes asked in vain 0.13, and seldom more than 0.3.
 _N_SAMPLED = 40
 _MIN_SHARE_TRACKED = 0.25
-# Number of frames whose descriptors are cached.
-_N_DESCRIBED = 3
+# Patches of a place are described in another size too: it is seen again from farther, or nearer.
+_WIDE = 1.5
 # How tracks are found: over more levels of the pyramid; near the predicted pixels; by alignment
 # alone, where the prediction is that of poses that are known.
 _Search: TypeAlias = Literal["wide", "near", "aligned"]
@@ -93,9 +93,7 @@ class KltFrontend:
         self.rig_offsets = rig_offsets or RigOffsets(config, is_stereo=self._is_stereo)
         self._calibrated = CalibratedCamera(self.camera, self.rig_offsets)
         self._config = config
-        self._descriptors = DescriptorFrontend(camera, config)
         self._depths = DepthAligner(self.camera, config.depth)
-        self._described: dict[int, Observations] = {}
         self._pool = ThreadPoolExecutor(1, "corners") if config.runtime.threads > 2 else None
 
     def extract(self, frame: Frame) -> KltObservations:
@@ -232,35 +230,13 @@ class KltFrontend:
         """Register in two rounds: over more levels of the pyramid, and from the result."""
         rough = self._register_from(prior, reference, current, "wide", is_step=True)
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
-            # Descriptors match corners that moved too far for a track.
-            described = self._describe(reference), self._describe(current)
-            rough = self._descriptors.register(*described)
-            self._forget_described()
+            rough = self._register_places(self.describe(reference), self.describe(current))
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)
         result = self._register_from(found, reference, current, "near", is_step=True)
         # Nothing predicted it: what else it predicts must be there too.
         return check_view(result, reference.points_cam, self.camera)
-
-    def relocalize(
-        self, reference: KltObservations, current: KltObservations
-    ) -> RelativePose | Failure:
-        """Estimate the motion between frames that may be far apart, by descriptors and tracks."""
-        first, second = self._describe(reference), self._describe(current)
-        offset_px = self._offsets_px()[0]
-        rough = relocalize_observations(
-            first, second, self.camera, self._config, offset_px=offset_px
-        )
-        self._forget_described()
-        if isinstance(rough, Failure):
-            return rough
-        prior = MotionPrior(T_predicted=rough.T_reference_current)
-        result = self._register_from(prior, reference, current, "near", is_step=False)
-        result = check_view(result, reference.points_cam, self.camera)
-        if isinstance(result, Failure):
-            return result
-        return self._check_depth(reference, current, result)
 
     def align_depth(
         self,
@@ -277,7 +253,8 @@ class KltFrontend:
     def describe(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place: small, but for its image all that `recognize` needs."""
         frame, corners = observations.frame, observations.find_corners()
-        chosen, descriptors = describe_pixels(observations.image, corners.keypoints)
+        image, chosen = observations.image, thin(len(corners.keypoints))
+        keypoints = corners.keypoints[chosen]
         depth_points = None
         if isinstance(frame, RgbdFrame):
             points = grid_points(frame.depth, self.camera, self._config.depth)
@@ -287,8 +264,9 @@ class KltFrontend:
             pixels=observations.uvd[chosen].astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
             slopes=corners.slopes[chosen].astype(np.float32),
-            patches=cut_patches(observations.image, corners.keypoints[chosen]),
-            descriptors_left=descriptors,
+            patches=cut_patches(image, keypoints),
+            descriptors_left=describe_pixels(image, keypoints),
+            descriptors_wide=describe_pixels(image, keypoints, _WIDE),
             depth_points=depth_points,
         )
         self.rig_offsets.velocities.copy(observations, place)
@@ -309,11 +287,7 @@ class KltFrontend:
         -------
         RelativePose or Failure
         """
-        offset_px = self._offsets_px()[0]
-        first, second = (self._as_observations(place) for place in (reference, current))
-        rough = relocalize_observations(
-            first, second, self.camera, self._config, offset_px=offset_px
-        )
+        rough = self._register_places(reference, current)
         if isinstance(rough, Failure):
             return rough
         prior = MotionPrior(T_predicted=rough.T_reference_current)
@@ -324,6 +298,15 @@ class KltFrontend:
             return result
         return check_depths(
             result, points.astype(np.float64), frame.depth, self.camera, self._config.depth
+        )
+
+    def _register_places(self, reference: KltPlace, current: KltPlace) -> RelativePose | Failure:
+        """Register by descriptors, which match corners that moved too far for a track."""
+        first, second = (self._as_observations(place) for place in (reference, current))
+        matches = match_anywhere(reference.descriptors, current.descriptors)
+        offset_px = self._offsets_px()[0]
+        return register_anywhere(
+            first, second, matches, self.camera, self._config, offset_px=offset_px
         )
 
     def _as_observations(self, place: KltPlace) -> Observations:
@@ -346,16 +329,6 @@ class KltFrontend:
             points = grid_points(first.depth, self.camera, self._config.depth)
             return check_depths(result, points, second.depth, self.camera, self._config.depth)
         return result
-
-    def _forget_described(self) -> None:
-        for stamp_ns in sorted(self._described)[:-_N_DESCRIBED]:
-            del self._described[stamp_ns]
-
-    def _describe(self, observations: KltObservations) -> Observations:
-        stamp_ns = observations.stamp_ns
-        if stamp_ns not in self._described:
-            self._described[stamp_ns] = self._descriptors.extract(observations.frame)
-        return self._described[stamp_ns]
 
     def _register_from(
         self,
@@ -662,7 +635,8 @@ class KltPlace:
     slopes : ndarray of float32, shape (n, 2)
         Of the disparities.
     patches : ndarray of uint8, shape (n, 11, 11)
-    descriptors_left : ndarray of uint8, shape (n, 32)
+    descriptors_left, descriptors_wide : ndarray of uint8, shape (n, 32)
+        Of patches of two sizes.
     depth_points : ndarray of float32, shape (m, 3), or None
         A grid of the depth image as points, metres.
     """
@@ -673,7 +647,13 @@ class KltPlace:
     slopes: NDArray[np.float32]
     patches: NDArray[np.uint8]
     descriptors_left: NDArray[np.uint8]
+    descriptors_wide: NDArray[np.uint8]
     depth_points: NDArray[np.float32] | None = None
+
+    @property
+    def descriptors(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The descriptors of the corners, of both sizes."""
+        return self.descriptors_left, self.descriptors_wide
 
     @property
     def uvd(self) -> FloatArray:

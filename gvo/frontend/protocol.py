@@ -26,7 +26,7 @@ class Frontend(Protocol[ObservationsT]):
 
     Any object with these two methods will do; nothing is to be inherited. Observations are the
     front-end's own affair but for their `stamp_ns`; what else is used of them is in `HasPoints`,
-    `CountsKeypoints` and their length. What else a front-end may offer is in `Relocalizer`,
+    `CountsKeypoints` and their length. What else a front-end may offer is in `Recognizer`,
     `Reconfigurable`, `HasCamera`, `AlignsDepth` and `LearnsRig`, looked up once when `Odometry` is
     made.
 
@@ -63,16 +63,6 @@ class Frontend(Protocol[ObservationsT]):
         """
 
 
-class Relocalizer(Protocol):
-    """A front-end that finds a place again, however far apart two frames are."""
-
-    def relocalize(self, reference: _Own, current: _Own, /) -> RelativePose | Failure:
-        """Estimate the motion between two frames; rather fail than be wrong.
-
-        Without this method `register` is called, without a prior.
-        """
-
-
 class Reconfigurable(Protocol):
     """A front-end whose parameters can change while it runs."""
 
@@ -106,7 +96,7 @@ class LearnsRig(Protocol):
 
 
 class Recognizer(Protocol):
-    """A front-end that knows frames again that it keeps small: loops need one.
+    """A front-end that knows frames again that it keeps small: loops and lost cameras need one.
 
     A place has `stamp_ns`, `points_cam` (n, 3) and `descriptors_left` (n, m); what else
     `recognize` needs is the front-end's own affair.
@@ -161,7 +151,6 @@ class CheckedFrontend(Generic[ObservationsT]):
 
     def __init__(self, frontend: Frontend[ObservationsT]) -> None:
         self._frontend = frontend
-        self._relocalizer: Relocalizer | None = _capability(frontend, "relocalize")
         self._reconfigurable: Reconfigurable | None = _capability(frontend, "reconfigure")
         self._learner: LearnsRig | None = _capability(frontend, "rig_offsets")
         self._aligner: AlignsDepth | None = _capability(frontend, "align_depth")
@@ -173,11 +162,6 @@ class CheckedFrontend(Generic[ObservationsT]):
         """The front-end's own camera, where it has one; `reconfigure` may change it."""
         camera = None if self._camera_holder is None else self._camera_holder.camera
         return camera if isinstance(camera, StereoCamera | PinholeCamera) else None
-
-    @property
-    def offers_relocalization(self) -> bool:
-        """Tell whether the front-end is a `Relocalizer`."""
-        return self._relocalizer is not None
 
     @property
     def rig_offsets(self) -> RigOffsets | None:
@@ -200,16 +184,9 @@ class CheckedFrontend(Generic[ObservationsT]):
             When the front-end returns neither RelativePose nor Failure.
         """
         note("frontend.begin", reference=reference)
-        return self._check("register", self._frontend.register(reference, current, prior))
-
-    def relocalize(
-        self, reference: ObservationsT, current: ObservationsT
-    ) -> RelativePose | Failure:
-        """Register two frames of unknown motion; raises as `register`."""
-        if self._relocalizer is None:
-            return self.register(reference, current, None)
-        note("frontend.begin", reference=reference)
-        return self._check("relocalize", self._relocalizer.relocalize(reference, current))
+        result = self._checked("register", self._frontend.register(reference, current, prior))
+        note("frontend.end", result=result)
+        return result
 
     def align_depth(
         self, reference: ObservationsT, current: ObservationsT, T_reference_current: FloatArray
@@ -224,11 +201,6 @@ class CheckedFrontend(Generic[ObservationsT]):
         """Hand over a configuration, where the front-end takes one."""
         if self._reconfigurable is not None:
             self._reconfigurable.reconfigure(config)
-
-    def _check(self, method: str, result: object) -> RelativePose | Failure:
-        checked = self._checked(method, result)
-        note("frontend.end", result=checked)
-        return checked
 
     def _checked(self, method: str, result: object) -> RelativePose | Failure:
         if not isinstance(result, RelativePose | Failure):

@@ -1,7 +1,8 @@
-"""Relative pose from 3D-3D correspondences, between neighbours and for relocalization."""
+"""Relative pose from 3D-3D correspondences, between neighbours and for places seen again."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import Config
+from gvo.frontend.matching import mutual_best
 from gvo.frontend.verification import verify_motion
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
@@ -37,9 +39,10 @@ _N_ROUGH_ITERATIONS = 2
 _MAX_RATIO = 0.8
 # More RANSAC hypotheses: more matches are wrong than between neighbouring frames.
 _N_HYPOTHESES = 1000
-# By chance few matches agree; of a place seen again most do.
-_MIN_INLIERS_FACTOR = 2
-_MIN_INLIER_SHARE = 0.4
+# Matches that have to agree, before the view tells: at least, and as a share. Of places that are
+# seen again from elsewhere a quarter of the matches is right, often fewer than twenty.
+_MIN_INLIERS = 8
+_MIN_INLIER_SHARE = 0.2
 # Share of the points in view. In rendered streets of repeated facades, places that only look alike
 # reach 0.16 and the same place, seen from 10 m behind, 0.26; in a room it has 0.45.
 _MIN_SHARE_OF_VIEW = 0.25
@@ -228,45 +231,48 @@ def _weights(correspondences: Correspondences, config: Config) -> FloatArray | N
     return np.asarray(1.0 / correspondences.target_points[:, 2] ** 2)
 
 
-def match_anywhere(reference: Observations, current: Observations) -> IntArray:
+def match_anywhere(reference: Sequence[NDArray[Any]], current: Sequence[NDArray[Any]]) -> IntArray:
     """Match descriptors of the whole images: ratio test, reciprocal.
 
     Parameters
     ----------
-    reference, current : Observations
+    reference, current : sequences of ndarray of uint8 or float32, shape (n, m)
+        Descriptors of the same points, one array for each size of their patches. The first size
+        is compared with all of the other image: what is nearer there looks larger.
 
     Returns
     -------
     ndarray of int64, shape (m, 2)
         Indices into reference and current, each at most once.
     """
-    first, second = reference.descriptors_left, current.descriptors_left
-    if min(len(first), len(second)) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    forth, back = _best(first, second), _best(second, first)
-    indices = np.flatnonzero(forth >= 0)
-    is_mutual = back[forth[indices]] == indices
-    pairs = np.column_stack([indices, forth[indices]])
-    return np.asarray(pairs[is_mutual])
+    sizes = [(reference[0], each) for each in current]
+    sizes += [(each, current[0]) for each in reference[1:]]
+    found = [_match(*each) for each in sizes]
+    pairs = np.concatenate([each[0] for each in found])
+    distances = np.concatenate([each[1] for each in found])
+    return np.asarray(pairs[mutual_best(pairs, distances, len(reference[0]), len(current[0]))])
 
 
-def relocalize_observations(
+def register_anywhere(
     reference: Observations,
     current: Observations,
+    matches: IntArray,
     camera: StereoCamera,
     config: Config,
     *,
     offset_px: float,
 ) -> RelativePose | Failure:
-    """Estimate the motion between two frames far apart, from descriptors of the whole images.
+    """Estimate the motion between two frames far apart; the view has to confirm it.
 
     Parameters
     ----------
     reference, current : Observations
+    matches : ndarray of int64, shape (n, 2)
+        See `match_anywhere`.
     camera : StereoCamera
         Of both frames.
     config : Config
-        Sections `ransac` and `registration`; more matches must agree than between neighbours.
+        Sections `ransac` and `registration`; fewer matches have to agree than between neighbours.
     offset_px : float
         To be taken off all disparities.
 
@@ -274,26 +280,18 @@ def relocalize_observations(
     -------
     RelativePose or Failure
     """
-    matches = match_anywhere(reference, current)
-    n_hypotheses = max(config.ransac.n_hypotheses, _N_HYPOTHESES)
-    ransac = config.ransac.model_copy(update={"n_hypotheses": n_hypotheses})
-    result = register_correspondences(
+    ransac, n_needed = config.ransac, max(_MIN_INLIERS, int(_MIN_INLIER_SHARE * len(matches)))
+    few = {
+        "n_hypotheses": max(ransac.n_hypotheses, _N_HYPOTHESES),
+        "min_inliers": min(ransac.min_inliers, n_needed),
+    }
+    return register_correspondences(
         Correspondences.of(reference, current, matches).without_offset(offset_px, camera),
         matches,
         camera,
-        config.model_copy(update={"ransac": ransac}),
+        config.model_copy(update={"ransac": ransac.model_copy(update=few)}),
         stamps_ns=(reference.stamp_ns, current.stamp_ns),
     )
-    n_needed = max(
-        _MIN_INLIERS_FACTOR * config.ransac.min_inliers, _MIN_INLIER_SHARE * len(matches)
-    )
-    if isinstance(result, Failure) or result.n_inliers >= n_needed:
-        return result
-    reason = (
-        f"{result.n_inliers} of {len(matches)} matches agree, too few to know a place again: "
-        f"{n_needed:.0f} are needed"
-    )
-    return Failure(reason=reason, n_matches=len(matches), n_inliers=result.n_inliers)
 
 
 def check_view(
@@ -362,10 +360,20 @@ def _n_occupied(bands: FloatArray) -> float:
     return float(np.exp(-shares @ np.log(shares)))
 
 
-def _best(first: NDArray[Any], second: NDArray[Any]) -> IntArray:
-    """Return the match of each descriptor that passes the ratio test, shape (n,); else -1."""
-    norm = cv2.NORM_HAMMING if first.dtype == np.uint8 else cv2.NORM_L2
-    nearest = cv2.BFMatcher(norm).knnMatch(first, second, k=2)
-    best = np.array([pair[0].trainIdx for pair in nearest], dtype=np.int64)
-    distances: FloatArray = np.array([[match.distance for match in pair] for pair in nearest])
-    return np.where(distances[:, 0] <= _MAX_RATIO * distances[:, 1], best, -1)
+def _match(first: NDArray[Any], second: NDArray[Any]) -> tuple[IntArray, FloatArray]:
+    """Return pairs that are the best of both and pass the ratio test, and their distances."""
+    if min(len(first), len(second)) < 2:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    (forth, distances), (back, _) = _best(first, second), _best(second, first)
+    indices = np.flatnonzero(forth >= 0)
+    indices = indices[back[forth[indices]] == indices]
+    return np.column_stack([indices, forth[indices]]), distances[indices]
+
+
+def _best(first: NDArray[Any], second: NDArray[Any]) -> tuple[IntArray, FloatArray]:
+    """Return the match of each descriptor that passes the ratio test, else -1; its distance."""
+    is_binary = first.dtype == np.uint8
+    kind, norm = (cv2.CV_32S, cv2.NORM_HAMMING) if is_binary else (cv2.CV_32F, cv2.NORM_L2)
+    distances, nearest = cv2.batchDistance(first, second, kind, normType=norm, K=2)
+    is_distinct = distances[:, 0] <= _MAX_RATIO * distances[:, 1]
+    return np.where(is_distinct, nearest[:, 0], -1), distances[:, 0].astype(np.float64)

@@ -144,11 +144,6 @@ class RawStep:
         return self.reference_ns is None or self.registration is not None
 
     @property
-    def registered_ns(self) -> int | None:
-        """Stamp of the frame that this one is registered against; None where there is none."""
-        return None if self.registration is None else self.reference_ns
-
-    @property
     def edge(self) -> Edge:
         """The step as a measurement."""
         return Edge(

@@ -180,15 +180,21 @@ class _Way(NamedTuple):
             self.part + is_guess,
         )
 
+    def covariance_since(self, other: _Way, *, drifts: bool) -> FloatArray:
+        """Return the covariance of what lies between another keyframe and this one, in its axes."""
+        n_steps = self.n_steps - other.n_steps
+        covariance = np.sign(n_steps) * (self.covariance - other.covariance)
+        if drifts:
+            covariance = covariance + n_steps * (self.drift - other.drift)
+        Ad = se3.adjoint(se3.invert(self.T_first_keyframe))
+        return np.asarray(Ad @ covariance @ Ad.T)
+
     def chi2(self, loop: Loop, before: _Way, *, drifts: bool) -> float:
         """Return by how much a loop to a keyframe before contradicts the way from there."""
-        T_frame_first = se3.invert(self.T_first_keyframe)
-        covariance, n_steps = self.covariance - before.covariance, self.n_steps - before.n_steps
-        if drifts:
-            covariance = covariance + n_steps * (self.drift - before.drift)
-        Ad = se3.adjoint(T_frame_first)
-        error = se3.log(T_frame_first @ before.T_first_keyframe @ loop.T_reference_frame)
-        return float(se3.mahalanobis(error, Ad @ covariance @ Ad.T + loop.covariance))
+        T_frame_before = se3.invert(self.T_first_keyframe) @ before.T_first_keyframe
+        error = se3.log(T_frame_before @ loop.T_reference_frame)
+        covariance = self.covariance_since(before, drifts=drifts) + loop.covariance
+        return float(se3.mahalanobis(error, covariance))
 
 
 class _Solution(NamedTuple):
@@ -305,6 +311,22 @@ class RunGraph:
         the others is only guessed.
         """
         return min((self._worlds.get(e.reference_id, 0) for e in edges), default=self._n_worlds)
+
+    def from_keyframe(self, stamp_ns: int, loop: Loop) -> Edge | None:
+        """Return a loop as an edge from another keyframe, by the way between; None if guessed."""
+        if stamp_ns == loop.reference_ns:
+            return loop.edge
+        if not {stamp_ns, loop.reference_ns} <= self._ways.keys():
+            return None
+        first, second = self._ways[stamp_ns], self._ways[loop.reference_ns]
+        if first.part != second.part:
+            return None
+        way = Edge(
+            reference_id=stamp_ns,
+            T_reference_frame=se3.invert(first.T_first_keyframe) @ second.T_first_keyframe,
+            covariance=second.covariance_since(first, drifts=True),
+        )
+        return _join(way, loop.edge)
 
     def _unmeasured(self, last: Estimate, estimate: Estimate) -> Edge:
         coasted_s, elapsed_s = 1e-9 * np.diff([self._measured_ns, last.stamp_ns, estimate.stamp_ns])

@@ -19,7 +19,7 @@ from gvo.odometry.keyframes import view_overlap
 from gvo.types import FloatArray, Frame, Loop, RelativePose
 
 # A frame that shows less than so much of the latest place is another one.
-_MAX_OVERLAP = 0.75
+_MAX_OVERLAP = 0.7
 # Places that are never searched: the latest ones.
 _N_RECENT = 10
 # Places that a view is registered against: those of the best scores, if they stand out.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -93,6 +93,7 @@ class Odometry:
         self._previous: Estimate | None = None  # by the raw chain
         self._graph = RunGraph(self._config.window)
         self._loops = self._make_detector()
+        self._graph.loops = () if self._loops is None else self._loops.loops
         self._trust = DepthTrust(self._config.depth.icp)
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
@@ -186,17 +187,19 @@ class Odometry:
             step = self._chain.advance(observations)
         with watch.stage("links"):
             scores, offered = self._link(observations, step)
-            relocalized = self._relocalize(observations, step)
-            offered += relocalized
             offered += self._align_depths(observations, offered)
+        with watch.stage("loops"):
+            found = self._look_early(observations, step, scores)
+            joining = self._join(found)
         with watch.stage("window"):
-            causal = self._add_to_window(step, offered, is_resumed=bool(relocalized))
+            offered += joining
+            causal = self._add_to_window(step, offered, is_resumed=bool(joining))
             T_previous_frame = self._last_step(step.estimate, causal)
-            joins = self._join_segments(step, causal)
+            joins = self._join_segments(causal)
             self._select_keyframes(observations, step, scores, causal)
             self._keep_anchor()
         with watch.stage("loops"):
-            loops = self._close_loops(observations, causal)
+            loops = self._close_loops(observations, causal, found)
         self._keep_frame(frame)
         poses = causal, T_previous_frame
         return self._result(observations, step, offered, *poses, joins, loops, watch.stage_ms)
@@ -394,20 +397,27 @@ class Odometry:
         """Return the keyframes of earlier segments that the current one is not joined to."""
         return self._segments.unjoined(self._keyframes.stamps_ns)
 
-    def _relocalize(self, observations: _Observations, step: RawStep) -> list[_Offer]:
-        """Return the edge to a keyframe of an earlier segment, where two frames agree."""
-        if not self._config.window.relocalize:
+    def _look_early(
+        self, observations: _Observations, step: RawStep, scores: dict[int, float]
+    ) -> tuple[Loop, ...] | None:
+        """Look for places before the window takes the frame, if its segment is not joined."""
+        is_there = step.registration is not None and step.reference_ns in self._window
+        if not is_there or not self._unjoined():
+            return None
+        T_world_frame = self._window.pose(step.reference_ns) @ step.T_reference_frame
+        is_keyframe = self._is_keyframe_needed(scores)
+        return self._look(observations, T_world_frame, [step.edge], is_keyframe=is_keyframe)
+
+    def _join(self, loops: Sequence[Loop] | None) -> list[_Offer]:
+        """Return the edge that loops give to a keyframe of another segment in the window."""
+        if not loops:
             return []
-        waiting_ns = [ns for ns in self._unjoined() if ns in self._window]
-        for ns in self._segments.choose_waiting(waiting_ns):
-            result = self._frontend.relocalize(self._keyframes[ns], observations)
-            if isinstance(result, Failure):
-                continue
-            edge, former_ns = self._edge_of(ns, result), self._segments.candidate_ns
-            known = self._window.relative_pose(former_ns, ns) if former_ns in waiting_ns else None
-            is_sure = self._segments.confirm(edge, step.estimate, step.registered_ns, known)
-            return [("keyframe", edge)] if is_sure else []
-        return []
+        loop, segment_of = loops[-1], self._segments.segment_of  # the last one is of this frame
+        there = segment_of(loop.reference_ns)
+        kept = [ns for ns in self._unjoined() if ns in self._window and segment_of(ns) == there]
+        nearest = min(kept, key=lambda ns: abs(ns - loop.reference_ns), default=None)
+        edge = None if nearest is None else self._graph.from_keyframe(nearest, loop)
+        return [] if edge is None else [("keyframe", edge)]
 
     def _add_to_window(self, step: RawStep, offered: list[_Offer], *, is_resumed: bool) -> Estimate:
         stamp_ns = step.estimate.stamp_ns
@@ -425,10 +435,10 @@ class Odometry:
             return np.asarray(se3.invert(T_world_previous) @ causal.T_world_frame)
         return np.asarray(se3.invert(previous.T_world_frame) @ raw.T_world_frame)
 
-    def _join_segments(self, step: RawStep, causal: Estimate) -> tuple[SegmentJoin, ...]:
+    def _join_segments(self, causal: Estimate) -> tuple[SegmentJoin, ...]:
         """Return the segments that the accepted edges of a frame join."""
         stamp_ns = causal.stamp_ns
-        self._segments.note_frame(stamp_ns, step.registered_ns, causal.status)
+        self._segments.note_frame(stamp_ns, causal.status)
         ties_ns = [int(edge.reference_id) for edge in self._window.edges(stamp_ns)]  # type: ignore[call-overload]
         joins = [self._segments.join(stamp_ns, tie_ns) for tie_ns in ties_ns]
         return tuple(join for join in joins if join is not None)
@@ -444,13 +454,15 @@ class Odometry:
         is_tied = causal.status in (Status.OK, Status.RESUMED)
         if not is_tied or causal.frame_id not in self._window:
             return
-        config = self._config.window
-        # A keyframe that cannot be registered stands for nothing that is in view.
-        if config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores), config):
+        if self._is_keyframe_needed(scores):
             self._keyframes.add(observations, n_steps=step.n_steps)
             self._window.keep(causal.stamp_ns)
-            self._segments.note_keyframe()
         self._release_keyframes(scores, step.n_steps)
+
+    def _is_keyframe_needed(self, scores: dict[int, float]) -> bool:
+        config = self._config.window
+        # A keyframe that cannot be registered stands for nothing that is in view.
+        return config.n_keyframes > 0 and is_needed(self._keyframes.registrable(scores), config)
 
     def _release_keyframes(self, scores: dict[int, float], n_steps: int) -> None:
         config, unjoined = self._config.window, self._unjoined()
@@ -463,28 +475,39 @@ class Odometry:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
 
-    def _close_loops(self, observations: _Observations, causal: Estimate) -> tuple[Loop, ...]:
-        """Add a frame to the graph of the run, and the loops of a keyframe."""
-        stamp_ns = causal.stamp_ns
-        kept_ns = self._keyframes.stamps_ns
-        edges, is_keyframe = self._window.edges(stamp_ns), stamp_ns in kept_ns
-        is_tied = causal.status in (Status.OK, Status.RESUMED)
-        if self._loops is None or not self._config.loops.enabled or not is_tied:
-            self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
+    def _look(
+        self,
+        observations: _Observations,
+        T_world_frame: FloatArray,
+        edges: Sequence[Edge],
+        *,
+        is_keyframe: bool,
+    ) -> tuple[Loop, ...]:
+        """Return the loops that are confirmed with a frame."""
+        if self._loops is None or not self._config.loops.enabled:
             return ()
-        loops = self._loops.look(
+        return self._loops.look(
             observations,
-            causal.T_world_frame,
-            near=set(kept_ns).difference(self._unjoined()),
+            T_world_frame,
+            near=set(self._keyframes.stamps_ns).difference(self._unjoined()),
             world=self._graph.world_of(edges),
             is_keyframe=is_keyframe,
         )
-        self._graph.loops = self._loops.loops
-        is_keyframe = is_keyframe or stamp_ns in self._loops
+
+    def _close_loops(
+        self, observations: _Observations, causal: Estimate, loops: tuple[Loop, ...] | None
+    ) -> tuple[Loop, ...]:
+        """Add a frame to the graph of the run, and the loops of a keyframe, if not found early."""
+        stamp_ns = causal.stamp_ns
+        edges, is_keyframe = self._window.edges(stamp_ns), stamp_ns in self._keyframes.stamps_ns
+        if loops is None and causal.status in (Status.OK, Status.RESUMED):
+            T_world_frame = causal.T_world_frame
+            loops = self._look(observations, T_world_frame, edges, is_keyframe=is_keyframe)
+        is_keyframe = is_keyframe or (self._loops is not None and stamp_ns in self._loops)
         self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
-        if is_keyframe:
+        if is_keyframe and loops is not None and self._loops is not None:
             self._graph.advance(loops, self._loops)
-        return loops
+        return loops or ()
 
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""

@@ -56,7 +56,6 @@ def check_frontend(
     - it maps the current frame to the reference, not the other way round (camera images only);
     - the same call gives the same result, bit for bit, and changes none of its arguments;
     - where nothing can be seen there is a falsy `Failure` with a reason, and no exception;
-    - `relocalize`, where it has one, fails or says the same as `register`, within 5 sigma;
     - `describe` and `recognize`, where it has them, give places of at most 100 kB, in which the
       same frame is recognized, within 5 sigma of where it is, and frames without anything are not.
 
@@ -98,9 +97,6 @@ def check_frontend(
         _check_prior(frontend, result, *pair)
     _check_direction(frontend, *frames[:2])
     _check_capabilities(frontend)
-    if CheckedFrontend(frontend).offers_relocalization:
-        for pair, result in zip(pairwise(observations), results, strict=True):
-            _check_relocalization(CheckedFrontend(frontend), result, *pair)
     for nothing in _without_anything(frames[0], frames[-1], blank):
         _check_places(CheckedFrontend(frontend).recognizer, observations[0], nothing)
         _check_nothing_seen(frontend, observations[0], nothing)
@@ -137,7 +133,7 @@ def _check_capabilities(frontend: Frontend[Any]) -> None:
             value is None or isinstance(value, kinds),
             f"{name} is a {type(value).__name__}, which is none of {kinds}",
         )
-    for name in ("relocalize", "reconfigure", "describe", "recognize"):
+    for name in ("reconfigure", "describe", "recognize"):
         method = getattr(frontend, name, None)
         _require(method is None or callable(method), f"{name} must be a method")
     is_there = [getattr(frontend, name, None) is not None for name in ("describe", "recognize")]
@@ -227,25 +223,6 @@ def _misled(result: RelativePose) -> FloatArray:
     signs = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     error: FloatArray = signs * np.minimum(_PRIOR_SIGMAS * sigmas, _PRIOR_LIMITS)
     return np.asarray(result.T_reference_current @ se3.exp(error))
-
-
-def _check_relocalization(
-    frontend: CheckedFrontend[Any], result: RelativePose, reference: Stamped, current: Stamped
-) -> None:
-    name = f"relocalize({reference.stamp_ns}, {current.stamp_ns})"
-    first, second = (frontend.relocalize(reference, current) for _ in range(2))
-    _require(
-        fingerprint(first) == fingerprint(second),
-        f"{name} gives another result when called again with the same arguments",
-    )
-    if isinstance(first, Failure):
-        _require(bool(first.reason.strip()), f"the Failure of {name} gives no reason")
-        return
-    _check_agreement(
-        f"{name} and register",
-        se3.invert(result.T_reference_current) @ first.T_reference_current,
-        result.covariance + first.covariance,
-    )
 
 
 def _check_places(recognizer: Recognizer | None, observations: Stamped, frame: Stamped) -> None:

@@ -203,14 +203,20 @@ def test_places_of_sift_are_found_too() -> None:
     assert index.scores(extract(again, "sift").descriptors).argmax() == 3
 
 
-def test_pixels_near_the_border_are_not_described() -> None:
-    pixels = np.array(
-        [[5.0, 100.0], [100.0, 100.0], [160.5, 120.0], [310.0, 100.0], [100.0, 235.0]]
-    )
-    chosen, descriptors = describe_pixels(blobs(), pixels)
-    assert chosen.tolist() == [1, 2]
-    assert descriptors.shape == (2, 32)
-    many = np.random.default_rng(0).uniform([30, 30], [290, 210], (1000, 2))
-    chosen, descriptors = describe_pixels(blobs(), many)
-    assert len(chosen) == len(descriptors) == 400
-    assert np.all(np.diff(chosen) > 0)
+def test_pixels_are_described_alike_when_the_image_is_turned_or_enlarged() -> None:
+    image, pixels = blobs(), np.array([[100.0, 100.0], [160.5, 120.0], [2.0, 100.0]])
+    first = describe_pixels(image, pixels)
+    assert first.shape == (3, 32)
+    height, width = image.shape
+    turned = np.ascontiguousarray(np.rot90(image, -1))
+    again = describe_pixels(turned, np.column_stack([height - 1 - pixels[:, 1], pixels[:, 0]]))
+    large = np.asarray(cv2.resize(image, (2 * width, 2 * height)), dtype=np.uint8)
+    wide = describe_pixels(large, 2.0 * pixels + 0.5, 2.0)
+    for other in (again, wide):
+        n_bits = np.bitwise_count(first[:2] ^ other[:2]).sum(axis=1)
+        assert n_bits.max() < 64
+        assert np.bitwise_count(first[0] ^ other[1]).sum() > 80
+
+
+def test_nothing_has_no_descriptors() -> None:
+    assert describe_pixels(blobs(), np.zeros((0, 2))).shape == (0, 32)

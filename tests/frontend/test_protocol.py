@@ -90,8 +90,11 @@ class Capable(Answering):
         self.rig_offsets = RigOffsets(Config(), is_stereo=True)
         self.configs: list[Config] = []
 
-    def relocalize(self, reference: Any, current: Any) -> Any:
+    def align_depth(self, reference: Any, current: Any, T_reference_current: Any) -> Any:
         return (reference, current) if self.answer == "pair" else self.answer
+
+    def recognize(self, reference: Any, current: Any, observations: Any) -> Any:
+        return self.answer
 
     def reconfigure(self, config: Config) -> None:
         self.configs.append(config)
@@ -103,7 +106,8 @@ def test_a_front_end_of_two_methods_is_asked_for_no_more() -> None:
     assert frontend.rig_offsets is None
     frontend.reconfigure(Config())
     assert frontend.extract(5) == 5
-    assert frontend.relocalize(1, 2)
+    assert not frontend.align_depth(1, 2, np.eye(4))
+    assert frontend.recognizer is None
 
 
 def test_what_a_front_end_offers_is_used() -> None:
@@ -114,7 +118,9 @@ def test_what_a_front_end_offers_is_used() -> None:
     config = Config()
     frontend.reconfigure(config)
     assert inner.configs == [config]
-    assert frontend.relocalize(1, 2) is inner.answer
+    assert frontend.align_depth(1, 2, np.eye(4)) is inner.answer
+    recognizer: object = frontend.recognizer
+    assert recognizer is inner
 
 
 def test_what_is_offered_must_be_what_its_name_says() -> None:
@@ -123,8 +129,8 @@ def test_what_is_offered_must_be_what_its_name_says() -> None:
     frontend = CheckedFrontend(inner)
     assert frontend.camera is None
     assert frontend.rig_offsets is None
-    with pytest.raises(ValueError, match=r"relocalize of Capable must return .* got tuple"):
-        frontend.relocalize(1, 2)
+    with pytest.raises(ValueError, match=r"align_depth of Capable must return .* got tuple"):
+        frontend.align_depth(1, 2, np.eye(4))
 
 
 def test_points_are_counted_where_the_observations_tell() -> None:

@@ -374,7 +374,7 @@ def test_a_camera_that_turned_in_the_dark_is_found_again() -> None:
         for n, result in enumerate(results)
     ]
     assert errors[joined[0] - 1] > 0.1
-    assert max(errors[joined[0] :]) < 0.06
+    assert max(errors[joined[0] :]) < 0.08
 
 
 def test_nothing_but_blank_images_gives_finite_poses() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gvo.backend.window_graph import NewPose, WindowGraph
 from gvo.config import Config
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
+from gvo.geometry.camera import StereoCamera
 from gvo.odometry.odometry import Odometry
 from gvo.odometry.segments import Segments
 from gvo.types import (
@@ -46,6 +48,8 @@ class Beacon:
     see: Callable[[FloatArray], FloatArray | None] = lambda T: T
     reach_m: float = 0.5
     n_looked: int = 0
+    camera = StereoCamera(fx=300, fy=300, cx=160, cy=120, width=320, height=240, baseline=0.1)
+    points_cam = np.array([[x, y, 3.0] for x in (-1.0, 0.0, 1.0) for y in (-0.5, 0.5)])
 
     def extract(self, frame: Place) -> Place:
         return frame
@@ -58,16 +62,26 @@ class Beacon:
             return Failure(reason="nothing in common")
         return relative(T)
 
-    def relocalize(self, reference: Place, current: Place) -> RelativePose | Failure:
+    def describe(self, observations: Place) -> SimpleNamespace:
+        return SimpleNamespace(
+            stamp_ns=observations.stamp_ns,
+            T_world_frame=observations.T_world_frame,
+            points_cam=self.points_cam,
+            descriptors_left=np.arange(32 * 6, dtype=np.uint8).reshape(6, 32),
+        )
+
+    def recognize(
+        self, reference: SimpleNamespace, current: SimpleNamespace, observations: Place
+    ) -> RelativePose | Failure:
         self.n_looked += 1
-        seen = None if current.is_dark else self.see(true_step(reference, current))
+        seen = self.see(true_step(reference, observations))  # type: ignore[arg-type]
         return Failure(reason="never seen") if seen is None else relative(seen)
 
 
 class Plain(Beacon):
     """The same without a way to look for a place."""
 
-    relocalize = None  # type: ignore[assignment]
+    recognize = None  # type: ignore[assignment]
 
 
 def true_step(reference: Place, current: Place) -> FloatArray:
@@ -96,9 +110,12 @@ def walk(n_dark: int = 6, n_after: int = 12, *, away: FloatArray) -> list[Place]
     ]
 
 
-def run(frontend: Beacon, places: list[Place], **window: object) -> list[FrameResult]:
-    settings = {"lost_after_s": 0.35, "keyframe_distance_m": 0.3, "n_keyframes": 4} | window
-    odometry = Odometry(config=Config.model_validate({"window": settings}), frontend=frontend)
+def run(frontend: Beacon, places: list[Place], **loops: object) -> list[FrameResult]:
+    settings = {
+        "window": {"lost_after_s": 0.35, "keyframe_distance_m": 0.3, "n_keyframes": 4},
+        "loops": loops,
+    }
+    odometry = Odometry(config=Config.model_validate(settings), frontend=frontend)
     return [odometry.track(place) for place in places]
 
 
@@ -154,8 +171,8 @@ def test_a_keyframe_that_is_seen_twice_joins_the_segments() -> None:
     assert (join.segment, join.to_segment) == (1, 0)
     assert join.reference_ns < 10 * STEP_NS
     joined = join.stamp_ns // STEP_NS
-    # The first bright frame sees it, the next one, registered against the first, confirms it.
-    assert joined == 17
+    # The first frame that is registered again sees it, the next one confirms it.
+    assert joined == 18
     assert results[joined].status is Status.RESUMED
     found = errors(results, places)
     assert found[joined - 1] > 1.0
@@ -204,7 +221,7 @@ def test_after_a_frame_that_no_window_took_the_step_is_that_of_the_raw_chain(
 
 def test_nobody_looks_where_that_is_switched_off() -> None:
     frontend = Beacon()
-    results = run(frontend, walk(away=AWAY), relocalize=False)
+    results = run(frontend, walk(away=AWAY), enabled=False)
     assert frontend.n_looked == 0
     assert not any(result.joins for result in results)
 
@@ -237,36 +254,30 @@ def test_a_false_candidate_is_forgotten_when_the_next_two_agree() -> None:
     n_false = iter(range(1000))
     places = walk(away=AWAY)
     results = run(Beacon(see=lambda T: T if next(n_false) else np.asarray(at(5.0) @ T)), places)
-    assert [len(result.joins) for result in results[16:20]] == [0, 0, 1, 0]
+    assert [len(result.joins) for result in results[17:21]] == [0, 0, 1, 0]
     assert errors(results, places)[-1] < 0.02
 
 
-def test_without_a_way_to_look_for_a_place_it_is_registered_without_a_prior() -> None:
-    places = walk(away=at(0.2, turn=0.5))
-    results = run(Plain(reach_m=0.3), places)
-    assert [join.to_segment for result in results for join in result.joins] == [0]
-    assert errors(results, places)[-1] < 0.02
+def test_without_a_way_to_look_for_a_place_segments_stay_apart() -> None:
+    results = run(Plain(), walk(away=AWAY))
+    assert results[-1].segment == 1
+    assert not any(result.joins for result in results)
 
 
-def test_a_camera_that_stands_still_elsewhere_stops_looking() -> None:
-    frontend = Beacon(see=lambda _: None)
-    places = walk(n_after=1, away=AWAY)
-    places += [Place(stamp_ns=(len(places) + n) * STEP_NS, T_world_frame=AWAY) for n in range(60)]
-    run(frontend, places)
-    assert 20 <= frontend.n_looked <= 40
-
-
-def test_a_camera_that_moves_on_elsewhere_looks_ever_more_rarely() -> None:
-    frontend = Beacon(see=lambda _: None)
-    places = walk(n_after=600, away=AWAY)
-    counts = []
-    settings = {"lost_after_s": 0.35, "keyframe_distance_m": 0.1}
-    odometry = Odometry(config=Config.model_validate({"window": settings}), frontend=frontend)
-    for place in places:
-        odometry.track(place)
-        counts.append(frontend.n_looked)
-    assert counts[40] - counts[16] >= 40
-    assert 4 <= counts[-1] - counts[-200] <= 2 * 200 // 30 + 2
+def test_a_place_that_is_no_keyframe_any_more_joins_by_the_way_to_one_that_is() -> None:
+    places = walk(away=np.eye(4))  # where the walk began
+    odometry = Odometry(
+        config=Config.model_validate(
+            {"window": {"lost_after_s": 0.35, "keyframe_distance_m": 0.1, "n_keyframes": 1}}
+        ),
+        frontend=Beacon(see=lambda T: T if np.linalg.norm(T[:3, 3]) < 0.3 else None),
+    )
+    results = [odometry.track(place) for place in places]
+    joins = [join for result in results for join in result.joins]
+    (loop, *_) = (loop for result in results for loop in result.loops)
+    assert joins[0].reference_ns != loop.reference_ns
+    joined = joins[0].stamp_ns // STEP_NS
+    assert max(errors(results, places)[joined:]) < 0.05
 
 
 def test_keyframes_that_wait_are_no_more_than_those_in_use() -> None:
@@ -290,8 +301,8 @@ def test_keyframes_that_wait_are_no_more_than_those_in_use() -> None:
 def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> None:
     segments = Segments()
     for n in (10, 20, 30):
-        segments.note_frame(n, None, Status.LOST)
-        segments.note_frame(n + 1, n, Status.RESUMED)
+        segments.note_frame(n, Status.LOST)
+        segments.note_frame(n + 1, Status.RESUMED)
     assert segments.current == 3
     assert segments.unjoined([5, 15, 25, 35]) == [5, 15, 25]
     assert segments.join(31, 5) == SegmentJoin(segment=3, to_segment=0, stamp_ns=31, reference_ns=5)
@@ -299,11 +310,3 @@ def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> 
     assert segments.join(32, 15) is not None
     assert segments.unjoined([5, 15, 25, 35]) == [25]
     assert segments.join(33, 5) is None
-
-
-@pytest.mark.parametrize("n", [0, 1, 5])
-def test_every_waiting_keyframe_has_its_turn(n: int) -> None:
-    segments = Segments()
-    waiting = list(range(n))
-    looked = [ns for _ in range(10) for ns in segments.choose_waiting(waiting)]
-    assert set(looked) == set(waiting)
