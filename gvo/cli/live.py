@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
 import typer
 
+from gvo._text import cut
 from gvo.cli.options import (
     Bag,
     CalibrationFiles,
@@ -123,6 +124,7 @@ def live(
     out = new_folder(out, "live", force=force)
     outputs.check(force=force)
     options = recording_options(calibration, left, right, color, depth)
+    page = None if view is None else _address("--view", view)
     end = _End()
     with ExitStack() as stack, told_where_it_stands(out), ended_by_a_signal(end):
         sinks = _connect(camera, qos, foxglove, stack)
@@ -136,8 +138,8 @@ def live(
             )
         except ValueError as error:
             raise ConfigurationError(f"--queue, --max-lag: {error}") from error
-        if view is not None:
-            _show(odometry, source, view, stack)
+        if page is not None:
+            _show(odometry, source, page, stack)
         end.stop = odometry.stop
         runs = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
     for folder, result in runs:
@@ -191,17 +193,17 @@ def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack
 def _address(option: str, text: str) -> _Address:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or len(port) > 5 or int(port) > _MAX_PORT:
-        raise ConfigurationError(f"{option} {text}: expected [HOST:]PORT")
+        raise ConfigurationError(f"{option} {cut(text, 60)}: expected [HOST:]PORT")
     return {"host": host.strip("[]") or "127.0.0.1", "port": int(port)}
 
 
-def _show(odometry: LiveOdometry, source: Source, view: str, stack: ExitStack) -> None:
+def _show(odometry: LiveOdometry, source: Source, page: _Address, stack: ExitStack) -> None:
     """Serve the page of a run until it ends."""
     from gvo.viz.view import serve
     from gvo.viz.view.live import LivePlayer
 
     odometry.viewer = LivePlayer(source, odometry.parameters)
-    server = stack.enter_context(serve(odometry.viewer, **_address("--view", view)))
+    server = stack.enter_context(serve(odometry.viewer, **page))
     warn([server.note] if server.note else [])
     _say(f"{server.url} shows the run")
 

@@ -28,6 +28,7 @@ from gvo.live.transport import SET_POSE, TRIGGER, NetworkWriter, Parameters, Ser
 from gvo.runs.outputs.bag import RunMessages
 from gvo.runs.outputs.frames import RunFrames
 from gvo.types import FrameResult, StereoFrame
+from tests.conftest import Command, is_one_line
 from tests.live.pipe import LiveCommand, sent
 from tests.viz.view.fakes import result_of
 
@@ -292,6 +293,31 @@ def test_a_port_that_is_taken_ends_in_one_line(server: Foxglove) -> None:
     assert "\n" not in str(raised.value)
     with pytest.raises(ConfigurationError, match=r"cannot listen on 192\.0\.2\.1:0: "):
         Foxglove(host="192.0.2.1", port=0)
+
+
+@pytest.mark.parametrize("address", ["8765:", "here", "99999", "9" * 5000, "-1"])
+def test_an_address_without_a_port_ends_in_one_line(
+    address: str, command: Command, tmp_path: Path
+) -> None:
+    for option in ("--foxglove", "--view"):
+        answer = command("live", "-", f"{option}={address}", f"--out={tmp_path / 'out'}")
+        assert (answer.code, is_one_line(answer.err)) == (2, True)
+        assert f"{option} " in answer.err
+
+
+def test_the_command_ends_in_one_line_where_the_port_is_taken_or_the_package_missing(
+    server: Foxglove, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = [f"--foxglove={server.url.removeprefix('ws://')}", f"--out={tmp_path / 'out'}"]
+    answer = command("live", "-", *options)
+    assert (answer.code, is_one_line(answer.err)) == (2, True)
+    assert "cannot listen on 127.0.0.1" in answer.err
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.delitem(sys.modules, "gvo.live.foxglove")
+    answer = command("live", "-", *options)
+    assert (answer.code, is_one_line(answer.err)) == (2, True)
+    assert "pip install" in answer.err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no list of open ports")
