@@ -2,7 +2,6 @@
 
 import csv
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +14,9 @@ import gvo
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.poses.inputs import find_base_frame, read_truth
-from gvo.io.recording import RecordingInfo, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.testing import faults as made
+from gvo.testing.faults import FaultySource
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
 from tests.conftest import Command
@@ -40,28 +40,7 @@ from tests.rendered_walk import (
 NO_REPORT = gvo.RunOutputs(report=False)
 
 
-class FaultySource:
-    """A source of which some images cannot be read."""
-
-    def __init__(self, source: Source, *, faulty: set[int]) -> None:
-        self._source = source
-        self._faulty = faulty
-
-    @property
-    def info(self) -> RecordingInfo:
-        return self._source.info
-
-    def images(self) -> Iterator[StampedImage]:
-        for index, image in enumerate(self._source.images()):
-            is_faulty = index // 2 in self._faulty
-            yield replace(image, load=_fail) if is_faulty else image
-
-    def ground_truth(self) -> Trajectory | None:
-        return self._source.ground_truth()
-
-
-def _fail() -> np.ndarray:
-    raise RecordingError("the image is of zero size")
+UNREADABLE = made.Unloadable(message="the image is of zero size")
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +138,8 @@ def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, thre
 
 
 def test_a_faulty_frame_is_skipped_and_counted(room: SyntheticRecording, tmp_path: Path) -> None:
-    result = gvo.run_recording(FaultySource(room, faulty={3, 4}), tmp_path, outputs=NO_REPORT)
+    faulty = FaultySource(room, replace(UNREADABLE, first=3, end=5))
+    result = gvo.run_recording(faulty, tmp_path, outputs=NO_REPORT)
     assert not result.is_complete
     assert result.summary["status_counts"]["skipped"] == 2
     assert len(gvo.read_trajectory(tmp_path / "raw.txt")) == 10
@@ -172,7 +152,7 @@ def test_a_recording_without_a_usable_frame_is_refused(
     room: SyntheticRecording, tmp_path: Path
 ) -> None:
     with pytest.raises(RecordingError, match=r"no usable frame.*zero size"):
-        gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path)
+        gvo.run_recording(FaultySource(room, UNREADABLE), tmp_path)
 
 
 def test_a_truth_of_another_time_is_a_warning(room: SyntheticRecording, tmp_path: Path) -> None:
@@ -190,19 +170,10 @@ class TruthlessSource(FaultySource):
         raise TrajectoryError("groundtruth.txt: line 3: expected 8 numbers, got 2")
 
 
-class OneEyedSource(FaultySource):
-    """A stereo source that lost some images of its right camera."""
-
-    def images(self) -> Iterator[StampedImage]:
-        for index, image in enumerate(self._source.images()):
-            if image.stream == 0 or index // 2 not in self._faulty:
-                yield image
-
-
 def test_a_malformed_truth_of_the_recording_is_a_warning(
     room: SyntheticRecording, tmp_path: Path
 ) -> None:
-    result = gvo.run_recording(TruthlessSource(room, faulty=set()), tmp_path)
+    result = gvo.run_recording(TruthlessSource(room), tmp_path)
     assert result.is_complete
     assert "line 3" in result.warnings[0]
     assert (tmp_path / "summary.json").exists()
@@ -210,7 +181,8 @@ def test_a_malformed_truth_of_the_recording_is_a_warning(
 
 
 def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:
-    result = gvo.run_recording(OneEyedSource(room, faulty={2, 5}), tmp_path, outputs=NO_REPORT)
+    lonely = FaultySource(room, made.Dropped(first=2, end=6, every=3, streams=(1,)))
+    result = gvo.run_recording(lonely, tmp_path, outputs=NO_REPORT)
     assert result.is_complete
     assert result.summary["frames"] == 10
     assert result.summary["unpaired_images"] == 2
@@ -224,7 +196,7 @@ def test_a_run_without_poses_leaves_nothing_also_not_of_an_earlier_one(
     (tmp_path / "trajectories.png").write_text("")
     (tmp_path / "mine.txt").write_text("")
     with pytest.raises(RecordingError):
-        gvo.run_recording(FaultySource(room, faulty=set(range(12))), tmp_path, force=True)
+        gvo.run_recording(FaultySource(room, UNREADABLE), tmp_path, force=True)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -247,13 +219,8 @@ def test_poses_without_stamps_belong_to_the_frames_in_their_order(
 
 
 def test_a_run_in_which_nothing_could_be_registered_says_so(tmp_path: Path) -> None:
-    class Black(FaultySource):
-        def images(self) -> Iterator[StampedImage]:
-            for image in self._source.images():
-                yield replace(image, load=lambda: np.zeros((192, 256), np.uint8))
-
     drive = SyntheticRecording("handheld", "stereo", n_frames=4, scale=0.4)
-    result = gvo.run_recording(Black(drive, faulty=set()), tmp_path)
+    result = gvo.run_recording(FaultySource(drive, made.Black()), tmp_path)
     assert not result.is_complete
     assert "no frame could be registered" in result.warnings[0]
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 4
