@@ -25,6 +25,7 @@ from importlib.util import find_spec
 from io import BytesIO
 from itertools import chain
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 
@@ -72,7 +73,10 @@ class Ros1:
         uri = _find_master()
         if rospy.core.is_initialized():
             return
-        if not {"ROS_IP", "ROS_HOSTNAME"} & os.environ.keys() and _host(uri) in _LOOPBACK:
+        if (
+            not {"ROS_IP", "ROS_HOSTNAME"} & os.environ.keys()
+            and urlsplit(uri).hostname in _LOOPBACK
+        ):
             os.environ["ROS_IP"] = "127.0.0.1"  # else it listens on all networks
         rospy.core.configure_logging = lambda *_: None  # takes over all of Python's logging
         try:
@@ -200,10 +204,6 @@ def _bound_messages(tcpros: Any) -> None:  # noqa: ANN401
     tcpros.recv_buff = recv_buff
 
 
-def _host(uri: str) -> str:
-    return str(import_module("rosgraph.network").parse_http_host_and_port(uri)[0])
-
-
 def _find_master() -> str:
     """Return the address of the master; rospy would wait for one for ever."""
     rosgraph = import_module("rosgraph")
@@ -211,7 +211,6 @@ def _find_master() -> str:
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_MASTER_TIMEOUT_S)
     try:
-        _host(uri)
         rosgraph.Master("/gvo").getPid()
     except (OSError, ValueError, rosgraph.MasterException, xmlrpc.client.Error) as error:
         raise ConfigurationError(

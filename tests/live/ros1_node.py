@@ -82,7 +82,10 @@ def main() -> None:
         end()
         tell("ended")
     node.close()
-    left = [one.name for one in threading.enumerate() if not one.daemon]
+    threads = [one for one in threading.enumerate() if not one.daemon]
+    for thread in set(threads) - {threading.main_thread()}:
+        thread.join(20.0)
+    left = [one.name for one in threads if one.is_alive()]
     tell("left", threads=left)
 
 

@@ -187,8 +187,9 @@ def test_what_is_played_is_tracked_as_from_its_files(
 @pytest.mark.recorded
 def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Path) -> None:  # noqa: F811
     recording = gvo_data / "kitti_06_start"
-    odometry = live(ros, tmp_path / "out")
     driver = ros.start(DRIVER, recording)
+    driver.wait_for("introduced")  # CameraInfo is sent once, and not again
+    odometry = live(ros, tmp_path / "out")
     driver.wait_for("driven")
     driver.send(signal.SIGKILL)
     odometry.wait_for("no images for")
