@@ -10,8 +10,6 @@ J.-Y. Bouguet, "Pyramidal implementation of the affine Lucas Kanade feature trac
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +133,7 @@ def detect_corners(image: ImageArray, config: KltConfig) -> FloatArray:
 
 def _local_maxima(
     reduced: ImageArray, min_eigenvalue: float, border: int
-) -> tuple[IntArray, NDArray[Any]]:
+) -> tuple[IntArray, NDArray[np.float32]]:
     """Return pixels of the full image, shape (n, 2), and their scores, shape (n,)."""
     scores = cv2.cornerMinEigenVal(reduced, _BLOCK_PX)
     neighbours = cv2.dilate(scores, np.ones((3, 3), dtype=np.uint8))
@@ -144,19 +142,21 @@ def _local_maxima(
     found = np.flatnonzero(is_corner[border:-border, border:-border])
     rows, columns = np.divmod(found, reduced.shape[1] - 2 * border)
     rows, columns = rows + border, columns + border
-    return _REDUCTION * np.column_stack([columns, rows]), scores[rows, columns]
+    chosen = scores[rows, columns].astype(np.float32)
+    return _REDUCTION * np.column_stack([columns, rows]), chosen
 
 
 def _best_of_cells(
-    pixels: IntArray, responses: NDArray[Any], size_px: int, *, width: int
+    pixels: IntArray, responses: NDArray[np.float32], size_px: int, *, width: int
 ) -> IntArray:
-    """Return the index of the strongest corner of each cell, sorted."""
+    """Return the index of the strongest corner of each cell, sorted; scores are positive."""
     columns, rows = width // size_px + 1, int(pixels[:, 1].max(initial=0)) // size_px + 1
     cells = pixels[:, 1] // size_px * columns + pixels[:, 0] // size_px
-    weakest_first = np.argsort(responses, kind="stable")
-    best = np.full(rows * columns, -1)
-    best[cells[weakest_first]] = weakest_first  # of several in a cell the last stays
-    return np.sort(best[best >= 0])
+    # Positive floats are ordered as their bits are; of equal ones in a cell the last wins.
+    keys = responses.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    best = np.zeros(rows * columns, dtype=np.uint64)
+    np.maximum.at(best, cells, keys | np.arange(len(keys), dtype=np.uint64))
+    return np.sort((best[best > 0] & np.uint64(0xFFFFFFFF)).astype(np.int64))
 
 
 def halve(image: ImageArray) -> ImageArray:

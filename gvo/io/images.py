@@ -23,6 +23,7 @@ MAX_PIXELS = 100_000_000
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND"
+_MAX_STORED = 65535  # bytes of a stored block
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the type of colour
 # Of each pass of an interlaced image: the first column and row, the steps of both.
 _PNG_PASSES = (
@@ -504,22 +505,22 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
     OpenCV asks for the memory of a chunk, up to gigabytes, before it sees that there is no more.
     """
-    chunks = _png_chunks(data)
     return all(
-        end <= len(data) and _is_png_chunk_sound(data[start:end]) for _, start, end in chunks
+        end <= len(data) and _is_png_chunk_sound(data.data[start:end])
+        for _, start, end in _png_chunks(data)
     )
 
 
-def _is_png_chunk_sound(chunk: NDArray[np.uint8]) -> bool:
-    check, name = chunk[-4:].tobytes(), chunk[4:8].tobytes()
-    return name != b"IDAT" or zlib.crc32(chunk[4:-4].data) == int.from_bytes(check, "big")
+def _is_png_chunk_sound(chunk: memoryview) -> bool:
+    check, name = int.from_bytes(chunk[-4:], "big"), chunk[4:8].tobytes()
+    return name != b"IDAT" or zlib.crc32(chunk[4:-4]) == check
 
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
     """Yield the name of each chunk, and where it and its checksum begin and end."""
     start, name = len(_PNG_MAGIC), b""
     while start < len(data) and name != _PNG_END:
-        head = data[start : start + 8].tobytes()
+        head = data.data[start : start + 8].tobytes()
         name, end = head[4:], start + 12 + int.from_bytes(head[:4], "big")
         yield name, start, end
         start = end
@@ -529,24 +530,36 @@ def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a PNG whose stream ends where its rows do; one that is malformed as it is.
 
     libpng inflates all that follows, up to a thousand times its bytes. The rows are written
-    uncompressed: they are inflated once.
+    uncompressed: they are inflated once, without their checksum, which libpng compares.
     """
-    parts, rows, n_left = [_PNG_MAGIC], list[bytes](), _n_png_bytes(data[8:33].tobytes())
-    inflater, packer = zlib.decompressobj(), zlib.compressobj(0)
+    parts, contents, n_bytes = [_PNG_MAGIC], list[memoryview](), _n_png_bytes(data[8:33].tobytes())
     for name, start, end in _png_chunks(data):
         if name in (b"IHDR", b"PLTE", b"tRNS"):
             parts.append(data[start:end].tobytes())
-        elif name == b"IDAT" and n_left and not inflater.eof:
-            try:
-                row = inflater.decompress(data[start + 8 : end - 4].data, n_left)
-            except zlib.error:
-                return data
-            n_left -= len(row)
-            rows.append(packer.compress(row))
-    if n_left or not rows:
+        elif name == b"IDAT":
+            contents.append(data.data[start + 8 : end - 4])
+    stream, inflater = b"".join(contents), zlib.decompressobj(wbits=-zlib.MAX_WBITS)
+    try:
+        rows = inflater.decompress(stream[2:], n_bytes) if n_bytes else b""
+    except zlib.error:
         return data
-    parts += [*_png_chunk(b"IDAT", [*rows, packer.flush()]), *_png_chunk(_PNG_END, [])]
+    if not rows or len(rows) < n_bytes:
+        return data
+    check = inflater.unused_data[:4]
+    if len(check) < 4:
+        check = struct.pack(">I", zlib.adler32(rows))
+    stored = [stream[:2], *_stored(rows), check]
+    parts += [*_png_chunk(b"IDAT", stored), *_png_chunk(_PNG_END, [])]
     return np.frombuffer(b"".join(parts), dtype=np.uint8)
+
+
+def _stored(content: bytes) -> Iterator[bytes]:
+    """Yield content as stored blocks of a stream, which `zlib` at level 0 copies twice."""
+    for first in range(0, len(content), _MAX_STORED):
+        block = content[first : first + _MAX_STORED]
+        is_last = first + _MAX_STORED >= len(content)
+        yield struct.pack("<BHH", is_last, len(block), len(block) ^ 0xFFFF)
+        yield block
 
 
 def _n_png_bytes(header: bytes) -> int:

@@ -255,13 +255,13 @@ def search_disparities(
 
 def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
     """Return the next peaks, in steps, where they are nearly as good as the best, else NaN."""
-    rows = np.arange(len(best))
+    rows, around = np.arange(len(best)), np.arange(-_PEAK_STEPS, _PEAK_STEPS + 1)
     elsewhere, peaks = correlations.copy(), best
     least = correlations[rows, best] - _MAX_GAP
     rivals = np.full((len(best), _N_RIVALS), np.nan)
     for rank in range(_N_RIVALS):
-        for offset in range(-_PEAK_STEPS, _PEAK_STEPS + 1):
-            elsewhere[rows, np.clip(peaks + offset, 0, n_steps)] = -1.0
+        peak = np.clip(peaks[:, np.newaxis] + around, 0, n_steps)
+        elsewhere[rows[:, np.newaxis], peak] = -1.0
         peaks = np.argmax(elsewhere, axis=1)
         high = np.flatnonzero(elsewhere[rows, peaks] > least)
         between, is_between = parabola_minimum(-elsewhere[high])
@@ -285,15 +285,20 @@ def _correlate(
     """Return the correlations at disparities n_steps .. 0 of pixels, (n, n_steps + 1)."""
     radius = _COARSE_RADIUS_PX
     size = 2 * radius + 1
-    padded = np.pad(left, radius, mode="edge")
+    padded = _padded(left, radius, radius)
     patches = sliding_window_view(padded, (size, size))[pixels]
     patches = patches - patches.mean(axis=(1, 2), keepdims=True)
     energy = np.maximum(np.sum(patches**2, axis=(1, 2)), _MIN_ENERGY)
-    padded = np.pad(right, ((radius, radius), (radius + n_steps, radius)), mode="edge")
+    padded = _padded(right, radius, radius + n_steps)
     strips = sliding_window_view(padded, (size, size + n_steps))[pixels]
     products = correlate_rows(patches, strips)
     energies = sliding_window_view(_energies(padded), n_steps + 1, axis=1)[pixels]
     return np.asarray(products / np.sqrt(energies * energy[:, np.newaxis]))
+
+
+def _padded(image: NDArray[np.float32], radius: int, margin_left: int) -> NDArray[np.float32]:
+    margins = radius, radius, margin_left, radius
+    return np.asarray(cv2.copyMakeBorder(image, *margins, cv2.BORDER_REPLICATE), dtype=np.float32)
 
 
 def _energies(image: NDArray[np.float32]) -> NDArray[np.float32]:
