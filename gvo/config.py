@@ -149,7 +149,7 @@ class KltConfig(Section):
         0.15, "standard deviation of the disparity of a corner or track, for stereo", "px", gt=0
     )
     sigma_factor: float = _parameter(
-        2.4, "inflation of a registration's sigmas: errors of neighbouring tracks correlate", gt=0
+        2.4, "largest inflation of a registration's sigmas: errors of near tracks correlate", gt=0
     )
 
 
@@ -257,7 +257,7 @@ class RegistrationConfig(Section):
     )
     pixel_sigma_px: float = _parameter(0.7, "standard deviation of a keypoint's pixel", "px", gt=0)
     sigma_factor: float = _parameter(
-        1.2, "inflation of the sigmas of a registration: errors of the matches are correlated", gt=0
+        1.2, "largest inflation of a registration's sigmas: errors of the matches correlate", gt=0
     )
 
 

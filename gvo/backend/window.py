@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -57,6 +58,12 @@ class SlidingWindow:
         Who chooses keyframes: the caller by `keep` and `release`, or the window by distance and
         angle (`window.keyframe_distance_m`, `window.keyframe_angle_deg`, `window.n_keyframes`).
 
+    Attributes
+    ----------
+    variance_factor : float
+        By which covariances are multiplied that are given out: what those of all edges turned out
+        to be too large by. Poses and gates do not depend on it.
+
     Examples
     --------
     >>> window = SlidingWindow()
@@ -85,6 +92,7 @@ class SlidingWindow:
         self._motion = ConstantVelocity(self._config)
         self._admission = Admission(self._graph, self._motion)
         self._batch_result: BatchResult | None = None
+        self.variance_factor = 1.0
 
     def __repr__(self) -> str:
         """Return the number of poses, the newest, and the counts in one line."""
@@ -196,7 +204,7 @@ class SlidingWindow:
         self._update_motion(pose, estimate)
         if self._keeps_by_distance and frame_id in self:
             self._keep_by_distance(frame_id)
-        return estimate
+        return self._scaled(estimate)
 
     def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate | Rejected:
         """Add an edge between two poses of the window, such as a loop.
@@ -219,8 +227,10 @@ class SlidingWindow:
         if fault or gated:
             return self._reject(frame_id, fault or gated, edge=edge, is_gated=bool(gated))
         answer = self._try(lambda: self._graph.add_edge(frame_id, edge), frame_id, edge=edge)
-        self._counter.add(n_edges=int(isinstance(answer, Estimate)))
-        return answer
+        if isinstance(answer, Rejected):
+            return answer
+        self._counter.add(n_edges=1)
+        return self._scaled(answer)
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate | Rejected:
         """Add a measurement of a pose of the window in the world.
@@ -241,8 +251,10 @@ class SlidingWindow:
         if fault:
             return self._reject(frame_id, fault)
         answer = self._try(lambda: self._graph.add_prior(frame_id, prior), frame_id)
-        self._counter.add(n_priors=int(isinstance(answer, Estimate)))
-        return answer
+        if isinstance(answer, Rejected):
+            return answer
+        self._counter.add(n_priors=1)
+        return self._scaled(answer)
 
     def keep(self, frame_id: FrameId) -> None:
         """Keep a pose in the window until it is released."""
@@ -279,7 +291,7 @@ class SlidingWindow:
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return the current estimate of a pose of the window."""
         self._poses.require(frame_id)
-        return self._graph.estimate(frame_id)
+        return self._scaled(self._graph.estimate(frame_id))
 
     def covariance(self, frame_id: FrameId) -> FloatArray:
         """Return the marginal covariance, shape (6, 6), of a pose of the window."""
@@ -302,7 +314,8 @@ class SlidingWindow:
         return Edge(
             reference_id=reference_id,
             T_reference_frame=se3.invert(self.pose(reference_id)) @ self.pose(frame_id),
-            covariance=self._graph.relative_covariance(reference_id, frame_id),
+            covariance=self.variance_factor
+            * self._graph.relative_covariance(reference_id, frame_id),
         )
 
     def graph(self) -> list[GraphEdge]:
@@ -332,7 +345,7 @@ class SlidingWindow:
 
     def pop_finished(self) -> list[Estimate]:
         """Return the smoothed estimates of the poses that left since the last call."""
-        return self._graph.pop_finished()
+        return [self._scaled(estimate) for estimate in self._graph.pop_finished()]
 
     def finish(self) -> list[Estimate]:
         """Return all estimates that were not popped yet, by stamp, and empty the window.
@@ -373,7 +386,13 @@ class SlidingWindow:
         if self._config.gate is None:
             return ""
         known = self.relative_pose(edge.reference_id, frame_id)
-        return disagreement(edge, known.T_reference_frame, known.covariance, gate=self._config.gate)
+        covariance = self._graph.relative_covariance(edge.reference_id, frame_id)
+        return disagreement(edge, known.T_reference_frame, covariance, gate=self._config.gate)
+
+    def _scaled(self, estimate: Estimate) -> Estimate:
+        if self.variance_factor == 1.0:
+            return estimate
+        return replace(estimate, covariance=self.variance_factor * estimate.covariance)
 
     def _reject(
         self, frame_id: FrameId, reason: str, *, edge: Edge | None = None, is_gated: bool = False

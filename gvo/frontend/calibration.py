@@ -67,6 +67,13 @@ _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
 # Innovations are clipped to so many sigmas.
 _MAX_SURPRISE = 3.0
+# Loops that the variance factor is averaged over; the shortest one, in seconds, as errors that last
+# do not show at once; the largest squared misclosure of one, per degree of freedom; and the share
+# of the variance that errors are taken to have which last for longer than loops.
+_N_LOOPS = 30
+_MIN_LOOP_S = 0.3
+_MAX_MISCLOSURE = 2.0
+_LASTING = 0.25
 # Moved to the middle of the exposure, points must stay in front of the camera.
 _MIN_DEPTH_M = 0.05
 
@@ -110,6 +117,46 @@ class ConstantFilter:
         gain = self._variance / (self._variance + sigma**2)
         self.value += gain * min(max(error, -limit), limit)
         self._variance *= 1.0 - gain
+
+
+class VarianceFactor:
+    """What the inflation of registrations' covariances should have been, by loops of them.
+
+    A link to a keyframe and the steps since then measure the same motion. Where they differ by less
+    than stated, errors of neighbouring tracks correlate less than `sigma_factor` assumes. What
+    lasts for longer than such a loop, it does not show: a part of the assumption always stays.
+
+    Parameters
+    ----------
+    sigma_factor : float
+        Inflation of the registrations' sigmas; no more than that is taken back.
+
+    Attributes
+    ----------
+    value : float
+        By which the stated covariances are to be multiplied, at most one.
+
+    References
+    ----------
+    W. Förstner, "Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten", Allgemeine
+    Vermessungs-Nachrichten 86, 1979 (the variance factor by misclosures).
+    """
+
+    def __init__(self, sigma_factor: float) -> None:
+        self.value = 1.0
+        self._least = min(sigma_factor**-2, 1.0)
+        self._mean = 1.0
+
+    def note(self, misclosure: float, elapsed_s: float) -> None:
+        """Take a loop: its squared misclosure in stated sigmas per degree of freedom; its length.
+
+        A misclosure that is not finite is unknown.
+        """
+        if elapsed_s < _MIN_LOOP_S or not math.isfinite(misclosure):
+            return
+        self._mean += (min(misclosure, _MAX_MISCLOSURE) - self._mean) / _N_LOOPS
+        value = _LASTING + (1.0 - _LASTING) * self._mean
+        self.value = min(max(value, self._least), 1.0)
 
 
 class FrameVelocities:
@@ -195,6 +242,8 @@ class RigOffsets:
         Those of them that registrations tell, by name.
     velocities : FrameVelocities
         Of the frames that are in use.
+    variance_factor : VarianceFactor
+        Of the covariances of registrations.
     """
 
     def __init__(self, config: Config, *, is_stereo: bool = True) -> None:
@@ -215,6 +264,8 @@ class RigOffsets:
             if is_learnt
         }
         self.velocities = FrameVelocities()
+        section = config.klt if config.frontend.kind == "klt" else config.registration
+        self.variance_factor = VarianceFactor(section.sigma_factor)
         self._is_stereo = is_stereo
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []

@@ -214,8 +214,14 @@ class RawChain(Generic[ObservationsT]):
             for node in self._nodes
         ]
 
-    def advance(self, current: ObservationsT) -> RawStep:
+    def advance(self, current: ObservationsT, *, variance_factor: float = 1.0) -> RawStep:
         """Register the next frame and return its step.
+
+        Parameters
+        ----------
+        current : observations
+        variance_factor : float
+            Of the step's covariance in that of the chain.
 
         Raises
         ------
@@ -233,7 +239,7 @@ class RawChain(Generic[ObservationsT]):
         for node in self._nodes:
             result = self._register(self._poses, node, current)
             if isinstance(result, RelativePose):
-                return self._append(self._poses, node, current, result)
+                return self._append(self._poses, node, current, result, variance_factor)
             failures.append(result)
         failure = next((each for each in failures if each.reason), failures[-1])
         return self._coast(self._poses, current, failure)
@@ -285,10 +291,11 @@ class RawChain(Generic[ObservationsT]):
         node: _Node[ObservationsT],
         current: ObservationsT,
         result: RelativePose,
+        variance_factor: float,
     ) -> RawStep:
         reference, stamp_ns = node.estimate, current.stamp_ns
         T, covariance = result.T_reference_current, result.covariance
-        estimate = poses.append(reference, stamp_ns, T, covariance)
+        estimate = poses.append(reference, stamp_ns, T, variance_factor * covariance)
         is_steady = self._note_velocity(poses, result, 1e-9 * (stamp_ns - reference.stamp_ns))
         n_steps = node.n_steps + 1
         self._nodes = [_Node(observations=current, estimate=estimate, n_steps=n_steps)]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from gvo.backend.gating import disagreement
 from gvo.backend.keyframe_policy import choose_links, proximity
@@ -16,7 +18,7 @@ from gvo.frontend.protocol import HasPoints, ObservationsT
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.chain import RawStep
-from gvo.types import Edge, FloatArray, FrameLink, LinkKind
+from gvo.types import Edge, Estimate, FloatArray, FrameLink, LinkKind
 
 # Points of a keyframe that its view overlap is estimated from.
 _N_SAMPLES = 64
@@ -170,6 +172,14 @@ class Keyframes(Generic[ObservationsT]):
         T_current_keyframe : mapping of int to ndarray of float64, shape (4, 4)
             By stamp of the keyframe.
         """
+        kept = [self._kept[stamp_ns].points_cam for stamp_ns in T_current_keyframe]
+        samples = [points for points in kept if points is not None]
+        is_uniform = len(samples) == len(kept) and len({*map(len, samples)}) == 1
+        # Samples of one size, as of most frames, are looked at together.
+        if is_uniform and self._camera is not None:
+            poses = np.stack(list(T_current_keyframe.values()))
+            overlaps = view_overlaps(np.stack(samples), poses, self._camera)
+            return dict(zip(T_current_keyframe, overlaps.tolist(), strict=True))
         return {stamp_ns: self._score(stamp_ns, T) for stamp_ns, T in T_current_keyframe.items()}
 
     def _score(self, stamp_ns: int, T_current_keyframe: FloatArray) -> float:
@@ -190,16 +200,23 @@ def view_overlap(
     points_keyframe: FloatArray, T_current_keyframe: FloatArray, camera: StereoCamera
 ) -> float:
     """Return the share of points (n, 3) in view of another camera, at about the same distance."""
-    if len(points_keyframe) == 0:
-        return 0.0
-    T = T_current_keyframe
-    x, y, z = T[:3, :3] @ points_keyframe.T + T[:3, 3:]
-    zoom = z / points_keyframe[:, 2]
+    return float(view_overlaps(points_keyframe, T_current_keyframe, camera))
+
+
+def view_overlaps(
+    points_keyframes: FloatArray, T_current_keyframes: FloatArray, camera: StereoCamera
+) -> FloatArray:
+    """Return these shares, shape (...), of points (..., n, 3) by poses (..., 4, 4)."""
+    T, points = T_current_keyframes, np.swapaxes(points_keyframes, -1, -2)
+    moved = T[..., :3, :3] @ points + T[..., :3, 3:]
+    x, y, z = moved[..., 0, :], moved[..., 1, :], moved[..., 2, :]
+    zoom = z / points[..., 2, :]
     is_in_view = (zoom > 1.0 / _MAX_ZOOM) & (zoom < _MAX_ZOOM)
     # The limits of the image times z, which is positive where the zoom is right.
     u, v = camera.fx * x + camera.cx * z, camera.fy * y + camera.cy * z
     is_in_view &= (u >= 0.0) & (u < camera.width * z) & (v >= 0.0) & (v < camera.height * z)
-    return float(np.count_nonzero(is_in_view)) / len(points_keyframe)
+    n_in_view = np.count_nonzero(is_in_view, axis=-1)
+    return np.asarray(n_in_view / max(points.shape[-1], 1))
 
 
 def link_keyframes(
@@ -295,3 +312,26 @@ def chi2(edge: Edge, T_world_reference: FloatArray, T_world_frame: FloatArray) -
     T_reference_frame = se3.invert(T_world_reference) @ T_world_frame
     residual = se3.log(se3.invert(edge.T_reference_frame) @ T_reference_frame)
     return float(se3.mahalanobis(residual, edge.covariance))
+
+
+def misclosure(link: Edge, start: Estimate, end: Estimate) -> float:
+    """Return the squared misclosure of a link and the steps since, per degree of freedom.
+
+    Parameters
+    ----------
+    link : Edge
+        From the keyframe to the frame.
+    start, end : Estimate
+        Keyframe and frame by the chain of steps.
+
+    Returns
+    -------
+    float
+        In sigmas of both; NaN where the covariances of the chain are too large to be subtracted.
+    """
+    T_start_end = se3.invert(start.T_world_frame) @ end.T_world_frame
+    Ad = se3.adjoint(se3.invert(T_start_end))
+    covariance = link.covariance + end.covariance - Ad @ start.covariance @ Ad.T
+    residual = se3.log(se3.invert(link.T_reference_frame) @ T_start_end)
+    _, solved, info = dposv(covariance, residual)
+    return float(residual @ solved) / len(residual) if info == 0 else math.nan

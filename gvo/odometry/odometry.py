@@ -24,7 +24,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
-from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes
+from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
 from gvo.odometry.loops import LoopDetector
 from gvo.odometry.segments import Segments
 from gvo.types import (
@@ -89,6 +89,9 @@ class Odometry:
         self._window = SlidingWindow(self._config.window)
         self._keyframes: Keyframes[Any] = Keyframes(self._view(), self._config.window)
         self._segments = Segments()
+        # Keyframes by the raw chain, which was not broken since, and whether it ever was.
+        self._starts: dict[int, Estimate] = {}
+        self._is_broken = False
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
         self._graph = RunGraph(self._config.window)
@@ -184,7 +187,8 @@ class Odometry:
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
-            step = self._chain.advance(observations)
+            step = self._chain.advance(observations, variance_factor=self._variance_factor())
+            self._note_break(step)
         with watch.stage("links"):
             scores, offered = self._link(observations, step)
             offered += self._align_depths(observations, offered)
@@ -363,7 +367,31 @@ class Odometry:
         is_linked = isinstance(result, RelativePose)
         T_frame_keyframe = se3.invert(T_keyframe_frame)
         self._keyframes.note_attempt(stamp_ns, T_frame_keyframe, step.n_steps, is_linked=is_linked)
-        return None if isinstance(result, Failure) else self._edge_of(stamp_ns, result)
+        if isinstance(result, Failure):
+            return None
+        link = self._edge_of(stamp_ns, result)
+        self._note_misclosure(link, step)
+        return link
+
+    def _variance_factor(self) -> float:
+        offsets = self._frontend.rig_offsets
+        return 1.0 if offsets is None else offsets.variance_factor.value
+
+    def _note_break(self, step: RawStep) -> None:
+        """Let covariances be what edges state once a pose rests on a guess."""
+        if step.failure is not None:
+            self._starts, self._is_broken = {}, True
+        self._window.variance_factor = 1.0 if self._is_broken else self._variance_factor()
+
+    def _note_misclosure(self, link: Edge, step: RawStep) -> None:
+        """Tell the front-end how well a link agrees with the raw chain since its keyframe."""
+        offsets, start = self._frontend.rig_offsets, self._starts.get(int(link.reference_id))  # type: ignore[call-overload]
+        if offsets is None or start is None:
+            return
+        factor = offsets.variance_factor
+        scaled = replace(link, covariance=factor.value * link.covariance)
+        elapsed_s = 1e-9 * (step.estimate.stamp_ns - start.stamp_ns)
+        factor.note(factor.value * misclosure(scaled, start, step.estimate), elapsed_s)
 
     def _edge_of(self, stamp_ns: int, result: RelativePose) -> Edge:
         return Edge(
@@ -456,6 +484,7 @@ class Odometry:
             return
         if self._is_keyframe_needed(scores):
             self._keyframes.add(observations, n_steps=step.n_steps)
+            self._starts[causal.stamp_ns] = step.estimate
             self._window.keep(causal.stamp_ns)
         self._release_keyframes(scores, step.n_steps)
 
@@ -474,6 +503,8 @@ class Odometry:
         for stamp_ns in self._keyframes.stamps_ns:
             if stamp_ns not in self._window:
                 self._keyframes.drop(stamp_ns)
+        kept_ns = self._keyframes.stamps_ns
+        self._starts = {ns: each for ns, each in self._starts.items() if ns in kept_ns}
 
     def _look(
         self,

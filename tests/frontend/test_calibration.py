@@ -1,6 +1,7 @@
 """Constant errors of a camera: the filter, a rolling shutter, and rendered planted errors."""
 
 import gc
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -19,6 +20,7 @@ from gvo.frontend.calibration import (
     ConstantFilter,
     FrameVelocities,
     RigOffsets,
+    VarianceFactor,
     describe_offsets,
     settle_rows,
     settling_rates,
@@ -96,6 +98,35 @@ def test_one_wild_measurement_moves_it_no_farther_than_three_sigmas() -> None:
     tame.update(3.0 * np.hypot(0.1, 0.02), 0.02)
     wild.update(50.0, 0.02)
     assert wild.value == pytest.approx(tame.value)
+
+
+@pytest.mark.parametrize(
+    ("misclosure", "sigma_factor", "expected"),
+    [
+        (0.2, 2.4, 0.4),
+        (1.0, 2.4, 1.0),
+        (50.0, 2.4, 1.0),  # never wider than assumed
+        (0.2, 1.2, 1.2**-2),  # never surer than residuals are
+        (0.2, 0.9, 1.0),
+    ],
+)
+def test_an_inflation_is_taken_back_as_far_as_loops_close_better(
+    misclosure: float, sigma_factor: float, expected: float
+) -> None:
+    factor = VarianceFactor(sigma_factor)
+    for _ in range(300):
+        factor.note(misclosure, 1.0)
+        factor.note(0.0, 0.1)  # too short to tell
+        factor.note(math.nan, 1.0)
+    assert factor.value == pytest.approx(expected, abs=1e-3)
+
+
+def test_one_loop_far_off_does_not_undo_what_many_showed() -> None:
+    factor = VarianceFactor(2.4)
+    for _ in range(300):
+        factor.note(0.2, 1.0)
+    factor.note(1e9, 1.0)
+    assert factor.value < 0.5
 
 
 def test_what_is_noted_counts_from_the_next_frame_and_once() -> None:

@@ -1,15 +1,16 @@
 """How much the current frame has in common with the kept ones."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from gvo.config import WindowConfig
+from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
-from gvo.odometry.keyframes import Keyframes
-from gvo.types import FloatArray, Observations
+from gvo.odometry.keyframes import Keyframes, misclosure
+from gvo.types import Edge, Estimate, FloatArray, Observations
 
 CAMERA = StereoCamera(fx=100.0, fy=100.0, cx=50.0, cy=40.0, width=100, height=80, baseline=0.1)
 
@@ -155,3 +156,48 @@ def test_the_number_of_kept_frames_is_counted() -> None:
     kept = keyframes(1, 2, 3)
     kept.drop(2)
     assert len(kept) == 2
+
+
+def test_samples_of_one_size_overlap_as_each_does_alone() -> None:
+    kept = keyframes(1, 2, 3)
+    kept.add(observe(4, wall(20)))
+    poses = {1: shifted(dx=1.0), 2: shifted(dz=-0.5), 3: np.eye(4)}
+    alone = {ns: kept.scores({ns: T})[ns] for ns, T in poses.items()}
+    assert kept.scores(poses) == alone
+    assert kept.scores({**poses, 4: np.eye(4)}) == {**alone, 4: 1.0}
+
+
+def chain(n: int, sigmas: FloatArray, rng: np.random.Generator) -> tuple[Estimate, Estimate]:
+    """Return the 20th and the last pose of a chain of true steps and noise."""
+    step = se3.exp(np.array([0.01, 0.03, 0.0, 0.1, 0.0, 0.8]))
+    T, covariance, found = np.eye(4), np.zeros((6, 6)), list[Estimate]()
+    for _ in range(n):
+        measured = step @ se3.exp(sigmas * rng.normal(size=6))
+        T = T @ measured
+        covariance = se3.compose_covariance(covariance, measured, np.diag(sigmas**2))
+        found.append(Estimate(stamp_ns=len(found), T_world_frame=T, covariance=covariance))
+    return found[19], found[-1]
+
+
+def test_a_misclosure_is_one_on_average_where_covariances_fit() -> None:
+    rng = np.random.default_rng(4)
+    sigmas = np.array([1e-3, 1e-3, 1e-3, 5e-3, 5e-3, 1e-2])
+    step = se3.exp(np.array([0.01, 0.03, 0.0, 0.1, 0.0, 0.8]))
+    found = []
+    for _ in range(200):
+        T_true = np.linalg.matrix_power(step, 10)
+        link = Edge(
+            reference_id=19,
+            T_reference_frame=T_true @ se3.exp(2.0 * sigmas * rng.normal(size=6)),
+            covariance=np.diag(4.0 * sigmas**2),
+        )
+        found.append(misclosure(link, *chain(30, sigmas, rng)))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_chain_whose_covariance_cannot_be_subtracted_tells_nothing() -> None:
+    rng = np.random.default_rng(4)
+    start, end = chain(30, np.full(6, 1e-3), rng)
+    link = Edge(reference_id=19, T_reference_frame=np.eye(4), covariance=1e-12 * np.eye(6))
+    assert np.isnan(misclosure(link, end, start))
+    assert np.isnan(misclosure(replace(link, covariance=np.full((6, 6), np.nan)), start, end))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gvo.config import CameraConfig, Config, FrontendConfig, WindowConfig
+from gvo.frontend.calibration import RigOffsets
 from gvo.frontend.klt import KltFrontend
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -243,7 +244,9 @@ def test_the_raw_chain_does_not_depend_on_the_window(window: dict[str, Any]) -> 
         run(map(stereo_frame, range(N_FRAMES)), with_known_readout(each))
         for each in (configure(), configure(**window))
     )
-    assert same_estimates((r.raw for r in results), (r.raw for r in others))
+    # Links tell how much of the stated covariances is true, but nothing of the poses.
+    poses, of_others = (np.array([r.raw.T_world_frame for r in each]) for each in (results, others))
+    np.testing.assert_array_equal(poses, of_others)
     assert not same_estimates((r.causal for r in results), (r.causal for r in others))
 
 
@@ -462,6 +465,51 @@ def test_its_keyframes_are_chosen_by_distance() -> None:
     assert {a // STEP_NS for a, _ in links} <= set(range(0, 30, 4))
     assert max(b - a for a, b in links) > 10 * STEP_NS
     assert max(result.n_links for result in results) == 3
+
+
+class CautiousFrontend(ScanFrontend):
+    """States four times the variances of its errors, and learns of it where it is asked to."""
+
+    def __init__(self, *, is_learning: bool) -> None:
+        super().__init__()
+        if is_learning:
+            self.rig_offsets = RigOffsets(Config())
+
+    def register(
+        self, reference: Scan, current: Scan, prior: MotionPrior | None
+    ) -> RelativePose | Failure:
+        result = super().register(reference, current, prior)
+        if isinstance(result, Failure):
+            return result
+        return replace(result, covariance=4.0 * result.covariance)
+
+
+@pytest.mark.parametrize("empty", [-1, 70])
+def test_covariances_shrink_to_what_loops_show_and_no_pose_moves(empty: int) -> None:
+    config = Config.model_validate({"window": {"size": 3, "keyframe_distance_m": 1.0}})
+    scans = [Scan(i * STEP_NS, None if i == empty else scan_pose(i)) for i in range(90)]
+    runs, factors = [], []
+    for is_learning in (True, False):
+        frontend = CautiousFrontend(is_learning=is_learning)
+        odometry = Odometry(config=config, frontend=frontend)
+        runs.append([odometry.track(scan) for scan in scans])
+        factors.append(odometry.window.variance_factor)
+        if is_learning:
+            # A quarter is kept of what they are too wide, for errors that no loop shows.
+            value = frontend.rig_offsets.variance_factor.value
+            assert value == pytest.approx(0.25 + 0.75 / 4.0, abs=0.12)
+    for learnt, stated in zip(*runs, strict=True):
+        for kind in ("raw", "causal"):
+            one, other = getattr(learnt, kind), getattr(stated, kind)
+            np.testing.assert_array_equal(one.T_world_frame, other.T_world_frame)
+    learnt, stated = (run[-1] for run in runs)
+    # Where the chain was broken the window's rest on a guess, which is as uncertain as before.
+    assert factors == [pytest.approx(value, abs=0.05) if empty < 0 else 1.0, 1.0]
+    expected = factors[0] * stated.causal.covariance
+    np.testing.assert_allclose(learnt.causal.covariance, expected, rtol=1e-9)
+    if empty < 0:
+        shares = np.diag(learnt.raw.covariance) / np.diag(stated.raw.covariance)
+        assert np.all((shares > value) & (shares < 0.95))
 
 
 class OnceWrongFrontend(ScanFrontend):
