@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gvo.frontend.stereo.patches import steps_around
+from gvo.frontend.stereo.patches import cut_patches, steps_around
 from gvo.geometry.camera import StereoCamera
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
 
@@ -130,11 +129,11 @@ class Templates:
     @classmethod
     def of(cls, image: ImageArray, pixels: FloatArray) -> Templates:
         """Cut patches around whole pixels, shape (n, 2), out of an image."""
-        return cls.of_patches(cut_patches(image, pixels))
+        return cls.of_patches(cut_patches(image, pixels, RADIUS_PX + 1))
 
     @classmethod
     def of_patches(cls, patches: NDArray[np.uint8]) -> Templates:
-        """Prepare patches as `cut_patches` gives them."""
+        """Prepare patches (n, 11, 11), which are one pixel wider on all sides."""
         n, size = len(patches), 2 * RADIUS_PX + 1
         wide = patches.astype(np.float32)
         along = 0.5 * (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2])
@@ -192,19 +191,11 @@ class Templates:
         return pixels, are_alike & (np.hypot(*moves.T) < _MAX_LAST_STEP_PX)
 
 
-def cut_patches(image: ImageArray, pixels: FloatArray) -> NDArray[np.uint8]:
-    """Cut patches and a margin of one pixel around whole pixels (n, 2), shape (n, 11, 11)."""
-    size = 2 * RADIUS_PX + 3
-    padded = cv2.copyMakeBorder(image, *(RADIUS_PX + 1,) * 4, cv2.BORDER_REPLICATE)
-    u, v = pixels.astype(np.int64).T
-    return np.asarray(sliding_window_view(padded, (size, size))[v, u])
-
-
 def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.float32]:
     """Return warped patches around pixels, shape (n, s * s), interpolated."""
     if len(pixels) == 0:  # refused by OpenCV
         return np.zeros((0, (2 * RADIUS_PX + 1) ** 2), dtype=np.float32)
-    places = np.matmul(warps.astype(np.float32), np.stack(steps_around(RADIUS_PX, RADIUS_PX)))
+    places = np.matmul(warps.astype(np.float32), steps_around(RADIUS_PX, RADIUS_PX))
     places += pixels.astype(np.float32)[:, :, np.newaxis]
     seen = cv2.remap(
         image, places[:, 0], places[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

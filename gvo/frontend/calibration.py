@@ -264,8 +264,9 @@ class RigOffsets:
             if is_learnt
         }
         self.velocities = FrameVelocities()
-        section = config.klt if config.frontend.kind == "klt" else config.registration
-        self.variance_factor = VarianceFactor(section.sigma_factor)
+        # Matches of descriptors share a bias, and loops of them do: nothing is taken back there.
+        is_tracking = config.frontend.kind == "klt"
+        self.variance_factor = VarianceFactor(config.klt.sigma_factor if is_tracking else 1.0)
         self._is_stereo = is_stereo
         self._disparity_error: ConstantError | None = None
         self._readout_errors: list[ConstantError] = []

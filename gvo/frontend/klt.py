@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.alignment import Templates, cut_patches, move_slopes, patch_warps
+from gvo.frontend.alignment import RADIUS_PX, Templates, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
@@ -23,6 +23,7 @@ from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
 from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
+from gvo.frontend.stereo.patches import cut_patches
 from gvo.frontend.tracking import detect_corners, track_pixels
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -264,7 +265,7 @@ class KltFrontend:
             pixels=observations.uvd[chosen].astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
             slopes=corners.slopes[chosen].astype(np.float32),
-            patches=cut_patches(image, keypoints),
+            patches=cut_patches(image, keypoints, RADIUS_PX + 1),
             descriptors_left=describe_pixels(image, keypoints),
             descriptors_wide=describe_pixels(image, keypoints, _WIDE),
             depth_points=depth_points,

@@ -63,7 +63,10 @@ class PinholeCamera:
             Pixels (u, v).
         """
         x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
-        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        u = self.fx * x / z + self.cx
+        pixels = np.empty((*u.shape, 2), dtype=u.dtype)
+        pixels[..., 0], pixels[..., 1] = u, self.fy * y / z + self.cy
+        return pixels
 
     def is_in_view(self, pixels: FloatArray) -> BoolArray:
         """Tell which pixels (u, v), shape (n, 2), lie within the image; shape (n,)."""
@@ -84,8 +87,9 @@ class PinholeCamera:
             Points of depth one in the `cam` frame.
         """
         x = (pixels[..., 0] - self.cx) / self.fx
-        y = (pixels[..., 1] - self.cy) / self.fy
-        return np.stack([x, y, np.ones_like(x)], axis=-1)
+        rays = np.ones((*x.shape, 3), dtype=x.dtype)
+        rays[..., 0], rays[..., 1] = x, (pixels[..., 1] - self.cy) / self.fy
+        return rays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

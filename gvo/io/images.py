@@ -23,6 +23,8 @@ MAX_PIXELS = 100_000_000
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND"
+_PNG_SUB = 1  # filter of a row: differences from the pixel to the left
+_MAX_SUMMED = 1 << 25  # bytes of rows of differences whose sums, four times as many, are held
 _MAX_STORED = 65535  # bytes of a stored block
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by the type of colour
 # Of each pass of an interlaced image: the first column and row, the steps of both.
@@ -190,10 +192,8 @@ def decode_image(data: NDArray[np.uint8], where: str) -> NDArray[Any]:
     is_complete = _COMPLETE.get(header.format)
     if is_complete is not None and not is_complete(data):
         raise RecordingError(f"{where}: the {header.format} image is truncated or damaged")
-    if header.format == "PNG":
-        data = _cut_png(data)
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        pixels = _decode_png(data) if header.format == "PNG" else _decode_by_opencv(data)
     except cv2.error as error:
         raise RecordingError(f"{where}: the image cannot be decoded") from error
     if pixels is None or pixels.size == 0:
@@ -526,11 +526,15 @@ def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
         start = end
 
 
-def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a PNG whose stream ends where its rows do; one that is malformed as it is.
+def _decode_by_opencv(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
 
-    libpng inflates all that follows, up to a thousand times its bytes. The rows are written
-    uncompressed: they are inflated once, without their checksum, which libpng compares.
+
+def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+    """Decode a PNG; None where OpenCV cannot.
+
+    libpng inflates all that follows the rows, up to a thousand times its bytes. It is given them
+    uncompressed and cut there, what is malformed as it is, and what OpenCV wrote not at all.
     """
     parts, contents, n_bytes = [_PNG_MAGIC], list[memoryview](), _n_png_bytes(data[8:33].tobytes())
     for name, start, end in _png_chunks(data):
@@ -538,19 +542,39 @@ def _cut_png(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
             parts.append(data[start:end].tobytes())
         elif name == b"IDAT":
             contents.append(data.data[start + 8 : end - 4])
-    stream, inflater = b"".join(contents), zlib.decompressobj(wbits=-zlib.MAX_WBITS)
+    stream, inflater = b"".join(contents), zlib.decompressobj()
     try:
-        rows = inflater.decompress(stream[2:], n_bytes) if n_bytes else b""
+        rows = inflater.decompress(stream, n_bytes) if n_bytes else b""
     except zlib.error:
-        return data
+        rows = b""
     if not rows or len(rows) < n_bytes:
-        return data
-    check = inflater.unused_data[:4]
-    if len(check) < 4:
-        check = struct.pack(">I", zlib.adler32(rows))
+        return _decode_by_opencv(data)
+    pixels = _unfiltered(parts[1], rows) if len(parts) == 2 else None
+    if pixels is not None:
+        return pixels
+    end = len(stream) - len(inflater.unused_data)
+    check = stream[end - 4 : end] if inflater.eof else struct.pack(">I", zlib.adler32(rows))
     stored = [stream[:2], *_stored(rows), check]
     parts += [*_png_chunk(b"IDAT", stored), *_png_chunk(_PNG_END, [])]
-    return np.frombuffer(b"".join(parts), dtype=np.uint8)
+    return _decode_by_opencv(np.frombuffer(b"".join(parts), dtype=np.uint8))
+
+
+def _unfiltered(header: bytes, rows: bytes) -> NDArray[Any] | None:
+    """Return the pixels of rows of differences, as OpenCV writes them; None of other rows."""
+    width, height, depth, colour, *methods = struct.unpack(">IIBBBBB", header[8:21])
+    n = {(8, 0): 1, (8, 2): 3, (16, 0): 2}.get((depth, colour), 0)
+    if n == 0 or any(methods) or len(rows) > _MAX_SUMMED:
+        return None
+    filtered = np.frombuffer(rows, dtype=np.uint8).reshape(height, 1 + n * width)
+    if np.any(filtered[:, 0] != _PNG_SUB):
+        return None
+    # Sums along rows, modulo 256, by those over rectangles: ten times as fast as in bytes.
+    differences = np.ascontiguousarray(filtered[:, 1:]).reshape(height, width, n)
+    sums = cv2.integral(differences).reshape(height + 1, width + 1, n).astype(np.uint8)
+    pixels = sums[1:, 1:] - sums[:-1, 1:]
+    if depth == 16:
+        return np.asarray(pixels.view(">u2")[:, :, 0].astype(np.uint16))
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if n == 3 else pixels[:, :, 0]
 
 
 def _stored(content: bytes) -> Iterator[bytes]:

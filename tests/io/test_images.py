@@ -1,5 +1,6 @@
 """Image files, ranges of grey, and depth as counts, both ways."""
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,34 @@ def _data(data: bytes) -> NDArray[np.uint8]:
 def test_formats_without_loss_are_decoded_unchanged(tiny: Any, suffix: str, is_color: bool) -> None:
     pixels = tiny.texture(1, is_color=is_color)
     np.testing.assert_array_equal(decode_image(_data(_encoded(pixels, suffix)), "image"), pixels)
+
+
+@pytest.mark.parametrize("options", [[], [cv2.IMWRITE_PNG_COMPRESSION, 6]])
+@pytest.mark.parametrize("shape", [(32, 48), (1, 1), (31, 7, 3), (20, 33, 4)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_png_of_any_kind_is_decoded_as_opencv_does(
+    dtype: type[np.generic], shape: tuple[int, ...], options: list[int]
+) -> None:
+    largest = np.iinfo(dtype).max
+    pixels = np.random.default_rng(5).integers(0, largest, shape, dtype, endpoint=True)
+    data = cv2.imencode(".png", pixels, options)[1].ravel()
+    decoded = decode_image(data, "image")
+    assert (decoded.dtype, decoded.shape) == (pixels.dtype, pixels.shape)
+    np.testing.assert_array_equal(decoded, pixels)
+
+
+def test_rows_of_a_png_that_their_checksum_contradicts_are_not_believed(tiny: Any) -> None:
+    data = bytearray(_encoded(tiny.texture(1), ".png"))
+    start = data.index(b"IDAT")
+    end = start + 4 + int.from_bytes(data[start - 4 : start], "big")
+    data[end - 1] ^= 1  # of the stream; the chunk's own is right
+    data[end : end + 4] = zlib.crc32(data[start:end]).to_bytes(4, "big")
+    by_opencv = cv2.imdecode(_data(bytes(data)), cv2.IMREAD_UNCHANGED)
+    if by_opencv is None:
+        with pytest.raises(RecordingError, match="cannot be decoded"):
+            decode_image(_data(bytes(data)), "image")
+    else:
+        np.testing.assert_array_equal(decode_image(_data(bytes(data)), "image"), by_opencv)
 
 
 def _bomb(suffix: str, pixels: NDArray[Any]) -> bytes:

@@ -17,8 +17,8 @@ from gvo.frontend.stereo.patches import (
     Likeness,
     Patches,
     correlate_rows,
+    cut_patches,
     interpolate_strips,
-    sample_patches,
 )
 from gvo.frontend.tracking import halve
 from gvo.types import BoolArray, FloatArray, ImageArray, IntArray
@@ -107,8 +107,7 @@ def measure_corners(
     owners = np.concatenate([np.arange(len(placed)), doubtful])
     starts = np.concatenate([rough[placed], rivals[placed[doubtful], ranks]])
     # One pixel wider on all sides, for the gradients along rows and across them.
-    u, v = corners[placed].T
-    left = sample_patches(images[0], u, v, radius + 1, radius + 1)
+    left = cut_patches(images[0], corners[placed], radius + 1).astype(np.float32)
     found, right, is_at_rest = _search_strips(
         (left, images[1]), corners[placed], owners, starts, config, row_offset_px=row_offset_px
     )

@@ -55,14 +55,14 @@ def sample_patches(
     shape = len(u), 2 * radius_v + 1, 2 * radius_u + 1
     if len(u) == 0:  # refused by OpenCV
         return np.zeros(shape, dtype=np.float32)
-    steps_u, steps_v = steps_around(radius_u, radius_v)
-    columns = u.astype(np.float32)[:, np.newaxis] + steps_u
+    steps = steps_around(radius_u, radius_v)
+    columns = u.astype(np.float32)[:, np.newaxis] + steps[0]
     if slopes is not None:
-        columns -= slopes.astype(np.float32) @ np.stack([steps_u, steps_v])
+        columns -= slopes.astype(np.float32) @ steps
     patches = cv2.remap(
         image,
         columns,
-        v.astype(np.float32)[:, np.newaxis] + steps_v,
+        v.astype(np.float32)[:, np.newaxis] + steps[1],
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
@@ -70,10 +70,23 @@ def sample_patches(
 
 
 @lru_cache(maxsize=32)
-def steps_around(radius_u: int, radius_v: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the offsets (u, v) from the centre of a patch to its pixels, row by row."""
+def steps_around(radius_u: int, radius_v: int) -> NDArray[np.float32]:
+    """Return the offsets (u, v) of the pixels of a patch from its centre, row by row, (2, n)."""
     v, u = np.mgrid[-radius_v : radius_v + 1, -radius_u : radius_u + 1].astype(np.float32)
-    return u.ravel(), v.ravel()
+    return np.stack([u.ravel(), v.ravel()])
+
+
+def cut_patches(image: ImageArray, pixels: FloatArray, radius: int) -> NDArray[np.uint8]:
+    """Return patches around whole pixels (n, 2) of an image, whose border is replicated.
+
+    Returns
+    -------
+    ndarray of uint8, shape (n, 2 * radius + 1, 2 * radius + 1)
+    """
+    size = 2 * radius + 1
+    padded = cv2.copyMakeBorder(image, *(radius,) * 4, cv2.BORDER_REPLICATE)
+    u, v = pixels.astype(np.int64).T
+    return np.asarray(sliding_window_view(padded, (size, size))[v, u])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
