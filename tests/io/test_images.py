@@ -85,7 +85,7 @@ def test_formats_without_loss_are_decoded_unchanged(tiny: Any, suffix: str, is_c
 @pytest.mark.parametrize("shape", [(32, 48), (1, 1), (31, 7, 3), (20, 33, 4)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_png_of_any_kind_is_decoded_as_opencv_does(
-    dtype: type[np.generic], shape: tuple[int, ...], options: list[int]
+    dtype: type[np.unsignedinteger[Any]], shape: tuple[int, ...], options: list[int]
 ) -> None:
     largest = np.iinfo(dtype).max
     pixels = np.random.default_rng(5).integers(0, largest, shape, dtype, endpoint=True)
