@@ -252,8 +252,9 @@ class Peer:
 
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Return a domain of this process alone, as far as there are."""
-    number = 1 + os.getpid() % 100
+    """Return a domain that no other worker of this session has."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    number = 1 + (os.getppid() + worker) % 100
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     for name in ("CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
         monkeypatch.delenv(name, raising=False)
