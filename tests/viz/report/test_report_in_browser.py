@@ -29,9 +29,11 @@ return [...document.querySelectorAll('section[id]')].map(section => {
 });
 """
 
-_TEXT_HEIGHTS = """
+_TEXT_SIZES = """
 return [...document.querySelectorAll('.panel > svg text')]
-  .map(e => e.getBoundingClientRect().height).filter(height => height > 0);
+  .filter(e => e.getBoundingClientRect().height > 0)
+  .map(e => [parseFloat(getComputedStyle(e).fontSize), e.getScreenCTM()])
+  .map(([size, M]) => size * Math.hypot(M.c, M.d));
 """
 
 
@@ -87,12 +89,12 @@ def test_on_a_narrow_screen_plots_can_be_read(browser: Browser, short_report: Pa
     browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
     try:
         assert browser.run("return document.documentElement.scrollWidth <= innerWidth")
-        heights = browser.run(_TEXT_HEIGHTS)
+        sizes = browser.run(_TEXT_SIZES)
     finally:
         browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert isinstance(heights, list)
-    assert len(heights) > 50
-    assert min(heights) > 7.5
+    assert isinstance(sizes, list)
+    assert len(sizes) > 50
+    assert min(sizes) > 6.4
 
 
 @pytest.mark.acceptance
