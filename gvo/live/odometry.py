@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -226,6 +227,7 @@ class LiveOdometry:
             is_robot=not base_frame.is_camera and not base_frame.origin,
         )
         self._loop, self._save = loop, save
+        loop.take_waited_s = self._waiting.take_waited_s
         if self.viewer is not None:
             self.viewer.begin(loop.window)
             loop.on_tracked = self.viewer.add
@@ -397,6 +399,7 @@ class WaitingPairs:
         self._fault: GvoError | None = None
         self._changed = threading.Condition()
         self._actions: deque[Callable[[], object]] = deque()
+        self._waited_s = 0.0
         self.n_dropped = 0
         self.on_pair: Callable[[int], None] = lambda _: None
 
@@ -439,12 +442,19 @@ class WaitingPairs:
             That ended the stream.
         """
         while True:
+            start_s = time.perf_counter()
             with self._changed:
                 self._changed.wait_for(lambda: self._actions or self._items or self._is_closed)
                 action = self._actions.popleft() if self._actions else None
+            self._waited_s += time.perf_counter() - start_s
             if action is None:
                 return self._take()
             action()
+
+    def take_waited_s(self) -> float:
+        """Return how long `take` has waited since the last call, seconds."""
+        waited_s, self._waited_s = self._waited_s, 0.0
+        return waited_s
 
     def _take(self) -> _Item | None:
         with self._changed:

@@ -189,15 +189,13 @@ class Arrivals(AbstractContextManager["Arrivals"]):
         """Return what is wrong with the images in a line; empty where they come."""
         now_s = time.monotonic()
         silent_s = [now_s - (times[-1] if times else self._started_s) for times in self._times_s]
-        missing = [stream for stream in (0, 1) if silent_s[stream] > _SILENT_S]
-        if not missing:
-            return ""
-        names = self._info.stream_names
-        lasting = f"for {min(silent_s[stream] for stream in missing):.0f} s"
-        if len(missing) == 2:
-            return f"no images {lasting} on {self._topics[0]} and {self._topics[1]}"
-        (silent,) = missing
+        silent = int(silent_s[1] > silent_s[0])
         other = 1 - silent
+        if silent_s[silent] <= _SILENT_S:
+            return ""
+        names, lasting = self._info.stream_names, f"for {silent_s[silent]:.0f} s"
+        if silent_s[other] > 0.5 * _SILENT_S:
+            return f"no images {lasting} on {self._topics[0]} and {self._topics[1]}"
         rate = _rate_hz(self._times_s[other])
         return (
             f"no {names[silent]} image {lasting} on {self._topics[silent]}; {names[other]} comes "

@@ -73,6 +73,8 @@ class RunLoop:
         window as it was then; of the base frame.
     output_faults : list of str
         Why outputs were not written to their end.
+    take_waited_s : callable
+        Returns how long the last frame was waited for, seconds, which is no time of reading.
     on_tracked : callable or None
         Called after the outputs with each frame and what it gave, poses of the camera; with a
         faulty one and None.
@@ -103,6 +105,7 @@ class RunLoop:
         self._outputs: list[Output] = []
         self.edges: list[tuple[int, Edge]] = []
         self.output_faults: list[str] = []
+        self.take_waited_s: Callable[[], float] = lambda: 0.0
         self.on_tracked: Callable[[Frame | FaultyFrame, FrameResult | None], None] | None = None
         self._asked_ns: int | None = None
         self._odometry = Odometry(source.info.camera, config)
@@ -225,7 +228,7 @@ class RunLoop:
             except RecordingError as error:
                 self.statistics.broken_off = str(error)
                 return
-            self._read_ms = 1e3 * (time.perf_counter() - start)
+            self._read_ms = 1e3 * (time.perf_counter() - start - self.take_waited_s())
             yield item
 
     def _take(self, item: Frame | FaultyFrame) -> None:

@@ -4,6 +4,7 @@ import io
 import json
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,27 @@ def test_what_waits_comes_in_its_order() -> None:
         waiting.put(item)
     assert taken(waiting) == [(10, ""), (20, "alone"), (30, "")]
     assert waiting.n_dropped == 0
+
+
+def test_the_time_of_reading_is_without_that_of_waiting(drive_bag: Path, tmp_path: Path) -> None:
+    class Late:
+        """A camera with a long exposure."""
+
+        def __init__(self) -> None:
+            self.source = gvo.open_recording(drive_bag)
+            self.info = self.source.info
+
+        def images(self) -> Iterator[StampedImage]:
+            for image in self.source.images():
+                time.sleep(0.05)
+                yield image
+
+        def ground_truth(self) -> None:
+            return None
+
+    ((folder, _),) = LiveOdometry(Late()).run(tmp_path / "out", outputs=NO_REPORT)
+    rows = (folder / "timings.csv").read_text().splitlines()[1:]
+    assert np.median([float(row.split(",")[1]) for row in rows]) < 50
 
 
 def test_for_one_more_the_oldest_is_dropped_and_says_so() -> None:
