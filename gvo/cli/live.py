@@ -140,7 +140,7 @@ def live(
             raise ConfigurationError(f"--queue, --max-lag: {error}") from error
         if page is not None:
             _show(odometry, source, page, stack)
-        end.stop = odometry.stop
+        end.follow(odometry.stop)
         runs = odometry.run(out, outputs=outputs, force=force, on_progress=_status(odometry))
     for folder, result in runs:
         tell(result, folder)
@@ -152,11 +152,17 @@ class _End:
 
     def __init__(self) -> None:
         self.has_come = threading.Event()
-        self.stop: Callable[[], None] = lambda: None
+        self._stop: Callable[[], None] = lambda: None
 
     def __call__(self) -> None:
         self.has_come.set()
-        self.stop()
+        self._stop()
+
+    def follow(self, stop: Callable[[], None]) -> None:
+        """Let the signal stop this from now on, also one that has come."""
+        self._stop = stop
+        if self.has_come.is_set():
+            stop()
 
 
 def _connect(words: list[str], qos: _Qos, foxglove: str | None, stack: ExitStack) -> list[Sink]:

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
@@ -302,7 +303,8 @@ def ended_by_a_signal(stop: Callable[[], None]) -> Iterator[None]:
         received.append(number)
         if len(received) > 1:
             raise KeyboardInterrupt
-        stop()
+        # Not here: what stops may be held by the very code that the signal came into.
+        threading.Thread(target=stop, daemon=True).start()
 
     try:
         with _handling(receive):
