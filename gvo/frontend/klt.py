@@ -231,7 +231,8 @@ class KltFrontend:
         """Register in two rounds: over more levels of the pyramid, and from the result."""
         rough = self._register_from(prior, reference, current, "wide", is_step=True)
         if prior is None and not isinstance(rough, RelativePose | Contradiction):
-            rough = self._register_places(self.describe(reference), self.describe(current))
+            places = self.describe(reference), self.describe(current)
+            rough = self._register_places(*places) or rough
         if isinstance(rough, Failure):
             return rough
         found = MotionPrior(T_predicted=rough.T_reference_current)

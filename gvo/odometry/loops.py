@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from bisect import bisect_right
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
@@ -16,7 +17,7 @@ from gvo.frontend.protocol import Recognizer
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.keyframes import view_overlap
-from gvo.types import FloatArray, Frame, Loop, RelativePose
+from gvo.types import FloatArray, Frame, Loop, RelativePose, SegmentJoin, Status
 
 # A frame that shows less than so much of the latest place is another one.
 _MAX_OVERLAP = 0.7
@@ -272,6 +273,63 @@ class LoopDetector:
         length, angle = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
         turn = (_DRIFT * angle) ** 2 + (_DRIFT * 0.1 * length) ** 2
         return T, np.repeat([turn, (_DRIFT * length) ** 2], 3)
+
+
+class Segments:
+    """Which segment a run is in, and which ones are joined.
+
+    While the camera is lost its pose is a guess that nobody should rely on. The frames after that
+    are a segment of their own, somewhere in the world: where, only a loop to a place of an earlier
+    segment can tell.
+    """
+
+    def __init__(self) -> None:
+        self._starts_ns: list[int] = []
+        self._groups = [0]
+        self._is_lost = False
+
+    @property
+    def current(self) -> int:
+        """The segment of the latest frame."""
+        return len(self._starts_ns)
+
+    def segment_of(self, stamp_ns: int) -> int:
+        """Return the segment of an earlier frame."""
+        return bisect_right(self._starts_ns, stamp_ns)
+
+    def note_frame(self, stamp_ns: int, status: Status) -> None:
+        """Add a frame; the first one that is lost begins a segment."""
+        if status is Status.LOST and not self._is_lost:
+            self._starts_ns.append(stamp_ns)
+            self._groups.append(self.current)
+        self._is_lost = status is Status.LOST
+
+    def unjoined(self, stamps_ns: Iterable[int]) -> list[int]:
+        """Return the keyframes of segments that the current one is not joined to."""
+        present = self._groups[self.current]
+        return [ns for ns in stamps_ns if self._groups[self.segment_of(ns)] != present]
+
+    def join(self, stamp_ns: int, reference_ns: int) -> SegmentJoin | None:
+        """Join the segment of a frame to that of an earlier one, and to all that are joined to it.
+
+        Parameters
+        ----------
+        stamp_ns, reference_ns : int
+            The frame, and the one that it was registered against.
+
+        Returns
+        -------
+        SegmentJoin or None
+            None where they are joined already.
+        """
+        segment, other = self.segment_of(stamp_ns), self.segment_of(reference_ns)
+        present, former = self._groups[segment], self._groups[other]
+        if present == former:
+            return None
+        self._groups = [former if group == present else group for group in self._groups]
+        return SegmentJoin(
+            segment=segment, to_segment=other, stamp_ns=stamp_ns, reference_ns=reference_ns
+        )
 
 
 def _loop(reference_ns: int, stamp_ns: int, result: RelativePose) -> Loop:

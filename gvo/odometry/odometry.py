@@ -25,8 +25,7 @@ from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.odometry.chain import RawChain, RawStep
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.keyframes import Keyframes, judge_links, link_keyframes, misclosure
-from gvo.odometry.loops import LoopDetector
-from gvo.odometry.segments import Segments
+from gvo.odometry.loops import LoopDetector, Segments
 from gvo.types import (
     Edge,
     Estimate,

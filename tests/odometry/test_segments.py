@@ -13,8 +13,8 @@ from gvo.config import Config
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
+from gvo.odometry.loops import Segments
 from gvo.odometry.odometry import Odometry
-from gvo.odometry.segments import Segments
 from gvo.types import (
     Failure,
     FloatArray,
