@@ -47,6 +47,8 @@ _GUESS_SIGMAS = np.array([3.0, 3.0, 3.0, 100.0, 100.0, 100.0])
 # the turn, and radians per metre.
 _DRIFT = 0.01
 _TURN_PER_M = 0.0005
+# Of the edges between two parts, so many are compared with each other.
+_N_VOTERS = 32
 # An optimization begins with a loop when the graph has grown by this share, and by so many
 # keyframes, since the last one, and is taken over so many keyframes later.
 _GROWTH = 0.25
@@ -552,13 +554,14 @@ class RunGraph:
         confirmed = [loop for loop in loops if not loop.reason]
         if not (confirmed or self._guesses):
             return loops, frozenset()
-        graph = self._whole(loops, drift=_DRIFT * np.sqrt(len(self._edges)))
+        refused = self._outvoted(confirmed)
+        possible = [each for each in confirmed if (each.reference_ns, each.stamp_ns) not in refused]
+        drift = _DRIFT * np.sqrt(len(self._edges))
+        graph = self._whole(possible, drift=drift, refused=refused)
         optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
         optimizer.run()
         keyframes = list(self._keyframes)
-        refused: set[tuple[object, int]] = {
-            (keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused
-        }
+        refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
         # A keyframe that was merged elsewhere had its loop refused.
         refused |= {
             (loop.reference_ns, loop.stamp_ns)
@@ -651,6 +654,42 @@ class RunGraph:
             else loop
             for loop in self.loops
         )
+
+    def _outvoted(self, loops: Sequence[Loop]) -> set[tuple[object, int]]:
+        """Return which loops and edges between two parts contradict the one with most agreement.
+
+        Odometry is trusted but for its drift over the whole way, however many of them agree.
+        """
+        across: dict[tuple[int, int], list[tuple[int, Edge]]] = {}
+        for frame_ns, edge in [*((loop.stamp_ns, loop.edge) for loop in loops), *self._edges]:
+            reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
+            parts = self._ways[reference_ns].part, self._ways[frame_ns].part
+            if parts[0] != parts[1] and self._guesses.get(frame_ns) != reference_ns:
+                across.setdefault(parts, []).append((frame_ns, edge))
+        refused: set[tuple[object, int]] = set()
+        for group in across.values():
+            voters = group[:: len(group) // _N_VOTERS + 1]
+            n_agreeing = [sum(self._agree(*one, *each) for each in voters) for one in voters]
+            best = voters[int(np.argmax(n_agreeing))]
+            against = [each for each in group if not self._agree(*best, *each)]
+            refused |= {(edge.reference_id, frame_ns) for frame_ns, edge in against}
+        return refused
+
+    def _agree(self, first_ns: int, first: Edge, second_ns: int, second: Edge) -> bool:
+        """Tell whether two edges agree, as far as odometry between their ends drifts."""
+        start, end, other_start, other_end = (
+            self._ways[ns]  # type: ignore[index]
+            for ns in (first.reference_id, first_ns, second.reference_id, second_ns)
+        )
+        T_starts = se3.invert(other_start.T_first_keyframe) @ start.T_first_keyframe
+        T_ends = se3.invert(end.T_first_keyframe) @ other_end.T_first_keyframe
+        T_expected = T_starts @ first.T_reference_frame @ T_ends
+        drift = other_end.covariance_since(end, drifts=True)
+        covariance = se3.compose_covariance(first.covariance, T_ends, drift) + second.covariance
+        Ad = se3.adjoint(se3.invert(second.T_reference_frame))
+        drift = other_start.covariance_since(start, drifts=True)
+        difference = se3.log(se3.invert(T_expected) @ second.T_reference_frame)
+        return bool(se3.mahalanobis(difference, covariance + Ad @ drift @ Ad.T) <= INLIER_CHI2)
 
     def _variance_factor(self, loops: Sequence[Loop]) -> float:
         """Return how much more odometry drifts than its covariances say, 1 at least.

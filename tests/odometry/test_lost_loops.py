@@ -197,3 +197,15 @@ def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
     back = [measured(drive.truth, k, 9, SIGMAS, None) for k in (2, 8)]
     assert graph.world_of(back) == 0
     assert graph.world_of(back[1:]) == 1
+
+
+def test_what_most_contradict_across_a_loss_is_refused_whatever_odometry_could_bend() -> None:
+    truth = block(1.9, n_per_lap=N_LAP)
+    drive = lit_again(truth, dark=range(20, 25))
+    twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
+    false = [drive.loop(5 * k, 50 + 5 * k, T=twin) for k in range(4)]
+    true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
+    edges = [(loop.stamp_ns, loop.edge) for loop in false]
+    refused = drive.graph._outvoted([*false, *true, *true])
+    assert refused == {(edge.reference_id, stamp_ns) for stamp_ns, edge in edges}
+    assert drive.graph._outvoted([*false, *false, *true]).isdisjoint(refused)
