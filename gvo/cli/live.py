@@ -110,7 +110,7 @@ def live(
     ] = 10,
     max_lag: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Drop pairs that are older than the newest by more."),
+        typer.Option(metavar="S", help="Drop pairs whose poses would come later, but the newest."),
     ] = None,
     bag: Bag = None,
     with_report: Report = True,

@@ -78,7 +78,7 @@ class LiveOdometry:
     max_waiting : int
         Pairs that wait at most; the oldest is dropped for one more.
     max_lag_s : float, optional
-        Pairs that are older than the newest by more are dropped.
+        Pairs whose poses would come later are dropped, but for the newest.
     say : callable
         Is told, in a line, what happens to the images.
 
@@ -377,7 +377,8 @@ class WaitingPairs:
     max_waiting : int
         Pairs that wait; the oldest is dropped for one more.
     max_lag_s : float or None
-        A pair that is so much older than the newest one is dropped; None: as old as may be.
+        A pair is dropped if its pose would come later after it, were tracking to take as long as
+        with the last one; the newest never is. None: as late as may be.
 
     Attributes
     ----------
@@ -394,7 +395,9 @@ class WaitingPairs:
         self._max_waiting, self._max_lag_s = max_waiting, max_lag_s
         self._items: deque[_Item] = deque()
         self._n_pairs = 0
-        self._newest_ns: int | None = None
+        self._newest_ns, self._newest_s = 0, 0.0  # its stamp, and when it came
+        self._taken_s: float | None = None
+        self._tracking_s = 0.0  # of the last pair
         self._is_tied = self._is_closed = False
         self._fault: GvoError | None = None
         self._changed = threading.Condition()
@@ -410,7 +413,7 @@ class WaitingPairs:
             if not isinstance(item, FaultyFrame):
                 self.on_pair(item[0].stamp_ns)
                 self._n_pairs += 1
-                self._newest_ns = item[0].stamp_ns
+                self._newest_ns, self._newest_s = item[0].stamp_ns, time.perf_counter()
                 limit = self._max_waiting if self._is_tied else _MAX_BEFORE_TIED
                 if self._n_pairs > limit:
                     self._drop_oldest(limit)
@@ -432,6 +435,8 @@ class WaitingPairs:
     def note(self, progress: Progress) -> None:
         """Note how many frames are tracked."""
         self._is_tied = progress.n_tracked >= _N_TIED
+        if self._taken_s is not None:
+            self._tracking_s = time.perf_counter() - self._taken_s
 
     def take(self) -> _Item | None:
         """Return the oldest one, waiting for it; None after the end.
@@ -466,9 +471,14 @@ class WaitingPairs:
             if isinstance(item, FaultyFrame):
                 return item
             self._n_pairs -= 1
-            lag_s = 1e-9 * ((self._newest_ns or 0) - item[0].stamp_ns)
-            if self._is_tied and self._max_lag_s is not None and lag_s > self._max_lag_s:
-                return self._dropped(item, f"{lag_s:.2f} s behind the newest (--max-lag)")
+            now_s = time.perf_counter()
+            waited_s = now_s - self._newest_s + 1e-9 * (self._newest_ns - item[0].stamp_ns)
+            lag_s = waited_s + self._tracking_s
+            may_drop = self._is_tied and self._n_pairs > 0 and self._max_lag_s is not None
+            if may_drop and lag_s > (self._max_lag_s or 0.0):
+                self._taken_s = None
+                return self._dropped(item, f"its pose would be {lag_s:.2f} s late (--max-lag)")
+            self._taken_s = now_s
             return item
 
     def through(self, items: Iterable[_Item]) -> Iterator[_Item]:
