@@ -514,15 +514,18 @@ def _explain(error: ValidationError) -> str:
     name = cut(".".join(str(part) for part in first["loc"]), MAX_SHOWN)
     if first["type"] != "extra_forbidden":
         return f"{name}={shortened(first['input'])}: {first['msg'].lower()}; see `gvo config --all`"
-    known = _known_keys() if "." in name else list(sections())
+    known = list(values_by_name(Config()) if "." in name else sections())
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
     return f"unknown key {name}: did you mean {nearest}? `gvo config --all` lists all"
 
 
-def _known_keys() -> list[str]:
-    return [
-        f"{section}.{key}" for section, group in sections().items() for key in group.model_fields
-    ]
+def values_by_name(config: Config) -> dict[str, Value]:
+    """Return the values of all parameters by `section.key`."""
+    return {
+        f"{section}.{key}": value
+        for section, values in config.model_dump().items()
+        for key, value in values.items()
+    }
 
 
 def sections() -> dict[str, type[Section]]:

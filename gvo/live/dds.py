@@ -23,7 +23,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from gvo._text import cut
-from gvo.config import list_parameters
+from gvo.config import list_parameters, values_by_name
 from gvo.errors import ConfigurationError, GvoError, missing_extra
 from gvo.io.bag.reader import typestore
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, Topic
@@ -298,10 +298,7 @@ class _ParameterServices:
         return _made("SetParametersResult", successful=not reason, reason=reason)
 
     def _value(self, name: str) -> object:
-        if name not in self._known:
-            return None
-        section, _, key = name.partition(".")
-        return getattr(getattr(self._parameters.config, section), key)
+        return values_by_name(self._parameters.config).get(name)
 
     def _descriptor(self, name: str) -> Any:  # noqa: ANN401
         known, whole, real = self._known.get(name), [], []

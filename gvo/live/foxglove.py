@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from gvo.config import Config
+from gvo.config import Config, values_by_name
 from gvo.errors import ConfigurationError, missing_extra
 from gvo.io.bag.reader import typestore
 from gvo.live.transport import Parameters, Publisher, Service
@@ -215,11 +215,8 @@ def _schema(name: str, type_: str) -> foxglove.Schema:
 
 def _values(config: Config, names: Sequence[str]) -> list[foxglove.Parameter]:
     """Return the parameters of those names; of no names, all."""
-    known = {
-        f"{section}.{key}": _NULL if value is None else value
-        for section, values in config.model_dump().items()
-        for key, value in values.items()
-    }
+    values = values_by_name(config)
+    known = {name: _NULL if value is None else value for name, value in values.items()}
     chosen = [name for name in names if name in known] or ([] if names else known)
     return [foxglove.Parameter(name, value=known[name]) for name in chosen]
 

@@ -31,7 +31,7 @@ from rosbags.typesys.msg import denormalize_msgtype, normalize_msgtype
 
 from gvo.config import Config, Parameter, list_parameters
 from gvo.errors import ConfigurationError, GvoError, RecordingError
-from gvo.io.bag.reader import typestore
+from gvo.io.bag.reader import serialize, typestore
 from gvo.io.bag.topics import Topic
 from gvo.live.transport import Parameters, Service, ServiceType
 
@@ -410,5 +410,4 @@ def _make(name: str, /, **fields: object) -> Any:  # noqa: ANN401 - made at run 
 def _opened(node: Ros1, topic: str, name: str) -> Callable[[object], None]:
     type_ = f"{_PACKAGE}/{name}"
     publisher = node.advertise(topic, type_, is_latched=True)
-    serialize = typestore(is_ros1=True).serialize_ros1
-    return lambda message: publisher.publish(bytes(serialize(message, type_)), 0)
+    return lambda message: publisher.publish(serialize(message, type_, is_ros1=True), 0)

@@ -10,7 +10,7 @@ from typing import Final, TypeVar
 
 from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
-from gvo.io.bag.reader import OLD_TF_TYPE, TF_TYPE, BagMessage
+from gvo.io.bag.reader import BagMessage
 from gvo.io.bag.source import BagSource
 from gvo.io.bag.topics import (
     CAMERA_INFO_TYPE,
@@ -22,12 +22,11 @@ from gvo.io.bag.topics import (
     describe_topics,
 )
 from gvo.io.calibration.files import CalibrationPaths
-from gvo.io.poses.tf import TfBuffer, read_tf
+from gvo.io.poses.tf import TF_TYPES, TfBuffer, read_tf
 from gvo.io.recording import StampedImage
 from gvo.live.transport import Transport
 
-_TF_TYPES = (TF_TYPE, OLD_TF_TYPE)
-_SMALL = (CAMERA_INFO_TYPE, *_TF_TYPES)
+_SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
 _OWN = "/gvo/"
 # Messages of each topic that are kept: what a calibration or a mount is read from.
@@ -94,7 +93,7 @@ class NetworkReader:
         """
         types = {topic.name: topic.type for topic in self.topics}
         for name in names:
-            if not self._kept.get(name) and types.get(name) not in _TF_TYPES:
+            if not self._kept.get(name) and types.get(name) not in TF_TYPES:
                 raise RecordingError(f"{self.transport.name}: nothing came on {name}")
         with self._changed:
             kept = [message for name in names for message in self._kept[name]]

@@ -15,7 +15,7 @@ from rosbags.typesys import get_types_from_msg
 from gvo._text import cut
 from gvo.config import Config, validate_configuration
 from gvo.errors import ConfigurationError
-from gvo.io.bag.reader import BagMessage, typestore
+from gvo.io.bag.reader import BagMessage, serialize, typestore
 from gvo.io.bag.topics import Topic
 from gvo.io.convert.bag_messages import MessageWriter
 
@@ -171,10 +171,9 @@ class Service:
         """
         self.type.register(is_ros1=is_ros1)
         message = decode(request, self.type.request_type, is_ros1=is_ros1)
-        store = typestore(is_ros1=is_ros1)
-        response = store.types[self.type.response_type](**self.answer(message))
-        serialize = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-        return bytes(serialize(response, self.type.response_type))
+        type_ = self.type.response_type
+        response = typestore(is_ros1=is_ros1).types[type_](**self.answer(message))
+        return serialize(response, type_, is_ros1=is_ros1)
 
 
 def decode(data: bytes, type_: str, *, is_ros1: bool) -> Any:  # noqa: ANN401 - made at run time

@@ -15,13 +15,13 @@ from gvo.config import Config
 from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.bag.messages import stamp_of, transform_of
-from gvo.io.bag.reader import BagMessage, BagReader, typestore
+from gvo.io.bag.reader import BagMessage, BagReader, serialize, typestore
 from gvo.io.bag.topics import Topic
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import StampedImage
 from gvo.live.odometry import LiveOdometry, LiveRun, Stretches
 from gvo.live.topics import NetworkReader, TopicSource, wait_for
-from gvo.live.transport import SET_POSE, Parameters
+from gvo.live.transport import SET_POSE, Parameters, decode
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray
@@ -81,11 +81,10 @@ class Play:
         service, is_ros1 = self.network.services[name], self.network.is_ros1
         service.type.register(is_ros1=is_ros1)
         store = typestore(is_ros1=is_ros1)
-        code = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-        request = store.types[service.type.request_type](**fields)
-        answer = service.call(bytes(code(request, service.type.request_type)), is_ros1=is_ros1)
-        return decode(answer, service.type.response_type)
+        type_ = service.type.request_type
+        request = serialize(store.types[type_](**fields), type_, is_ros1=is_ros1)
+        answer = service.call(request, is_ros1=is_ros1)
+        return decode(answer, service.type.response_type, is_ros1=is_ros1)
 
 
 def pose_of(message: Any) -> FloatArray:
@@ -237,16 +236,14 @@ def test_where_the_stamps_go_back_another_run_begins(drive_bag: Path, tmp_path: 
 
 def shifted(message: BagMessage, by_ns: int) -> BagMessage:
     """Return a message with another stamp."""
-    store = typestore(is_ros1=message.is_ros1)
     content = message.decode()
     if hasattr(content, "header"):
         stamp = content.header.stamp
         stamp.sec += by_ns // SECOND_NS
-    code = store.serialize_ros1 if message.is_ros1 else store.serialize_cdr
     return BagMessage(
         topic=message.topic,
         log_time_ns=message.log_time_ns + by_ns,
-        data=bytes(code(content, message.topic.type)),
+        data=serialize(content, message.topic.type, is_ros1=message.is_ros1),
         is_ros1=message.is_ros1,
     )
 

@@ -228,6 +228,21 @@ def typestore(*, is_ros1: bool) -> Typestore:
     return store
 
 
+def serialize(message: object, type_: str, *, is_ros1: bool) -> bytes:
+    """Return the bytes of a message, as ROS 1 has them or as CDR.
+
+    Parameters
+    ----------
+    message : object
+        Of a class of `typestore`.
+    type_ : str
+        `package/msg/Name`.
+    is_ros1 : bool
+    """
+    store = typestore(is_ros1=is_ros1)
+    return bytes((store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, type_))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderFiles:
     """What a folder holds.

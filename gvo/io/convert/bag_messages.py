@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.errors import RecordingError
 from gvo.geometry.camera import Calibration
-from gvo.io.bag.reader import TF_TYPE, typestore
+from gvo.io.bag.reader import TF_TYPE, serialize, typestore
 from gvo.io.bag.topics import CAMERA_INFO_TYPE, COMPRESSED_TYPE, IMAGE_TYPE
 from gvo.io.images import MILLIMETRES, encode_image, exact_counts
 from gvo.io.poses.ground_truth import TRUTH_FRAMES
@@ -117,8 +117,7 @@ class MessageWriter(ABC):
 
     def serialize(self, message: object, type_: str) -> bytes:
         """Return the bytes of a message, as ROS 1 has them or as CDR."""
-        serialize = self._store.serialize_ros1 if self.is_ros1 else self._store.serialize_cdr
-        return bytes(serialize(message, type_))
+        return serialize(message, type_, is_ros1=self.is_ros1)
 
     def is_wanted(self, topic: str) -> bool:
         """Tell whether anybody takes the messages of a topic; else none need be made."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from gvo.backend.window import SlidingWindow
-from gvo.config import Config
+from gvo.config import Config, values_by_name
 from gvo.io.recording import Source
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult
 from gvo.viz.view.clouds import Cloud, KeyframeClouds, accumulate, frame_cloud
@@ -154,15 +154,8 @@ class LivePlayer:
         ConfigurationError
             When the run refuses it.
         """
-        now, wanted = self.config.model_dump(), config.model_dump()
-        self.parameters.set(
-            {
-                f"{section}.{key}": value
-                for section, values in wanted.items()
-                for key, value in values.items()
-                if value != now[section][key]
-            }
-        )
+        now, wanted = values_by_name(self.config), values_by_name(config)
+        self.parameters.set({name: value for name, value in wanted.items() if value != now[name]})
 
 
 class LiveHistory:
