@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
@@ -28,6 +29,7 @@ from gvo.live.transport import Transport
 
 _SMALL = (CAMERA_INFO_TYPE, *TF_TYPES)
 _IMAGES = (IMAGE_TYPE, COMPRESSED_TYPE)
+_LOGGER = logging.getLogger(__name__)
 _OWN = "/gvo/"
 # Messages of each topic that are kept: what a calibration or a mount is read from.
 _N_KEPT: Final = 100
@@ -51,8 +53,6 @@ class NetworkReader:
     ----------
     topics : list of Topic
         Those announced, without those of gvo itself.
-    n_dropped : int
-        Images that were given up since too many waited to be paired.
     """
 
     damage = ""
@@ -61,7 +61,7 @@ class NetworkReader:
         self.transport = transport
         self.topics: list[Topic] = []
         self.notes: list[str] = []
-        self.n_dropped = 0
+        self._is_crowded = False
         self._kept: dict[str, deque[BagMessage]] = {}
         self._images: deque[BagMessage] = deque()
         self._changed = threading.Condition()
@@ -134,7 +134,9 @@ class NetworkReader:
             self._images.append(message)
             if len(self._images) > _N_WAITING:
                 self._images.popleft()
-                self.n_dropped += 1
+                if not self._is_crowded:
+                    _LOGGER.warning("images are given up: more than %d wait", _N_WAITING)
+                self._is_crowded = True
             self._changed.notify_all()
 
 

@@ -438,6 +438,19 @@ def test_a_stream_that_stops_is_told_with_the_rate_of_the_other(drive_bag: Path)
     assert "left comes at" in state
 
 
+def test_images_that_nobody_takes_are_given_up_with_a_word(
+    drive_bag: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def script(play: Play) -> None:
+        for _ in range(12):
+            play.send_all()
+
+    play = Play(drive_bag, script)
+    play._thread.join(timeout=60)
+    assert len([*play.reader.images()]) == 300
+    assert caplog.text.count("images are given up") == 1
+
+
 def test_topics_of_gvo_itself_are_no_camera() -> None:
     network = Network()
     network.announce(
