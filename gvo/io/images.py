@@ -6,7 +6,7 @@ import re
 import stat
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -536,7 +536,8 @@ def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     libpng inflates all that follows the rows, up to a thousand times its bytes. It is given them
     uncompressed and cut there, what is malformed as it is, and what OpenCV wrote not at all.
     """
-    parts, contents, n_bytes = [_PNG_MAGIC], list[memoryview](), _n_png_bytes(data[8:33].tobytes())
+    parts, contents = list[bytes | memoryview]([_PNG_MAGIC]), list[memoryview]()
+    n_bytes = _n_png_bytes(data[8:33].tobytes())
     for name, start, end in _png_chunks(data):
         if name in (b"IHDR", b"PLTE", b"tRNS"):
             parts.append(data[start:end].tobytes())
@@ -559,7 +560,7 @@ def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     return _decode_by_opencv(np.frombuffer(b"".join(parts), dtype=np.uint8))
 
 
-def _unfiltered(header: bytes, rows: bytes) -> NDArray[Any] | None:
+def _unfiltered(header: bytes | memoryview, rows: bytes) -> NDArray[Any] | None:
     """Return the pixels of rows of differences, as OpenCV writes them; None of other rows."""
     width, height, depth, colour, *methods = struct.unpack(">IIBBBBB", header[8:21])
     n = {(8, 0): 1, (8, 2): 3, (16, 0): 2}.get((depth, colour), 0)
@@ -577,10 +578,10 @@ def _unfiltered(header: bytes, rows: bytes) -> NDArray[Any] | None:
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if n == 3 else pixels[:, :, 0]
 
 
-def _stored(content: bytes) -> Iterator[bytes]:
+def _stored(content: bytes) -> Iterator[bytes | memoryview]:
     """Yield content as stored blocks of a stream, which `zlib` at level 0 copies twice."""
     for first in range(0, len(content), _MAX_STORED):
-        block = content[first : first + _MAX_STORED]
+        block = memoryview(content)[first : first + _MAX_STORED]
         is_last = first + _MAX_STORED >= len(content)
         yield struct.pack("<BHH", is_last, len(block), len(block) ^ 0xFFFF)
         yield block
@@ -599,7 +600,7 @@ def _n_png_bytes(header: bytes) -> int:
     return sum(h * (1 + (w * n_bits + 7) // 8) for w, h in sizes if min(w, h, n_bits) > 0)
 
 
-def _png_chunk(name: bytes, contents: list[bytes]) -> list[bytes]:
+def _png_chunk(name: bytes, contents: Sequence[bytes | memoryview]) -> list[bytes | memoryview]:
     check = zlib.crc32(name)
     for content in contents:
         check = zlib.crc32(content, check)
