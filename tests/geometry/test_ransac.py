@@ -39,14 +39,20 @@ def random_points(rng: np.random.Generator, n: int) -> FloatArray:
 def scene(
     rng: np.random.Generator, n: int, n_outliers: int
 ) -> tuple[FloatArray, Correspondences, BoolArray]:
-    """Return T_target_source, correspondences and which of them obey it."""
+    """Return T_target_source, correspondences and which obey it: the others miss it by far."""
     T = random_motion(rng)
     source = random_points(rng, n)
     target = move(T, source)
     is_inlier = rng.permutation(n) >= n_outliers
-    target[~is_inlier] = random_points(rng, n_outliers)
-    matches = matched(source, target)
-    return T, matches, is_inlier
+    wrong = np.stack([random_points(rng, n_outliers) for _ in range(9)])
+    missed_px = np.linalg.norm(
+        project(wrong.reshape(-1, 3)).reshape(wrong.shape) - project(target[~is_inlier]), axis=2
+    )
+    missed_m = np.linalg.norm(wrong - target[~is_inlier], axis=2)
+    is_far = (missed_px > 10.0) & (missed_m > 0.5)
+    assert is_far.any(axis=0).all()
+    target[~is_inlier] = wrong[is_far.argmax(axis=0), np.arange(n_outliers)]
+    return T, matched(source, target), is_inlier
 
 
 def run(matches: Correspondences, config: RansacConfig, seed: int = 0) -> Consensus | Failure:
