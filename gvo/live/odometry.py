@@ -40,6 +40,8 @@ _Item: TypeAlias = Pair | FaultyFrame
 # Frames that are tied to one another before any is dropped, and what waits for them at most.
 _N_TIED = 2
 _MAX_BEFORE_TIED = 300
+# Of as many frames, one in twenty may take longer than the slowest.
+_N_TIMED = 20
 _N_WARMING = 3
 # Stamps that go back by more are those of another run: a clock was set, or a bag begins again.
 _BACK_NS = 1_000_000_000
@@ -378,7 +380,7 @@ class WaitingPairs:
         Pairs that wait; the oldest is dropped for one more.
     max_lag_s : float or None
         A pair is dropped if its pose would come later after it, were tracking to take as long as
-        with the last one; the newest never is. None: as late as may be.
+        with the slowest of the last twenty; the newest never is. None: as late as may be.
 
     Attributes
     ----------
@@ -397,7 +399,7 @@ class WaitingPairs:
         self._n_pairs = 0
         self._newest_ns, self._newest_s = 0, 0.0  # its stamp, and when it came
         self._taken_s: float | None = None
-        self._tracking_s = 0.0  # of the last pair
+        self._tracking_s: deque[float] = deque([0.0], maxlen=_N_TIMED)  # of the last pairs
         self._is_tied = self._is_closed = False
         self._fault: GvoError | None = None
         self._changed = threading.Condition()
@@ -436,7 +438,7 @@ class WaitingPairs:
         """Note how many frames are tracked."""
         self._is_tied = progress.n_tracked >= _N_TIED
         if self._taken_s is not None:
-            self._tracking_s = time.perf_counter() - self._taken_s
+            self._tracking_s.append(time.perf_counter() - self._taken_s)
 
     def take(self) -> _Item | None:
         """Return the oldest one, waiting for it; None after the end.
@@ -473,7 +475,7 @@ class WaitingPairs:
             self._n_pairs -= 1
             now_s = time.perf_counter()
             waited_s = now_s - self._newest_s + 1e-9 * (self._newest_ns - item[0].stamp_ns)
-            lag_s = waited_s + self._tracking_s
+            lag_s = waited_s + max(self._tracking_s)
             may_drop = self._is_tied and self._n_pairs > 0 and self._max_lag_s is not None
             if may_drop and lag_s > (self._max_lag_s or 0.0):
                 self._taken_s = None
