@@ -467,8 +467,8 @@ class BatchOptimizer:
         self.start = min(self.starts, key=self.starts.__getitem__)
         self.values, self.error = starts[self.start], self.starts[self.start]
 
-    def run(self) -> None:
-        """Optimize until the error converges.
+    def run(self, *, only_refuse: bool = False) -> None:
+        """Optimize until the error converges, or until it is known which edges are refused.
 
         Raises
         ------
@@ -478,7 +478,8 @@ class BatchOptimizer:
         try:
             if self._is_graduated and self._doubted:
                 self._graduate()
-            self._descend(_MAX_ITERATIONS)
+            if not only_refuse:
+                self._descend(_MAX_ITERATIONS)
         except RuntimeError as error:
             raise SmoothingError(f"GTSAM: {first_line(error)}") from error
         if fault := place_fault(self.poses()[:, :3, 3]):

@@ -559,7 +559,7 @@ class RunGraph:
         drift = _DRIFT * np.sqrt(len(self._edges))
         graph = self._whole(possible, drift=drift, refused=refused)
         optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
-        optimizer.run()
+        optimizer.run(only_refuse=True)
         keyframes = list(self._keyframes)
         refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
         # A keyframe that was merged elsewhere had its loop refused.
