@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from gvo.cli import options as opt
-from gvo.cli.terminal import Command, at_work, exit_code, is_shown, say, told_where_it_stands, warn
+from gvo.cli.terminal import at_work, exit_code, is_shown, say, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -19,11 +20,6 @@ if TYPE_CHECKING:
 
 _CONFIGURATIONS = (".yaml", ".yml")
 _MAX_WARNINGS = 20
-
-
-def add_commands(app: typer.Typer) -> None:
-    """Add the command to the `gvo` command."""
-    app.command(cls=Command)(batch)
 
 
 def batch(
@@ -34,6 +30,7 @@ def batch(
         ),
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="Folder to write, or a URL.")],
+    *,
     sweep: Annotated[
         list[str] | None,
         typer.Option(
@@ -57,50 +54,42 @@ def batch(
         typer.Option(metavar="URL", help="Scheduler of a Dask cluster, as tcp://host:8786."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Run finished runs again.")] = False,
-    start: opt.Start = 0.0,
-    duration: opt.Duration = None,
-    every: opt.Every = 1,
+    excerpt: opt.Excerpt,
     with_report: Annotated[
         bool, typer.Option("--report/--no-report", help="Draw the picture and page of each run.")
     ] = True,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write the plots as PNG and PDF too.")
     ] = None,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    options: opt.Options,
 ) -> None:
     """Run many recordings or configurations: one table, one report."""
     from gvo.batch import BatchOptions, connected, find_recordings, make_variants, run_batch
     from gvo.batch.results import outcome
     from gvo.batch.running import check_plots
-    from gvo.io.excerpt import make_excerpt
+    from gvo.io.calibration.files import paths_of
 
     if scheduler is not None and workers is not None:
         raise ConfigurationError("--workers starts processes here, --scheduler names a cluster")
-    excerpt = make_excerpt(start, duration, every)
     asked, files = _sort_arguments(recordings, configs)
     variants = make_variants(files, opt.with_loops(set_, loops), sweep or [])
     found = find_recordings(asked)
-    options = BatchOptions(
-        recording=opt.recording_options(
-            [path.absolute() for path in calibration or ()], left, right, color, depth
-        ),
+    files_from_anywhere = tuple(path.absolute() for path in paths_of(options.calibration))
+    batch_options = BatchOptions(
+        recording=replace(options, calibration=files_from_anywhere),
         excerpt=excerpt,
         report=with_report,
         force=force,
         plots=plots,
     )
-    check_plots(out, options)
+    check_plots(out, batch_options)
     counts = _count(len(found), "recording"), _count(len(variants), "configuration")
     say(", ".join(counts))
     told = told_where_it_stands(out, and_then=": the same command goes on")
     with at_work(told, _progress()) as work, connected(scheduler, workers) as client:
         progress = work.on_progress
         table = run_batch(
-            found, variants, out=out, client=client, options=options, on_progress=progress
+            found, variants, out=out, client=client, options=batch_options, on_progress=progress
         )
     _report(*outcome(table), out)
 

@@ -12,7 +12,6 @@ import typer
 
 from gvo.cli import options as opt
 from gvo.cli.terminal import (
-    Command,
     at_work,
     exit_code,
     interruptible,
@@ -34,37 +33,25 @@ _DEFAULT_PORT = 8080
 _SIGNALS_S = 0.1
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the commands to the `gvo` command."""
-    for command in (explain, view, round_trip):
-        app.command(cls=Command)(command)
-
-
 def explain(
     recordings: opt.Recordings,
     frame: Annotated[
         int, typer.Option("--frame", min=0, metavar="N", help="Number of the frame, from 0.")
     ],
+    *,
     out: opt.Out = None,
     force: opt.Force = False,
     start: opt.Start = 0.0,
     every: opt.Every = 1,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    parameters: opt.Parameters,
+    options: opt.Options,
 ) -> None:
     """Show one frame from image to pose, step by step, as pictures."""
     from gvo.diagnostics.explain import explain_frame
     from gvo.io.excerpt import make_excerpt
     from gvo.viz.explanation import write_explanation
 
-    parameters = opt.load(config, set_)
     excerpt = make_excerpt(start, None, every)
-    options = opt.recording_options(calibration, left, right, color, depth)
     out = opt.new_folder(out, recordings[0], what=f"-frame-{frame}", force=force)
     source = opt.open_source(recordings, parameters, options)
     with progress(source.info.name) as show:
@@ -81,6 +68,7 @@ def view(
         list[Path],
         typer.Argument(metavar="RECORDING...", help="Bags, a data-set folder, or a run's folder."),
     ],
+    *,
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is everywhere.")
     ] = "127.0.0.1",
@@ -89,11 +77,7 @@ def view(
     ),
     config: opt.ConfigFile = None,
     set_: opt.Settings = None,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    options: opt.Options,
 ) -> None:
     """Watch odometry in the browser, with its parameters as controls."""
     from gvo.viz.view import serve
@@ -102,7 +86,6 @@ def view(
     with interruptible() as check, ExitStack() as stack:
         shown: Player | Path = recordings[0]
         truth: Trajectory | None = None
-        options = opt.recording_options(calibration, left, right, color, depth)
         if len(recordings) == 1 and (recordings[0] / "frames.csv").is_file():
             given = {"config": config, "set": set_, **asdict(options)}
             _refuse_for_a_run(recordings[0], given)
@@ -141,28 +124,18 @@ def _find_truth(source: Source) -> Trajectory | None:
 
 def round_trip(
     recordings: opt.Recordings,
+    *,
     out: opt.Out = None,
     force: opt.Force = False,
-    start: opt.Start = 0.0,
-    duration: opt.Duration = None,
-    every: opt.Every = 1,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    excerpt: opt.Excerpt,
+    parameters: opt.Parameters,
+    options: opt.Options,
 ) -> None:
     """Run forward, then backward: the drift without a ground truth."""
-    from gvo.io.excerpt import make_excerpt
     from gvo.runs.round_trip import run_round_trip
     from gvo.trajectory.round_trip import format_round_trip_errors
 
-    parameters = opt.load(config, set_)
-    excerpt = make_excerpt(start, duration, every)
     out = opt.new_folder(out, recordings[0], what="-round-trip", force=force)
-    options = opt.recording_options(calibration, left, right, color, depth)
     source = opt.open_source(recordings, parameters, options)
     for line in source.info.decisions:
         say(line)

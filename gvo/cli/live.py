@@ -13,26 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 import typer
 
 from gvo._text import cut
-from gvo.cli.options import (
-    Bag,
-    CalibrationFiles,
-    Color,
-    ConfigFile,
-    Depth,
-    Force,
-    Left,
-    Loops,
-    Out,
-    Report,
-    Right,
-    Settings,
-    load,
-    new_folder,
-    recording_options,
-    with_loops,
-)
+from gvo.cli import options as opt
 from gvo.cli.terminal import (
-    Command,
     ended_by_a_signal,
     exit_code,
     say,
@@ -64,11 +46,6 @@ _Sensor = Literal["stereo", "rgbd"]
 _Qos = Literal["sensor", "reliable", "system"]
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the command to the `gvo` command."""
-    app.command(cls=Command)(live)
-
-
 def live(
     camera: Annotated[
         list[str],
@@ -77,15 +54,12 @@ def live(
             help="ros1; ros2; - for standard input; or camera and its devices: 0, a film.",
         ),
     ],
-    calibration: CalibrationFiles = None,
+    *,
+    options: opt.Options,
     sensor: Annotated[_Sensor, typer.Option(help="What standard input gives.")] = "stereo",
     is_rectified: Annotated[
         bool, typer.Option("--rectified", help="The images of - and camera are rectified already.")
     ] = False,
-    left: Left = None,
-    right: Right = None,
-    color: Color = None,
-    depth: Depth = None,
     frame: Annotated[
         str | None, typer.Option(metavar="NAME", help="The robot's frame, such as base_link.")
     ] = None,
@@ -100,11 +74,9 @@ def live(
     view: Annotated[
         str | None, typer.Option(metavar="[HOST:]PORT", help="Serve the page in the browser there.")
     ] = None,
-    out: Out = None,
-    force: Force = False,
-    config: ConfigFile = None,
-    set_: Settings = None,
-    loops: Loops = None,
+    out: opt.Out = None,
+    force: opt.Force = False,
+    parameters: opt.LoopParameters,
     queue: Annotated[
         int, typer.Option(metavar="N", help="Pairs that wait; the oldest is dropped for one more.")
     ] = 10,
@@ -112,18 +84,16 @@ def live(
         float | None,
         typer.Option(metavar="S", help="Drop pairs whose poses would come later, but the newest."),
     ] = None,
-    bag: Bag = None,
-    with_report: Report = True,
+    bag: opt.Bag = None,
+    with_report: opt.Report = True,
 ) -> None:
     """Track a running camera: of ROS, through a pipe, or a device."""
     from gvo.live.odometry import LiveOdometry
     from gvo.runs.outputs.options import RunOutputs
 
-    parameters = load(config, with_loops(set_, loops))
     outputs = RunOutputs(bag=bag, report=with_report)
-    out = new_folder(out, "live", force=force)
+    out = opt.new_folder(out, "live", force=force)
     outputs.check(force=force)
-    options = recording_options(calibration, left, right, color, depth)
     page = None if view is None else _address("--view", view)
     end = _End()
     with ExitStack() as stack, told_where_it_stands(out), ended_by_a_signal(end):

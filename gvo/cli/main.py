@@ -15,14 +15,13 @@ from typer.main import get_command
 
 from gvo._text import plain_number
 from gvo._version import __version__
-from gvo.cli import batch as cli_batch
-from gvo.cli import inspect as cli_inspect
-from gvo.cli import live as cli_live
 from gvo.cli import options as opt
+from gvo.cli.batch import batch
+from gvo.cli.inspect import explain, round_trip, view
+from gvo.cli.live import live
 from gvo.cli.terminal import (
     EXIT_FAULTS,
     EXIT_UNUSABLE,
-    Command,
     at_work,
     ended_by_signals,
     exit_code,
@@ -49,7 +48,7 @@ app = typer.Typer(
     invoke_without_command=True,
     pretty_exceptions_enable=False,
 )
-_command = partial(app.command, cls=Command)
+_command = partial(opt.add_command, app)
 # What is refused of a command line; Typer gives the class no name of its own.
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
@@ -100,13 +99,11 @@ def demo(
 @_command()
 def run(
     recordings: opt.Recordings,
+    *,
     out: opt.Out = None,
     force: opt.Force = False,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
-    start: opt.Start = 0.0,
-    duration: opt.Duration = None,
-    every: opt.Every = 1,
+    parameters: opt.LoopParameters,
+    excerpt: opt.Excerpt,
     frame: Annotated[
         str | None, typer.Option(metavar="NAME", help="Frame of tf whose poses are written.")
     ] = None,
@@ -131,33 +128,24 @@ def run(
     rerun: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write a .rrd for the Rerun viewer.")
     ] = None,
-    loops: opt.Loops = None,
     with_report: opt.Report = True,
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each plot as PNG and PDF too.")
     ] = None,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    options: opt.Options,
 ) -> None:
     """Estimate the trajectory of a recording, with covariances."""
-    from gvo.io.excerpt import make_excerpt
     from gvo.io.poses.base_frame import parse_initial_pose
     from gvo.io.poses.inputs import find_base_frame, read_truth
     from gvo.runs.outputs.options import RunOutputs
     from gvo.runs.run import run_recording
 
-    parameters = opt.load(config, opt.with_loops(set_, loops))
-    excerpt = make_excerpt(start, duration, every)
     pose = None if initial_pose is None else parse_initial_pose(initial_pose)
     outputs = RunOutputs(
         bag=bag, world=world, overlay=overlay, rerun=rerun, report=with_report, plots=plots
     )
     out = opt.new_folder(out, recordings[0], force=force)
     outputs.check(force=force)
-    options = opt.recording_options(calibration, left, right, color, depth)
     source = opt.open_source(recordings, parameters, options)
     base_frame = find_base_frame(source, frame, T_initial=None if isinstance(pose, str) else pose)
     truth = (
@@ -185,24 +173,18 @@ def run(
 @_command("check")
 def check_(
     recordings: opt.Recordings,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
+    *,
+    parameters: opt.Parameters,
     frame: Annotated[
         str, typer.Option(metavar="NAME", help="The robot's base frame in tf.")
     ] = "base_link",
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
+    options: opt.Options,
     as_json: _AsJson = False,
 ) -> None:
     """Look for what would make odometry fail, before it runs."""
     from gvo.diagnostics.check import check_recording, format_check
     from gvo.io.poses.inputs import read_transforms
 
-    parameters = opt.load(config, set_)
-    options = opt.recording_options(calibration, left, right, color, depth)
     source = opt.open_source(recordings, parameters, options)
     result = check_recording(
         source,
@@ -384,27 +366,21 @@ def compare(
 def convert_(
     recordings: opt.Recordings,
     target: Annotated[Path, typer.Argument(help=".bag, .mcap, .db3, or a folder to make.")],
+    *,
     layout: Annotated[
         _Layout | None, typer.Option(help="Layout of the folder that is written.")
     ] = None,
     rectify: Annotated[bool, typer.Option("--rectify", help="Rectify the images.")] = False,
     png: Annotated[bool, typer.Option("--png", help="Compress the images of a bag.")] = False,
-    calibration: opt.CalibrationFiles = None,
-    left: opt.Left = None,
-    right: opt.Right = None,
-    color: opt.Color = None,
-    depth: opt.Depth = None,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
+    options: opt.Options,
+    parameters: opt.Parameters,
 ) -> None:
     """Write a data-set folder as a bag, or a bag as such a folder."""
     from gvo.io.convert.common import check_new
     from gvo.io.convert.convert import convert
 
     check_new(target)
-    options = opt.recording_options(calibration, left, right, color, depth)
-    settings = opt.load(config, set_)
-    source = opt.open_source(recordings, settings, options)
+    source = opt.open_source(recordings, parameters, options)
     with (
         interruptible() as check,
         told_what_stands(f"{target} is not written; the same command begins anew"),
@@ -415,7 +391,7 @@ def convert_(
             layout=layout,
             rectify=rectify,
             compress=png,
-            config=settings,
+            config=parameters,
             progress=check,
         )
     say(f"wrote {target}: {written.n_images} images, {written.n_poses} true poses")
@@ -425,16 +401,15 @@ def convert_(
 
 @_command("config")
 def config_(
+    *,
     everything: Annotated[
         bool, typer.Option("--all", help="Print the parameters for experts too.")
     ] = False,
-    config: opt.ConfigFile = None,
-    set_: opt.Settings = None,
+    parameters: opt.Parameters,
 ) -> None:
     """Print the parameters that matter most, or all."""
     from gvo.config import describe_configuration
 
-    parameters = opt.load(config, set_)
     typer.echo(describe_configuration(parameters, for_experts=everything), nl=False)
     if not everything:
         say("# The others, for experts: gvo config --all")
@@ -452,9 +427,8 @@ def _parse_lengths(text: str) -> list[float]:
     return lengths
 
 
-cli_batch.add_commands(app)
-cli_live.add_commands(app)
-cli_inspect.add_commands(app)
+for _each in (batch, live, explain, view, round_trip):
+    _command()(_each)
 
 
 def _run() -> Any:  # noqa: ANN401 - an exit code, or None

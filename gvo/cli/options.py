@@ -1,17 +1,19 @@
 """Options that commands share: parameters, recordings, calibration, topics."""
 
-from __future__ import annotations
-
+import inspect
 import logging
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from gvo.cli.terminal import Command
 
+if TYPE_CHECKING:
     from gvo.config import Config
+    from gvo.io.excerpt import Excerpt as _Excerpt
     from gvo.io.opening import RecordingOptions
     from gvo.io.recording import Source
 
@@ -23,19 +25,13 @@ Settings = Annotated[
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML, see `gvo config`.")
 ]
+Loops = Annotated[
+    bool | None,
+    typer.Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled."),
+]
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RECORDING...", help="Bags, or one data-set folder.")
 ]
-CalibrationFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
-    ),
-]
-Left = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the left images.")]
-Right = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the right images.")]
-Color = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the colour images.")]
-Depth = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic of the depth images.")]
 Out = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder to write; gvo-RECORDING if omitted.")
 ]
@@ -47,14 +43,52 @@ Report = Annotated[
     bool, typer.Option("--report/--no-report", help="Draw the picture and report.html.")
 ]
 Start = Annotated[float, typer.Option(metavar="S", help="Seconds to skip at the start.")]
-Duration = Annotated[float | None, typer.Option(metavar="S", help="Seconds to read from there.")]
 Every = Annotated[int, typer.Option(metavar="N", help="Take every Nth frame.")]
 
 
-Loops = Annotated[
-    bool | None,
-    typer.Option("--loops/--no-loops", help="Find loops, write global poses; loops.enabled."),
-]
+class _Group(NamedTuple):
+    """Marks a parameter of a command that stands for the options of a function."""
+
+    make: Callable[..., Any]
+
+
+def add_command(app: typer.Typer, name: str | None = None) -> Callable[[Callable[..., None]], Any]:
+    """Return a decorator that adds a command, with the options of its groups in their places."""
+    return lambda run: app.command(name, cls=Command)(_ungrouped(run))
+
+
+def _ungrouped(run: Callable[..., None]) -> Callable[..., None]:
+    """Take the options of each group, and give the command what its function makes of them."""
+    groups: dict[str, tuple[Callable[..., Any], list[str]]] = {}
+    options: list[inspect.Parameter] = []
+    for name, option in inspect.signature(run, eval_str=True).parameters.items():
+        [*marks] = getattr(option.annotation, "__metadata__", ())
+        if marks and isinstance(marks[0], _Group):
+            inner = inspect.signature(marks[0].make).parameters
+            groups[name] = marks[0].make, [*inner]
+            options += inner.values()
+        else:
+            options.append(option)
+
+    @wraps(run)
+    def command(**given: Any) -> None:  # noqa: ANN401 - options of any type
+        for name, (make, names) in groups.items():
+            given[name] = make(**{each: given.pop(each) for each in names})
+        run(**given)
+
+    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in options]
+    command.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in keywords}
+    return command
+
+
+def load(config: ConfigFile = None, set_: Settings = None) -> "Config":
+    """Return the parameters of a file, changed by settings."""
+    from gvo.config import load_configuration
+
+    parameters = load_configuration(config, set_ or [])
+    _LOGGER.debug("parameters: %s", parameters.model_dump(exclude_defaults=True) or "defaults")
+    return parameters
 
 
 def with_loops(settings: list[str] | None, loops: bool | None) -> list[str]:
@@ -62,13 +96,51 @@ def with_loops(settings: list[str] | None, loops: bool | None) -> list[str]:
     return [*(settings or []), *([] if loops is None else [f"loops.enabled={str(loops).lower()}"])]
 
 
-def load(path: Path | None, settings: list[str] | None) -> Config:
-    """Return the parameters of a file, changed by settings."""
-    from gvo.config import load_configuration
+def _load_with_loops(
+    config: ConfigFile = None, set_: Settings = None, loops: Loops = None
+) -> "Config":
+    return load(config, with_loops(set_, loops))
 
-    config = load_configuration(path, settings or [])
-    _LOGGER.debug("parameters: %s", config.model_dump(exclude_defaults=True) or "defaults")
-    return config
+
+def _make_excerpt(
+    start: Start = 0.0,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Seconds to read from there.")
+    ] = None,
+    every: Every = 1,
+) -> "_Excerpt":
+    from gvo.io.excerpt import make_excerpt
+
+    return make_excerpt(start, duration, every)
+
+
+def _topic(images: str) -> Any:  # noqa: ANN401 - has no public type
+    return typer.Option(metavar="TOPIC", help=f"Topic of the {images} images.")
+
+
+def _recording_options(
+    calibration: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE", help="ROS, Kalibr or EuRoC YAML, repeatable; replaces the recording's."
+        ),
+    ] = None,
+    left: Annotated[str | None, _topic("left")] = None,
+    right: Annotated[str | None, _topic("right")] = None,
+    color: Annotated[str | None, _topic("colour")] = None,
+    depth: Annotated[str | None, _topic("depth")] = None,
+) -> "RecordingOptions":
+    from gvo.io.opening import RecordingOptions
+
+    return RecordingOptions(
+        calibration=tuple(calibration or ()), left=left, right=right, color=color, depth=depth
+    )
+
+
+Parameters = Annotated["Config", _Group(load)]
+LoopParameters = Annotated["Config", _Group(_load_with_loops)]
+Excerpt = Annotated["_Excerpt", _Group(_make_excerpt)]
+Options = Annotated["RecordingOptions", _Group(_recording_options)]
 
 
 def new_folder(
@@ -82,22 +154,9 @@ def new_folder(
     return folder
 
 
-def recording_options(
-    calibration: Sequence[Path] | None,
-    left: str | None,
-    right: str | None,
-    color: str | None,
-    depth: str | None,
-) -> RecordingOptions:
-    """Return the options of a recording."""
-    from gvo.io.opening import RecordingOptions
-
-    return RecordingOptions(
-        calibration=tuple(calibration or ()), left=left, right=right, color=color, depth=depth
-    )
-
-
-def open_source(recordings: Sequence[Path], config: Config, options: RecordingOptions) -> Source:
+def open_source(
+    recordings: Sequence[Path], config: "Config", options: "RecordingOptions"
+) -> "Source":
     """Open a recording as the options say."""
     from gvo.io.opening import open_recording
 
