@@ -19,20 +19,19 @@ if TYPE_CHECKING:
     from gvo.batch.engine import BatchProgress as BatchProgress
     from gvo.batch.engine import ClusterError as ClusterError
     from gvo.batch.engine import connected as connected
-    from gvo.batch.recordings import NamedRecording as NamedRecording
-    from gvo.batch.recordings import find_recordings as find_recordings
+    from gvo.batch.inputs import NamedRecording as NamedRecording
+    from gvo.batch.inputs import Variant as Variant
+    from gvo.batch.inputs import find_recordings as find_recordings
+    from gvo.batch.inputs import make_variants as make_variants
     from gvo.batch.running import run as run
     from gvo.batch.running import run_batch as run_batch
     from gvo.batch.tasks import BatchOptions as BatchOptions
-    from gvo.batch.variants import Variant as Variant
-    from gvo.batch.variants import make_variants as make_variants
 
 _MODULES = {
     "gvo.batch.engine": ("BatchProgress", "ClusterError", "connected"),
-    "gvo.batch.recordings": ("NamedRecording", "find_recordings"),
+    "gvo.batch.inputs": ("NamedRecording", "Variant", "find_recordings", "make_variants"),
     "gvo.batch.running": ("run", "run_batch"),
     "gvo.batch.tasks": ("BatchOptions",),
-    "gvo.batch.variants": ("Variant", "make_variants"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 _NEEDED = ("dask", "distributed", "pandas", "pyarrow", "fsspec", "cryptography")

@@ -16,8 +16,7 @@ import dask
 from distributed import CancelledError, Client, Future, KilledWorker, LocalCluster, Security
 
 from gvo._text import cut
-from gvo.batch.rows import BatchRow
-from gvo.batch.tasks import Task, TaskOptions
+from gvo.batch.tasks import BatchRow, Task, TaskOptions
 from gvo.batch.worker import work
 from gvo.errors import GvoError, missing_extra
 

@@ -11,7 +11,7 @@ from typing import get_args, get_type_hints
 import pandas as pd
 import pyarrow  # type: ignore[import-untyped]  # noqa: F401 - pandas would miss it too late
 
-from gvo.batch.rows import BatchRow, RunStatus, Value
+from gvo.batch.tasks import BatchRow, RunStatus, Value
 from gvo.errors import OutputError, write_faults
 from gvo.io.run_folder.line_file import replace_bytes
 

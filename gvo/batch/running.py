@@ -15,12 +15,10 @@ from distributed import Client
 
 from gvo._version import __version__
 from gvo.batch.engine import BatchProgress, Engine, connected
-from gvo.batch.recordings import NamedRecording, find_recordings
+from gvo.batch.inputs import NamedRecording, Variant, differences, find_recordings, name_variants
 from gvo.batch.results import to_frame, write_results
-from gvo.batch.rows import BatchRow
 from gvo.batch.storage import Place, is_url, store
-from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions
-from gvo.batch.variants import Variant, differences, name_variants
+from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions
 from gvo.config import Config
 from gvo.errors import OutputError, write_faults
 from gvo.io.run_folder.line_file import check_new, replace_text

@@ -13,8 +13,7 @@ from distributed import get_worker
 from gvo.errors import GvoError
 
 if TYPE_CHECKING:
-    from gvo.batch.rows import BatchRow
-    from gvo.batch.tasks import Task, TaskOptions
+    from gvo.batch.tasks import BatchRow, Task, TaskOptions
     from gvo.types import Progress
 
 _REPORT_EVERY_S = 1.0

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gvo._trace import note
 from gvo.config import Config
-from gvo.frontend.alignment import RADIUS_PX, Templates, move_slopes, patch_warps
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
@@ -24,7 +23,14 @@ from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
 from gvo.frontend.stereo.patches import cut_patches
-from gvo.frontend.tracking import detect_corners, track_pixels
+from gvo.frontend.tracking import (
+    RADIUS_PX,
+    Templates,
+    detect_corners,
+    move_slopes,
+    patch_warps,
+    track_pixels,
+)
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.types import (

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gvo.batch.rows import BatchRow
+from gvo.batch.tasks import BatchRow
 
 _NAMED = {"recording": "a", "variant": "default", "source": "/a.bag", "folder": "a"}
 

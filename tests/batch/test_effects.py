@@ -19,7 +19,7 @@ from gvo.batch.effects import (
     variant_means,
 )
 from gvo.batch.results import to_frame
-from gvo.batch.rows import BatchRow
+from gvo.batch.tasks import BatchRow
 from tests.batch.rows import complete, failed
 
 SIZES, KINDS = (5, 10, 20), ("orb", "klt")

@@ -16,11 +16,9 @@ from distributed import Client
 
 import gvo
 from gvo.batch.engine import BatchProgress, Engine, connected
-from gvo.batch.recordings import NamedRecording
-from gvo.batch.rows import BatchRow
+from gvo.batch.inputs import NamedRecording, make_variants
 from gvo.batch.running import make_tasks
-from gvo.batch.tasks import MARK, Task, TaskOptions
-from gvo.batch.variants import make_variants
+from gvo.batch.tasks import MARK, BatchRow, Task, TaskOptions
 from tests.batch.conftest import NO_REPORT, is_complete, wait_until
 
 N_MANY = 300

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.batch.recordings import NamedRecording, find_recordings, safe_name
-from gvo.batch.recordings import _name as name_all
+from gvo.batch.inputs import NamedRecording, find_recordings, safe_name
+from gvo.batch.inputs import _name as name_all
 from gvo.batch.storage import fetch
 from gvo.errors import RecordingError
 

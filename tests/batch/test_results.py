@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvo.batch.results import CSV, PARQUET, to_frame, write_results
-from gvo.batch.rows import BatchRow, Value
+from gvo.batch.tasks import BatchRow, Value
 from gvo.errors import OutputError
 from tests.batch.rows import complete, failed
 

@@ -13,9 +13,8 @@ from distributed import Client
 import gvo
 import gvo.batch
 from gvo.batch import BatchOptions, BatchProgress, Variant, run, run_batch
-from gvo.batch.recordings import NamedRecording, find_recordings
+from gvo.batch.inputs import NamedRecording, find_recordings, make_variants
 from gvo.batch.running import make_tasks
-from gvo.batch.variants import make_variants
 from gvo.errors import OutputError
 from tests.batch.conftest import NO_REPORT, assert_same_run, copy_of, state_of
 

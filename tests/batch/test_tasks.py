@@ -12,8 +12,7 @@ import fsspec
 import pytest
 
 import gvo
-from gvo.batch.rows import BatchRow
-from gvo.batch.tasks import MARK, BatchOptions, Task, TaskOptions, digest, run_task
+from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions, digest, run_task
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import written_alone
 from gvo.types import Progress

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gvo
-from gvo.batch.variants import Variant, differences, make_variants, name_variants
+from gvo.batch.inputs import Variant, differences, make_variants, name_variants
 from gvo.config import Config
 from gvo.errors import ConfigurationError
 

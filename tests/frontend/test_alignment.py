@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvo.config import KltConfig
-from gvo.frontend.alignment import Templates, move_slopes, patch_warps
-from gvo.frontend.tracking import detect_corners, track_pixels
+from gvo.frontend.tracking import Templates, detect_corners, move_slopes, patch_warps, track_pixels
 from gvo.geometry.camera import StereoCamera
 from gvo.types import FloatArray
 from tests.frontend import analytic

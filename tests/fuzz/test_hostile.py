@@ -30,7 +30,7 @@ from gvo.errors import (
 from gvo.io.bag.image_encodings import decode_rvl
 from gvo.io.bag.messages import decode_compressed, transform_of
 from gvo.io.bag.reader import BagReader, typestore
-from gvo.io.bag.recovery import inflate
+from gvo.io.bag.recovery import scan
 from gvo.io.bag.recovery.mcap import MAGIC
 from gvo.io.calibration.files import read_cameras
 from gvo.io.datasets.files import read_stamped_rows
@@ -347,7 +347,7 @@ def test_what_is_no_file_is_no_image(name: str) -> None:
 def test_a_bzip2_chunk_that_explodes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inflate, "MAX_INFLATED", 1 << 20)
+    monkeypatch.setattr(scan, "MAX_INFLATED", 1 << 20)
     path = tmp_path / "bomb.bag"
     writer = Writer(path)
     writer.set_compression(Writer.CompressionFormat.BZ2)

@@ -14,10 +14,9 @@ import numpy as np
 
 from gvo._text import html_text, number_text, visible
 from gvo.batch.effects import ERROR, relative, swept
-from gvo.batch.report.boxes import box_plot
-from gvo.batch.report.effects import effect_sheets, front_sheet
+from gvo.batch.report.plots import box_plot, effect_sheets, front_sheet
 from gvo.batch.report.values import Batch
-from gvo.batch.rows import BatchRow
+from gvo.batch.tasks import BatchRow
 from gvo.io.run_folder.writer import REPORT
 from gvo.types import FloatArray
 from gvo.viz.report.page import facts_html, list_html, plots_html, write_page

@@ -12,9 +12,9 @@ import pandas as pd
 
 from gvo._text import visible
 from gvo.batch.effects import ERROR, comparable, variant_means
+from gvo.batch.inputs import DEFAULT, flatten
 from gvo.batch.results import to_frame
-from gvo.batch.rows import BatchRow
-from gvo.batch.variants import DEFAULT, flatten
+from gvo.batch.tasks import BatchRow
 from gvo.config import Config
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.plots import plain

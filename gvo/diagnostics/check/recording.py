@@ -12,9 +12,8 @@ from gvo.diagnostics.check.findings import CheckResult, Finding, Limits, judged,
 from gvo.diagnostics.check.frame_tree import check_frame_tree
 from gvo.diagnostics.check.images import check_images, check_usable
 from gvo.diagnostics.check.sampling import Survey, survey
-from gvo.diagnostics.check.shutter import check_shutter
 from gvo.diagnostics.check.stereo import check_stereo
-from gvo.diagnostics.check.timing import check_timing
+from gvo.diagnostics.check.timing import check_shutter, check_timing
 from gvo.errors import CalibrationError
 from gvo.geometry.camera import PinholeCamera, StereoCamera
 from gvo.io.poses.inputs import CAMERA_CHANGED, describe_camera_changes

@@ -6,19 +6,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from gvo._trace import Trace, watched
 from gvo.config import Config
-from gvo.diagnostics.explain.extraction import (
-    explain_depth_pixels,
-    explain_keypoints,
-    explain_measured,
-    explain_subpixel,
-)
-from gvo.diagnostics.explain.motion import (
+from gvo.diagnostics.explain.steps import (
     Registration,
     describe,
     explain_consensus,
+    explain_depth_pixels,
+    explain_keypoints,
     explain_matches,
+    explain_measured,
     explain_refinement,
     explain_rows,
+    explain_subpixel,
     registrations_of,
 )
 from gvo.diagnostics.explain.values import FrameExplanation, Step

@@ -14,14 +14,15 @@ from gvo.io.bag.cameras import BagCamera, image_frame, read_bag_cameras, recorde
 from gvo.io.bag.messages import transform_of
 from gvo.io.bag.reader import BagMessage, MessageReader
 from gvo.io.bag.topics import CameraTopics
-from gvo.io.calibration.camera_info import make_calibration, make_rgbd_calibration
-from gvo.io.calibration.files import CalibrationPaths, read_cameras
-from gvo.io.calibration.stereo_pair import (
+from gvo.io.calibration.camera_info import (
     has_baseline,
+    make_calibration,
+    make_rgbd_calibration,
     pair_of_baseline,
     pair_of_extrinsics,
     stereo_baseline,
 )
+from gvo.io.calibration.files import CalibrationPaths, read_cameras
 from gvo.io.poses.tf import TfBuffer, read_tf
 from gvo.io.recording import DepthView
 from gvo.types import Failure, FloatArray

@@ -30,10 +30,17 @@ from rosbags.serde import SerdeError
 
 from gvo.errors import RecordingError
 from gvo.io.bag.recovery import mcap, ros1
-from gvo.io.bag.recovery.inflate import DamageError, inflate_message, inflate_whole
 from gvo.io.bag.recovery.mcap import McapScan
 from gvo.io.bag.recovery.ros1 import Ros1Scan
-from gvo.io.bag.recovery.scan import Channel, FoundMessage, Scan, standard_type
+from gvo.io.bag.recovery.scan import (
+    Channel,
+    DamageError,
+    FoundMessage,
+    Scan,
+    inflate_message,
+    inflate_whole,
+    standard_type,
+)
 
 _Reader: TypeAlias = Reader1 | Reader2
 _SCANS: dict[str, type[Scan]] = {".bag": Ros1Scan, ".mcap": McapScan}

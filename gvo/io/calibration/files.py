@@ -21,10 +21,11 @@ from gvo.io.calibration.camera_info import (
     RegionOfInterest,
     make_calibration,
     make_rgbd_calibration,
+    pair_of_extrinsics,
     read_array,
     read_numbers,
+    stereo_baseline,
 )
-from gvo.io.calibration.stereo_pair import pair_of_extrinsics, stereo_baseline
 from gvo.io.recording import Sensor
 from gvo.types import FloatArray
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
+from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.io.calibration.files import (
     CalibrationPaths,
     CameraSet,
@@ -15,7 +16,6 @@ from gvo.io.calibration.files import (
     read_calibration_file,
     read_cameras,
 )
-from gvo.io.calibration.stereo_pair import stereo_baseline
 from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
 from gvo.io.images import FULL_RANGE, GreyRange
 from gvo.trajectory.formats import read_trajectory

@@ -11,9 +11,8 @@ from gvo._text import cut, plain_number
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
-from gvo.io.calibration.camera_info import check_camera, rectified_calibration
+from gvo.io.calibration.camera_info import check_camera, rectified_calibration, stereo_baseline
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
-from gvo.io.calibration.stereo_pair import stereo_baseline
 from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamped_rows
 from gvo.io.images import FULL_RANGE, GreyRange, read_image
 from gvo.trajectory.formats import read_trajectory

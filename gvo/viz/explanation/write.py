@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gvo._text import html_text
-from gvo.diagnostics.explain.motion import has_prior
+from gvo.diagnostics.explain.steps import has_prior
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
 from gvo.errors import ConfigurationError, write_faults
 from gvo.types import ConstantError, StereoFrame
@@ -24,8 +24,13 @@ from gvo.viz.explanation.extraction import (
     draw_stereo,
     draw_subpixel,
 )
-from gvo.viz.explanation.motion import draw_consensus, draw_matches, draw_residuals
-from gvo.viz.explanation.pose import draw_links, draw_pose
+from gvo.viz.explanation.motion import (
+    draw_consensus,
+    draw_links,
+    draw_matches,
+    draw_pose,
+    draw_residuals,
+)
 from gvo.viz.explanation.sheet import TITLES, Picture
 from gvo.viz.report.page import write_page
 

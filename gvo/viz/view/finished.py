@@ -16,9 +16,8 @@ from gvo.trajectory.alignment import alignment, pair
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.view import panels
-from gvo.viz.view.layers import COLOURS
 from gvo.viz.view.player import RunPlayer
-from gvo.viz.view.scene import Scene, Up
+from gvo.viz.view.scene import COLOURS, Scene, Up
 from gvo.viz.view.server import ViewServer, open_server
 
 N_ELLIPSOIDS = 60

@@ -18,10 +18,9 @@ from gvo.types import FloatArray, ImageArray, IntArray
 from gvo.viz.view import panels
 from gvo.viz.view.controls import ParameterControls
 from gvo.viz.view.history import FrameView
-from gvo.viz.view.layers import COLOURS
 from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.player import Player
-from gvo.viz.view.scene import Scene
+from gvo.viz.view.scene import COLOURS, Scene
 from gvo.viz.view.server import ViewServer, open_server
 
 FILE_NAME = "gvo.yaml"

@@ -13,10 +13,9 @@ import viser
 from gvo._text import html_text
 from gvo.trajectory.trajectory import format_stamp
 from gvo.types import FloatArray, FrameResult
-from gvo.viz.view.layers import COLOURS
 from gvo.viz.view.live import LivePlayer
 from gvo.viz.view.player import Player, RunPlayer
-from gvo.viz.view.scene import LAYERS, Scene, Up, position_sigmas
+from gvo.viz.view.scene import COLOURS, LAYERS, Scene, Up, position_sigmas
 
 MAIN_WIDTH_PX = 330
 FRAME_WIDTH_PX = 430

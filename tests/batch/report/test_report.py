@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvo.batch.report.boxes import MAX_ROWS, box_of
+from gvo.batch.report.plots import MAX_ROWS, box_of
 from gvo.batch.report.report import run_address, write_batch_report
 from gvo.batch.report.values import log_limits, log_ticks
-from gvo.batch.rows import BatchRow, Value
+from gvo.batch.tasks import BatchRow, Value
 from gvo.config import Config
 from gvo.errors import ConfigurationError
 from tests.batch.rows import complete, failed

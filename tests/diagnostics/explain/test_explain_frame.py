@@ -13,7 +13,7 @@ from gvo._trace import Event, Trace
 from gvo.backend.keyframe_policy import choose_links
 from gvo.config import Config, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
-from gvo.diagnostics.explain.motion import explain_consensus, explain_refinement
+from gvo.diagnostics.explain.steps import explain_consensus, explain_refinement
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.frames import frames

@@ -25,7 +25,7 @@ from gvo.io.bag.topics import (
     TopicChoice,
     choose_topics,
 )
-from gvo.io.calibration.stereo_pair import stereo_baseline
+from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.types import FloatArray
 from tests.io.camera_bags import Message, camera_info, header, image, make, write
 

@@ -19,8 +19,7 @@ from gvo.errors import ConfigurationError
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.viz.explanation import write_explanation
-from gvo.viz.explanation.motion import draw_residuals
-from gvo.viz.explanation.pose import position_covariance
+from gvo.viz.explanation.motion import draw_residuals, position_covariance
 from gvo.viz.explanation.sheet import Sheet
 from tests.viz.browser import Browser
 

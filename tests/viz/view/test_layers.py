@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.types import FloatArray
-from gvo.viz.view.layers import ChunkedArray
+from gvo.viz.view.scene import ChunkedArray
 
 rows_of_one_number = st.lists(st.integers(0, 3), max_size=20).map(
     lambda values: np.array(values, dtype=np.float64).reshape(-1, 1)

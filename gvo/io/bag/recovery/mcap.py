@@ -13,8 +13,15 @@ from pathlib import Path
 from typing import TypeAlias
 from zlib import crc32
 
-from gvo.io.bag.recovery.inflate import DamageError, Window
-from gvo.io.bag.recovery.scan import Channel, Entry, Losses, Scan, standard_type
+from gvo.io.bag.recovery.scan import (
+    Channel,
+    DamageError,
+    Entry,
+    Losses,
+    Scan,
+    Window,
+    standard_type,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 

@@ -10,8 +10,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from gvo.io.bag.recovery.inflate import MAX_INFLATED, DamageError, Window
-from gvo.io.bag.recovery.scan import Channel, Entry, Losses, Scan, share, standard_type
+from gvo.io.bag.recovery.scan import (
+    MAX_INFLATED,
+    Channel,
+    DamageError,
+    Entry,
+    Losses,
+    Scan,
+    Window,
+    share,
+    standard_type,
+)
 
 MAGIC = b"#ROSBAG V2.0\n"
 
