@@ -277,7 +277,7 @@ def _fit(points_a: FloatArray, points_b: FloatArray, *, is_scaled: bool) -> Simi
 def _best_rotation(vectors_a: FloatArray, vectors_b: FloatArray) -> FloatArray:
     """Return the least-squares R_a_b (eq. 40); any optimum if the vectors lie on a line.
 
-    `geometry.ransac` refuses points on a line, where the rotation about it would be noise. Here
+    `geometry.umeyama` refuses points on a line, where the rotation about it would be noise. Here
     only the aligned positions count, and a camera may drive straight or have two poses.
     """
     if len(vectors_a) == 1:

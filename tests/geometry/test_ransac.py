@@ -13,13 +13,8 @@ from scipy.stats import chisquare
 from gvo.config import RansacConfig
 from gvo.geometry import ransac
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.ransac import (
-    Consensus,
-    draw_samples,
-    find_inliers,
-    fit_rigid_triples,
-    ransac_rigid,
-)
+from gvo.geometry.ransac import Consensus, draw_samples, find_inliers, ransac_rigid
+from gvo.geometry.umeyama import fit_rigid_triples
 from gvo.types import BoolArray, Failure, FloatArray
 from tests.geometry.scenes import CAMERA, matched, move, project, random_motion, seeds
 

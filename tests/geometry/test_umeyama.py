@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvo.geometry.ransac import fit_rigid, fit_rigid_batch, fit_rigid_triples
+from gvo.geometry.umeyama import fit_rigid, fit_rigid_batch, fit_rigid_triples
 from gvo.types import Failure, FloatArray
 from tests.geometry.scenes import move, seeds
 

@@ -32,7 +32,7 @@ from mutation import (  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = ("gvo/geometry", "gvo/backend", "gvo/trajectory/evaluation.py")
-TESTS = ("tests/geometry", "tests/backend", "tests/trajectory/test_evaluation.py")
+TESTS = ("tests/geometry", "tests/backend", "tests/trajectory", "tests/odometry/test_graph.py")
 MIN_COVERAGE = 0.95
 MIN_KILLED = 0.85
 RESULTS = Path(tempfile.gettempdir()) / "gvo-mutation.json"
