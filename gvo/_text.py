@@ -24,9 +24,6 @@ MAX_TEXT_BYTES = 1 << 28
 MAX_LINE = 1 << 20
 """Characters of a line; an edge with its covariance has a thousandth."""
 
-MAX_LINES = 3_000_000
-"""Lines of a table, as many: rows of a few bytes take more memory than their text."""
-
 MAX_SHOWN = 80
 """Largest length of a value in a message, characters."""
 
@@ -131,7 +128,7 @@ def exists(path: Path) -> bool:
 
 
 def text_lines(
-    path: Path, fault: type[Exception], *, is_held: bool = False
+    path: Path, fault: type[Exception], *, max_lines: int | None = None
 ) -> Iterator[tuple[int, str]]:
     """Yield numbers, from one, and lines of a text file, one at a time.
 
@@ -141,8 +138,8 @@ def text_lines(
         File, pipe or device.
     fault : type
         Raised if it cannot be read, is no text, or a line has more than `MAX_LINE` characters.
-    is_held : bool
-        All is held in memory: no more than `MAX_LINES` and `MAX_TEXT_BYTES` then.
+    max_lines : int, optional
+        All is held in memory: no more than as many lines, and `MAX_TEXT_BYTES`.
     """
     n_left = MAX_TEXT_BYTES
     try:
@@ -152,8 +149,8 @@ def text_lines(
                 n_left -= len(line)
                 if len(line) > MAX_LINE:
                     raise fault(f"{path}: a line has more than {MAX_LINE} characters")
-                if is_held and (n_left < 0 or number > MAX_LINES):
-                    limits = f"{MAX_TEXT_BYTES} bytes or {MAX_LINES} lines"
+                if max_lines is not None and (n_left < 0 or number > max_lines):
+                    limits = f"{MAX_TEXT_BYTES} bytes or {max_lines} lines"
                     raise fault(f"{path}: holds more than {limits}")
                 yield number, line
     except OSError as error:
@@ -162,7 +159,7 @@ def text_lines(
         raise fault(f"{path}: is no text file") from error
 
 
-def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "utf-8") -> str:
+def read_text(path: Path, *, max_bytes: int) -> str:
     r"""Read a text file of limited size, with line ends as \n.
 
     Parameters
@@ -171,8 +168,6 @@ def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "u
         File, pipe or device.
     max_bytes : int
         Largest size.
-    encoding : str
-        "utf-8", or "utf-8-sig" to skip a byte order mark.
 
     Raises
     ------
@@ -185,7 +180,7 @@ def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES, encoding: str = "u
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"it holds more than {max_bytes} bytes")
-    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+    return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def number_text(value: float | None, form: str = ".4g") -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path, PurePosixPath
 
-from gvo._text import YamlError, cut, load_yaml, read_text
+from gvo._text import YamlError, cut, load_yaml, text_lines
 from gvo.batch.results import CSV, PARQUET
 from gvo.batch.storage import Place, is_url
 from gvo.batch.tasks import MARK, Value
@@ -32,6 +32,7 @@ _COMMENT = re.compile(r"(^|\s)#.*")
 _TAKEN = {f"{name}{end}" for name in (CSV, PARQUET, REPORT, MARK) for end in ("", ".new")}
 DEFAULT = "default"
 _MAX_SHOWN = 100
+_MAX_LISTED = 1_000_000  # lines of a list of recordings
 _MAX_VARIANTS = 100_000
 
 
@@ -88,11 +89,7 @@ def _expand(text: str) -> list[str]:
 
 
 def _read_list(path: Path) -> Iterator[str]:
-    try:
-        lines = read_text(path, encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
-    for number, line in enumerate(lines, start=1):
+    for number, line in text_lines(path, RecordingError, max_lines=_MAX_LISTED):
         entry = _COMMENT.sub("", line).strip()
         if not entry:
             continue

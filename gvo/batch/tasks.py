@@ -20,6 +20,7 @@ from gvo.io.excerpt import Excerpt
 from gvo.io.opening import RecordingOptions, open_recording
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.io.recording import Source
+from gvo.io.run_folder.reader import MAX_SUMMARY_BYTES
 from gvo.io.run_folder.writer import SUMMARY
 from gvo.runs.outputs.options import RunOutputs
 from gvo.runs.run import RunResult, run_recording
@@ -316,7 +317,7 @@ def _find_finished(
 ) -> RunResult | None:
     """Return the complete run in the folder of a task, if it is the task's own."""
     try:
-        summary = json.loads(read_text(folder / SUMMARY))
+        summary = json.loads(read_text(folder / SUMMARY, max_bytes=MAX_SUMMARY_BYTES))
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(summary, dict) or summary.get("state") != "complete":

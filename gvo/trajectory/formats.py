@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +24,11 @@ from gvo.types import BoolArray, FloatArray, IntArray
 MAX_POSITION_M = 1e12
 """Largest coordinate, metres: a hundred times the distance of the planets."""
 
+MAX_LINES = 3_000_000
+"""Of a table: rows of a few bytes take more memory than their text."""
+
+_MAX_NUMBERS = 18_200_000  # of a table: poses of a day at 30 Hz
+_BLOCK = 4096  # poses that are made of rows at once, by steps that take several times their memory
 _MAX_REASON = 300  # characters
 _FORMATS = (
     "8 columns (TUM: stamp tx ty tz qx qy qz qw), 12 (KITTI: the first three rows of the pose) "
@@ -311,10 +316,9 @@ def _read_tum(path: Path, rows: Iterable[Row], *, is_sorted: bool = True) -> Tra
     # TUM's own ground truths repeat stamps, rounded to 0.1 ms; their tools keep the last row
     is_last = np.diff(table.stamps_ns, append=table.stamps_ns[-1] + 1) != 0
     table = table.take(is_last)
-    R = _rotations_of_quaternions(table, table.values[:, 3:])
     return Trajectory(
         stamps_ns=check_increasing(table),
-        T_world_frame=se3.make_transform(R, table.values[:, :3]),
+        T_world_frame=_poses(table, partial(_of_quaternions, order=[3, 4, 5, 6])),
         n_repeated=int(np.count_nonzero(~is_last)),
     )
 
@@ -322,23 +326,15 @@ def _read_tum(path: Path, rows: Iterable[Row], *, is_sorted: bool = True) -> Tra
 def _read_euroc(path: Path, rows: Iterable[Row], n_columns: int) -> Trajectory:
     table = read_table(path, rows, slice(1, 8), n_columns=n_columns, unit_ns=1)
     stamps_ns = check_increasing(table)
-    R = _rotations_of_quaternions(table, table.values[:, [4, 5, 6, 3]])
-    T_world_frame = se3.make_transform(R, table.values[:, :3])
+    T_world_frame = _poses(table, partial(_of_quaternions, order=[4, 5, 6, 3]))
     return Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_frame)
 
 
 def _read_kitti(path: Path, rows: Iterable[Row]) -> Trajectory:
     table = read_table(path, rows, slice(0, 12), n_columns=12)
-    P = table.values.reshape(-1, 3, 4)
-    M = P[:, :, :3]
-    is_wrong = ~se3.is_rotation(M, tolerance=_ROUNDING)
-    table.refuse(is_wrong, "the first three columns of the pose are no rotation")
-    stamps_ns, stamps_from = _kitti_stamps(path, len(P))
-    return Trajectory(
-        stamps_ns=stamps_ns,
-        T_world_frame=se3.make_transform(se3.nearest_rotation(M), P[:, :, 3]),
-        stamps_from=stamps_from,
-    )
+    T_world_frame = _poses(table, _of_matrices)
+    stamps_ns, stamps_from = _kitti_stamps(path, len(T_world_frame))
+    return Trajectory(stamps_ns=stamps_ns, T_world_frame=T_world_frame, stamps_from=stamps_from)
 
 
 def _kitti_stamps(path: Path, n_rows: int) -> tuple[IntArray, StampsFrom]:
@@ -352,10 +348,26 @@ def _kitti_stamps(path: Path, n_rows: int) -> tuple[IntArray, StampsFrom]:
     return np.arange(n_rows, dtype=np.int64) * 1_000_000_000, "rows"
 
 
-def _rotations_of_quaternions(table: Table, quaternions_xyzw: FloatArray) -> FloatArray:
+def _poses(table: Table, convert: Callable[[Table], FloatArray]) -> FloatArray:
+    T = np.empty((len(table.numbers), 4, 4))
+    for rows in (slice(first, first + _BLOCK) for first in range(0, len(T), _BLOCK)):
+        T[rows] = convert(table.take(rows))
+    return T
+
+
+def _of_quaternions(table: Table, order: list[int]) -> FloatArray:
+    quaternions_xyzw = table.values[:, order]
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
     table.refuse(np.abs(norms - 1.0) > _ROUNDING, "the quaternion is not of length one")
-    return np.asarray(Rotation.from_quat(quaternions_xyzw).as_matrix())
+    R = np.asarray(Rotation.from_quat(quaternions_xyzw).as_matrix())
+    return se3.make_transform(R, table.values[:, :3])
+
+
+def _of_matrices(table: Table) -> FloatArray:
+    P = table.values.reshape(-1, 3, 4)
+    is_wrong = ~se3.is_rotation(P[:, :, :3], tolerance=_ROUNDING)
+    table.refuse(is_wrong, "the first three columns of the pose are no rotation")
+    return se3.make_transform(se3.nearest_rotation(P[:, :, :3]), P[:, :, 3])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -407,7 +419,7 @@ def read_rows(path: Path, *, is_growing: bool = False) -> Iterator[Row]:
     if is_growing and not exists(path):
         return
     header: list[str] = []
-    for number, line in text_lines(path, TrajectoryError, is_held=True):
+    for number, line in text_lines(path, TrajectoryError, max_lines=MAX_LINES):
         text, mark, comment = line.rstrip("\n").partition("#")
         fields = text.replace(",", " ").split()
         if mark:
@@ -437,7 +449,7 @@ class Table(NamedTuple):
     stamps_ns: IntArray
     values: FloatArray
 
-    def take(self, rows: IntArray | BoolArray) -> Table:
+    def take(self, rows: IntArray | BoolArray | slice) -> Table:
         """Return some of the rows."""
         return Table(self.path, self.numbers[rows], self.stamps_ns[rows], self.values[rows])
 
@@ -491,6 +503,8 @@ def read_table(
         except ValueError as error:
             raise row.error(f"{error}; expected {len(row.fields)} numbers") from None
         numbers.append(row.number)
+        if len(values) > _MAX_NUMBERS:
+            raise row.error(f"the table holds more than {_MAX_NUMBERS} numbers")
     table = Table(
         path,
         np.frombuffer(numbers, dtype=np.int64),

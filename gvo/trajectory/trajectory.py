@@ -19,6 +19,7 @@ from gvo.types import Estimate, FloatArray, IntArray
 StampsFrom = Literal["file", "times", "rows", "topic"]
 
 _ROTATION_TOLERANCE = 1e-3
+_BLOCK = 4096  # poses checked at once, which takes several times their memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -274,7 +275,9 @@ def _checked_array(name: str, values: FloatArray, shape: tuple[int, ...]) -> Flo
 
 
 def _check_rigid(poses: FloatArray) -> None:
-    is_rigid = se3.is_rotation(poses[:, :3, :3], tolerance=_ROTATION_TOLERANCE)
+    blocks = (poses[first : first + _BLOCK, :3, :3] for first in range(0, len(poses), _BLOCK))
+    checked = [se3.is_rotation(R, tolerance=_ROTATION_TOLERANCE) for R in blocks]
+    is_rigid = np.concatenate([np.empty(0, dtype=np.bool_), *checked])
     is_rigid &= np.all(poses[:, 3] == (0.0, 0.0, 0.0, 1.0), axis=1)
     if not np.all(is_rigid):
         index = int(np.argmin(is_rigid))

@@ -116,7 +116,7 @@ def test_a_line_that_leads_nowhere_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"list\.txt, line 2: x\*\.bag: no recording there"):
         find_recordings([tmp_path / "list.txt"])
     (tmp_path / "list.txt").write_bytes(b"\xff\xfe")
-    with pytest.raises(RecordingError, match=r"list\.txt: cannot be read"):
+    with pytest.raises(RecordingError, match=r"list\.txt: is no text file"):
         find_recordings([tmp_path / "list.txt"])
 
 

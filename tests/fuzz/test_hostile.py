@@ -4,8 +4,9 @@ import json
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sized
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,7 +39,7 @@ from gvo.io.edges.lines import parse_line, read_lines
 from gvo.io.images import MAX_PIXELS, decode_image, read_header, read_image
 from gvo.io.poses.ground_truth import parse_truth
 from gvo.io.run_folder.reader import read_run
-from gvo.trajectory.formats import read_rows, read_table, read_trajectory
+from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.g2o import Measurement
 from gvo.trajectory.g2o import parse_line as parse_g2o_line
 from gvo.types import Failure
@@ -237,7 +238,7 @@ def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
     code = (
         "import numpy as np, struct\nfrom gvo.io.bag.image_encodings import decode_rvl\n"
         f"{used}\n"
-        "data = np.full(30_000_000, 0x11, np.uint8)\n"
+        "data = np.full(12_000_000, 0x11, np.uint8)\n"
         "data[:8] = np.frombuffer(struct.pack('<II', 4, 4), np.uint8)\n"
         "decode_rvl(data, 'x')\n"
         f"{used}"
@@ -247,26 +248,66 @@ def test_an_rvl_image_takes_memory_by_its_size_not_by_its_data() -> None:
     assert after - before < 200
 
 
-def test_a_table_of_tiny_rows_takes_a_few_times_its_text(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text("0 0 0 0 0 0 0 1\n" * 20_000)
+@pytest.mark.parametrize(
+    ("row", "read", "n_bytes"),
+    [
+        # The numbers of a row, its pose, and the copy that the trajectory keeps.
+        ("{0} 0 0 0 0 0 0 1\n", read_trajectory, 8 * (9 + 2 * 16)),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", read_trajectory, 8 * (14 + 2 * 16)),
+        # A stamp and a text, in a pair.
+        ("{0} a" + 80 * " b" + "\n", partial(read_stamped_rows, unit_ns=1), 200),
+    ],
+)
+def test_a_table_of_tiny_rows_takes_as_much_as_its_numbers(
+    tmp_path: Path, row: str, read: Callable[[Path], Sized], n_bytes: int
+) -> None:
+    path = tmp_path / "table.txt"
+    path.write_text("".join(row.format(k) for k in range(12_000)))
     tracemalloc.start()
     try:
-        table = read_table(path, read_rows(path), slice(1, 8), n_columns=8, unit_ns=1)
+        assert len(read(path)) == 12_000
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert table.values.shape == (20_000, 7)
-    assert peak < 8 * path.stat().st_size
+    assert peak < 1.2 * 12_000 * n_bytes
 
 
-@pytest.mark.parametrize(("name", "limit"), [("MAX_LINES", 9), ("MAX_TEXT_BYTES", 150)])
+def test_a_table_of_a_run_takes_as_much_as_its_columns(tmp_path: Path) -> None:
+    for name in ("raw.txt", "smoothed.txt"):
+        (tmp_path / name).touch()
+    rows = "".join(f"{k},ok,250,{k},dark\n" for k in range(12_000))
+    (tmp_path / "frames.csv").write_text("stamp_ns,status,n_matches,other,reason\n" + rows)
+    tracemalloc.start()
+    try:
+        assert len(read_run(tmp_path).frames.statuses) == 12_000
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 1.5 * 12_000 * (2 * 8 + 2 * 2 * 8)
+
+
+def test_a_summary_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    for name in ("frames.csv", "raw.txt", "smoothed.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "summary.json").write_text("[" + 6_000_000 * "[]," + "[]]")
+    with pytest.raises(RecordingError, match="holds more than"):
+        read_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"trajectory.formats.MAX_LINES": 9, "io.datasets.files._MAX_ROWS": 9},
+        {"_text.MAX_TEXT_BYTES": 150},
+    ],
+)
 def test_a_table_that_is_too_long_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, limit: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, int]
 ) -> None:
     path = tmp_path / "poses.txt"
     path.write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(9)))
-    monkeypatch.setattr(f"gvo._text.{name}", limit)
+    for name, limit in changes.items():
+        monkeypatch.setattr(f"gvo.{name}", limit)
     assert len(read_trajectory(path)) == len(read_stamped_rows(path, unit_ns=1)) == 9
     path.write_text(path.read_text() + "9 0 0 0 0 0 0 1\n")
     with pytest.raises(TrajectoryError, match="holds more than"):

@@ -103,4 +103,4 @@ def _pose_on_body(cameras: CameraSet, sensor: Path) -> FloatArray:
 
 def _list_images(camera: Path) -> list[StampedPath]:
     rows = read_stamped_rows(camera / "data.csv", unit_ns=1, separator=",")
-    return [(stamp_ns, camera / "data" / fields[0]) for stamp_ns, fields in rows]
+    return [(stamp_ns, str(camera / "data" / name)) for stamp_ns, name in rows]

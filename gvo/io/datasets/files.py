@@ -17,7 +17,10 @@ from gvo.io.images import FULL_RANGE, GreyRange, read_image
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.trajectory.trajectory import parse_stamp
 
-StampedPath = tuple[int, Path]
+StampedPath = tuple[int, str]
+"""Stamp in nanoseconds, and a file, as text: it takes a third of a Path's memory."""
+
+_MAX_ROWS = 1_000_000  # of images, nine hours at 30 Hz
 _MAX_REASON = 300  # characters
 
 
@@ -30,7 +33,7 @@ class FolderSource:
         It names the recording.
     cameras : CameraSet
         Of both streams, or of the colour images.
-    streams : mapping of str to sequence of (int, Path)
+    streams : mapping of str to sequence of (int, str)
         Two names, and the stamps in nanoseconds and files of each; first the left or colour
         images.
     decisions : sequence of str
@@ -78,13 +81,13 @@ def _stream(
     stream: int, rows: Sequence[StampedPath], load: Callable[[Path], NDArray[Any]]
 ) -> Iterator[StampedImage]:
     for stamp_ns, path in rows:
-        yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(load, path))
+        yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(load, Path(path)))
 
 
 def read_stamped_rows(
     path: Path, *, unit_ns: int, n_fields: int = 2, separator: str | None = None
-) -> list[tuple[int, list[str]]]:
-    """Read a table whose first field is a stamp.
+) -> list[tuple[int, str]]:
+    """Read a table whose first field is a stamp, its second perhaps a name.
 
     Parameters
     ----------
@@ -95,8 +98,8 @@ def read_stamped_rows(
 
     Returns
     -------
-    list of (int, list of str)
-        Stamp in nanoseconds, without loss, and the fields behind it.
+    list of (int, str)
+        Stamp in nanoseconds, without loss, and the field behind it; empty where there is none.
 
     Raises
     ------
@@ -106,7 +109,7 @@ def read_stamped_rows(
     rows = []
     for number, (stamp, *fields) in read_rows(path, n_fields=n_fields, separator=separator):
         try:
-            rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields))
+            rows.append((parse_stamp(stamp, unit_ns=unit_ns), fields[0] if fields else ""))
         except ValueError as error:
             reason = cut(str(error), _MAX_REASON)
             raise RecordingError(f"{path}, line {number}: {reason}") from None
@@ -138,7 +141,7 @@ def read_rows(
         When the file cannot be read, holds no row, or a row is too short.
     """
     is_empty = True
-    for number, line in text_lines(path, RecordingError, is_held=True):
+    for number, line in text_lines(path, RecordingError, max_lines=_MAX_ROWS):
         text = line.strip()
         if not text or text.startswith("#"):
             continue

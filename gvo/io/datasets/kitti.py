@@ -112,7 +112,7 @@ class KittiSource(FolderSource):
         paths = sorted(path for path in folder.iterdir() if path.suffix in _IMAGE_SUFFIXES)
         if not paths:
             raise RecordingError(f"{folder}: holds no .png or .jpg images")
-        return [(self._stamp_of(path), path) for path in paths]
+        return [(self._stamp_of(path), str(path)) for path in paths]
 
     def _stamp_of(self, path: Path) -> int:
         n_rows = len(self._stamps_ns)
@@ -130,18 +130,19 @@ def _find_pair(folder: Path) -> tuple[str, str]:
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
 
 
-def _image_size(paths: Sequence[Path], grey_range: GreyRange) -> tuple[int, int]:
+def _image_size(paths: Sequence[str], grey_range: GreyRange) -> tuple[int, int]:
     """Return width and height of the first image that can be read."""
     first_fault = ""
     for path in paths:
         try:
-            height, width = read_image(path, grey_range).shape[:2]
+            height, width = read_image(Path(path), grey_range).shape[:2]
         except RecordingError as error:
             first_fault = first_fault or str(error)
             continue  # it becomes a faulty frame later
         return width, height
+    folder, n_images = Path(paths[0]).parent, len(paths)
     raise RecordingError(
-        f"{paths[0].parent}: none of its {len(paths)} images can be read; the first: {first_fault}"
+        f"{folder}: none of its {n_images} images can be read; the first: {first_fault}"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -80,7 +80,7 @@ class TumSource(FolderSource):
         elif cameras.depth_scale is not None:
             scale, reason = cameras.depth_scale, "by the calibration"
         else:
-            scale, reason = _assume_scale([path for _, path in images["depth"]])
+            scale, reason = _assume_scale(path for _, path in images["depth"])
         super().__init__(
             folder,
             cameras,
@@ -104,7 +104,7 @@ class TumSource(FolderSource):
 
 def _list_images(table: Path) -> list[StampedPath]:
     rows = read_stamped_rows(table, unit_ns=10**9)
-    return [(stamp_ns, table.parent / fields[0]) for stamp_ns, fields in rows]
+    return [(stamp_ns, str(table.parent / name)) for stamp_ns, name in rows]
 
 
 def _find_calibration(folder: Path, explicit: tuple[Path, ...]) -> CameraSet:
@@ -159,13 +159,13 @@ def _published_camera(
     )
 
 
-def _assume_scale(paths: Sequence[Path]) -> tuple[float, str]:
+def _assume_scale(paths: Iterable[str]) -> tuple[float, str]:
     """Choose between the two scales in use by the first depth image that can be read.
 
     The scale of TUM's tools unless the scene would then be nearer than such a camera can see,
     and millimetres put it where it can.
     """
-    for path in paths:
+    for path in map(Path, paths):
         median = _median_depth(path)
         if median is None:
             continue

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -12,16 +14,24 @@ from typing import Any, cast, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gvo._text import read_text
+from gvo._text import read_text, text_lines
 from gvo.errors import RecordingError, TrajectoryError
 from gvo.geometry import se3
 from gvo.io.run_folder.writer import GLOBAL, LOOPS, TRAJECTORIES, TRUE_POSITIONS, TRUTH
-from gvo.trajectory.formats import MAX_POSITION_M, read_covariances, read_trajectory
+from gvo.trajectory.formats import (
+    MAX_LINES,
+    MAX_POSITION_M,
+    read_covariances,
+    read_trajectory,
+)
 from gvo.trajectory.trajectory import StampsFrom, Trajectory
 from gvo.types import BoolArray, FloatArray, IntArray
 
 COUNTS = ("keypoints", "points", "matches", "inliers", "links", "edges", "rejected")
 """What `frames.csv` may count, as columns `n_...`."""
+
+MAX_SUMMARY_BYTES = 1 << 24
+"""Of `summary.json`: nested lists of two bytes take thirty times their memory."""
 
 _ROUNDING = 1e-2
 _EXPECTED = "expected a folder that gvo run or gvo smooth wrote"
@@ -228,7 +238,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        summary = json.loads(read_text(path))
+        summary = json.loads(read_text(path, max_bytes=MAX_SUMMARY_BYTES))
     except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: is damaged: {error}; run again") from error
     if not isinstance(summary, dict):
@@ -252,93 +262,103 @@ def _transform_fault(value: object) -> str:
     return se3.transform_fault(T, tolerance=_ROUNDING)
 
 
-def _whole_lines(path: Path) -> list[str]:
-    """Return the whole lines of a file: an unfinished last one is left out."""
-    try:
-        text = read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from error
-    return text[: text.rfind("\n") + 1].splitlines()
+def _columns(path: Path, required: Sequence[str]) -> dict[str, Any] | None:
+    """Return the columns of a table by name, numbers as arrays; None where it is missing or empty.
 
-
-def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]] | None:
-    """Return the rows of a table; None where the file is missing or empty."""
-    lines = _whole_lines(path) if path.is_file() else []
-    if not lines:
+    An unfinished last line is left out.
+    """
+    if not path.is_file():
         return None
-    reader = csv.DictReader(lines, strict=True)
+    lines = text_lines(path, RecordingError, max_lines=MAX_LINES)
+    reader = csv.reader((line for _, line in lines if line.endswith("\n")), strict=True)
     try:
-        absent = [name for name in columns if name not in (reader.fieldnames or ())]
-        rows = [] if absent else list(reader)
+        names = next(reader, None)
+        return None if names is None else _read_columns(path, names, reader, required)
     except csv.Error as error:
         raise RecordingError(f"{path}:{reader.line_num}: {error}; {_EXPECTED}") from error
-    if absent:
-        raise RecordingError(f"{path}:1: no column {absent[0]}; {_EXPECTED}")
-    for number, row in enumerate(rows, start=2):
-        if None in row.values() or None in row:
-            raise RecordingError(f"{path}:{number}: expected {len(reader.fieldnames or ())} fields")
-    return rows
 
 
-def _integers(path: Path, rows: list[dict[str, str]], column: str) -> IntArray:
+def _read_columns(
+    path: Path, names: list[str], rows: Iterable[list[str]], required: Sequence[str]
+) -> dict[str, Any]:
+    columns = {name: _empty_column(name) for name in names}
+    absent = [name for name in required if name not in columns]
+    if absent or len(columns) < len(names):
+        fault = f"no column {absent[0]}" if absent else "two columns of one name"
+        raise RecordingError(f"{path}:1: {fault}; {_EXPECTED}")
+    name = ""
     try:
-        return np.array([int(row[column]) for row in rows], dtype=np.int64)
+        for number, row in enumerate(filter(None, rows), start=2):
+            if len(row) != len(names):
+                raise RecordingError(f"{path}:{number}: expected {len(names)} fields")
+            for name, value in zip(names, row, strict=True):
+                values, convert = columns[name]
+                values.append(convert(value))
     except (ValueError, OverflowError) as error:
-        raise RecordingError(f"{path}: {column}: {error}; {_EXPECTED}") from error
+        raise RecordingError(f"{path}: {name}: {error}; {_EXPECTED}") from error
+    held = {name: values for name, (values, _) in columns.items()}
+    return {key: each if isinstance(each, list) else np.array(each) for key, each in held.items()}
 
 
-def _floats(path: Path, rows: list[dict[str, str]], column: str) -> FloatArray:
-    try:
-        return np.array([float(row[column] or "nan") for row in rows], dtype=np.float64)
-    except ValueError as error:
-        raise RecordingError(f"{path}: {column}: {error}; {_EXPECTED}") from error
+def _empty_column(name: str) -> tuple[Any, Callable[[str], Any]]:
+    """Return what holds the values of a column, and what makes them of text."""
+    if name in ("status", "kind", "reason"):
+        known: dict[str, str] = {}
+        return [], lambda text: known.setdefault(text, text)
+    if name in ("stamp_ns", "reference_ns", "is_accepted") or name.startswith("n_"):
+        return array("q"), int
+    if name in ("chi2", "residual") or name.endswith(("_ms", "_m")):
+        return array("d"), lambda text: float(text or "nan")
+    return deque(maxlen=0), str  # it is not kept
 
 
 def _read_frames(path: Path) -> FrameTable:
-    rows = _rows(path, ("stamp_ns", "status", "reason")) or []
-    present = [name for name in COUNTS if rows and f"n_{name}" in rows[0]]
+    columns = _columns(path, ("stamp_ns", "status", "reason"))
+    if columns is None:
+        return FrameTable(stamps_ns=np.empty(0, dtype=np.int64), statuses=(), counts={}, reasons=())
+    counted = COUNTS if len(columns["stamp_ns"]) else ()
     return FrameTable(
-        stamps_ns=_integers(path, rows, "stamp_ns"),
-        statuses=tuple(row["status"] for row in rows),
-        counts={name: _integers(path, rows, f"n_{name}") for name in present},
-        reasons=tuple(row["reason"] for row in rows),
+        stamps_ns=columns["stamp_ns"],
+        statuses=tuple(columns["status"]),
+        counts={name: columns[f"n_{name}"] for name in counted if f"n_{name}" in columns},
+        reasons=tuple(columns["reason"]),
     )
 
 
 def _read_edges(path: Path) -> EdgeTable | None:
-    rows = _rows(path, ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2"))
-    if rows is None:
+    columns = _columns(path, ("stamp_ns", "reference_ns", "kind", "is_accepted", "chi2"))
+    if columns is None:
         return None
     return EdgeTable(
-        stamps_ns=_integers(path, rows, "stamp_ns"),
-        reference_ns=_integers(path, rows, "reference_ns"),
-        kinds=np.array([row["kind"] for row in rows], dtype=np.str_),
-        is_accepted=_integers(path, rows, "is_accepted").astype(np.bool_),
-        chi2=_floats(path, rows, "chi2"),
+        stamps_ns=columns["stamp_ns"],
+        reference_ns=columns["reference_ns"],
+        kinds=np.array(columns["kind"], dtype=np.str_),
+        is_accepted=columns["is_accepted"].astype(np.bool_),
+        chi2=columns["chi2"],
     )
 
 
 def _read_timings(path: Path) -> TimingTable | None:
-    rows = _rows(path, ("stamp_ns",))
-    if rows is None:
+    columns = _columns(path, ("stamp_ns",))
+    if columns is None:
         return None
-    columns = [name for name in (rows[0] if rows else ()) if name.endswith("_ms")]
+    timed = [name for name in columns if name.endswith("_ms") and len(columns["stamp_ns"])]
     return TimingTable(
-        stamps_ns=_integers(path, rows, "stamp_ns"),
-        stages_ms={name.removesuffix("_ms"): _floats(path, rows, name) for name in columns},
+        stamps_ns=columns["stamp_ns"],
+        stages_ms={name.removesuffix("_ms"): columns[name] for name in timed},
     )
 
 
 def _read_loops(path: Path) -> LoopTable | None:
-    rows = _rows(path, ("stamp_ns", "reference_ns", "n_inliers", "residual", "reason"))
-    if rows is None:
+    columns = _columns(path, ("stamp_ns", "reference_ns", "n_inliers", "residual", "reason"))
+    if columns is None:
         return None
     return LoopTable(
-        stamps_ns=_integers(path, rows, "stamp_ns"),
-        reference_ns=_integers(path, rows, "reference_ns"),
-        n_inliers=_integers(path, rows, "n_inliers"),
-        residuals=_floats(path, rows, "residual"),
-        reasons=tuple(row["reason"] for row in rows),
+        stamps_ns=columns["stamp_ns"],
+        reference_ns=columns["reference_ns"],
+        n_inliers=columns["n_inliers"],
+        residuals=columns["residual"],
+        reasons=tuple(columns["reason"]),
     )
 
 
@@ -360,19 +380,20 @@ def _read_truth(folder: Path, summary: dict[str, Any]) -> Trajectory | None:
     if (folder / TRUTH).is_file():
         truth = read_trajectory(folder / TRUTH)
     elif (folder / TRUE_POSITIONS).is_file():
-        path = folder / TRUE_POSITIONS
-        rows = _rows(path, ("stamp_ns", "x_m", "y_m", "z_m")) or []
-        positions = np.column_stack([_floats(path, rows, f"{axis}_m") for axis in "xyz"])
-        truth = _positions(path, _integers(path, rows, "stamp_ns"), positions)
+        truth = _read_positions(folder / TRUE_POSITIONS)
     origin = summary.get("ground_truth_stamps_from")
     if truth is not None and origin in get_args(StampsFrom):
         return replace(truth, stamps_from=cast(StampsFrom, origin))
     return truth
 
 
-def _positions(path: Path, stamps_ns: IntArray, positions: FloatArray) -> Trajectory:
+def _read_positions(path: Path) -> Trajectory:
+    columns = _columns(path, ("stamp_ns", "x_m", "y_m", "z_m"))
+    if columns is None:
+        return Trajectory.of([])
     try:
-        return Trajectory.of_positions(stamps_ns, positions)
+        positions = np.column_stack([columns[f"{axis}_m"] for axis in "xyz"])
+        return Trajectory.of_positions(columns["stamp_ns"], positions)
     except ValueError as error:
         raise TrajectoryError(f"{path}: {error}; run again") from error
 

@@ -12,9 +12,9 @@ def test_stamps_are_read_without_loss(tmp_path: Path) -> None:
     path = tmp_path / "rgb.txt"
     path.write_text("1305031102.175304001 a\n1.037875e-01 b\n0 c\n")
     rows = read_stamped_rows(path, unit_ns=10**9)
-    assert rows == [(1305031102175304001, ["a"]), (103_787_500, ["b"]), (0, ["c"])]
+    assert rows == [(1305031102175304001, "a"), (103_787_500, "b"), (0, "c")]
     path.write_text("4611686018427387903,a\n")
-    assert read_stamped_rows(path, unit_ns=1, separator=",") == [(4611686018427387903, ["a"])]
+    assert read_stamped_rows(path, unit_ns=1, separator=",") == [(4611686018427387903, "a")]
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "1,5", "stamp", "1e40", "1e999999999999"])
