@@ -2,7 +2,8 @@
 
 It outlives the window. What lies between two keyframes is solved by itself, the earlier one being
 the origin: of the poses found there, those of other keyframes become edges, and the frames between
-hang on the earlier keyframe. An edge and a frame take a few hundred bytes each.
+hang on the earlier keyframe. What is needed again at the end only, of all frames and of keyframes
+that were merged, is written to temporary files: memory grows with the map, not with the run.
 
 While the run goes, the graph is optimized in a thread whenever loops have come. It is taken over a
 fixed number of keyframes later, so that a run can be repeated. Of the keyframes that came back to a
@@ -17,22 +18,30 @@ measurements", IROS 2012, doi:10.1109/IROS.2012.6385779.
 from __future__ import annotations
 
 import copy
+import io
 import logging
-from bisect import bisect
+import os
+import tempfile
+import weakref
+from array import array
+from bisect import bisect, bisect_left
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from itertools import count
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvo.backend.batch import INLIER_CHI2, BatchOptimizer, LocalGraph, WholeGraph
 from gvo.backend.factors import ORIGIN, Factors
 from gvo.backend.motion_model import predict_step
 from gvo.config import WindowConfig
 from gvo.geometry import se3
+from gvo.io.run_folder.line_file import append_whole
 from gvo.odometry.keyframes import chi2
 from gvo.types import Edge, Estimate, FloatArray, FrameId, Loop, Optimum, PosePrior, Status
 
@@ -54,11 +63,96 @@ _N_VOTERS = 32
 _GROWTH = 0.25
 _N_APART = 20
 _N_LATER = 5
-# Keyframes up to which linked frames are keyframes too: some seconds of work at the end.
+# Keyframes up to which linked frames are keyframes too: some seconds of work at the end. And
+# frames from a keyframe to the next one at most: they are solved at once.
 _MAX_LINKED = 2000
+_MAX_BETWEEN = 200
 # Keyframes that came back to a place and stay; the latest ones stay in any case.
 _N_PER_PLACE = 3
 _N_LATEST = 50
+
+
+# Rows of a table that are in memory.
+_N_IN_MEMORY = 100
+_T, _COVARIANCE = ((4, 4),), ((6, 6),)
+_STATUSES: Final = tuple(Status)
+
+_KEYFRAME: Final = np.dtype(
+    [
+        *(("T_first_keyframe", "f8", *_T), ("covariance", "f8", *_COVARIANCE)),
+        *(("drift", "f8", *_COVARIANCE), ("n_steps", "i8"), ("part", "i8")),  # its way
+        *(("status", "i8"), ("is_guess", "i8"), ("n_frames", "i8")),
+        *(("T_step", "f8", *_T), ("step_covariance", "f8", *_COVARIANCE)),
+    ]
+)
+"""The way to a keyframe, how many frames are before it, and its pose in the keyframe before."""
+_FRAME: Final = np.dtype(
+    [
+        *(("keyframe_ns", "i8"), ("stamp_ns", "i8"), ("status", "i8"), ("T", "f8", *_T)),
+        *(("covariance", "f8", *_COVARIANCE), ("with_next", "f8", *_COVARIANCE)),
+    ]
+)
+"""The pose of a frame in its keyframe, its covariance, and that with the next keyframe."""
+_MERGED: Final = np.dtype(
+    [("keyframe_ns", "i8"), ("T", "f8", *_T), ("covariance", "f8", *_COVARIANCE)]
+)
+"""The pose of a keyframe in the one that it was merged into."""
+
+
+class _Table:
+    """Rows by stamps; all but the latest ones are in a temporary file, gone with the object.
+
+    Where that cannot be written they stay in memory.
+    """
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self.stamps_ns = array("q")
+        self._dtype = dtype
+        self._file: io.FileIO | None = None
+        self._is_file_full = False
+        # How many rows are in the file, and those after them; replaced at once, for other threads.
+        self._rest: tuple[int, list[NDArray[Any]]] = (0, [])
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        number = self.number(stamp_ns)
+        return number < len(self) and self.stamps_ns[number] == stamp_ns
+
+    def number(self, stamp_ns: int) -> int:
+        """Return the number of the row of a stamp, where stamps ascend."""
+        return bisect_left(self.stamps_ns, stamp_ns)
+
+    def append(self, stamp_ns: int, *values: object) -> None:
+        rest = self._rest[1]
+        rest.append(np.array(values, dtype=self._dtype))
+        self.stamps_ns.append(stamp_ns)
+        if len(rest) >= _N_IN_MEMORY and not self._is_file_full:
+            self._write(rest)
+
+    def __getitem__(self, index: int) -> NDArray[Any]:
+        n_written, rest = self._rest
+        if index >= n_written or self._file is None:
+            return rest[index - n_written]
+        size = self._dtype.itemsize
+        row = os.pread(self._file.fileno(), size, index * size)
+        return np.frombuffer(row, dtype=self._dtype).reshape(())
+
+    def _write(self, rest: list[NDArray[Any]]) -> None:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - see finalize
+                weakref.finalize(self, self._file.close)
+            append_whole(self._file, b"".join(row.tobytes() for row in rest))
+        except OSError as error:
+            self._is_file_full = True
+            _LOGGER.warning("the graph of the run stays in memory: %s", error)
+            return
+        self._rest = self._rest[0] + len(rest), []
+
+
+_NO_STEP: Final = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=np.eye(6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,13 +162,7 @@ class _Stretch:
     Parameters
     ----------
     keyframe_ns : int
-    stamps_ns : tuple of int
-    T_keyframe_frame : ndarray of float64, shape (n, 4, 4)
-    covariances : ndarray of float64, shape (n, 6, 6)
-        Of T_keyframe_frame.
-    with_next : ndarray of float64, shape (n, 6, 6)
-        Their covariances with the pose of the next keyframe.
-    statuses : tuple of Status
+    frames : ndarray of _FRAME, shape (n,)
     next_ns : int or None
         The next keyframe; None while there is none.
     step : Edge or None
@@ -84,36 +172,25 @@ class _Stretch:
     """
 
     keyframe_ns: int
-    stamps_ns: tuple[int, ...]
-    T_keyframe_frame: FloatArray
-    covariances: FloatArray
-    with_next: FloatArray
-    statuses: tuple[Status, ...]
-    next_ns: int | None
-    step: Edge | None
-    is_guess: bool
-
-    def edge_to(self, stamp_ns: int) -> Edge:
-        """Return the pose of a frame in the keyframe."""
-        index = self.stamps_ns.index(stamp_ns)
-        return Edge(
-            reference_id=self.keyframe_ns,
-            T_reference_frame=self.T_keyframe_frame[index],
-            covariance=self.covariances[index],
-        )
+    frames: NDArray[Any]
+    next_ns: int | None = None
+    step: Edge | None = None
+    is_guess: bool = False
 
     def place(
         self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
     ) -> Iterator[Estimate]:
         """Yield the frames, bent so that both ends fit: where they are least certain, most."""
-        T_keyframe_frame, found = self.T_keyframe_frame, self.covariances
+        T_keyframe_frame, found, with_next = (
+            np.ascontiguousarray(self.frames[name]) for name in ("T", "covariance", "with_next")
+        )
         placed = se3.compose_covariance(covariances[self.keyframe_ns], T_keyframe_frame, found)
         if self.step is not None and self.next_ns is not None:
             T_next_keyframe = se3.invert(self.step.T_reference_frame)
             T_next_frame = T_next_keyframe @ T_keyframe_frame
             T_keyframe_next = se3.invert(poses[self.keyframe_ns]) @ poses[self.next_ns]
             # what the next keyframe tells of a frame when it turns out to be elsewhere
-            gains = self.with_next @ np.linalg.inv(self.step.covariance)
+            gains = with_next @ np.linalg.inv(self.step.covariance)
             if self.is_guess:
                 # too far for that: as much of the way as of the uncertainty
                 shares = np.clip(np.trace(gains, axis1=1, axis2=2) / 6.0, 0.0, 1.0)
@@ -122,7 +199,7 @@ class _Stretch:
             else:
                 miss = se3.log(T_next_keyframe @ T_keyframe_next)
                 T_keyframe_frame = T_keyframe_frame @ se3.exp(gains @ miss)
-            rest = found - gains @ np.swapaxes(self.with_next, 1, 2)
+            rest = found - gains @ np.swapaxes(with_next, 1, 2)
             rest = 0.5 * (rest + np.swapaxes(rest, 1, 2))
             forth, back = (
                 se3.compose_covariance(covariances[ns], T, rest)
@@ -131,23 +208,9 @@ class _Stretch:
             is_larger = np.linalg.det(back) > np.linalg.det(forth)
             placed = np.where((is_larger ^ self.is_guess)[:, np.newaxis, np.newaxis], back, forth)
         T_world_frame = poses[self.keyframe_ns] @ T_keyframe_frame
-        for stamp_ns, status, T, covariance in zip(
-            self.stamps_ns, self.statuses, T_world_frame, placed, strict=True
-        ):
-            yield Estimate(
-                stamp_ns=stamp_ns,
-                T_world_frame=T,
-                covariance=covariance,
-                status=status,
-                frame_id=stamp_ns,
-            )
-
-
-class _Merged(NamedTuple):
-    """A keyframe that was merged into another one, and its pose there."""
-
-    estimate: Estimate
-    edge: Edge
+        stamps_ns, statuses = (self.frames[name].tolist() for name in ("stamp_ns", "status"))
+        for row in zip(stamps_ns, statuses, T_world_frame, placed, strict=True):
+            yield _estimate(*row)
 
 
 class _Way(NamedTuple):
@@ -200,7 +263,7 @@ class _Way(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """The poses of keyframes, merged ones among them, and the loops as judged with them."""
+    """The poses of keyframes, and the loops as judged with them."""
 
     poses: dict[int, FloatArray]
     loops: tuple[Loop, ...]
@@ -232,19 +295,24 @@ class RunGraph:
         self._factors = Factors(config)
         # As they came: their poses are where an optimization starts.
         self._keyframes: dict[int, Estimate] = {}
-        self._merged: dict[int, _Merged] = {}
-        self._edges: list[tuple[int, Edge]] = []
-        # By their keyframe; that of the latest one has not ended.
-        self._stretches: dict[int, _Stretch] = {}
-        self._ways: dict[int, _Way] = {}  # to all keyframes, merged ones among them
+        # By numbers that ascend; and the numbers of those at a keyframe.
+        self._edges: dict[int, tuple[int, Edge]] = {}
+        self._touching: dict[int, dict[int, None]] = {}
+        self._numbers = count()
+        # All keyframes, merged ones too; where these are, and their rows there; the frames before
+        # each keyframe, and in a copy those after the last one.
+        self._known, self._merged, self._frames = _Table(_KEYFRAME), _Table(_MERGED), _Table(_FRAME)
+        self._merged_at = array("q")
+        self._open: _Stretch | None = None
+        self._way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
         # Where nothing measured connects a keyframe with those before: the one before it.
         self._guesses: dict[int, int] = {}
-        # The frames since the latest keyframe that follow a guess; worlds of frames, but for the
-        # first one.
+        # The frames since the latest keyframe that follow a guess; from which stamps on frames are
+        # of which world.
         self._adrift: set[object] = set()
-        self._worlds: dict[object, int] = {}
+        self._worlds = [(0, 0)]
         self._n_worlds = self._measured_ns = 0
         self._running: Future[_Solution] | None = None
         self._began_with: Estimate | None = None
@@ -278,14 +346,12 @@ class RunGraph:
         """
         last, self._last = self._last, estimate
         if last is None:
-            self._keyframes[estimate.stamp_ns] = estimate
-            way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
-            self._ways[estimate.stamp_ns] = way
+            self._know(estimate)
             self._n_worlds, self._measured_ns = 1, estimate.stamp_ns
             return
         stamp_ns, latest_ns = estimate.stamp_ns, next(reversed(self._keyframes))
-        if world := self.world_of(edges):
-            self._worlds[stamp_ns] = world
+        if (world := self.world_of(edges)) != self._worlds[-1][1]:
+            self._worlds.append((stamp_ns, world))
             self._n_worlds = max(self._n_worlds, world + 1)
         near = {latest_ns, *(each.stamp_ns for each, _ in self._arrivals)}
         ties = [edge for edge in edges if edge.reference_id in near]
@@ -296,15 +362,30 @@ class RunGraph:
         self._adrift |= {stamp_ns} if guess else set()
         self._measured_ns = stamp_ns if edges else self._measured_ns
         self._arrivals.append((estimate, [*edges, *guess]))
-        if is_keyframe or (is_linked and len(self) < _MAX_LINKED):
+        is_keyframe |= is_linked and len(self._known) < _MAX_LINKED
+        if is_keyframe or len(self._arrivals) >= _MAX_BETWEEN:
             self._close(stamp_ns)
 
     def _close(self, stamp_ns: int) -> None:
         """Make the newest frame a keyframe."""
-        if stamp_ns in self._adrift:
+        is_guess, newest = stamp_ns in self._adrift, self._arrivals[-1][0]
+        if is_guess:
             self._guesses[stamp_ns] = next(reversed(self._keyframes))
-        self._condense()
+        frames, step = self._condense(newest)
+        for row in frames:
+            self._frames.append(row[1], *row)
+        self._way = self._way.then(step, is_guess=is_guess)
+        self._know(newest, step, n_frames=len(frames))
         self._arrivals, self._adrift = [], set()
+
+    def _know(self, estimate: Estimate, step: Edge = _NO_STEP, *, n_frames: int = 0) -> None:
+        """Add a keyframe, where it is in the one before, and how many frames are between."""
+        stamp_ns = estimate.stamp_ns
+        what = _STATUSES.index(estimate.status), stamp_ns in self._guesses, n_frames
+        edge = step.T_reference_frame, step.covariance
+        self._known.append(stamp_ns, *self._way, *what, *edge)
+        self._merged_at.append(-1)
+        self._keyframes[stamp_ns] = estimate
 
     def world_of(self, edges: Sequence[Edge]) -> int:
         """Return the number of the world that the edges of the next frame connect it with.
@@ -312,15 +393,16 @@ class RunGraph:
         Where nothing connects a frame with earlier ones, another world begins: its place among
         the others is only guessed.
         """
-        return min((self._worlds.get(e.reference_id, 0) for e in edges), default=self._n_worlds)
+        starts = [bisect(self._worlds, (e.reference_id, self._n_worlds)) for e in edges]
+        return min((self._worlds[start - 1][1] for start in starts), default=self._n_worlds)
 
     def from_keyframe(self, stamp_ns: int, loop: Loop) -> Edge | None:
         """Return a loop as an edge from another keyframe, by the way between; None if guessed."""
         if stamp_ns == loop.reference_ns:
             return loop.edge
-        if not {stamp_ns, loop.reference_ns} <= self._ways.keys():
+        if stamp_ns not in self._known or loop.reference_ns not in self._known:
             return None
-        first, second = self._ways[stamp_ns], self._ways[loop.reference_ns]
+        first, second = self._way_to(stamp_ns), self._way_to(loop.reference_ns)
         if first.part != second.part:
             return None
         way = Edge(
@@ -341,10 +423,17 @@ class RunGraph:
             covariance=covariance,
         )
 
-    def _condense(self, *, is_closed: bool = True) -> None:
-        """Solve what came since the last keyframe; the newest frame becomes one if it is closed."""
-        frames = [estimate for estimate, _ in self._arrivals]
-        newest = frames.pop() if is_closed else None
+    def _condense(self, newest: Estimate | None = None) -> tuple[list[tuple[Any, ...]], Edge]:
+        """Solve what came since the last keyframe; the newest frame becomes one if it is given.
+
+        Returns
+        -------
+        list of tuple
+            Rows of the frames that hang on the last keyframe.
+        Edge
+            The pose of the newest one there.
+        """
+        frames = [estimate for estimate, _ in self._arrivals if estimate is not newest]
         origin_ns = next(reversed(self._keyframes))
         local = LocalGraph(origin_ns, self._factors)
         for estimate, edges in self._arrivals:
@@ -352,46 +441,68 @@ class RunGraph:
             # those that tie the frame to what is there already come first
             for edge in sorted(found, key=lambda each: each.reference_id not in local):
                 if estimate is newest and edge.reference_id not in local:
-                    self._edges.append((estimate.stamp_ns, edge))  # as it is
+                    self._add_edge(estimate.stamp_ns, edge)  # as it is
                 else:
                     local.add(estimate.stamp_ns, edge)
         solved = local.solve(None if newest is None else newest.stamp_ns)
-        hanging = [solved.pop(frame.stamp_ns) for frame in frames]
-        others = {
-            int(stamp_ns): Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)  # type: ignore[call-overload]
-            for stamp_ns, (T, covariance, _) in solved.items()
-        }
-        is_guess = newest is not None and newest.stamp_ns in self._guesses
-        if newest is not None and is_guess:
-            step = others[newest.stamp_ns]
-            variances = np.minimum(np.diagonal(step.covariance), _GUESS_SIGMAS**2)
-            others[newest.stamp_ns] = replace(step, covariance=np.diag(variances))
-        self._edges += others.items()
-        self._stretches[origin_ns] = _Stretch(
-            keyframe_ns=origin_ns,
-            stamps_ns=tuple(frame.stamp_ns for frame in frames),
-            T_keyframe_frame=np.array([each.T_origin_frame for each in hanging]).reshape(-1, 4, 4),
-            covariances=np.array([each.covariance for each in hanging]).reshape(-1, 6, 6),
-            with_next=np.array([each.with_last for each in hanging]).reshape(-1, 6, 6),
-            statuses=tuple(frame.status for frame in frames),
-            next_ns=None if newest is None else newest.stamp_ns,
-            step=None if newest is None else others[newest.stamp_ns],
-            is_guess=is_guess,
-        )
-        if newest is not None:
-            way = self._ways[origin_ns].then(others[newest.stamp_ns], is_guess=is_guess)
-            self._keyframes[newest.stamp_ns], self._ways[newest.stamp_ns] = newest, way
+        rows = [
+            (origin_ns, frame.stamp_ns, _STATUSES.index(frame.status), *solved.pop(frame.stamp_ns))
+            for frame in frames
+        ]
+        step = _NO_STEP
+        for frame_id, (T, covariance, _) in solved.items():
+            stamp_ns = int(frame_id)  # type: ignore[call-overload]
+            edge = Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)
+            if newest is not None and stamp_ns == newest.stamp_ns:
+                edge = step = self._step(stamp_ns, edge)
+            self._add_edge(stamp_ns, edge)
+        return rows, step
+
+    def _step(self, stamp_ns: int, edge: Edge) -> Edge:
+        """Return the edge to a new keyframe; what is guessed is bounded."""
+        if stamp_ns not in self._guesses:
+            return edge
+        variances = np.minimum(np.diagonal(edge.covariance), _GUESS_SIGMAS**2)
+        return replace(edge, covariance=np.diag(variances))
+
+    def _add_edge(self, frame_ns: int, edge: Edge) -> None:
+        number = next(self._numbers)
+        self._edges[number] = frame_ns, edge
+        for stamp_ns in (frame_ns, int(edge.reference_id)):  # type: ignore[call-overload]
+            self._touching.setdefault(stamp_ns, {})[number] = None
+
+    def _pop_edges(self, numbers: Iterable[int]) -> Iterator[tuple[int, Edge]]:
+        for number in [*numbers]:
+            frame_ns, edge = self._edges.pop(number)
+            for stamp_ns in (frame_ns, int(edge.reference_id)):  # type: ignore[call-overload]
+                del self._touching[stamp_ns][number]
+            yield frame_ns, edge
+
+    def _way_to(self, stamp_ns: int) -> _Way:
+        """Return the way to a keyframe."""
+        row = self._known[self._known.number(stamp_ns)]
+        T, covariance, drift = (row[key] for key in ("T_first_keyframe", "covariance", "drift"))
+        return _Way(T, covariance, drift, int(row["n_steps"]), int(row["part"]))
 
     def _from_keyframe(self, edge: Edge) -> Edge:
         """Return an edge from a frame that hangs on a keyframe as one from the keyframe."""
         reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
-        if reference_ns in self._keyframes or reference_ns > next(reversed(self._keyframes)):
+        if reference_ns in self._keyframes or reference_ns > self._known.stamps_ns[-1]:
             return edge
-        if reference_ns in self._merged:
-            return self._from_keyframe(_join(self._merged[reference_ns].edge, edge))
-        stretches = reversed(self._stretches.values())
-        home = next(each for each in stretches if each.keyframe_ns < reference_ns)
-        return self._from_keyframe(_join(home.edge_to(reference_ns), edge))
+        return self._from_keyframe(_join(self._home(reference_ns), edge))
+
+    def _home(self, stamp_ns: int) -> Edge:
+        """Return the pose of a frame, or of a merged keyframe, in its keyframe."""
+        is_frame = stamp_ns not in self._known
+        row = (
+            self._frames[self._frames.number(stamp_ns)]
+            if is_frame
+            else self._merged[self._merged_at[self._known.number(stamp_ns)]]
+        )
+        T, covariance = row["T"], row["covariance"]
+        return Edge(
+            reference_id=int(row["keyframe_ns"]), T_reference_frame=T, covariance=covariance
+        )
 
     def advance(self, loops: Sequence[Loop], places: Container[int]) -> None:
         """Begin an optimization in a thread, or take one over, where it is time.
@@ -405,7 +516,7 @@ class RunGraph:
         places : container of int
             Stamps of keyframes that loops may lead to.
         """
-        n_keyframes = len(self._stretches) + 1
+        n_keyframes = len(self._known)
         self._is_due = self._is_due or bool(loops)
         if self._running is not None and n_keyframes >= self._due:
             self._take_over(self._running, places)
@@ -433,7 +544,6 @@ class RunGraph:
         counting = {loop.stamp_ns: loop for loop in loops if not loop.reason}
         references = {loop.reference_ns for loop in counting.values()}
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
-        before = {each.next_ns: each.keyframe_ns for each in self._stretches.values()}
         references |= {*self._guesses, *self._guesses.values()}
         for ns in list(self._keyframes)[1:-_N_LATEST]:
             loop = counting.get(ns)
@@ -442,48 +552,48 @@ class RunGraph:
             if loop is not None and n_at[loop.reference_ns] > _N_PER_PLACE:
                 n_at[loop.reference_ns] -= 1
                 self._merge(ns, loop.edge)
-            elif loop is None and before[ns] in self._merged:
+            elif loop is None and self._merged_at[self._known.number(ns) - 1] >= 0:
                 self._merge(ns)
 
     def _merge(self, stamp_ns: int, loop: Edge | None = None) -> None:
         """Merge a keyframe into the one that it came back to, or else into the nearest."""
         edges: dict[int, Edge] = {}  # its pose in each neighbour
-        others = []
-        for frame_ns, edge in self._edges:
+        for frame_ns, edge in self._pop_edges(self._touching[stamp_ns]):
             if stamp_ns == frame_ns:
                 _fuse(edges, int(edge.reference_id), edge)  # type: ignore[call-overload]
-            elif stamp_ns == edge.reference_id:
-                _fuse(edges, frame_ns, _inverse(frame_ns, edge))
             else:
-                others.append((frame_ns, edge))
+                _fuse(edges, frame_ns, _inverse(frame_ns, edge))
+        del self._touching[stamp_ns]
         if loop is not None:
             _fuse(edges, int(loop.reference_id), loop)  # type: ignore[call-overload]
         hub_ns = min(edges, key=lambda ns: float(np.trace(edges[ns].covariance[3:, 3:])))
         hub_ns = hub_ns if loop is None else int(loop.reference_id)  # type: ignore[call-overload]
-        self._merged[stamp_ns] = _Merged(self._keyframes.pop(stamp_ns), edges.pop(hub_ns))
+        del self._keyframes[stamp_ns]
+        hub = edges.pop(hub_ns)
+        self._merged_at[self._known.number(stamp_ns)] = len(self._merged)
+        self._merged.append(stamp_ns, hub_ns, hub.T_reference_frame, hub.covariance)
         # What ties it to the other one counts once, shared out among the edges that go on there.
-        hub = self._merged[stamp_ns].edge
         hub = replace(hub, covariance=max(len(edges), 1) * hub.covariance)
         moved = {ns: _join(hub, _inverse(stamp_ns, edge)) for ns, edge in edges.items()}
-        self._edges = []
-        for frame_ns, edge in others:
-            if edge.reference_id == hub_ns and frame_ns in moved:
-                _fuse(moved, frame_ns, edge)
-            elif frame_ns == hub_ns and edge.reference_id in moved:
-                _fuse(moved, int(edge.reference_id), _inverse(frame_ns, edge))
+        neighbours = set().union(*(self._touching[ns] for ns in moved))
+        between = [number for number in self._touching[hub_ns] if number in neighbours]
+        for frame_ns, edge in self._pop_edges(between):
+            if frame_ns == hub_ns:
+                _fuse(moved, int(edge.reference_id), _inverse(frame_ns, edge))  # type: ignore[call-overload]
             else:
-                self._edges.append((frame_ns, edge))
-        self._edges += moved.items()
+                _fuse(moved, frame_ns, edge)
+        for each in moved.items():
+            self._add_edge(*each)
 
     def _copied(self) -> RunGraph:
         """Return the graph as it is, the frames since the latest keyframe among it."""
         graph = copy.copy(self)
-        graph._keyframes, graph._merged = dict(self._keyframes), dict(self._merged)
-        graph._stretches, graph._edges = dict(self._stretches), list(self._edges)
-        graph._guesses, graph._ways = dict(self._guesses), dict(self._ways)
+        graph._keyframes, graph._guesses = dict(self._keyframes), dict(self._guesses)
+        graph._edges, graph._touching = dict(self._edges), {}
         graph.loops = tuple(self.loops)
         if graph._arrivals:
-            graph._condense(is_closed=False)
+            frames = np.array(graph._condense()[0], dtype=_FRAME)
+            graph._open = _Stretch(keyframe_ns=self._known.stamps_ns[-1], frames=frames)
         return graph
 
     def optimize(
@@ -523,7 +633,7 @@ class RunGraph:
         return Optimum(
             estimates=graph._place(poses, by_keyframe),
             keyframes_ns=tuple(graph._keyframes),
-            edges=tuple(graph._edges),
+            edges=tuple(graph._edges.values()),
             loops=loops,
             residuals=np.sqrt(
                 [chi2(each.edge, poses[each.reference_ns], poses[each.stamp_ns]) for each in loops]
@@ -541,8 +651,6 @@ class RunGraph:
         error_before = optimizer.starts["odometry"]
         optimizer.run()
         poses = dict(zip(self._keyframes, optimizer.poses(), strict=True))
-        for stamp_ns, (_, edge) in reversed(self._merged.items()):
-            poses[stamp_ns] = poses[int(edge.reference_id)] @ edge.T_reference_frame  # type: ignore[call-overload]
         return _Solution(poses, loops, error_before, optimizer, firsts)
 
     def _judged(self, on_step: Callable[[str], None]) -> tuple[tuple[Loop, ...], _Pairs]:
@@ -566,8 +674,8 @@ class RunGraph:
         refused |= {
             (loop.reference_ns, loop.stamp_ns)
             for loop in confirmed
-            if loop.stamp_ns in self._merged
-            and self._merged[loop.stamp_ns].edge.reference_id != loop.reference_ns
+            if loop.stamp_ns not in self._keyframes
+            and self._home(loop.stamp_ns).reference_id != loop.reference_ns
         }
         reason = "contradicts odometry or the other loops"
         loops = tuple(
@@ -602,7 +710,7 @@ class RunGraph:
             first, second = sorted((root(stamps_ns[reference]), root(stamps_ns[frame])))
             roots[second] = first
         firsts = {ns: root(ns) for ns in stamps_ns if root(ns) != stamps_ns[0]}
-        for stamp_ns, edge in self._edges:
+        for stamp_ns, edge in self._edges.values():
             before_ns = self._guesses.get(stamp_ns, stamp_ns)
             if edge.reference_id == before_ns and root(before_ns) != root(stamp_ns):
                 roots[root(stamp_ns)] = root(before_ns)
@@ -622,7 +730,7 @@ class RunGraph:
             graph.add_pose(stamp_ns, stamp_ns, origin if estimate is first else None)
             graph.given[stamp_ns] = estimate.T_world_frame
         starts_ns = list(self._guesses)
-        for stamp_ns, edge in self._edges:
+        for stamp_ns, edge in self._edges.values():
             reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
             is_guess = self._guesses.get(stamp_ns) == reference_ns
             is_inside = bisect(starts_ns, stamp_ns) == bisect(starts_ns, reference_ns)
@@ -644,16 +752,20 @@ class RunGraph:
 
         However many agree with each other: those between equal rooms do.
         """
-        ways = self._ways
         reason = "farther from odometry than that drifts"
         return tuple(
             replace(loop, reason=reason)
             if not loop.reason
-            and loop.stamp_ns not in self._merged
-            and ways[loop.stamp_ns].chi2(loop, ways[loop.reference_ns], drifts=True) > INLIER_CHI2
+            and loop.stamp_ns in self._keyframes
+            and self._chi2(loop, drifts=True) > INLIER_CHI2
             else loop
             for loop in self.loops
         )
+
+    def _chi2(self, loop: Loop, *, drifts: bool) -> float:
+        """Return by how much a loop contradicts the way between its ends."""
+        way, before = self._way_to(loop.stamp_ns), self._way_to(loop.reference_ns)
+        return way.chi2(loop, before, drifts=drifts)
 
     def _outvoted(self, loops: Sequence[Loop]) -> set[tuple[object, int]]:
         """Return which loops and edges between two parts contradict the one with most agreement.
@@ -661,9 +773,10 @@ class RunGraph:
         Odometry is trusted but for its drift over the whole way, however many of them agree.
         """
         across: dict[tuple[int, int], list[tuple[int, Edge]]] = {}
-        for frame_ns, edge in [*((loop.stamp_ns, loop.edge) for loop in loops), *self._edges]:
+        starts_ns, edges = list(self._guesses), [(loop.stamp_ns, loop.edge) for loop in loops]
+        for frame_ns, edge in [*edges, *self._edges.values()]:
             reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
-            parts = self._ways[reference_ns].part, self._ways[frame_ns].part
+            parts = bisect(starts_ns, reference_ns), bisect(starts_ns, frame_ns)
             if parts[0] != parts[1] and self._guesses.get(frame_ns) != reference_ns:
                 across.setdefault(parts, []).append((frame_ns, edge))
         refused: set[tuple[object, int]] = set()
@@ -678,7 +791,7 @@ class RunGraph:
     def _agree(self, first_ns: int, first: Edge, second_ns: int, second: Edge) -> bool:
         """Tell whether two edges agree, as far as odometry between their ends drifts."""
         start, end, other_start, other_end = (
-            self._ways[ns]  # type: ignore[index]
+            self._way_to(ns)  # type: ignore[arg-type]
             for ns in (first.reference_id, first_ns, second.reference_id, second_ns)
         )
         T_starts = se3.invert(other_start.T_first_keyframe) @ start.T_first_keyframe
@@ -696,31 +809,72 @@ class RunGraph:
 
         The median over the loops of what each contradicts it by, unless that may be chance.
         """
-        ways = self._ways
-        ratios = []
+        starts_ns, ratios = list(self._guesses), []
         for loop in loops:
-            way, before = ways[loop.stamp_ns], ways[loop.reference_ns]
-            if not loop.reason and way.part == before.part:
-                ratios.append(way.chi2(loop, before, drifts=False) / 6.0)
+            is_inside = bisect(starts_ns, loop.stamp_ns) == bisect(starts_ns, loop.reference_ns)
+            if not loop.reason and is_inside:
+                ratios.append(self._chi2(loop, drifts=False) / 6.0)
         factor = float(np.median(ratios)) if ratios else 1.0
         return factor if factor > INLIER_CHI2 / 6.0 else 1.0
 
     def _place(
         self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
     ) -> tuple[Estimate, ...]:
-        """Return all frames."""
-        known = dict(self._keyframes)
-        for stamp_ns, (estimate, edge) in reversed(self._merged.items()):
-            before = covariances[int(edge.reference_id)]  # type: ignore[call-overload]
-            T, known[stamp_ns] = edge.T_reference_frame, estimate
-            covariances[stamp_ns] = se3.compose_covariance(before, T, edge.covariance)
-        estimates = [
-            replace(each, T_world_frame=poses[ns], covariance=covariances[ns], rejected=())
-            for ns, each in known.items()
-        ]
-        for stretch in self._stretches.values():
+        """Return all frames; those of merged keyframes are added to the poses."""
+        estimates = []
+        for number, stamp_ns in enumerate(self._known.stamps_ns):
+            self._place_merged(stamp_ns, poses, covariances)
+            status = int(self._known[number]["status"])
+            estimates.append(_estimate(stamp_ns, status, poses[stamp_ns], covariances[stamp_ns]))
+        for stretch in self._stretches():
             estimates += stretch.place(poses, covariances)
         return tuple(sorted(estimates, key=lambda estimate: estimate.stamp_ns))
+
+    def _place_merged(
+        self, stamp_ns: int, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
+    ) -> None:
+        """Add the pose of a keyframe that was merged, and of those on the way to where it is."""
+        pending = []
+        while stamp_ns not in poses:
+            pending.append((stamp_ns, self._home(stamp_ns)))
+            stamp_ns = int(pending[-1][1].reference_id)  # type: ignore[call-overload]
+        for merged_ns, edge in reversed(pending):
+            T, before = edge.T_reference_frame, covariances[stamp_ns]
+            poses[merged_ns] = poses[stamp_ns] @ T
+            covariances[merged_ns] = se3.compose_covariance(before, T, edge.covariance)
+            stamp_ns = merged_ns
+
+    def _stretches(self) -> Iterator[_Stretch]:
+        """Yield the frames between keyframes."""
+        stamps_ns, first = self._known.stamps_ns, 0
+        for number in range(1, len(stamps_ns)):
+            row = self._known[number]
+            end = first + int(row["n_frames"])
+            if end > first:
+                yield _Stretch(
+                    keyframe_ns=stamps_ns[number - 1],
+                    frames=np.array([self._frames[k] for k in range(first, end)], dtype=_FRAME),
+                    next_ns=stamps_ns[number],
+                    step=Edge(
+                        reference_id=stamps_ns[number - 1],
+                        T_reference_frame=row["T_step"],
+                        covariance=row["step_covariance"],
+                    ),
+                    is_guess=bool(row["is_guess"]),
+                )
+            first = end
+        if self._open is not None:
+            yield self._open
+
+
+def _estimate(stamp_ns: int, status: int, T: FloatArray, covariance: FloatArray) -> Estimate:
+    return Estimate(
+        stamp_ns=stamp_ns,
+        T_world_frame=T,
+        covariance=covariance,
+        status=_STATUSES[status],
+        frame_id=stamp_ns,
+    )
 
 
 def _join(first: Edge, second: Edge) -> Edge:
