@@ -350,6 +350,8 @@ class RunGraph:
             self._n_worlds, self._measured_ns = 1, estimate.stamp_ns
             return
         stamp_ns, latest_ns = estimate.stamp_ns, next(reversed(self._keyframes))
+        first_ns = self._known.stamps_ns[0]  # references before it are not in the graph
+        edges = [edge for edge in edges if int(edge.reference_id) >= first_ns]  # type: ignore[call-overload]
         if (world := self.world_of(edges)) != self._worlds[-1][1]:
             self._worlds.append((stamp_ns, world))
             self._n_worlds = max(self._n_worlds, world + 1)
@@ -619,7 +621,7 @@ class RunGraph:
             If the graph is empty.
         """
         if not self._keyframes:
-            raise ValueError("the graph of the run is empty: no frame has come")
+            raise ValueError("the graph of the run is empty: no frame has come (loops.enabled)")
         graph = self._copied()
         poses, loops, error_before, optimizer, firsts = graph._solve(on_step)
         found = np.broadcast_to(np.eye(6), (len(graph), 6, 6))

@@ -93,9 +93,7 @@ class Odometry:
         self._is_broken = False
         self._anchor_ns: int | None = None
         self._previous: Estimate | None = None  # by the raw chain
-        self._graph = RunGraph(self._config.window)
-        self._loops = self._make_detector()
-        self._graph.loops = () if self._loops is None else self._loops.loops
+        self._begin_map()
         self._trust = DepthTrust(self._config.depth.icp)
         # The last frame and the last registered one, to be extracted again after a change.
         self._frames: dict[int, Stamped] = {}
@@ -144,7 +142,8 @@ class Odometry:
           `features` (descriptor): then KLT keyframes, which hold their images, are extracted
           again, and those of descriptors are released.
         - `camera`, `stereo`: what was learnt of the camera is estimated anew.
-        - `loops`, `runtime`: with the next frame.
+        - `loops`, `runtime`: with the next frame. Where loops were not enabled, the map and the
+          global poses begin with it.
         - `sync`, `images`, `depth.scale`, `check`: not here, but where frames are read.
 
         A front-end of one's own is told at once where it is `Reconfigurable`.
@@ -222,7 +221,7 @@ class Odometry:
         SmoothingError
             When GTSAM fails.
         ValueError
-            Before the first frame.
+            Before the first frame, and where `loops.enabled` is false.
         """
         return self._graph.optimize()
 
@@ -261,10 +260,11 @@ class Odometry:
             stage_ms=stage_ms,
         )
 
-    def _make_detector(self) -> LoopDetector | None:
-        """Return a detector where the front-end can find places again."""
-        frontend = self._frontend.recognizer
-        return None if frontend is None else LoopDetector(frontend=frontend)
+    def _begin_map(self) -> None:
+        """Begin the graph of the run, with a detector where the front-end can find places again."""
+        self._graph, frontend = RunGraph(self._config.window), self._frontend.recognizer
+        self._loops = None if frontend is None else LoopDetector(frontend=frontend)
+        self._graph.loops = () if self._loops is None else self._loops.loops
 
     def _view(self) -> StereoCamera | None:
         """Return the camera of the view overlap."""
@@ -281,6 +281,8 @@ class Odometry:
         self._trust.mode = self._config.depth.icp
         self._keyframes.reconfigure(self._view(), self._config.window)
         self._chain.reconfigure(self._frontend, self._config.window, extracted)
+        if not former.loops.enabled:
+            self._begin_map()
 
     def _renew_frontend(self, former: Config) -> dict[int, Any]:
         """Return what a new front-end extracts from the last frames, where that has changed."""
@@ -528,6 +530,8 @@ class Odometry:
         self, observations: _Observations, causal: Estimate, loops: tuple[Loop, ...] | None
     ) -> tuple[Loop, ...]:
         """Add a frame to the graph of the run, and the loops of a keyframe, if not found early."""
+        if not self._config.loops.enabled:
+            return ()
         stamp_ns = causal.stamp_ns
         edges, is_keyframe = self._window.edges(stamp_ns), stamp_ns in self._keyframes.stamps_ns
         if loops is None and causal.status in (Status.OK, Status.RESUMED):
