@@ -29,7 +29,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -92,11 +92,10 @@ _FRAME: Final = np.dtype(
         *(("covariance", "f8", *_COVARIANCE), ("with_next", "f8", *_COVARIANCE)),
     ]
 )
-"""The pose of a frame in its keyframe, its covariance, and that with the next keyframe."""
-_MERGED: Final = np.dtype(
-    [("keyframe_ns", "i8"), ("T", "f8", *_T), ("covariance", "f8", *_COVARIANCE)]
-)
-"""The pose of a keyframe in the one that it was merged into."""
+"""The pose of a frame in its keyframe, its covariance, and that with the next keyframe.
+
+Also of a merged keyframe, in the one that it was merged into.
+"""
 
 
 class _Table:
@@ -153,64 +152,6 @@ class _Table:
 
 
 _NO_STEP: Final = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=np.eye(6))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Stretch:
-    """The frames from a keyframe to the next one; they hang on the earlier one.
-
-    Parameters
-    ----------
-    keyframe_ns : int
-    frames : ndarray of _FRAME, shape (n,)
-    next_ns : int or None
-        The next keyframe; None while there is none.
-    step : Edge or None
-        Its pose in the keyframe.
-    is_guess : bool
-        Nothing measured what is between them.
-    """
-
-    keyframe_ns: int
-    frames: NDArray[Any]
-    next_ns: int | None = None
-    step: Edge | None = None
-    is_guess: bool = False
-
-    def place(
-        self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
-    ) -> Iterator[Estimate]:
-        """Yield the frames, bent so that both ends fit: where they are least certain, most."""
-        T_keyframe_frame, found, with_next = (
-            np.ascontiguousarray(self.frames[name]) for name in ("T", "covariance", "with_next")
-        )
-        placed = se3.compose_covariance(covariances[self.keyframe_ns], T_keyframe_frame, found)
-        if self.step is not None and self.next_ns is not None:
-            T_next_keyframe = se3.invert(self.step.T_reference_frame)
-            T_next_frame = T_next_keyframe @ T_keyframe_frame
-            T_keyframe_next = se3.invert(poses[self.keyframe_ns]) @ poses[self.next_ns]
-            # what the next keyframe tells of a frame when it turns out to be elsewhere
-            gains = with_next @ np.linalg.inv(self.step.covariance)
-            if self.is_guess:
-                # too far for that: as much of the way as of the uncertainty
-                shares = np.clip(np.trace(gains, axis1=1, axis2=2) / 6.0, 0.0, 1.0)
-                bend = se3.log(T_keyframe_next @ T_next_keyframe)
-                T_keyframe_frame = se3.exp(shares[:, np.newaxis] * bend) @ T_keyframe_frame
-            else:
-                miss = se3.log(T_next_keyframe @ T_keyframe_next)
-                T_keyframe_frame = T_keyframe_frame @ se3.exp(gains @ miss)
-            rest = found - gains @ np.swapaxes(with_next, 1, 2)
-            rest = 0.5 * (rest + np.swapaxes(rest, 1, 2))
-            forth, back = (
-                se3.compose_covariance(covariances[ns], T, rest)
-                for ns, T in ((self.keyframe_ns, T_keyframe_frame), (self.next_ns, T_next_frame))
-            )
-            is_larger = np.linalg.det(back) > np.linalg.det(forth)
-            placed = np.where((is_larger ^ self.is_guess)[:, np.newaxis, np.newaxis], back, forth)
-        T_world_frame = poses[self.keyframe_ns] @ T_keyframe_frame
-        stamps_ns, statuses = (self.frames[name].tolist() for name in ("stamp_ns", "status"))
-        for row in zip(stamps_ns, statuses, T_world_frame, placed, strict=True):
-            yield _estimate(*row)
 
 
 class _Way(NamedTuple):
@@ -301,9 +242,9 @@ class RunGraph:
         self._numbers = count()
         # All keyframes, merged ones too; where these are, and their rows there; the frames before
         # each keyframe, and in a copy those after the last one.
-        self._known, self._merged, self._frames = _Table(_KEYFRAME), _Table(_MERGED), _Table(_FRAME)
+        self._known, self._merged, self._frames = map(_Table, (_KEYFRAME, _FRAME, _FRAME))
         self._merged_at = array("q")
-        self._open: _Stretch | None = None
+        self._open: list[tuple[Any, ...]] = []
         self._way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
@@ -407,23 +348,16 @@ class RunGraph:
         first, second = self._way_to(stamp_ns), self._way_to(loop.reference_ns)
         if first.part != second.part:
             return None
-        way = Edge(
-            reference_id=stamp_ns,
-            T_reference_frame=se3.invert(first.T_first_keyframe) @ second.T_first_keyframe,
-            covariance=second.covariance_since(first, drifts=True),
-        )
-        return _join(way, loop.edge)
+        T = se3.invert(first.T_first_keyframe) @ second.T_first_keyframe
+        return _join(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
 
     def _unmeasured(self, last: Estimate, estimate: Estimate) -> Edge:
         coasted_s, elapsed_s = 1e-9 * np.diff([self._measured_ns, last.stamp_ns, estimate.stamp_ns])
         _, covariance = predict_step(None, elapsed_s, self._config, coasted_s=coasted_s)
         if estimate.status is Status.LOST:
             covariance = np.diag(_GUESS_SIGMAS**2)
-        return Edge(
-            reference_id=last.stamp_ns,
-            T_reference_frame=se3.invert(last.T_world_frame) @ estimate.T_world_frame,
-            covariance=covariance,
-        )
+        T_last_frame = se3.invert(last.T_world_frame) @ estimate.T_world_frame
+        return _edge(last.stamp_ns, T_last_frame, covariance)
 
     def _condense(self, newest: Estimate | None = None) -> tuple[list[tuple[Any, ...]], Edge]:
         """Solve what came since the last keyframe; the newest frame becomes one if it is given.
@@ -454,7 +388,7 @@ class RunGraph:
         step = _NO_STEP
         for frame_id, (T, covariance, _) in solved.items():
             stamp_ns = int(frame_id)  # type: ignore[call-overload]
-            edge = Edge(reference_id=origin_ns, T_reference_frame=T, covariance=covariance)
+            edge = _edge(origin_ns, T, covariance)
             if newest is not None and stamp_ns == newest.stamp_ns:
                 edge = step = self._step(stamp_ns, edge)
             self._add_edge(stamp_ns, edge)
@@ -495,16 +429,11 @@ class RunGraph:
 
     def _home(self, stamp_ns: int) -> Edge:
         """Return the pose of a frame, or of a merged keyframe, in its keyframe."""
-        is_frame = stamp_ns not in self._known
-        row = (
-            self._frames[self._frames.number(stamp_ns)]
-            if is_frame
-            else self._merged[self._merged_at[self._known.number(stamp_ns)]]
-        )
-        T, covariance = row["T"], row["covariance"]
-        return Edge(
-            reference_id=int(row["keyframe_ns"]), T_reference_frame=T, covariance=covariance
-        )
+        if stamp_ns in self._known:
+            row = self._merged[self._merged_at[self._known.number(stamp_ns)]]
+        else:
+            row = self._frames[self._frames.number(stamp_ns)]
+        return _edge(int(row["keyframe_ns"]), row["T"], row["covariance"])
 
     def advance(self, loops: Sequence[Loop], places: Container[int]) -> None:
         """Begin an optimization in a thread, or take one over, where it is time.
@@ -573,7 +502,8 @@ class RunGraph:
         del self._keyframes[stamp_ns]
         hub = edges.pop(hub_ns)
         self._merged_at[self._known.number(stamp_ns)] = len(self._merged)
-        self._merged.append(stamp_ns, hub_ns, hub.T_reference_frame, hub.covariance)
+        place = hub.T_reference_frame, hub.covariance, np.zeros((6, 6))
+        self._merged.append(stamp_ns, hub_ns, stamp_ns, 0, *place)
         # What ties it to the other one counts once, shared out among the edges that go on there.
         hub = replace(hub, covariance=max(len(edges), 1) * hub.covariance)
         moved = {ns: _join(hub, _inverse(stamp_ns, edge)) for ns, edge in edges.items()}
@@ -594,8 +524,7 @@ class RunGraph:
         graph._edges, graph._touching = dict(self._edges), {}
         graph.loops = tuple(self.loops)
         if graph._arrivals:
-            frames = np.array(graph._condense()[0], dtype=_FRAME)
-            graph._open = _Stretch(keyframe_ns=self._known.stamps_ns[-1], frames=frames)
+            graph._open, _ = graph._condense()
         return graph
 
     def optimize(
@@ -823,14 +752,20 @@ class RunGraph:
         self, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
     ) -> tuple[Estimate, ...]:
         """Return all frames; those of merged keyframes are added to the poses."""
-        estimates = []
+        estimates: list[Estimate] = []
+        first, before_ns = 0, self._known.stamps_ns[0]
+        places = poses, covariances
         for number, stamp_ns in enumerate(self._known.stamps_ns):
-            self._place_merged(stamp_ns, poses, covariances)
-            status = int(self._known[number]["status"])
-            estimates.append(_estimate(stamp_ns, status, poses[stamp_ns], covariances[stamp_ns]))
-        for stretch in self._stretches():
-            estimates += stretch.place(poses, covariances)
-        return tuple(sorted(estimates, key=lambda estimate: estimate.stamp_ns))
+            row = self._known[number]
+            self._place_merged(stamp_ns, *places)
+            rows = [self._frames[k] for k in range(first, first + int(row["n_frames"]))]
+            if rows:
+                estimates += _place_frames(rows, before_ns, *places, next_ns=stamp_ns, step=row)
+            T, covariance = poses[stamp_ns], covariances[stamp_ns]
+            estimates.append(_estimate(stamp_ns, int(row["status"]), T, covariance))
+            first, before_ns = first + len(rows), stamp_ns
+        estimates += _place_frames(self._open, before_ns, *places)
+        return tuple(estimates)
 
     def _place_merged(
         self, stamp_ns: int, poses: dict[int, FloatArray], covariances: dict[int, FloatArray]
@@ -846,27 +781,61 @@ class RunGraph:
             covariances[merged_ns] = se3.compose_covariance(before, T, edge.covariance)
             stamp_ns = merged_ns
 
-    def _stretches(self) -> Iterator[_Stretch]:
-        """Yield the frames between keyframes."""
-        stamps_ns, first = self._known.stamps_ns, 0
-        for number in range(1, len(stamps_ns)):
-            row = self._known[number]
-            end = first + int(row["n_frames"])
-            if end > first:
-                yield _Stretch(
-                    keyframe_ns=stamps_ns[number - 1],
-                    frames=np.array([self._frames[k] for k in range(first, end)], dtype=_FRAME),
-                    next_ns=stamps_ns[number],
-                    step=Edge(
-                        reference_id=stamps_ns[number - 1],
-                        T_reference_frame=row["T_step"],
-                        covariance=row["step_covariance"],
-                    ),
-                    is_guess=bool(row["is_guess"]),
-                )
-            first = end
-        if self._open is not None:
-            yield self._open
+
+def _place_frames(
+    rows: Sequence[NDArray[Any] | tuple[Any, ...]],
+    keyframe_ns: int,
+    poses: dict[int, FloatArray],
+    covariances: dict[int, FloatArray],
+    *,
+    next_ns: int | None = None,
+    step: NDArray[Any] | None = None,
+) -> Iterator[Estimate]:
+    """Yield the frames that hang on a keyframe, in the world.
+
+    They are bent so that they fit the next keyframe, too: where they are least certain, most.
+
+    Parameters
+    ----------
+    rows : sequence of _FRAME
+    keyframe_ns : int
+    poses, covariances : dict of int to ndarray
+        Of keyframes.
+    next_ns : int, optional
+        The next keyframe, where there is one.
+    step : _KEYFRAME, optional
+        Its row.
+    """
+    frames = np.array(rows, dtype=_FRAME)
+    T_keyframe_frame, found, with_next = (
+        np.ascontiguousarray(frames[name]) for name in ("T", "covariance", "with_next")
+    )
+    placed = se3.compose_covariance(covariances[keyframe_ns], T_keyframe_frame, found)
+    if step is not None and next_ns is not None:
+        T_next_keyframe = se3.invert(step["T_step"])
+        T_next_frame = T_next_keyframe @ T_keyframe_frame
+        T_keyframe_next = se3.invert(poses[keyframe_ns]) @ poses[next_ns]
+        # what the next keyframe tells of a frame when it turns out to be elsewhere
+        gains = with_next @ np.linalg.inv(step["step_covariance"])
+        is_guess = bool(step["is_guess"])
+        if is_guess:
+            # too far for that: as much of the way as of the uncertainty
+            shares = np.clip(np.trace(gains, axis1=1, axis2=2) / 6.0, 0.0, 1.0)
+            bend = se3.log(T_keyframe_next @ T_next_keyframe)
+            T_keyframe_frame = se3.exp(shares[:, np.newaxis] * bend) @ T_keyframe_frame
+        else:
+            miss = se3.log(T_next_keyframe @ T_keyframe_next)
+            T_keyframe_frame = T_keyframe_frame @ se3.exp(gains @ miss)
+        rest = found - gains @ np.swapaxes(with_next, 1, 2)
+        rest = 0.5 * (rest + np.swapaxes(rest, 1, 2))
+        forth, back = (
+            se3.compose_covariance(covariances[ns], T, rest)
+            for ns, T in ((keyframe_ns, T_keyframe_frame), (next_ns, T_next_frame))
+        )
+        is_larger = np.linalg.det(back) > np.linalg.det(forth)
+        placed = np.where((is_larger ^ is_guess)[:, np.newaxis, np.newaxis], back, forth)
+    stamps_ns, statuses = (frames[name].tolist() for name in ("stamp_ns", "status"))
+    yield from map(_estimate, stamps_ns, statuses, poses[keyframe_ns] @ T_keyframe_frame, placed)
 
 
 def _estimate(stamp_ns: int, status: int, T: FloatArray, covariance: FloatArray) -> Estimate:
@@ -877,6 +846,10 @@ def _estimate(stamp_ns: int, status: int, T: FloatArray, covariance: FloatArray)
         status=_STATUSES[status],
         frame_id=stamp_ns,
     )
+
+
+def _edge(reference_id: FrameId, T: FloatArray, covariance: FloatArray) -> Edge:
+    return Edge(reference_id=reference_id, T_reference_frame=T, covariance=covariance)
 
 
 def _join(first: Edge, second: Edge) -> Edge:
@@ -894,11 +867,7 @@ def _inverse(frame_id: FrameId, edge: Edge) -> Edge:
     """Return the pose of the reference in the frame."""
     Ad = se3.adjoint(edge.T_reference_frame)
     covariance = Ad @ edge.covariance @ Ad.T
-    return Edge(
-        reference_id=frame_id,
-        T_reference_frame=se3.invert(edge.T_reference_frame),
-        covariance=0.5 * (covariance + covariance.T),
-    )
+    return _edge(frame_id, se3.invert(edge.T_reference_frame), 0.5 * (covariance + covariance.T))
 
 
 def _fuse(edges: dict[int, Edge], key: int, edge: Edge) -> None:

@@ -1,6 +1,8 @@
 """The graph of a run, by its own truth: simulated drives whose poses are known."""
 
+import errno
 import logging
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -260,6 +262,71 @@ def test_merged_keyframes_tell_no_more_than_they_did() -> None:
     assert np.median(sigmas[1] / sigmas[0]) < 1.5
     differences = poses(after)[10:, :3, 3] - poses(before)[10:, :3, 3]
     assert np.median(np.abs(differences) / sigmas[0]) < 0.5
+
+
+def stand(n_frames: int, *, every: int = 50) -> Drive:
+    """Return a drive that does not move; frames between keyframes hang on them."""
+    drive = Drive(np.tile(np.eye(4), (n_frames, 1, 1)), every=every, n_links=0)
+    return drive.run()
+
+
+def test_a_frame_that_hangs_on_a_keyframe_takes_no_memory() -> None:
+    drive = stand(1)
+    drive.truth = np.tile(np.eye(4), (1_300, 1, 1))
+    drive.every = 100
+    sizes = []
+    tracemalloc.start()
+    try:
+        for j in range(1, len(drive.truth)):
+            drive.step(j)
+            drive.edges.clear()
+            if j in (200, 1_200):
+                sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert (sizes[1] - sizes[0]) / 1_000 < 60
+    assert len(drive.graph.optimize(covariances=False).estimates) == len(drive.truth)
+
+
+def test_frames_without_a_keyframe_do_not_wait_without_end() -> None:
+    drive = stand(450, every=1_000)
+    assert len(drive.graph) == 3
+    assert len(drive.graph.optimize(covariances=False).estimates) == 450
+
+
+@pytest.mark.parametrize("is_full", [False, True])
+def test_what_is_written_comes_back_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, is_full: bool
+) -> None:
+    def optimum() -> Optimum:
+        drive = looped(3)
+        for loop in drive.graph.loops:
+            drive.graph._merge(loop.stamp_ns, loop.edge)
+        return drive.graph.optimize()
+
+    expected = optimum()
+
+    def refuse(file: object, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(graph_module, "_N_IN_MEMORY", 7)
+    if is_full:
+        monkeypatch.setattr(graph_module, "append_whole", refuse)
+    with caplog.at_level(logging.WARNING):
+        found = optimum()
+    for first, second in zip(found.estimates, expected.estimates, strict=True):
+        np.testing.assert_array_equal(first.T_world_frame, second.T_world_frame)
+        np.testing.assert_array_equal(first.covariance, second.covariance)
+        assert first.stamp_ns == second.stamp_ns
+    assert ("stays in memory" in caplog.text) == is_full
+
+
+def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
+    whole, later = Drive(block(0.3, n_per_lap=N_LAP)).run(), RunGraph(WindowConfig())
+    for j in range(10, 30):
+        pose = estimate_at(j * PERIOD_NS, whole.truth[j])
+        later.add_frame(pose, whole.edges[j], is_keyframe=j % 5 == 0)
+    np.testing.assert_allclose(poses(later.optimize()), whole.truth[10:30], atol=1e-9)
 
 
 @pytest.mark.acceptance

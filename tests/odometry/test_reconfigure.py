@@ -263,3 +263,17 @@ def test_no_sequence_of_configurations_breaks_it(sensor: Sensor, data: st.DataOb
     for estimate in [*finished, *(e for r in results for e in (r.raw, r.causal))]:
         assert np.isfinite(estimate.T_world_frame).all()
         assert np.isfinite(estimate.covariance).all()
+
+
+def test_the_map_begins_where_loops_are_enabled() -> None:
+    items = recorded("stereo")
+    odometry = odometry_of("stereo", change(Config(), loops={"enabled": False}))
+    for frame in items[:4]:
+        odometry.track(frame)
+    with pytest.raises(ValueError, match=r"no frame has come \(loops.enabled\)"):
+        odometry.optimize()
+    odometry.reconfigure(Config())
+    for frame in items[4:]:
+        odometry.track(frame)
+    stamps_ns = [estimate.stamp_ns for estimate in odometry.optimize().estimates]
+    assert stamps_ns == [frame.stamp_ns for frame in items[4:]]
