@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,11 +83,39 @@ def interrupt(
     return process.returncode, errors
 
 
-def refused(answer: Answer) -> str:
+def refused(answer: Answer | subprocess.CompletedProcess[str]) -> str:
     """Check that a command refused in one line; return it."""
+    if isinstance(answer, subprocess.CompletedProcess):
+        answer = Answer(answer.returncode, answer.stdout, answer.stderr)
     assert answer.code == 2
     assert is_one_line(answer.err), answer.err
     return answer.err
+
+
+def run_of(recording: Path | Any, out: Path, **options: Any) -> gvo.RunResult:
+    """Run odometry over a recording or the path of one, by default without a report."""
+    source = gvo.open_recording(recording) if isinstance(recording, Path) else recording
+    given: dict[str, Any] = {"outputs": gvo.RunOutputs(report=False)} | options
+    return gvo.run_recording(source, out, **given)
+
+
+def assert_same_files(out: Path, expected: Path, names: Iterable[str] = TABLES) -> None:
+    """Check that files of two runs are equal to the bit."""
+    for name in names:
+        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
+
+
+def line_of_poses(path: Path, n: int = 20) -> Path:
+    """Write a trajectory along x, a pose a second."""
+    path.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(n)))
+    return path
+
+
+def listeners(port: int) -> set[str]:
+    """Return the local addresses that listen on a port, as the kernel lists them."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    ends = [row[1].split(":") for row in rows if row[3] == "0A"]
+    return {address for address, at in ends if int(at, 16) == port}
 
 
 @pytest.fixture(scope="session")
@@ -100,6 +128,13 @@ def gvo_data() -> Path:
     if not folder.is_dir():
         pytest.fail(f"GVO_DATA={name} is no folder")
     return folder
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty folder, in which the test works."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture
@@ -153,6 +188,5 @@ def walk_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def walk_run(walk_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run over `walk_bag`: poses of the camera from the identity."""
     out = tmp_path_factory.mktemp("walk_run")
-    outputs = gvo.RunOutputs(report=False)
-    assert gvo.run_recording(gvo.open_recording(walk_bag), out, outputs=outputs).is_complete
+    assert run_of(walk_bag, out).is_complete
     return out

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from gvo.types import Estimate, FloatArray, FrameResult, Loop, Optimum, Status
+from gvo.types import Estimate, FloatArray, FrameResult, Loop, Observations, Optimum, Status
 
 
 def estimate_at(stamp_ns: int, T: FloatArray | None = None, **changes: Any) -> Estimate:
@@ -16,7 +16,6 @@ def estimate_at(stamp_ns: int, T: FloatArray | None = None, **changes: Any) -> E
 
 
 def result_of(raw: Estimate, **changes: Any) -> FrameResult:
-    """Return a tracked frame whose causal pose is the raw one."""
     counts = dict.fromkeys(("n_keypoints", "n_points", "n_matches", "n_inliers", "n_links"), 0)
     poses = {"raw": raw, "causal": raw, "finished": (), "status": Status.OK, "reason": ""}
     given: dict[str, Any] = poses | counts | changes
@@ -48,3 +47,16 @@ def optimum_of(estimates: Iterable[Estimate], *loops: Loop) -> Optimum:
         error=0.5,
         n_iterations=3,
     )
+
+
+def observations_of(stamp_ns: int, points: FloatArray, **changes: Any) -> Observations:
+    """Return points of the left camera, without descriptors."""
+    n = len(points)
+    given: dict[str, Any] = {
+        "keypoints": np.zeros((n, 2)),
+        "disparities": np.ones(n),
+        "points_cam": points,
+        "sigmas": np.ones((n, 3)),
+        "descriptors_left": np.zeros((n, 32), dtype=np.uint8),
+    }
+    return Observations(stamp_ns=stamp_ns, **given | changes)

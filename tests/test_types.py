@@ -3,15 +3,8 @@
 import numpy as np
 import pytest
 
-from gvo.types import (
-    Edge,
-    Estimate,
-    Failure,
-    Observations,
-    RelativePose,
-    RgbdFrame,
-    StereoFrame,
-)
+from gvo.types import Edge, Estimate, Failure, RelativePose, RgbdFrame, StereoFrame
+from tests.results import observations_of
 
 
 def grey(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -84,13 +77,5 @@ def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
 
 
 def test_observations_count_their_points() -> None:
-    observations = Observations(
-        stamp_ns=0,
-        keypoints=np.zeros((4, 2)),
-        disparities=np.ones(4),
-        points_cam=np.zeros((4, 3)),
-        sigmas=np.ones((4, 3)),
-        descriptors_left=np.zeros((4, 32), dtype=np.uint8),
-        n_keypoints=9,
-    )
+    observations = observations_of(0, np.zeros((4, 3)), n_keypoints=9)
     assert len(observations) == 4

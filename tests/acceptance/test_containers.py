@@ -1,6 +1,5 @@
 """One recording in every container: ROS 1, ROS 2 in sqlite3 and MCAP, plain and compressed."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,10 +16,11 @@ import gvo
 from gvo.geometry.camera import Calibration, stereo_camera
 from gvo.geometry.lens import DistortionModel
 from gvo.io.convert.convert import convert
-from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.io.recording import Sensor, Source
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, RgbdFrame, StereoFrame
+from tests.recordings import Held, hold
 
 pytestmark = pytest.mark.acceptance
 
@@ -34,86 +34,32 @@ _LENSES: dict[DistortionModel, list[float]] = {
 _EVERY = 3  # of the frames of the world, so that the camera moves between two of them
 
 
-class Rendered:
-    """A walk in a room, rendered once."""
-
-    def __init__(self, sensor: Sensor) -> None:
-        self._rendered = SyntheticRecording(
-            "handheld", sensor, n_frames=_EVERY * _N_FRAMES, scale=0.35
-        )
-        self._pixels: dict[tuple[int, int], NDArray[Any]] = {}
-
-    @property
-    def info(self) -> RecordingInfo:
-        return replace(self._rendered.info, n_images=_N_FRAMES)
-
-    def images(self) -> Iterator[StampedImage]:
-        for index, image in enumerate(self._rendered.images()):
-            if index // 2 % _EVERY == 0:
-                yield replace(image, load=partial(self._load, image))
-
-    def ground_truth(self) -> Trajectory | None:
-        return self._rendered.ground_truth().select(slice(None, None, _EVERY))
-
-    def _load(self, image: StampedImage) -> NDArray[Any]:
-        key = (image.stamp_ns, image.stream)
-        if key not in self._pixels:
-            self._pixels[key] = image.load()
-        return self._pixels[key]
+def _walk(sensor: Sensor) -> Held:
+    source = SyntheticRecording("handheld", sensor, n_frames=_EVERY * _N_FRAMES, scale=0.35)
+    return hold(source, every=_EVERY)
 
 
-_STEREO, _RGBD = Rendered("stereo"), Rendered("rgbd")
+_STEREO, _RGBD = _walk("stereo"), _walk("rgbd")
 
 
-class RawPair:
-    """A rendered pair as cameras with lenses, turned against each other, would see it."""
-
-    def __init__(self, rendered: Rendered, model: DistortionModel) -> None:
-        self._rendered = rendered
-        self._calibrations = tuple(
-            _raw(ideal, model, turn)
-            for ideal, turn in zip(
-                rendered.info.calibrations,
-                ([0.01, -0.004, 0.006], [-0.006, 0.005, -0.01]),
-                strict=True,
-            )
-        )
-        self._maps = [_distortion_maps(calibration) for calibration in self._calibrations]
-
-    @property
-    def info(self) -> RecordingInfo:
-        return replace(self._rendered.info, calibrations=self._calibrations)
-
-    def images(self) -> Iterator[StampedImage]:
-        for image in self._rendered.images():
-            yield replace(image, load=partial(self._load, image))
-
-    def ground_truth(self) -> Trajectory | None:
-        return self._rendered.ground_truth()
-
-    def _load(self, image: StampedImage) -> NDArray[Any]:
-        pixels = cv2.remap(image.load(), *self._maps[image.stream], cv2.INTER_CUBIC)
-        return np.asarray(pixels)
+def _raw_pair(model: DistortionModel) -> Held:
+    """Return the pair as cameras with lenses, turned against each other, would see it."""
+    turns = [0.01, -0.004, 0.006], [-0.006, 0.005, -0.01]
+    pairs = zip(_STEREO.info.calibrations, turns, strict=True)
+    cameras = tuple(_raw(ideal, model, turn) for ideal, turn in pairs)
+    seen = replace(_STEREO, info=replace(_STEREO.info, calibrations=cameras))
+    for stream, camera in enumerate(cameras):
+        seen = seen.with_pixels(partial(_remapped, _distortion_maps(camera)), stream=stream)
+    return seen
 
 
-class Millimetres:
-    """A recording whose depth is in whole millimetres, as sensors give it."""
+def _remapped(maps: tuple[NDArray[Any], NDArray[Any]], image: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC))
 
-    def __init__(self, rendered: Rendered) -> None:
-        self._rendered = rendered
-        self.info = rendered.info
-        self.ground_truth = rendered.ground_truth
 
-    def images(self) -> Iterator[StampedImage]:
-        for image in self._rendered.images():
-            yield replace(image, load=partial(self._load, image))
-
-    def _load(self, image: StampedImage) -> NDArray[Any]:
-        pixels = image.load()
-        if image.stream == 0:
-            return pixels
-        rounded: NDArray[np.float32] = np.round(pixels * 1000).astype(np.float32) / np.float32(1000)
-        return rounded
+def _in_millimetres(depth: NDArray[Any]) -> NDArray[Any]:
+    """Round depth to whole millimetres, as sensors give it."""
+    return np.asarray(np.round(depth * 1000).astype(np.float32) / np.float32(1000))
 
 
 def _raw(ideal: Calibration, model: DistortionModel, turn: list[float]) -> Calibration:
@@ -192,9 +138,9 @@ def _frames(source: Source) -> list[tuple[int, bytes, bytes]]:
 
 _SOURCES: dict[str, Source] = {
     "rectified": _STEREO,
-    "raw": RawPair(_STEREO, "plumb_bob"),
+    "raw": _raw_pair("plumb_bob"),
     "metres": _RGBD,
-    "millimetres": Millimetres(_RGBD),
+    "millimetres": _RGBD.with_pixels(_in_millimetres, stream=1),
 }
 
 
@@ -225,10 +171,8 @@ def test_every_container_gives_the_same_frames_and_cameras_bit_by_bit(
 
 
 @pytest.mark.parametrize("model", sorted(_LENSES))
-def test_raw_images_give_what_they_give_rectified_beforehand_bit_by_bit(
-    tmp_path: Path, model: DistortionModel
-) -> None:
-    raw = RawPair(_STEREO, model)
+def test_raw_images_give_what_rectified_ones_give(tmp_path: Path, model: DistortionModel) -> None:
+    raw = _raw_pair(model)
     convert(raw, tmp_path / "raw.mcap")
     convert(raw, tmp_path / "rectified.bag", rectify=True)
     on_the_fly, beforehand = (
@@ -240,10 +184,8 @@ def test_raw_images_give_what_they_give_rectified_beforehand_bit_by_bit(
 
 
 @pytest.mark.parametrize("model", sorted(_LENSES))
-def test_behind_a_lens_and_rectified_anew_the_motion_is_the_same(
-    tmp_path: Path, model: DistortionModel
-) -> None:
-    convert(RawPair(_STEREO, model), tmp_path / "raw.bag")
+def test_behind_a_lens_the_motion_is_the_same(tmp_path: Path, model: DistortionModel) -> None:
+    convert(_raw_pair(model), tmp_path / "raw.bag")
     raw = gvo.open_recording(tmp_path / "raw.bag")
     convert(raw, tmp_path / "euroc")
     anew = gvo.open_recording(tmp_path / "euroc")

@@ -14,7 +14,7 @@ import gvo
 from gvo.backend.batch import BatchOptimizer, Robust, WholeGraph, sparse_marginals
 from gvo.geometry import se3
 from gvo.types import Edge, FloatArray, PosePrior
-from tests.backend.walks import seeds
+from tests.backend.walks import seeds, values_of
 
 SIGMAS = np.array([0.01] * 3 + [0.05] * 3)
 N = 24
@@ -87,17 +87,8 @@ def by_gtsam(edges: list[tuple[int, Edge]], T_world: FloatArray) -> gtsam.Nonlin
     return factors
 
 
-def values_of(poses: FloatArray) -> gtsam.Values:
-    values = gtsam.Values()
-    for number, T in enumerate(poses):
-        values.insert(number, gtsam.Pose3(T))
-    return values
-
-
 @pytest.mark.parametrize("robust", ["none", "huber", "gnc"])
-def test_exact_edges_give_the_exact_poses_from_any_start(
-    robust: Robust,
-) -> None:
+def test_exact_edges_give_the_exact_poses_from_any_start(robust: Robust) -> None:
     poses = circle()
     graph = graph_of(links(poses))
     rng = np.random.default_rng(0)

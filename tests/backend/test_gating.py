@@ -89,16 +89,8 @@ def arriving(T_0_1: FloatArray, twist_of_1: FloatArray, T_1_2: FloatArray) -> li
     return [edge(1, T_1_2, SURE), edge(1, T_1_2, SURE), edge(0, T_0_2, SURE)]
 
 
-def first_to_last(edges: list[Edge]) -> list[Edge]:
-    return [*edges[1:], edges[0]]
-
-
-def last_to_first(edges: list[Edge]) -> list[Edge]:
-    return edges[::-1]
-
-
 @pytest.mark.parametrize("is_stretch", [False, True])
-@pytest.mark.parametrize("rearrange", [list, first_to_last, last_to_first])
+@pytest.mark.parametrize("rearrange", [list, lambda e: [*e[1:], e[0]], lambda e: e[::-1]])
 @settings(max_examples=15)
 @given(seed=seeds)
 def test_turns_of_uncertain_references_excuse_what_lies_across_a_long_arm_and_no_stretch(

@@ -14,6 +14,7 @@ from gvo.backend.pose_graph import PoseGraph, definite, first_line
 from gvo.errors import SmoothingError
 from gvo.types import FloatArray
 from tests.backend import walks
+from tests.backend.walks import values_of
 
 STEP = gtsam.Pose3(walks.STEP)
 ORIGIN = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
@@ -30,19 +31,11 @@ def factors_of(*factors: Any) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def values_of(poses: dict[int, gtsam.Pose3]) -> gtsam.Values:
-    values = gtsam.Values()
-    for key, pose in poses.items():
-        values.insert(key, pose)
-    return values
-
-
 def power(n: int) -> gtsam.Pose3:
     return gtsam.Pose3(walks.power(n))
 
 
 def chain(n: int, sigma: float = 0.1, *, is_whole: bool = False) -> PoseGraph:
-    """Return a graph of n poses a step apart."""
     graph = PoseGraph(is_whole=is_whole)
     factors = factors_of(
         gtsam.PriorFactorPose3(0, gtsam.Pose3(), ORIGIN),
@@ -90,9 +83,7 @@ def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, key: int)
 
 @pytest.mark.parametrize("leaving", [[0], [0, 1], [2, 0], [3, 1, 2]])
 @pytest.mark.parametrize("turn_rad", [0.0, 1.0])
-def test_what_those_that_leave_knew_stays_also_after_iterations(
-    leaving: Sequence[int], turn_rad: float
-) -> None:
+def test_what_those_knew_that_leave_outlasts_steps(leaving: Sequence[int], turn_rad: float) -> None:
     n = 6
     graph, twin = chain(n), chain(n)
     factors = loop_of(n, turn_rad)
@@ -247,9 +238,7 @@ def correlations(rng: np.random.Generator, least: float) -> FloatArray:
 
 
 @given(seed=walks.seeds, exponent=st.floats(-9.0, -7.0))
-def test_a_little_less_than_definite_is_mended_and_keeps_what_it_says(
-    seed: int, exponent: float
-) -> None:
+def test_a_little_less_than_definite_is_mended_in_what_it_lacks(seed: int, exponent: float) -> None:
     rng = np.random.default_rng(seed)
     sigmas = 10.0 ** rng.uniform(-4, 4, size=6)
     scale = np.outer(sigmas, sigmas)

@@ -26,7 +26,18 @@ from gvo.types import (
     Rejected,
     Status,
 )
-from tests.backend.walks import STEP, STEP_NS, edge, go_on, number, power, seeds, shifted, walk
+from tests.backend.walks import (
+    STEP,
+    STEP_NS,
+    edge,
+    go_on,
+    number,
+    power,
+    seeds,
+    shifted,
+    values_of,
+    walk,
+)
 
 KERNELS = ["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 
@@ -113,7 +124,6 @@ class Problem:
     """By the pose after which they come: frame and prior."""
 
     def all_edges(self, n: int) -> list[tuple[int, Edge]]:
-        """Return frame and edge of all that came with the first n poses."""
         found = [(frame, edge) for frame in range(n) for edge in self.edges[frame]]
         return found + [late for after in range(n) for late in self.late_edges.get(after, [])]
 
@@ -123,7 +133,6 @@ class Problem:
 
 
 def feed(window: SlidingWindow, problem: Problem) -> list[Estimate]:
-    """Give a window all measurements; none may be refused."""
     causal = []
     for frame, frame_edges in enumerate(problem.edges):
         stamp = frame * STEP_NS
@@ -158,13 +167,6 @@ def build(
     return graph
 
 
-def values_of(poses: Mapping[Any, FloatArray]) -> gtsam.Values:
-    values = gtsam.Values()
-    for frame, T in poses.items():
-        values.insert(frame, gtsam.Pose3(T))
-    return values
-
-
 def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
@@ -180,7 +182,7 @@ def batch(
     """Optimise all measurements of the first n poses at once, from the true poses."""
     n = len(problem.poses) if n is None else n
     graph = build(problem, kernel, n)
-    optimum = optimise(graph, values_of(dict(enumerate(problem.poses[:n]))))
+    optimum = optimise(graph, values_of(problem.poses[:n]))
     return optimum, gtsam.Marginals(graph, optimum)
 
 
@@ -329,9 +331,7 @@ def small_window(seed: int, size: int | None) -> tuple[SlidingWindow, Problem]:
 
 @pytest.mark.parametrize("size", [5, 8, None])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_poses_and_covariances_of_the_window_are_those_of_the_batch(
-    seed: int, size: int | None
-) -> None:
+def test_poses_and_covariances_of_a_window_are_of_the_batch(seed: int, size: int | None) -> None:
     window, problem = small_window(seed, size)
     optimum, marginals = batch(problem)
     poses = window.poses()
@@ -357,9 +357,7 @@ def relative_covariance(marginals: gtsam.Marginals, values: gtsam.Values, a: int
 
 @pytest.mark.parametrize("size", [5, None])
 @pytest.mark.parametrize(("back_a", "back_b"), [(1, 0), (3, 1), (0, 4), (2, 3)])
-def test_relative_poses_carry_the_joint_covariance(
-    size: int | None, back_a: int, back_b: int
-) -> None:
+def test_relative_poses_have_joint_covariances(size: int | None, back_a: int, back_b: int) -> None:
     window, problem = small_window(2, size)
     optimum, marginals = batch(problem)
     a, b = 24 - back_a, 24 - back_b
@@ -430,9 +428,7 @@ def test_the_graph_tells_residuals_and_weights_as_gtsam_does(kernel: Any, size: 
 
 @pytest.mark.parametrize("kernel", KERNELS[1:])
 @pytest.mark.parametrize("threshold", [None, 5.0])
-def test_full_smoothing_with_a_kernel_reaches_the_cost_of_the_batch(
-    kernel: Any, threshold: float | None
-) -> None:
+def test_full_smoothing_with_a_kernel_is_the_batch(kernel: Any, threshold: float | None) -> None:
     problem = loopy_problem(12, 30, 0.01)
     for frame in (10, 20):  # a dozen sigmas, one of several edges each
         edge = problem.edges[frame][0]
@@ -445,7 +441,7 @@ def test_full_smoothing_with_a_kernel_reaches_the_cost_of_the_batch(
     smoothed = window.finish()
     graph = build(problem, kernel, threshold=threshold)
     found = values_of({number(e.frame_id): e.T_world_frame for e in smoothed})
-    truth = values_of(dict(enumerate(problem.poses)))
+    truth = values_of(problem.poses)
     assert graph.error(found) <= graph.error(optimise(graph, found)) * (1 + 1e-6)
     if kernel in ("huber", "cauchy"):  # the others have many optima
         assert graph.error(found) <= graph.error(optimise(graph, truth)) * (1 + 1e-6)
@@ -631,9 +627,7 @@ def test_positions_alone_turn_the_trajectory_into_the_world(size: int | None) ->
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(("size", "n"), [(2, 100), (5, 200), (None, 100)])
-def test_smoothing_consecutive_edges_returns_the_chain(
-    kernel: Any, size: int | None, n: int
-) -> None:
+def test_smoothing_consecutive_edges_gives_the_chain(kernel: Any, size: int | None, n: int) -> None:
     rng = np.random.default_rng(n)
     poses = wander(rng, n)
     edges = net(poses, rng, 0.02)
@@ -749,9 +743,7 @@ def test_a_loop_with_a_large_turn_is_closed_when_the_call_returns(turn_rad: floa
 
 @pytest.mark.parametrize("turn_rad", [0.6, -1.2])
 @pytest.mark.parametrize("sigma", [0.3, 1e-3])
-def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once_with_the_others(
-    turn_rad: float, sigma: float
-) -> None:
+def test_a_pose_that_closes_a_large_turn_settles_with_others(turn_rad: float, sigma: float) -> None:
     # It starts where one of its edges leads, and ends where both pull alike.
     window, edges, _ = drifted_chain(turn_rad)
     before = window.poses()
@@ -769,9 +761,7 @@ def test_a_pose_that_closes_a_loop_with_a_large_turn_is_settled_at_once_with_the
 
 
 @pytest.mark.parametrize(("start_sigma", "sigma"), [(1e2, 1e-2), (1e4, 1.0), (1.0, 1e-4)])
-def test_a_whole_graph_takes_sigmas_at_which_cholesky_gives_up(
-    start_sigma: float, sigma: float
-) -> None:
+def test_a_whole_graph_takes_sigmas_that_defeat_cholesky(start_sigma: float, sigma: float) -> None:
     start = PosePrior(T_world_frame=np.eye(4), covariance=start_sigma**2 * np.eye(6))
     window = SlidingWindow(WindowConfig(size=None, kernel="none"))
     window.add_pose(0, 0, [], start)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -36,7 +36,6 @@ def shifted(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
 def go_on(
     window: SlidingWindow, start: int, stop: int, step: FloatArray = STEP, sigma: float = 0.01
 ) -> list[Estimate]:
-    """Add poses, each seen from the one before."""
     return [
         window.add_pose(frame, frame * STEP_NS, [edge(frame - 1, step, sigma)] if frame else [])
         for frame in range(start, stop)
@@ -68,6 +67,13 @@ def failing(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gtsam.ISAM2, name, call)
         yield seen
+
+
+def values_of(poses: Mapping[Any, Any] | Iterable[Any]) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, pose in poses.items() if isinstance(poses, Mapping) else enumerate(poses):
+        values.insert(key, gtsam.Pose3(pose))
+    return values
 
 
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:

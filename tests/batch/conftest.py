@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import count, islice
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,9 @@ from distributed import Client, LocalCluster
 
 import gvo
 from gvo.batch import BatchOptions
-from gvo.io.recording import RecordingInfo, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.trajectory.trajectory import Trajectory
-from tests.conftest import GVO, TABLES
+from tests.conftest import GVO
+from tests.recordings import Held, hold
 
 N_FRAMES = 8
 # Long enough to be stopped in the middle, also where the machine is busy.
@@ -31,44 +30,27 @@ NO_REPORT = BatchOptions(report=False)
 _PATIENCE_S = 60.0
 
 
-class Walk:
-    """Some frames of a walk in a rendered room, those of another number elsewhere."""
-
-    def __init__(self, number: int) -> None:
-        self._first, n_frames = number * N_FRAMES, (number + 1) * N_FRAMES
-        self._source = SyntheticRecording("handheld", "stereo", n_frames=n_frames, scale=0.25)
-        self.info: RecordingInfo = replace(self._source.info, n_images=N_FRAMES)
-
-    def images(self) -> Iterator[StampedImage]:
-        return islice(self._source.images(), 2 * self._first, None)
-
-    def ground_truth(self) -> Trajectory:
-        return self._source.ground_truth().select(slice(self._first, None))
+def walk(number: int) -> Held:
+    """Return some frames of a walk in a rendered room, those of another number elsewhere."""
+    first, n_frames = number * N_FRAMES, (number + 1) * N_FRAMES
+    whole = hold(SyntheticRecording("handheld", "stereo", n_frames=n_frames, scale=0.25))
+    assert whole.truth is not None
+    truth = whole.truth.select(slice(first, None))
+    info = replace(whole.info, n_images=N_FRAMES)
+    return Held(info=info, items=whole.items[2 * first :], truth=truth)
 
 
-class ThereAndBack:
-    """A rendered recording, walked to and fro again and again."""
-
-    def __init__(self) -> None:
-        source = Walk(0)
-        images = list(source.images())
-        self._pairs = [images[n : n + 2] for n in range(0, len(images), 2)]
-        self._pixels = {id(image): image.load() for image in images}
-        self.info: RecordingInfo = replace(source.info, n_images=N_LONG)
-
-    def images(self) -> Iterator[StampedImage]:
-        start_ns = self._pairs[0][0].stamp_ns
-        way = [*range(N_FRAMES), *range(N_FRAMES - 2, 0, -1)]
-        for number in range(N_LONG):
-            for image in self._pairs[way[number % len(way)]]:
-                stamp_ns = start_ns + number * 50_000_000
-                pixels = self._pixels[id(image)]
-                yield replace(
-                    image, stamp_ns=stamp_ns, load=lambda pixels=pixels: pixels, log_time_ns=None
-                )
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
+def there_and_back() -> Held:
+    """Return a rendered recording that is walked to and fro again and again."""
+    source = walk(0)
+    start_ns = source.items[0].stamp_ns
+    way = [*range(N_FRAMES), *range(N_FRAMES - 2, 0, -1)]
+    items = [
+        replace(image, stamp_ns=start_ns + number * 50_000_000, log_time_ns=None)
+        for number in range(N_LONG)
+        for image in source.items[2 * way[number % len(way)] :][:2]
+    ]
+    return Held(info=replace(source.info, n_images=N_LONG), items=items)
 
 
 @pytest.fixture(scope="session")
@@ -76,7 +58,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with three bags: walk0, walk1, walk2."""
     folder = tmp_path_factory.mktemp("bags")
     for number in range(3):
-        gvo.convert(Walk(number), folder / f"walk{number}.mcap")
+        gvo.convert(walk(number), folder / f"walk{number}.mcap")
     return folder
 
 
@@ -84,7 +66,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag whose run takes some seconds."""
     path = tmp_path_factory.mktemp("long") / "long.mcap"
-    gvo.convert(ThereAndBack(), path)
+    gvo.convert(there_and_back(), path)
     return path
 
 
@@ -113,12 +95,6 @@ def blocked(tmp_path: Path) -> Path:
     return tmp_path / "blocked"
 
 
-def assert_same_run(out: Path, expected: Path) -> None:
-    """The tables of two runs are the same to the bit."""
-    for name in TABLES:
-        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
-
-
 def state_of(out: Path) -> dict[Path, tuple[int, bytes]]:
     """Return what would tell that a file was written again."""
     files = [path for path in out.rglob("*") if path.is_file()]
@@ -126,7 +102,6 @@ def state_of(out: Path) -> dict[Path, tuple[int, bytes]]:
 
 
 def wait_until(is_true: Callable[[], object], what: str) -> None:
-    """Wait for what comes sooner or later."""
     end_s = time.monotonic() + _PATIENCE_S
     while not is_true():
         if time.monotonic() > end_s:
@@ -163,7 +138,6 @@ class Cluster:
         self.address = str(json.loads(file.read_text())["address"])
 
     def add_worker(self, *options: str, cwd: Path | None = None) -> str:
-        """Start a worker with one thread; return its name."""
         name = f"worker{next(self._numbers)}"
         place = ["--host", "127.0.0.1", "--local-directory", str(self._folder), "--name", name]
         rest = ["--nthreads", "1", "--no-nanny", "--no-dashboard", *options]
@@ -171,7 +145,6 @@ class Cluster:
         return name
 
     def make_up(self, n_workers: int) -> None:
-        """Start workers until there are so many."""
         alive = {name: each for name, each in self.workers.items() if each.poll() is None}
         self.workers = alive
         while len(self.workers) < n_workers:
@@ -236,7 +209,6 @@ def cluster(any_cluster: Cluster) -> Cluster:
 
 @pytest.fixture(scope="module")
 def near() -> Iterator[Client]:
-    """Return the client of workers that are threads of this process."""
     with (
         LocalCluster(
             n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
@@ -248,7 +220,6 @@ def near() -> Iterator[Client]:
 
 @pytest.fixture
 def memory() -> Iterator[str]:
-    """Return a URL in memory, empty."""
     import fsspec
 
     files: Any = fsspec.filesystem("memory")

@@ -17,15 +17,8 @@ from gvo.batch import BatchOptions, BatchProgress
 from gvo.batch.running import check_plots
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
-from tests.batch.conftest import (
-    assert_same_run,
-    copy_of,
-    is_complete,
-    is_under_way,
-    state_of,
-    wait_until,
-)
-from tests.conftest import GVO, Answer, Command, is_one_line, python, refused
+from tests.batch.conftest import copy_of, is_complete, is_under_way, state_of, wait_until
+from tests.conftest import GVO, Answer, Command, assert_same_files, is_one_line, python, refused
 
 Batch = Callable[..., Answer]
 
@@ -45,10 +38,7 @@ def test_all_complete_is_0(batch: Batch, bags: Path, tmp_path: Path) -> None:
     answer = batch(bags, "--out", tmp_path)
     assert answer.code == 0
     lines = answer.out.splitlines()
-    assert lines == [
-        "3 recordings, 1 configuration",
-        f"3 runs: 3 complete; {tmp_path}/report.html",
-    ]
+    assert lines == ["3 recordings, 1 configuration", f"3 runs: 3 complete; {tmp_path}/report.html"]
     said = sorted(line.partition("] ")[2] for line in answer.err.splitlines())
     assert said == [f"walk{n}: complete" for n in range(3)]
     assert [line.partition("]")[0] for line in answer.err.splitlines()] == ["[1/3", "[2/3", "[3/3"]
@@ -163,9 +153,7 @@ def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> No
     assert "expected a recording" in said
 
 
-def test_a_folder_that_cannot_be_written_is_a_line(
-    batch: Batch, bags: Path, tmp_path: Path
-) -> None:
+def test_a_folder_that_cannot_be_written_is_told(batch: Batch, bags: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refused(batch(bags, "--out", tmp_path / "file"))
 
@@ -198,7 +186,7 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
     # Nothing of what the processes have to say to one another.
     assert all(line.startswith("[") for line in answer.stderr.splitlines()), answer.stderr
     bag = bags / "walk0.mcap"
-    assert_same_run(tmp_path / bag.stem, run_alone(bag))
+    assert_same_files(tmp_path / bag.stem, run_alone(bag))
 
 
 @pytest.mark.acceptance

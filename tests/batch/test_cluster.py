@@ -11,22 +11,13 @@ from distributed import Client
 
 import gvo
 from gvo.batch import BatchProgress, ClusterError, run
-from tests.batch.conftest import (
-    NO_REPORT,
-    Cluster,
-    assert_same_run,
-    is_complete,
-    is_under_way,
-    state_of,
-    wait_until,
-)
-from tests.conftest import GVO, Command
+from tests.batch.conftest import NO_REPORT, Cluster, is_complete, is_under_way, state_of, wait_until
+from tests.conftest import GVO, Command, assert_same_files
 
 NOWHERE = "tcp://127.0.0.1:1"
 
 
 def batch(*arguments: object) -> subprocess.Popen[str]:
-    """Start `gvo batch`."""
     command = [*GVO, "batch", *map(str, arguments), "--no-report"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -60,11 +51,7 @@ def test_tasks_spread_over_the_workers(cluster: Cluster, bags: Path, tmp_path: P
 
 @pytest.mark.acceptance
 def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
-    cluster: Cluster,
-    bags: Path,
-    long_bag: Path,
-    tmp_path: Path,
-    run_alone: Callable[[Path], Path],
+    cluster: Cluster, bags: Path, long_bag: Path, tmp_path: Path, run_alone: Callable[[Path], Path]
 ) -> None:
     killed: list[str] = []
 
@@ -82,7 +69,7 @@ def test_a_worker_that_is_killed_in_the_middle_costs_nothing(
     assert len(killed) == 1
     assert table["status"].tolist() == ["complete"] * 4
     for bag in (long_bag, bags / "walk0.mcap"):
-        assert_same_run(tmp_path / bag.stem, run_alone(bag))
+        assert_same_files(tmp_path / bag.stem, run_alone(bag))
 
 
 @pytest.mark.acceptance
@@ -118,7 +105,7 @@ def test_a_batch_that_was_stopped_goes_on_where_it_was(
     assert "long: complete" in answer.err
     assert state_of(tmp_path / "walk0") == before
     for bag in (long_bag, bags / "walk0.mcap"):
-        assert_same_run(tmp_path / bag.stem, run_alone(bag))
+        assert_same_files(tmp_path / bag.stem, run_alone(bag))
 
 
 @pytest.mark.acceptance

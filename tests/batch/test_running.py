@@ -16,7 +16,8 @@ from gvo.batch import BatchOptions, BatchProgress, Variant, run, run_batch
 from gvo.batch.inputs import NamedRecording, find_recordings, make_variants
 from gvo.batch.running import make_tasks
 from gvo.errors import OutputError
-from tests.batch.conftest import NO_REPORT, assert_same_run, copy_of, state_of
+from tests.batch.conftest import NO_REPORT, copy_of, state_of
+from tests.conftest import assert_same_files
 
 FORCED = BatchOptions(report=False, force=True)
 
@@ -39,7 +40,7 @@ def test_a_batch_writes_runs_a_table_and_a_page(
     assert table["recording"].tolist() == ["walk1", "walk0", "none"]
     assert table["status"].tolist() == ["complete", "complete", "failed"]
     assert table["folder"].tolist() == ["walk1", "walk0", "none"]
-    assert_same_run(out / "walk0", run_alone(bags / "walk0.mcap"))
+    assert_same_files(out / "walk0", run_alone(bags / "walk0.mcap"))
     pd.testing.assert_frame_equal(pd.read_parquet(out / "results.parquet"), table)
     assert len(pd.read_csv(out / "results.csv")) == 3
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -48,9 +49,7 @@ def test_a_batch_writes_runs_a_table_and_a_page(
     assert {path.name for path in out.iterdir()} == expected
 
 
-def test_what_is_finished_is_found_and_the_rest_is_run(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
+def test_what_is_finished_is_found_the_rest_run(near: Client, bags: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(bags / "walk0.mcap", out=out, client=near, options=NO_REPORT)
     before = run_files(out)
@@ -66,9 +65,7 @@ def test_what_is_finished_is_found_and_the_rest_is_run(
     pd.testing.assert_frame_equal(forced[columns], table[columns])
 
 
-def test_configurations_have_folders_and_columns_of_their_own(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
+def test_configurations_have_folders_and_columns(near: Client, bags: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     configs = {"small": with_size(2), "large": with_size(9)}
     asked = [bags / "walk0.mcap", bags / "walk1.mcap"]
@@ -82,16 +79,14 @@ def test_configurations_have_folders_and_columns_of_their_own(
         assert summary["configuration"]["window"]["size"] == size
     single = run(asked, [with_size(2)], out=tmp_path / "b", client=near, options=NO_REPORT)
     assert "window.size" not in single.columns
-    assert_same_run(out / "walk0" / "small", tmp_path / "b" / "walk0")
+    assert_same_files(out / "walk0" / "small", tmp_path / "b" / "walk0")
 
 
 class StoppedError(Exception):
     """Ends a batch."""
 
 
-def test_a_stopped_batch_leaves_its_table_and_goes_on(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
+def test_a_stopped_batch_leaves_a_table(near: Client, bags: Path, tmp_path: Path) -> None:
     def stop(progress: BatchProgress) -> None:
         if progress.n_done == 1:
             raise StoppedError
@@ -154,15 +149,13 @@ def test_everything_may_lie_behind_urls(
     files.get("/place/out/", str(tmp_path / "copy"), recursive=True)
     names = {path.name for path in (tmp_path / "copy").iterdir() if path.is_file()}
     assert names == {"batch.json", "report.html", "results.csv", "results.parquet"}
-    assert_same_run(tmp_path / "copy" / "walk0", run_alone(bags / "walk0.mcap"))
+    assert_same_files(tmp_path / "copy" / "walk0", run_alone(bags / "walk0.mcap"))
     pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "copy" / "results.parquet"), first)
     again = run(f"{memory}/in/*.mcap", out=f"{memory}/out", client=near, options=NO_REPORT)
     assert again["is_found"].all()
 
 
-def test_names_of_files_that_are_no_text_are_no_obstacle(
-    near: Client, bags: Path, tmp_path: Path
-) -> None:
+def test_names_of_files_may_be_no_text(near: Client, bags: Path, tmp_path: Path) -> None:
     name = b"w\xffalk.mcap".decode(errors="surrogateescape")
     copy_of(bags / "walk0.mcap", tmp_path / "in", name)
     (tmp_path / "in" / b"\xfe.bag".decode(errors="surrogateescape")).touch()

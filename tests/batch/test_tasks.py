@@ -16,7 +16,8 @@ from gvo.batch.tasks import MARK, BatchOptions, BatchRow, Task, TaskOptions, dig
 from gvo.io.excerpt import Excerpt
 from gvo.io.run_folder.writer import written_alone
 from gvo.types import Progress
-from tests.batch.conftest import N_FRAMES, NO_REPORT, assert_same_run, copy_of, state_of
+from tests.batch.conftest import N_FRAMES, NO_REPORT, copy_of, state_of
+from tests.conftest import assert_same_files
 
 CONFIG = gvo.load_configuration(settings=["runtime.threads=1"])
 
@@ -57,7 +58,7 @@ def test_a_task_writes_what_a_run_writes(
     seen: list[int] = []
     row = run_task(task_of(bag), options, on_progress=lambda progress: seen.append(progress.n_done))
     out, alone = Path(options.out) / "a", run_alone(bag)
-    assert_same_run(out, alone)
+    assert_same_files(out, alone)
     assert {path.name for path in out.iterdir()} == {path.name for path in alone.iterdir()}
     assert seen == list(range(1, N_FRAMES + 1))
     summary = json.loads((alone / "summary.json").read_text())
@@ -105,7 +106,7 @@ def test_another_run_in_the_folder_is_replaced(
     row = run_task(task, options)
     assert (row.status, row.is_found) == ("complete", False)
     run_task(task, fresh)
-    assert_same_run(Path(options.out) / "a", tmp_path / "fresh" / "a")
+    assert_same_files(Path(options.out) / "a", tmp_path / "fresh" / "a")
 
 
 def test_an_interrupted_run_begins_anew(
@@ -118,12 +119,10 @@ def test_an_interrupted_run_begins_anew(
     row = run_task(task_of(bag), options, on_progress=lambda progress: seen.append(progress.n_done))
     assert (row.status, row.is_found) == ("complete", False)
     assert seen == list(range(1, N_FRAMES + 1))
-    assert_same_run(Path(options.out) / "a", run_alone(bag))
+    assert_same_files(Path(options.out) / "a", run_alone(bag))
 
 
-def test_a_recording_that_fails_is_a_row_with_its_reason(
-    options: TaskOptions, tmp_path: Path
-) -> None:
+def test_a_recording_that_fails_is_a_row_and_reason(options: TaskOptions, tmp_path: Path) -> None:
     (tmp_path / "text.bag").write_text("no bag")
     for source, said in ((tmp_path / "none.bag", "does not exist"), (tmp_path / "text.bag", "")):
         row = run_task(task_of(source, parameters={"a.b": 1}), options)
@@ -152,9 +151,7 @@ def test_a_run_with_faults_is_partly(
 
 
 @pytest.mark.parametrize("content", [None, '{"mark": "y"}', "[]", "{}", "\xff"])
-def test_a_disk_that_is_not_the_clients_is_refused(
-    bag: Path, options: TaskOptions, content: str | None
-) -> None:
+def test_a_disk_of_others_is_refused(bag: Path, options: TaskOptions, content: str | None) -> None:
     mark = Path(options.out) / MARK
     mark.unlink()
     if content is not None:
@@ -217,7 +214,7 @@ def test_recordings_and_results_may_lie_behind_urls(
     row = run_task(task_of(f"{memory}/walk.mcap"), options, scratch=scratch)
     assert row.status == "complete"
     files.get("/place/out/a/", str(tmp_path / "copy"), recursive=True)
-    assert_same_run(tmp_path / "copy", run_alone(bag))
+    assert_same_files(tmp_path / "copy", run_alone(bag))
     assert list(scratch.iterdir()) == []
     before = {path: (files.created(path), files.cat_file(path)) for path in files.find("/place")}
     assert run_task(task_of(f"{memory}/walk.mcap"), options, scratch=scratch).is_found
@@ -228,9 +225,7 @@ def test_recordings_and_results_may_lie_behind_urls(
     assert list(scratch.iterdir()) == []
 
 
-def test_hashes_tell_configurations_and_recordings_apart(
-    bag: Path, bags: Path, options: TaskOptions
-) -> None:
+def test_hashes_tell_configs_and_bags_apart(bag: Path, bags: Path, options: TaskOptions) -> None:
     other = gvo.load_configuration(settings=["window.size=3", "runtime.threads=1"])
     rows = [
         run_task(task_of(source, config, folder=str(n)), options)

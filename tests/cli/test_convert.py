@@ -1,5 +1,6 @@
 """`gvo convert`, in both directions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from gvo.io.convert.convert import convert, write_folder
 from gvo.io.recording import StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.trajectory.formats import read_trajectory
-from tests.conftest import Command
+from tests.conftest import Command, assert_same_files, refused, run_of
 from tests.io.conftest import Item, ListSource, Tiny
 
 _TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
@@ -21,7 +22,6 @@ _TRAJECTORIES = ("raw.txt", "causal.txt", "smoothed.txt")
 
 @pytest.fixture
 def kitti(tmp_path: Path) -> Path:
-    """Return a KITTI folder of noise."""
     return Tiny().write_kitti(tmp_path / "kitti", n_frames=3)
 
 
@@ -52,16 +52,8 @@ def test_a_run_on_what_comes_back_writes_the_same_bytes(command: Command, tmp_pa
     assert command("convert", tmp_path / "a.mcap", tmp_path / "kitti").code == 0
     assert command("convert", tmp_path / "kitti", tmp_path / "b.bag", "--png").code == 0
     for name in ("a.mcap", "kitti", "b.bag"):
-        assert (
-            command("run", "--no-report", tmp_path / name, "--out", tmp_path / f"run_{name}").code
-            == 0
-        )
-    for trajectory in _TRAJECTORIES:
-        first, *others = (
-            (tmp_path / f"run_{name}" / trajectory).read_bytes()
-            for name in ("a.mcap", "kitti", "b.bag")
-        )
-        assert others == [first, first]
+        run_of(tmp_path / name, tmp_path / f"run_{name}")
+        assert_same_files(tmp_path / f"run_{name}", tmp_path / "run_a.mcap", _TRAJECTORIES)
 
 
 def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path: Path) -> None:
@@ -99,14 +91,20 @@ def test_the_body_of_a_data_set_is_a_frame_of_its_bag(command: Command, tmp_path
     )
 
 
+def _noise(stamps_ns: Sequence[int], delay_ns: int = 0) -> ListSource:
+    tiny = Tiny()
+    items: list[Item] = [
+        (stream, stamp_ns + delay_ns * stream, tiny.texture(2 * k + stream))
+        for k, stamp_ns in enumerate(stamps_ns)
+        for stream in (0, 1)
+    ]
+    return tiny.stereo(items)
+
+
 def test_a_bag_that_is_cut_off_gives_what_it_holds_and_exit_code_3(
     command: Command, tmp_path: Path, kitti: Path
 ) -> None:
-    tiny = Tiny()
-    items: list[Item] = [
-        (stream, 10**8 * k, tiny.texture(2 * k + stream)) for k in range(800) for stream in (0, 1)
-    ]
-    convert(tiny.stereo(items), tmp_path / "whole.bag")
+    convert(_noise([10**8 * k for k in range(800)]), tmp_path / "whole.bag")
     data = (tmp_path / "whole.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: len(data) * 2 // 3])
     for target in ("folder", "b.mcap"):
@@ -117,18 +115,12 @@ def test_a_bag_that_is_cut_off_gives_what_it_holds_and_exit_code_3(
         copies = [i.load() for i in gvo.open_recording(tmp_path / target).images() if not i.stream]
         assert 100 < len(copies) < 800
         for k, pixels in enumerate(copies):
-            np.testing.assert_array_equal(pixels, tiny.texture(2 * k))
+            np.testing.assert_array_equal(pixels, Tiny().texture(2 * k))
 
 
 def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> None:
-    tiny = Tiny()
     for part in range(2):
-        items: list[Item] = [
-            (stream, 10**9 * part + 10**8 * k, tiny.texture(10 * part + 2 * k + stream))
-            for k in range(3)
-            for stream in (0, 1)
-        ]
-        convert(tiny.stereo(items), tmp_path / f"{part}.bag")
+        convert(_noise([10**9 * part + 10**8 * k for k in range(3)]), tmp_path / f"{part}.bag")
     answer = command("convert", tmp_path / "0.bag", tmp_path / "1.bag", tmp_path / "all")
     assert answer.code == 0
     assert [image.stamp_ns for image in _images(tmp_path / "all") if image.stream == 0] == [
@@ -137,13 +129,7 @@ def test_several_bags_become_one_folder(command: Command, tmp_path: Path) -> Non
 
 
 def test_settings_reach_the_pairs_of_kitti(command: Command, tmp_path: Path) -> None:
-    tiny = Tiny()
-    items: list[Item] = [
-        (stream, 10**8 * k + 3_000_000 * stream, tiny.texture(k))
-        for k in range(3)
-        for stream in (0, 1)
-    ]
-    convert(tiny.stereo(items), tmp_path / "a.bag")
+    convert(_noise([10**8 * k for k in range(3)], delay_ns=3_000_000), tmp_path / "a.bag")
     assert command("convert", tmp_path / "a.bag", tmp_path / "none").code == 2
     answer = command(
         "convert", tmp_path / "a.bag", tmp_path / "all", "--set", "sync.stereo_tolerance_ms=5"
@@ -162,16 +148,8 @@ def test_settings_reach_the_pairs_of_kitti(command: Command, tmp_path: Path) -> 
     ],
 )
 def test_misuse_is_one_line_and_exit_code_2(
-    command: Command,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    kitti: Path,
-    arguments: list[str],
-    expected: str,
+    command: Command, here: Path, kitti: Path, arguments: list[str], expected: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    answer = command(*(argument.format(kitti=kitti) for argument in arguments))
-    assert answer.code == 2
-    assert expected in answer.err
-    assert answer.err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["kitti"]
+    words = (argument.format(kitti=kitti) for argument in arguments)
+    assert expected in refused(command(*words))
+    assert [path.name for path in here.iterdir()] == ["kitti"]

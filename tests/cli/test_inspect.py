@@ -18,7 +18,16 @@ import numpy as np
 import pytest
 
 import gvo
-from tests.conftest import GVO, TABLES, Command, interrupt, is_one_line, python, refused, start
+from tests.conftest import (
+    GVO,
+    TABLES,
+    Command,
+    assert_same_files,
+    interrupt,
+    python,
+    refused,
+    start,
+)
 from tests.viz.explanation.test_explanation import RGBD, STEREO
 
 COMMANDS = (
@@ -87,8 +96,7 @@ def test_drawing_changes_nothing_of_the_run(
     arguments = ["run", drive_bag, "--out", tmp_path, "--duration", "0.6", "--no-report"]
     answer = command(*arguments)
     assert (answer.code, answer.err) == (0, "")
-    for name in TABLES:
-        assert (tmp_path / name).read_bytes() == (drawn / name).read_bytes(), name
+    assert_same_files(tmp_path, drawn)
     drawings = {"trajectories.png", "report.html", "film.webm", "run.rrd", "plots"}
     assert names_of(drawn) - names_of(tmp_path) == drawings
 
@@ -155,9 +163,7 @@ def test_compare_reports_what_it_prints(command: Command, tmp_path: Path) -> Non
     assert "01_above" in stems
 
 
-def test_the_report_of_a_comparison_is_not_written_unless_asked_for(
-    command: Command, tmp_path: Path
-) -> None:
+def test_a_comparison_is_not_reported_unless_asked_for(command: Command, tmp_path: Path) -> None:
     truth = poses(tmp_path / "truth.txt")
     command("compare", truth, truth)
     assert names_of(tmp_path) == {"truth.txt"}
@@ -182,16 +188,12 @@ def test_nothing_computed_is_lost_where_a_plot_cannot_be_written(
     assert (out / "report.html").is_file()
 
 
-def test_errors_are_printed_where_the_page_cannot_be_written(
-    command: Command, tmp_path: Path
-) -> None:
+def test_errors_are_printed_if_the_page_cannot_be_written(command: Command, tmp_path: Path) -> None:
     truth = poses(tmp_path / "truth.txt")
     for options in (["--report", truth / "page.html"], ["--plots", truth]):
         assert command("compare", truth, truth, *options).out == ""
         answer = command("compare", truth, truth, *options, "--force")
-        assert answer.code == 2
-        assert is_one_line(answer.err), answer.err
-        assert "truth.txt" in answer.err
+        assert "truth.txt" in refused(answer)
         assert "ATE" in answer.out
 
 
@@ -257,9 +259,7 @@ def test_a_stereo_frame_is_explained_as_the_run_tracked_it(
 
 
 @pytest.mark.acceptance
-def test_a_frame_with_depth_is_explained_by_its_depth(
-    command: Command, room_bag: Path, tmp_path: Path
-) -> None:
+def test_a_frame_is_explained_by_depth(command: Command, room_bag: Path, tmp_path: Path) -> None:
     options = ["--frame", "2", "--every", "2", "--set", "frontend.kind=descriptor"]
     answer = command("explain", room_bag, *options, "--out", tmp_path)
     numbers = check_explanation(answer, tmp_path, RGBD)
@@ -406,33 +406,25 @@ def test_a_command_line_that_cannot_be_is_refused_as_all_else(
     command: Command, room_bag: Path, *, arguments: list[str]
 ) -> None:
     answer = command(*(argument.format(bag=room_bag) for argument in arguments))
-    assert (answer.code, answer.out) == (2, "")
-    assert is_one_line(answer.err), answer.err
-    assert len(answer.err) < 300
+    assert len(refused(answer)) < 300
+    assert answer.out == ""
     assert re.search(r"; see `gvo( view| explain| round-trip)? --help`$", answer.err)
 
 
 @pytest.mark.parametrize(
-    ("module", "arguments", "extra"),
+    "words",
     [
-        ("viser", ["view", "{bag}", "--port", "0"], "[view]'"),
-        ("rerun", ["run", "{bag}", "--out", "out", "--rerun", "run.rrd"], "[rerun]'"),
+        ("viser", "[view]'", "view", "{bag}", "--port", "0"),
+        ("rerun", "[rerun]'", "run", "{bag}", "--out", "out", "--rerun", "run.rrd"),
     ],
 )
 def test_an_extra_that_is_not_installed_is_named(
-    command: Command,
-    monkeypatch: pytest.MonkeyPatch,
-    room_bag: Path,
-    tmp_path: Path,
-    *,
-    module: str,
-    arguments: list[str],
-    extra: str,
+    command: Command, monkeypatch: pytest.MonkeyPatch, room_bag: Path, here: Path, words: list[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    module, extra, *arguments = words
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
     said = refused(command(*(argument.format(bag=room_bag) for argument in arguments)))
     assert extra in said
-    assert names_of(tmp_path) == set()
+    assert names_of(here) == set()

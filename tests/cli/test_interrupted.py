@@ -17,15 +17,18 @@ from gvo.runs import round_trip, smooth
 from gvo.runs.smooth import Smoother
 from gvo.trajectory import evaluation
 from gvo.viz.report import run as report
-from tests.conftest import Command
+from tests.conftest import Command, line_of_poses
 
 ANEW = "the same command begins anew"
 POSES_STAND = "the poses so far are in {out}; --force begins anew"
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
+Interrupt = Callable[..., None]
+
+
 @pytest.fixture
-def interrupt(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def interrupt(monkeypatch: pytest.MonkeyPatch) -> Interrupt:
     """Return a function that makes a call of a method raise a signal in this process."""
 
     def at_call(owner: object, name: str, n: int, number: int = signal.SIGTERM) -> None:
@@ -45,7 +48,7 @@ def interrupt(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    ("words", "stands"),
+    "case",
     [
         (("check", "{bag}"), ANEW),
         (("convert", "{bag}", "{out}.bag"), f"{{out}}.bag is not written; {ANEW}"),
@@ -53,18 +56,12 @@ def interrupt(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         (("round-trip", "{bag}", "--out", "{out}"), POSES_STAND),
         (("run", "{bag}", "--out", "{out}"), POSES_STAND),
     ],
-    ids=lambda words: words[0],
+    ids=lambda case: case[0][0],
 )
 def test_a_signal_while_a_recording_is_read_ends_in_one_line(
-    command: Command,
-    interrupt: Callable[..., None],
-    drive_bag: Path,
-    tmp_path: Path,
-    *,
-    words: tuple[str, ...],
-    stands: str,
-    number: signal.Signals,
+    command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path, number: Any, case: Any
 ) -> None:
+    words, stands = case
     out = tmp_path / "out"
     interrupt(BagMessage, "decode", 12, number)
     answer = command(*(word.format(bag=drive_bag, out=out) for word in words))
@@ -80,11 +77,7 @@ def test_a_signal_while_a_recording_is_read_ends_in_one_line(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
-    command: Command,
-    interrupt: Callable[..., None],
-    drive_bag: Path,
-    tmp_path: Path,
-    number: signal.Signals,
+    command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     interrupt(report, "status_plot", 1, number)
     answer = command("run", drive_bag, "--out", tmp_path, "--duration", "0.3")
@@ -97,7 +90,7 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
 
 
 @pytest.mark.parametrize(
-    ("module", "draw", "words"),
+    "case",
     [
         (smooth, "plot_trajectories", ("smooth", "{poses}")),
         (smooth, "plot_trajectories", ("smooth", "{poses}", "--window")),
@@ -106,17 +99,10 @@ def test_a_signal_while_the_report_is_drawn_leaves_the_whole_run(
     ids=["optimized", "window", "round trip"],
 )
 def test_a_signal_while_a_picture_is_drawn_ends_at_once(
-    command: Command,
-    interrupt: Callable[..., None],
-    drive_bag: Path,
-    tmp_path: Path,
-    *,
-    module: object,
-    draw: str,
-    words: tuple[str, ...],
+    command: Command, interrupt: Interrupt, drive_bag: Path, tmp_path: Path, case: tuple[Any, ...]
 ) -> None:
-    poses, out = tmp_path / "poses.txt", tmp_path / "out"
-    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    module, draw, words = case
+    poses, out = line_of_poses(tmp_path / "poses.txt"), tmp_path / "out"
     interrupt(module, draw, 1)
     answer = command(*(word.format(bag=drive_bag, poses=poses) for word in words), "--out", out)
     assert answer.code == 143
@@ -129,8 +115,7 @@ def test_a_signal_while_a_picture_is_drawn_ends_at_once(
 def test_a_signal_while_poses_are_smoothed_leaves_those_before(
     command: Command, interrupt: Callable[..., None], tmp_path: Path, number: signal.Signals
 ) -> None:
-    poses, out = tmp_path / "poses.txt", tmp_path / "out"
-    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    poses, out = line_of_poses(tmp_path / "poses.txt"), tmp_path / "out"
     interrupt(Smoother, "take", 7, number)
     answer = command("smooth", poses, "--window", "--out", out)
     assert answer.code == CODES[number]
@@ -161,17 +146,13 @@ def test_a_signal_while_a_graph_is_optimized_leaves_the_best_poses(
 def test_a_signal_while_trajectories_are_compared_ends_in_one_line(
     command: Command, interrupt: Callable[..., None], tmp_path: Path
 ) -> None:
-    poses = tmp_path / "poses.txt"
-    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    poses = line_of_poses(tmp_path / "poses.txt")
     interrupt(evaluation, "relative_errors", 1)
     assert command("compare", poses, poses) == (143, "", f"gvo: interrupted; {ANEW}\n")
 
 
 def test_a_signal_while_the_demo_runs_ends_in_one_line(
-    command: Command,
-    interrupt: Callable[..., None],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    command: Command, interrupt: Interrupt, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("gvo.runs.demo.N_FRAMES", 3)
     interrupt(KltFrontend, "extract", 1)

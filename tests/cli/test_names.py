@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from gvo._text import html_text, visible
 from gvo.io.bag.reader import BagReader, typestore
-from tests.conftest import Command
+from tests.conftest import Command, line_of_poses
 
 # Escape sequences (of one and of two characters), a bell, marks that turn the direction of
 # writing, line ends, and markup of HTML, Matplotlib and Rich.
@@ -77,19 +77,13 @@ def texts(folder: Path) -> Iterator[str]:
     ids=lambda words: words[0],
 )
 def test_names_are_shown_escaped(
-    command: Command,
-    monkeypatch: pytest.MonkeyPatch,
-    evil_bag: Path,
-    tmp_path: Path,
-    *,
-    words: tuple[str, ...],
+    command: Command, evil_bag: Path, here: Path, words: tuple[str, ...]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     answer = command(*(word.replace("{bag}", str(evil_bag)) for word in words))
     shown = answer.out + answer.err
     assert answer.code in (0, 2, 3)
     assert words[0] in ("explain", "batch", "convert", "compare", "smooth") or "1b[31m" in shown
-    for text in (shown, *texts(tmp_path)):
+    for text in (shown, *texts(here)):
         assert all(line.isprintable() for line in text.split("\n"))
     for line in shown.split("\n"):
         assert "<b>&$" not in line or "u2066" in line  # the names have line ends between them
@@ -110,8 +104,7 @@ def test_a_report_and_a_summary_name_the_recording_without_harm(
 
 
 def test_names_of_files_are_shown_escaped(command: Command, tmp_path: Path) -> None:
-    path = tmp_path / f"{FILE}.txt"
-    path.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(9)))
+    path = line_of_poses(tmp_path / f"{FILE}.txt")
     page, plot = tmp_path / "page.html", tmp_path / "plot.png"
     for words in (
         ("compare", path, path, "--report", page, "--plot", plot),

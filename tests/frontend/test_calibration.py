@@ -40,6 +40,7 @@ from gvo.types import (
     StereoFrame,
 )
 from tests.geometry.scenes import move, project, unproject
+from tests.recordings import frames_of
 
 N_FRAMES = 20
 CAMERA = StereoCamera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480, baseline=0.1)
@@ -348,7 +349,7 @@ def rolling_frames(sensor: Sensor) -> tuple[gvo.SyntheticRecording, list[Frame]]
     recording = gvo.SyntheticRecording(
         "handheld", sensor, n_frames=6, scale=0.5, seed=2, readout_ms=25.0
     )
-    found = [each for each in gvo.frames(recording, Config()) if not isinstance(each, FaultyFrame)]
+    found = frames_of(recording)
     return recording, found
 
 
@@ -402,8 +403,7 @@ def shaken(sensor: Sensor, readout_ms: float) -> gvo.Odometry:
         "handheld", sensor, n_frames=36, seed=2, readout_ms=readout_ms
     )
     odometry = gvo.Odometry(recording.info.camera)
-    for frame in gvo.frames(recording, Config()):
-        assert not isinstance(frame, FaultyFrame)
+    for frame in frames_of(recording):
         odometry.track(frame)
     return odometry
 

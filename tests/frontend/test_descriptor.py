@@ -86,16 +86,6 @@ def configure(kind: Kind = "orb", threads: int = 1, **sections: dict[str, object
     return Config.model_validate(values)
 
 
-def true_disparities(observations: Observations) -> FloatArray:
-    return np.where(observations.keypoints[:, 1] < 100, *DISPARITIES)
-
-
-def away_from_the_seam(
-    observations: Observations,
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.asarray(np.abs(observations.keypoints[:, 1] - 99.5) > 12)
-
-
 def check_consistency(observations: Observations, camera: StereoCamera) -> None:
     n = len(observations)
     uvd = np.column_stack([observations.keypoints, observations.disparities])
@@ -114,9 +104,9 @@ def test_stereo_points_lie_on_the_walls(kind: Kind) -> None:
     check_consistency(observations, CAMERA)
     assert observations.descriptors_right is not None
     assert len(observations.descriptors_right) == len(observations)
-    errors = (observations.disparities - true_disparities(observations))[
-        away_from_the_seam(observations)
-    ]
+    rows = observations.keypoints[:, 1]
+    errors = observations.disparities - np.where(rows < 100, *DISPARITIES)
+    errors = errors[np.abs(rows - 99.5) > 12]  # away from the seam
     assert np.median(np.abs(errors)) < 0.08
     assert np.mean(np.abs(errors) < 0.5) > 0.95
     np.testing.assert_allclose(
@@ -138,9 +128,7 @@ def test_sigmas_grow_with_the_octave_from_that_of_the_image(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize(("limits", "half"), [((0.6, 1.8), 1), ((1.8, 20.0), 0)])
-def test_points_beyond_the_limits_of_depth_are_left_out(
-    limits: tuple[float, float], half: int
-) -> None:
+def test_points_beyond_limits_of_depth_are_left_out(limits: tuple[float, float], half: int) -> None:
     nearest, farthest = limits
     config = configure(stereo={"min_depth_m": nearest, "max_depth_m": farthest})
     observations = DescriptorFrontend(CAMERA, config).extract(stereo_frame())
@@ -196,16 +184,11 @@ def test_an_rgbd_camera_is_seen_as_a_stereo_camera_of_the_virtual_baseline() -> 
     assert as_stereo(CAMERA, config) is CAMERA
 
 
-def grey_pair(left: ImageArray, right: ImageArray) -> StereoFrame:
-    return StereoFrame(stamp_ns=1, left=left, right=right)
-
-
 @pytest.mark.parametrize("blank", ["both", "left", "right"])
 def test_blank_images_give_no_points_and_no_motion(blank: str) -> None:
     grey, drawn = np.full((200, 320), 90, dtype=np.uint8), draw()
-    frame = grey_pair(
-        grey if blank in ("both", "left") else drawn, grey if blank in ("both", "right") else drawn
-    )
+    left, right = (grey if blank in ("both", side) else drawn for side in ("left", "right"))
+    frame = StereoFrame(stamp_ns=1, left=left, right=right)
     frontend = DescriptorFrontend(CAMERA, configure())
     nothing, something = frontend.extract(frame), frontend.extract(stereo_frame())
     assert len(nothing) == 0
@@ -228,9 +211,7 @@ def expect(x_m: float) -> MotionPrior:
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
 @pytest.mark.parametrize("prior", ["none", "true", "wrong"])
-def test_the_motion_between_two_frames_is_found_with_and_without_a_prediction(
-    sensor: str, prior: str
-) -> None:
+def test_motion_of_frames_is_found_with_and_without_prediction(sensor: str, prior: str) -> None:
     x_m = 0.12  # 10 and 20 px
     if sensor == "stereo":
         frontend = DescriptorFrontend(CAMERA, configure())
@@ -253,7 +234,7 @@ def test_a_wrong_prediction_finds_nothing_where_the_wide_search_is_no_wider() ->
     assert isinstance(frontend.register(pair[0], pair[1], expect(0.12)), RelativePose)
 
 
-@settings(deadline=None, max_examples=3)
+@settings(max_examples=3)
 @given(x_m=st.floats(0.0, 0.1))
 def test_two_threads_see_what_one_sees(x_m: float) -> None:
     frame = stereo_frame(x_m)

@@ -16,16 +16,8 @@ from gvo.frontend.registration import check_view
 from gvo.frontend.tracking import track_pixels
 from gvo.geometry import se3
 from gvo.io.recording import Sensor
-from gvo.types import (
-    Failure,
-    FaultyFrame,
-    FloatArray,
-    Frame,
-    MotionPrior,
-    RelativePose,
-    RgbdFrame,
-    StereoFrame,
-)
+from gvo.types import Failure, FloatArray, Frame, MotionPrior, RelativePose, RgbdFrame, StereoFrame
+from tests.recordings import frames_of
 
 N_FRAMES = 6
 SENSORS: list[Sensor] = ["stereo", "rgbd"]
@@ -38,11 +30,7 @@ def recording(sensor: Sensor) -> gvo.SyntheticRecording:
 
 @cache
 def frames(sensor: Sensor) -> list[Frame]:
-    return [
-        frame
-        for frame in gvo.frames(recording(sensor), Config())
-        if not isinstance(frame, FaultyFrame)
-    ]
+    return frames_of(recording(sensor))
 
 
 def frontend(sensor: Sensor, **sections: dict[str, Any]) -> KltFrontend:
@@ -98,9 +86,7 @@ def test_the_motion_is_found_with_and_without_a_prediction(sensor: Sensor, prior
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_what_follows_a_failure_is_believed_where_enough_of_the_view_is_seen(
-    sensor: Sensor,
-) -> None:
+def test_what_follows_a_failure_is_believed_where_enough_of_it_is_seen(sensor: Sensor) -> None:
     first, second = observations(sensor)[:2]
     T = true_motion(sensor, 0, 1)
     priors = [MotionPrior(T_predicted=T, T_recent=T, is_confirmed=told) for told in (True, False)]

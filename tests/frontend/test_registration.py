@@ -16,6 +16,7 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import Failure, FloatArray, IntArray, MotionPrior, Observations, RelativePose
+from tests.results import observations_of
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 CAMERA = StereoCamera(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480, baseline=0.2)
@@ -40,13 +41,9 @@ def observe(
 ) -> Observations:
     n = len(points)
     uvd = CAMERA.project_stereo(points) + noise * SIGMAS * rng.normal(size=(n, 3))
-    return Observations(
-        stamp_ns=stamp_ns,
-        keypoints=uvd[:, :2],
-        disparities=uvd[:, 2],
-        points_cam=CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2]),
-        sigmas=np.tile(SIGMAS, (n, 1)),
-        descriptors_left=np.zeros((n, 32), dtype=np.uint8),
+    points, sigmas = CAMERA.unproject_stereo(uvd[:, :2], uvd[:, 2]), np.tile(SIGMAS, (n, 1))
+    return observations_of(
+        stamp_ns, points, keypoints=uvd[:, :2], disparities=uvd[:, 2], sigmas=sigmas
     )
 
 
@@ -87,7 +84,7 @@ def two_frames(
     return T, reference, current, np.stack([partners, order], axis=1)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=seeds)
 def test_the_motion_of_the_current_frame_is_found_among_outliers(seed: int) -> None:
     T, reference, current, matches = two_frames(seed)
@@ -142,7 +139,7 @@ def test_refinement_and_weights_each_reduce_the_error() -> None:
     assert squares["refined"] < 0.8 * squares["weighted"] < 0.8 * squares["plain"]
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(seed=seeds)
 def test_the_result_depends_on_the_frames_and_the_seed_alone(seed: int) -> None:
     _, reference, current, matches = two_frames(seed)
@@ -207,7 +204,7 @@ def forbid_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registration, "ransac_rigid", search)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=seeds)
 def test_a_prediction_that_most_matches_confirm_is_refined_without_samples(seed: int) -> None:
     T, reference, current, matches = two_frames(seed, n_outliers=20)
@@ -237,9 +234,7 @@ def test_a_prediction_that_few_matches_confirm_changes_nothing(error: float) -> 
 
 
 @pytest.mark.parametrize("is_predicted", [True, False])
-def test_a_rough_estimate_is_near_the_motion_and_starts_the_next_without_samples(
-    is_predicted: bool,
-) -> None:
+def test_a_rough_estimate_is_near_and_starts_the_next_without_samples(is_predicted: bool) -> None:
     T, reference, current, matches = two_frames(7, n_outliers=20)
     start = T @ se3.exp(np.repeat([0.002, 0.02], 3))
     given = Correspondences.of(reference, current, matches), matches, CAMERA, configure()
@@ -299,9 +294,7 @@ def test_without_refinement_the_fit_to_the_consensus_is_the_result_whatever_was_
 
 
 @pytest.mark.parametrize("refine", ["gauss_newton", "none"])
-def test_errors_of_constants_are_told_where_asked_for(
-    refine: Literal["gauss_newton", "none"],
-) -> None:
+def test_errors_of_constants_are_told_if_asked_for(refine: Literal["gauss_newton", "none"]) -> None:
     _, reference, current, matches = two_frames(8, n_outliers=0)
     given = Correspondences.of(reference, current, matches)
     asked = replace(

@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given
 
 from gvo.geometry.correspondences import Correspondences
-from gvo.types import FloatArray, Observations
+from gvo.types import FloatArray
 from tests.geometry.scenes import CAMERA, seeds, unproject
+from tests.results import observations_of
 
 
 def random_pixels(rng: np.random.Generator, n: int) -> FloatArray:
@@ -57,13 +58,12 @@ def test_matches_pair_what_each_frame_saw() -> None:
     for n in (6, 5):
         uvd = random_pixels(rng, n)
         frames.append(
-            Observations(
+            observations_of(
+                n,
+                unproject(uvd),
                 keypoints=uvd[:, :2],
-                points_cam=unproject(uvd),
                 disparities=uvd[:, 2],
                 sigmas=rng.uniform(0.1, 1.0, (n, 3)),
-                stamp_ns=n,
-                descriptors_left=np.zeros((n, 32), dtype=np.uint8),
             )
         )
     pairs = [(4, 0), (1, 3), (5, 4)]

@@ -117,7 +117,6 @@ def test_raw_images_are_rectified(tiny: Any) -> None:
 
 
 def _written(path: Path, tiny: Any, **changes: Any) -> Path:
-    """Write the camera of tiny recordings, by default with a lens, as a file; return the path."""
     D = {"distortion_coefficients": {"data": [-0.2, 0.05, 0.001, -0.001, 0.0]}}
     path.write_text(json.dumps(tiny.ros_camera(**(D | changes))))
     return path
@@ -276,7 +275,8 @@ def test_recorded_depth_is_the_count_of_the_nearest_pixel(gvo_data: Path) -> Non
         for pair in pair_images(source.images(), limit_ns=20_000_000, partner="depth")
         if isinstance(pair, tuple) and pair[0].stamp_ns == frame.stamp_ns
     )
-    stamps = {image.stamp_ns: n for n, image in enumerate(_of_stream(source, 1))}
+    depth_images = (image for image in source.images() if image.stream == 1)
+    stamps = {image.stamp_ns: n for n, image in enumerate(depth_images)}
     table = (gvo_data / "rgbd_dataset_freiburg1_xyz_start" / "depth.txt").read_text()
     rows = [line.split()[1] for line in table.splitlines() if not line.startswith("#")]
     path = gvo_data / "rgbd_dataset_freiburg1_xyz_start" / rows[stamps[second.stamp_ns]]
@@ -293,10 +293,6 @@ def test_recorded_depth_is_the_count_of_the_nearest_pixel(gvo_data: Path) -> Non
         count = int(counts[row, column]) if is_inside else 0
         expected = np.nan if count in (0, 65535) else np.float32(count) / np.float32(5000)
         np.testing.assert_equal(float(frame.depth[v, u]), float(expected))
-
-
-def _of_stream(source: Any, stream: int) -> list[StampedImage]:
-    return [image for image in source.images() if image.stream == stream]
 
 
 @pytest.mark.recorded

@@ -13,14 +13,8 @@ from gvo.config import WindowConfig
 from gvo.frontend.protocol import CheckedFrontend
 from gvo.geometry import se3
 from gvo.odometry.chain import RawChain, RawStep
-from gvo.types import (
-    Failure,
-    FloatArray,
-    MotionPrior,
-    Observations,
-    RelativePose,
-    Status,
-)
+from gvo.types import Failure, FloatArray, MotionPrior, Observations, RelativePose, Status
+from tests.results import observations_of
 
 seeds = st.integers(min_value=0, max_value=2**32 - 1)
 STEP_NS = 100_000_000
@@ -29,14 +23,7 @@ SETTINGS = WindowConfig(coasting_sigma_deg_per_s=20.0, coasting_sigma_m_per_s=4.
 
 
 def observe(stamp_ns: int) -> Observations:
-    return Observations(
-        stamp_ns=stamp_ns,
-        keypoints=np.zeros((0, 2)),
-        disparities=np.zeros(0),
-        points_cam=np.zeros((0, 3)),
-        sigmas=np.zeros((0, 3)),
-        descriptors_left=np.zeros((0, 32), dtype=np.uint8),
-    )
+    return observations_of(stamp_ns, np.zeros((0, 3)))
 
 
 class TrueFrontend:
@@ -83,7 +70,6 @@ class Unpredictable:
 
 
 def steady(stamp_ns: int) -> FloatArray:
-    """Return the pose of a camera that moves and turns at a constant rate."""
     twist = np.array([0.05, 0.3, -0.1, 0.2, 0.1, 1.5])
     return se3.exp(twist * (1e-9 * stamp_ns))
 
@@ -109,7 +95,7 @@ def test_the_first_frame_is_the_world() -> None:
     assert steps[0].estimate.status == Status.OK
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=seeds)
 def test_the_chain_is_the_product_of_its_relative_poses(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -264,9 +250,7 @@ class Spoilt(TrueFrontend):
         {"covariance": np.ones((6, 6))},
     ],
 )
-def test_a_relative_pose_that_is_none_is_a_failure_and_the_chain_goes_on(
-    changes: dict[str, Any],
-) -> None:
+def test_a_false_relative_pose_is_a_failure_and_the_chain_goes_on(changes: dict[str, Any]) -> None:
     stamps = stamps_of(6)
     chain = RawChain(CheckedFrontend(Spoilt(stamps[3], **changes)), SETTINGS)
     steps = [chain.advance(observe(stamp)) for stamp in stamps]

@@ -11,20 +11,9 @@ from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.odometry.keyframes import Keyframes, misclosure
 from gvo.types import Edge, Estimate, FloatArray, Observations
+from tests.results import observations_of
 
 CAMERA = StereoCamera(fx=100.0, fy=100.0, cx=50.0, cy=40.0, width=100, height=80, baseline=0.1)
-
-
-def observe(stamp_ns: int, points: FloatArray) -> Observations:
-    n = len(points)
-    return Observations(
-        stamp_ns=stamp_ns,
-        keypoints=np.zeros((n, 2)),
-        disparities=np.ones(n),
-        points_cam=points,
-        sigmas=np.ones((n, 3)),
-        descriptors_left=np.zeros((n, 32), dtype=np.uint8),
-    )
 
 
 def wall(n: int = 2000, depth: float = 4.0) -> FloatArray:
@@ -44,7 +33,7 @@ def keyframes(*stamps: int, **changes: Any) -> Keyframes[Observations]:
     }
     kept: Keyframes[Observations] = Keyframes(CAMERA, WindowConfig.model_validate(values | changes))
     for stamp in stamps:
-        kept.add(observe(stamp, wall()))
+        kept.add(observations_of(stamp, wall()))
     return kept
 
 
@@ -60,7 +49,7 @@ def test_the_overlap_is_the_share_of_the_points_still_in_view(share: float, n: i
     # The image shows 4 m of a wall 4 m away, so that a shift of 4 m leaves nothing.
     kept = keyframes()
     points = wall(n)
-    kept.add(observe(7, points))
+    kept.add(observations_of(7, points))
     shift = 4.0 * (1.0 - share)
     scores = kept.scores({7: shifted(dx=shift)})
     assert list(scores) == [7]
@@ -84,7 +73,7 @@ def test_points_at_a_quite_other_distance_are_not_counted() -> None:
 
 def test_a_frame_without_points_overlaps_with_nothing() -> None:
     kept = keyframes()
-    kept.add(observe(3, np.zeros((0, 3))))
+    kept.add(observations_of(3, np.zeros((0, 3))))
     assert kept.scores({3: np.eye(4)}) == {3: 0.0}
 
 
@@ -100,7 +89,7 @@ def test_kept_frames_are_known_by_stamp_in_their_order() -> None:
 
 def test_steps_are_counted_from_the_last_attempt_and_half_of_those_before_one_in_vain() -> None:
     kept = keyframes()
-    kept.add(observe(7, wall()), n_steps=3)
+    kept.add(observations_of(7, wall()), n_steps=3)
     assert kept.n_unasked({7: shifted(dx=0.2)}, 5) == {7: 2}
     kept.note_attempt(7, shifted(dx=0.2), 5, is_linked=True)
     assert kept.n_unasked({7: shifted(dx=0.4)}, 9) == {7: 4}
@@ -112,7 +101,7 @@ def test_steps_are_counted_from_the_last_attempt_and_half_of_those_before_one_in
 @pytest.mark.parametrize(("shift_px", "is_new"), [(0.0, False), (0.9, False), (1.1, True)])
 def test_the_same_view_adds_nothing(shift_px: float, is_new: bool, is_linked: bool) -> None:
     kept = keyframes()
-    kept.add(observe(7, wall()), n_steps=0)
+    kept.add(observations_of(7, wall()), n_steps=0)
     kept.note_attempt(7, shifted(dx=0.2), 2, is_linked=is_linked)
     there = shifted(dx=0.2 + shift_px * 4.0 / CAMERA.fx)
     assert (kept.n_unasked({7: there}, 8)[7] > 0) == is_new
@@ -145,7 +134,7 @@ def test_without_points_or_camera_the_score_is_the_proximity_of_the_poses() -> N
     pointless: Keyframes[Bare] = Keyframes(CAMERA, config)
     pointless.add(Bare(7))
     blind: Keyframes[Observations] = Keyframes(None, config)
-    blind.add(observe(7, wall()))
+    blind.add(observations_of(7, wall()))
     for kept in (pointless, blind):
         for distance_m, score in ((0.0, 1.0), (2.0, 0.8), (5.0, 0.5), (50.0, 0.0)):
             scores = kept.scores({7: shifted(dz=distance_m)})
@@ -160,7 +149,7 @@ def test_the_number_of_kept_frames_is_counted() -> None:
 
 def test_samples_of_one_size_overlap_as_each_does_alone() -> None:
     kept = keyframes(1, 2, 3)
-    kept.add(observe(4, wall(20)))
+    kept.add(observations_of(4, wall(20)))
     poses = {1: shifted(dx=1.0), 2: shifted(dz=-0.5), 3: np.eye(4)}
     alone = {ns: kept.scores({ns: T})[ns] for ns, T in poses.items()}
     assert kept.scores(poses) == alone

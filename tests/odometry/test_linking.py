@@ -70,31 +70,27 @@ def linked(measure: Registrations, step: RawStep, **changes: Any) -> list[Any]:
     return [link.reference_id for link in links]
 
 
-def test_a_link_that_bears_out_the_step_is_enough() -> None:
-    measure = Registrations(of_10=9.9)
-    assert linked(measure, step_of()) == measure.asked == [10]
-
-
-@pytest.mark.parametrize("sigmas", [10.1, -10.1, 1e6])
-def test_a_link_that_contradicts_the_step_calls_another_one(sigmas: float) -> None:
+@pytest.mark.parametrize(
+    ("sigmas", "changes", "asked", "found"),
+    [
+        (9.9, {}, [10], [10]),  # it bears out the step
+        *((sigmas, {}, [10, 80], [10, 80]) for sigmas in (10.1, -10.1, 1e6)),  # it contradicts it
+        (None, {}, [10, 80], [80]),  # it fails
+        (1e6, {"gate": None}, [10], [10]),  # nothing contradicts without a gate
+        (0.0, {"link_gain": 4.0}, [], []),  # steady steps tell as much
+    ],
+)
+def test_links_are_asked_for_until_one_bears_out_the_step(
+    sigmas: float | None, changes: dict[str, Any], asked: list[int], found: list[int]
+) -> None:
     measure = Registrations(of_10=sigmas)
-    assert linked(measure, step_of()) == measure.asked == [10, 80]
-
-
-def test_a_link_that_fails_is_stood_in_for() -> None:
-    measure = Registrations(of_10=None)
-    assert linked(measure, step_of()) == [80]
-    assert measure.asked == [10, 80]
+    assert linked(measure, step_of(), **changes) == found
+    assert measure.asked == asked
 
 
 def test_a_step_without_registration_wants_all_links_there_are() -> None:
     measure = Registrations()
     assert linked(measure, step_of(is_registered=False)) == measure.asked == [10, 80]
-
-
-def test_without_a_gate_nothing_contradicts() -> None:
-    measure = Registrations(of_10=1e6)
-    assert linked(measure, step_of(), gate=None) == [10]
 
 
 def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
@@ -105,11 +101,6 @@ def test_the_prediction_is_the_motion_from_the_keyframe() -> None:
 
     link_keyframes(measure, {10: 0.4}, {10: forward(-9.0)}, step_of(), CONFIG, n_unasked={10: 9})
     np.testing.assert_allclose(priors[10], forward(9.0), atol=1e-12)
-
-
-def test_steady_steps_that_tell_as_much_are_not_questioned() -> None:
-    measure = Registrations()
-    assert linked(measure, step_of(), link_gain=4.0) == measure.asked == []
 
 
 def test_an_unsteady_step_is_checked_until_a_keyframe_bears_it_out() -> None:

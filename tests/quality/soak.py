@@ -105,7 +105,6 @@ class EndlessDrive:
         )
 
     def images(self) -> Iterator[StampedImage]:
-        """Yield the images of both cameras, lap after lap."""
         for index in range(self.n_frames):
             pair = self._pairs[index % len(self._T_map_cam)]
             for stream, image in enumerate(pair):
@@ -201,7 +200,6 @@ class Watch:
         self.note(progress.n_done)
 
     def note(self, n_done: int) -> None:
-        """Note how many frames are done."""
         now_s = time.perf_counter()
         self._elapsed_s[(n_done - 1) % self._n_tenth] = now_s - self._last_s
         if n_done % self._n_tenth == 0 and len(self.tenths) < N_TENTHS:
@@ -216,7 +214,8 @@ class Watch:
         return float(sum(self._process.cpu_times()[:2]))
 
     def _end_tenth(self) -> None:
-        cpu_s, n_bytes = self._spent_s(), folder_size(self._folder)
+        cpu_s = self._spent_s()
+        n_bytes = sum(path.stat().st_size for path in self._folder.rglob("*") if path.is_file())
         self.tenths.append(
             Tenth(
                 memory_mb=self.memory_mb(),
@@ -243,13 +242,7 @@ class Watch:
         ]
 
 
-def folder_size(folder: Path) -> int:
-    """Return the bytes of the files in a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
 def show_tenth(number: int, tenth: Tenth) -> None:
-    """Print what a tenth cost."""
     print(
         f"{number:>5} {tenth.memory_mb:>9.1f} {tenth.elapsed_ms:>12.2f} {tenth.cpu_ms:>10.2f} "
         f"{tenth.n_bytes:>10.0f} {tenth.n_threads:>8}",
@@ -334,7 +327,6 @@ class Done:
         self._path, self._offset, self._n_lines = path, 0, 0
 
     def count(self) -> int:
-        """Return the number of rows but for the heading."""
         if self._path.exists():
             with self._path.open("rb") as file:
                 file.seek(self._offset)

@@ -20,10 +20,9 @@ from gvo.io.run_folder.reader import read_run
 from gvo.runs.round_trip import run_round_trip
 from gvo.runs.smooth import optimize_edges, smooth_edges, smooth_lines
 from gvo.types import Progress
-from tests.conftest import GVO, TABLES, python
+from tests.conftest import GVO, TABLES, assert_same_files, line_of_poses, python, run_of
 
 N = 12
-NO_REPORT = gvo.RunOutputs(report=False)
 # All but the times that things took.
 
 
@@ -37,12 +36,10 @@ class Reference:
     """Folders named by numbers of frames: what kill -9 would have left."""
 
     def run(self, out: Path, **options: Any) -> gvo.RunResult:
-        asked: dict[str, Any] = {"outputs": NO_REPORT} | options
-        return gvo.run_recording(gvo.open_recording(self.bag), out, **asked)
+        return run_of(self.bag, out, **options)
 
     def assert_same(self, out: Path) -> None:
-        for name in TABLES:
-            assert (out / name).read_bytes() == (self.folder / name).read_bytes(), name
+        assert_same_files(out, self.folder)
         assert {path.name for path in out.iterdir()} == {
             path.name for path in self.folder.iterdir()
         }
@@ -128,9 +125,7 @@ def test_a_run_that_was_stopped_is_replaced_only_where_that_is_asked_for(
     drive.assert_same(out)
 
 
-def test_a_folder_that_is_written_is_refused_and_the_first_run_goes_on(
-    drive: Reference, tmp_path: Path
-) -> None:
+def test_a_folder_in_use_is_refused_and_its_run_goes_on(drive: Reference, tmp_path: Path) -> None:
     refused: list[str] = []
 
     def start_another(progress: Progress) -> None:
@@ -210,9 +205,7 @@ def test_a_round_trip_on_a_full_disk_says_how_far_it_came(
 
 
 def smooth_file(folder: Path, out: Path) -> None:
-    poses = folder / "poses.txt"
-    poses.write_text("".join(f"{k} {k} 0 0 0 0 0 1\n" for k in range(20)))
-    smooth_edges(open_edges([poses]), out)
+    smooth_edges(open_edges([line_of_poses(folder / "poses.txt")]), out)
 
 
 def smooth_stream(folder: Path, out: Path) -> None:

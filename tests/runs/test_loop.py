@@ -1,25 +1,24 @@
 """The loop of a run: which frames reach the outputs, as poses of what, and how it ends."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry import se3
 from gvo.io.excerpt import Excerpt
 from gvo.io.poses.base_frame import BaseFrame
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.odometry import Odometry
 from gvo.runs.loop import RunLoop
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Estimate, FaultyFrame, FloatArray, Frame, FrameResult, Optimum, Progress
+from tests.recordings import Held, hold
 from tests.rendered_walk import CAMERA, T_BASE_CAM, moved_by_hand
 
 _N_FRAMES = 7
@@ -27,8 +26,6 @@ _N_FRAMES = 7
 
 @dataclass
 class Kept:
-    """An output that keeps what it is given."""
-
     frames: list[FrameResult] = field(default_factory=list)
     faulty: list[FaultyFrame] = field(default_factory=list)
     smoothed: list[Estimate] = field(default_factory=list)
@@ -57,49 +54,27 @@ class Kept:
         }
 
 
-class Rendered:
-    """A rendered recording, rendered once, without some of its images or with an end too early."""
-
-    def __init__(self, sensor: Sensor = "stereo") -> None:
-        source = SyntheticRecording("handheld", sensor, n_frames=_N_FRAMES, scale=0.25)
-        self.info: RecordingInfo = replace(source.info, frame_id=CAMERA)
-        self.items = [_loaded(image) for image in source.images()]
-        self.damage = ""
-
-    def images(self) -> Iterator[StampedImage]:
-        yield from self.items
-        if self.damage:
-            raise RecordingError(self.damage)
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
-
-
-def _loaded(image: StampedImage) -> StampedImage:
-    pixels = image.load()
-
-    def load() -> NDArray[Any]:
-        return pixels
-
-    return replace(image, load=load)
+def rendered(sensor: Sensor = "stereo") -> Held:
+    made = hold(SyntheticRecording("handheld", sensor, n_frames=_N_FRAMES, scale=0.25))
+    return Held(info=replace(made.info, frame_id=CAMERA), items=made.items)
 
 
 @pytest.fixture
-def walk() -> Rendered:
-    return Rendered()
+def walk() -> Held:
+    return rendered()
 
 
-def loop_over(source: Rendered, frame: BaseFrame | None = None, **options: Any) -> RunLoop:
+def loop_over(source: Held, frame: BaseFrame | None = None, **options: Any) -> RunLoop:
     return RunLoop(source, Config(), frame or BaseFrame(CAMERA), **options)
 
 
-def run(source: Rendered, frame: BaseFrame | None = None, **options: Any) -> tuple[Kept, RunLoop]:
+def run(source: Held, frame: BaseFrame | None = None, **options: Any) -> tuple[Kept, RunLoop]:
     kept, loop = Kept(), loop_over(source, frame, **options)
     loop.run([kept], None)
     return kept, loop
 
 
-def test_all_outputs_are_given_all_frames_and_each_smoothed_pose_once(walk: Rendered) -> None:
+def test_all_outputs_are_given_all_frames_and_each_smoothed_pose_once(walk: Held) -> None:
     first, second = Kept(), Kept()
     loop_over(walk).run([first, second], None)
     stamps = [image.stamp_ns for image in walk.items[::2]]
@@ -110,7 +85,7 @@ def test_all_outputs_are_given_all_frames_and_each_smoothed_pose_once(walk: Rend
     assert first == second
 
 
-def test_all_poses_are_of_the_frame_asked_for(walk: Rendered) -> None:
+def test_all_poses_are_of_the_frame_asked_for(walk: Held) -> None:
     camera = run(walk)[0].poses()
     base = run(walk, BaseFrame("base_link", T_BASE_CAM))[0].poses()
     T_initial = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
@@ -121,7 +96,7 @@ def test_all_poses_are_of_the_frame_asked_for(walk: Rendered) -> None:
         np.testing.assert_allclose(placed[name], T_initial @ expected, atol=1e-12)
 
 
-def test_steps_are_of_the_frame_asked_for(walk: Rendered) -> None:
+def test_steps_are_of_the_frame_asked_for(walk: Held) -> None:
     camera = run(walk)[0].frames
     base = run(walk, BaseFrame("base_link", T_BASE_CAM))[0].frames
     assert camera[0].T_previous_frame is base[0].T_previous_frame is None
@@ -133,7 +108,7 @@ def test_steps_are_of_the_frame_asked_for(walk: Rendered) -> None:
 
 
 def test_the_correction_of_the_map_is_one_of_the_world_asked_for(
-    walk: Rendered, monkeypatch: pytest.MonkeyPatch
+    walk: Held, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     T_map_world = se3.exp(np.array([0.1, 0.0, 0.2, 1.0, 2.0, 3.0]))
     track = Odometry.track
@@ -165,7 +140,7 @@ class Torn(Kept):
         raise RecordingError("torn at the end")
 
 
-def test_all_outputs_but_those_that_cannot_write_are_given_the_optimum(walk: Rendered) -> None:
+def test_all_outputs_but_those_that_cannot_write_are_given_the_optimum(walk: Held) -> None:
     first, early, late, last = Kept(), Torn(is_at_end=False), Torn(is_at_end=True), Kept()
     loop = loop_over(walk, BaseFrame("base_link", T_BASE_CAM))
     loop.run([first, early, late, last], None)
@@ -178,9 +153,7 @@ def test_all_outputs_but_those_that_cannot_write_are_given_the_optimum(walk: Ren
     np.testing.assert_allclose(poses, last.poses()["smoothed"], atol=0.05)
 
 
-def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(
-    walk: Rendered,
-) -> None:
+def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(walk: Held) -> None:
     asked: list[int] = []
     T_first = se3.exp(np.array([0.1, 0.2, 0.3, 4.0, 5.0, 6.0]))
 
@@ -194,7 +167,7 @@ def test_the_first_pose_is_asked_for_once_with_the_first_stamp_that_is_read(
     np.testing.assert_allclose(kept.frames[0].raw.T_world_frame, T_first, atol=1e-12)
 
 
-def test_only_the_excerpt_is_tracked_and_announced(walk: Rendered) -> None:
+def test_only_the_excerpt_is_tracked_and_announced(walk: Held) -> None:
     told: list[Progress] = []
     kept, loop = Kept(), loop_over(walk, excerpt=Excerpt(every=3))
     loop.run([kept], told.append)
@@ -203,9 +176,7 @@ def test_only_the_excerpt_is_tracked_and_announced(walk: Rendered) -> None:
     assert [(progress.n_done, progress.n_total) for progress in told] == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(
-    walk: Rendered,
-) -> None:
+def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(walk: Held) -> None:
     walk.items, walk.damage = walk.items[:8], "the last 3 frames are missing"
     kept, loop = run(walk)
     assert len(kept.frames) == len(kept.smoothed) == 4
@@ -215,7 +186,7 @@ def test_a_break_in_the_recording_is_noted_and_ends_the_run_with_all_poses(
 
 @pytest.mark.parametrize(("sensor", "n_lost"), [("stereo", 1), ("rgbd", 0)])
 def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lost: int) -> None:
-    source = Rendered(sensor)
+    source = rendered(sensor)
     del source.items[7]
     kept, loop = run(source)
     assert len(kept.frames) == _N_FRAMES - 1
@@ -224,7 +195,7 @@ def test_an_image_without_partner_is_a_loss_of_stereo_alone(sensor: Sensor, n_lo
     assert loop.statistics.is_complete == (n_lost == 0)
 
 
-def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Rendered) -> None:
+def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Held) -> None:
     kept = Kept()
 
     def interrupt(progress: Progress) -> None:
@@ -236,7 +207,7 @@ def test_interrupted_it_hands_out_the_poses_that_the_window_holds(walk: Rendered
     assert len(kept.frames) == len(kept.smoothed) == 5
 
 
-def test_opencv_gets_its_threads_back(walk: Rendered) -> None:
+def test_opencv_gets_its_threads_back(walk: Held) -> None:
     n_before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     n_inside = 0

@@ -19,7 +19,7 @@ from gvo.testing import faults as made
 from gvo.testing.faults import FaultySource
 from gvo.trajectory.formats import read_covariances, write_kitti
 from gvo.trajectory.trajectory import Trajectory
-from tests.conftest import Command
+from tests.conftest import Command, run_of
 from tests.io.pose_bags import PoseBag
 from tests.rendered_walk import (
     CAMERA,
@@ -36,9 +36,6 @@ from tests.rendered_walk import (
     true_poses,
     truth_stamps,
 )
-
-NO_REPORT = gvo.RunOutputs(report=False)
-
 
 UNREADABLE = made.Unloadable(message="the image is of zero size")
 
@@ -129,7 +126,7 @@ def test_a_picture_is_drawn(run_dir: Path) -> None:
 def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, threads: int) -> None:
     config = gvo.load_configuration(settings=[f"runtime.threads={threads}"])
     for out in (tmp_path / "a", tmp_path / "b"):
-        gvo.run_recording(gvo.open_recording(room_bag), out, outputs=NO_REPORT, config=config)
+        run_of(room_bag, out, config=config)
         config = gvo.Config()
     names = {path.name for path in (tmp_path / "a").glob("*.[tcg][xs2][tvo]")} - {"timings.csv"}
     assert len(names) == 13
@@ -139,7 +136,7 @@ def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, thre
 
 def test_a_faulty_frame_is_skipped_and_counted(room: SyntheticRecording, tmp_path: Path) -> None:
     faulty = FaultySource(room, replace(UNREADABLE, first=3, end=5))
-    result = gvo.run_recording(faulty, tmp_path, outputs=NO_REPORT)
+    result = run_of(faulty, tmp_path)
     assert not result.is_complete
     assert result.summary["status_counts"]["skipped"] == 2
     assert len(gvo.read_trajectory(tmp_path / "raw.txt")) == 10
@@ -148,9 +145,7 @@ def test_a_faulty_frame_is_skipped_and_counted(room: SyntheticRecording, tmp_pat
     assert len(rows) == 12
 
 
-def test_a_recording_without_a_usable_frame_is_refused(
-    room: SyntheticRecording, tmp_path: Path
-) -> None:
+def test_a_recording_without_a_frame_is_refused(room: SyntheticRecording, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"no usable frame.*zero size"):
         gvo.run_recording(FaultySource(room, UNREADABLE), tmp_path)
 
@@ -158,7 +153,7 @@ def test_a_recording_without_a_usable_frame_is_refused(
 def test_a_truth_of_another_time_is_a_warning(room: SyntheticRecording, tmp_path: Path) -> None:
     truth = room.ground_truth()
     late = Trajectory(stamps_ns=truth.stamps_ns + 10**12, T_world_frame=truth.T_world_frame)
-    result = gvo.run_recording(room, tmp_path, outputs=NO_REPORT, ground_truth=late)
+    result = run_of(room, tmp_path, ground_truth=late)
     assert result.evaluations == ()
     assert "not compared" in result.warnings[0]
 
@@ -170,9 +165,7 @@ class TruthlessSource(FaultySource):
         raise TrajectoryError("groundtruth.txt: line 3: expected 8 numbers, got 2")
 
 
-def test_a_malformed_truth_of_the_recording_is_a_warning(
-    room: SyntheticRecording, tmp_path: Path
-) -> None:
+def test_a_malformed_recorded_truth_is_a_warning(room: SyntheticRecording, tmp_path: Path) -> None:
     result = gvo.run_recording(TruthlessSource(room), tmp_path)
     assert result.is_complete
     assert "line 3" in result.warnings[0]
@@ -182,7 +175,7 @@ def test_a_malformed_truth_of_the_recording_is_a_warning(
 
 def test_colour_without_depth_makes_no_frame(room: SyntheticRecording, tmp_path: Path) -> None:
     lonely = FaultySource(room, made.Dropped(first=2, end=6, every=3, streams=(1,)))
-    result = gvo.run_recording(lonely, tmp_path, outputs=NO_REPORT)
+    result = run_of(lonely, tmp_path)
     assert result.is_complete
     assert result.summary["frames"] == 10
     assert result.summary["unpaired_images"] == 2
@@ -205,15 +198,11 @@ def test_poses_without_stamps_belong_to_the_frames_in_their_order(
 ) -> None:
     truth = room.ground_truth()
     write_kitti(tmp_path / "poses.txt", truth)
-    expected = gvo.run_recording(room, tmp_path / "a", outputs=NO_REPORT).evaluations
+    expected = run_of(room, tmp_path / "a").evaluations
     poses = gvo.read_trajectory(tmp_path / "poses.txt")
-    found = gvo.run_recording(
-        room, tmp_path / "b", outputs=NO_REPORT, ground_truth=poses
-    ).evaluations
+    found = run_of(room, tmp_path / "b", ground_truth=poses).evaluations
     assert found[0].ate_m == pytest.approx(expected[0].ate_m, abs=1e-9)
-    short = gvo.run_recording(
-        room, tmp_path / "c", outputs=NO_REPORT, ground_truth=poses.select(slice(0, 9))
-    )
+    short = run_of(room, tmp_path / "c", ground_truth=poses.select(slice(0, 9)))
     assert not short.is_complete
     assert "not compared" in short.warnings[0]
 
@@ -260,13 +249,9 @@ def _assert_moved(
             np.testing.assert_allclose(mine, wanted, atol=1e-5 * np.abs(wanted).max(initial=0.0))
 
 
-def test_poses_and_covariances_of_the_base_follow_from_those_of_the_camera(
-    walk_bag: Path, walk_run: Path, tmp_path: Path
-) -> None:
+def test_the_base_follows_from_the_camera(walk_bag: Path, walk_run: Path, tmp_path: Path) -> None:
     source = gvo.open_recording([walk_bag, on_a_robot(tmp_path / "tf.mcap").write()])
-    result = gvo.run_recording(
-        source, tmp_path / "out", outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
-    )
+    result = run_of(source, tmp_path / "out", base_frame=find_base_frame(source, "base_link"))
     assert result.summary["base_frame"] == "base_link"
     assert result.is_complete
     _assert_moved(tmp_path / "out", walk_run, T_BASE_CAM)
@@ -293,23 +278,16 @@ def test_a_camera_on_a_head_that_turns_is_placed_at_each_stamp(
 ) -> None:
     bag = _on_a_head(tmp_path / "tf.mcap", truth_stamps(rate_hz=20))
     source = gvo.open_recording([walk_bag, bag.write()])
-    out = tmp_path / "out"
-    result = gvo.run_recording(
-        source, out, outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
-    )
+    result = run_of(source, tmp_path / "out", base_frame=find_base_frame(source, "base_link"))
     assert result.warnings == ()
-    _assert_moved(out, walk_run, _panned(STAMPS_NS))
+    _assert_moved(tmp_path / "out", walk_run, _panned(STAMPS_NS))
 
 
-def test_a_head_of_which_tf_tells_too_late_is_guessed_with_a_warning(
-    walk_bag: Path, walk_run: Path, tmp_path: Path
-) -> None:
+def test_a_head_told_too_late_is_guessed(walk_bag: Path, walk_run: Path, tmp_path: Path) -> None:
     bag = _on_a_head(tmp_path / "tf.mcap", STAMPS_NS[3:])
     source = gvo.open_recording([walk_bag, bag.write()])
     out = tmp_path / "out"
-    result = gvo.run_recording(
-        source, out, outputs=NO_REPORT, base_frame=find_base_frame(source, "base_link")
-    )
+    result = run_of(source, out, base_frame=find_base_frame(source, "base_link"))
     assert result.warnings[0].startswith("tf does not say where the camera is")
     assert "at 3 stamps" in result.warnings[0]
     _assert_moved(out, walk_run, _panned(np.maximum(STAMPS_NS, STAMPS_NS[3])))
@@ -328,7 +306,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
         bag.fix(stamp_ns, place)
     source = gvo.open_recording([walk_bag, bag.write()])
     truth = read_truth(source, "/fix")
-    result = gvo.run_recording(source, tmp_path / "out", outputs=NO_REPORT, ground_truth=truth)
+    result = run_of(source, tmp_path / "out", ground_truth=truth)
     assert result.warnings == ()
     exact = true_poses(STAMPS_NS)
     points = exact[:, :3, :3] @ p_cam + exact[:, :3, 3]
@@ -342,9 +320,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
         assert evaluation.ate_m < 4 * at_camera < 0.02
 
 
-def test_a_bag_that_cannot_be_written_leaves_no_folder(
-    room: SyntheticRecording, tmp_path: Path
-) -> None:
+def test_a_bag_that_is_refused_leaves_no_folder(room: SyntheticRecording, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_text("mine")
     outputs = gvo.RunOutputs(bag=tmp_path / "run.mcap")
     with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):

@@ -26,9 +26,9 @@ MOVED = make_transform(np.eye(3), np.array([0.1, 0.2, 0.3]))
 class Recording:
     """A recording of three pairs of grey images."""
 
-    def __init__(self, *, grey: int = 7) -> None:
+    def __init__(self, *, grey: int = 7, **changes: Any) -> None:
         rendered = SyntheticRecording("driving", "stereo", n_frames=3, scale=0.25)
-        self.info = rendered.info
+        self.info = replace(rendered.info, **changes)
         self._grey = grey
 
     def images(self) -> Iterator[StampedImage]:
@@ -50,16 +50,9 @@ def identity(recording: Recording | None = None, **options: Any) -> dict[str, An
     return run_identity(recording or Recording(), **(asked | options))
 
 
-def more_images(recording: Recording) -> Recording:
-    recording.info = replace(recording.info, n_images=99)
-    return recording
-
-
-def other_calibration(recording: Recording) -> Recording:
-    first, second = recording.info.calibrations
-    moved = replace(first, K=first.K + np.array([[0.0, 0.0, 1e-9], [0, 0, 0], [0, 0, 0]]))
-    recording.info = replace(recording.info, calibrations=(moved, second))
-    return recording
+def other_calibrations() -> Any:
+    first, second = Recording().info.calibrations
+    return replace(first, K=first.K + 1e-9 * np.eye(3, k=2)), second
 
 
 def test_the_same_run_is_the_same_as_a_file_gives_it_back() -> None:
@@ -73,8 +66,8 @@ def test_the_same_run_is_the_same_as_a_file_gives_it_back() -> None:
     [
         {"recording": Recording(grey=8)},
         {"recording": Recording(grey=-1)},
-        {"recording": more_images(Recording())},
-        {"recording": other_calibration(Recording())},
+        {"recording": Recording(n_images=99)},
+        {"recording": Recording(calibrations=other_calibrations())},
         {"excerpt": Excerpt(every=2)},
         {"excerpt": Excerpt(duration_s=5.0)},
         {"base_frame": BaseFrame("base_link")},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,47 +16,22 @@ from gvo.config import Config
 from gvo.diagnostics.check import check_recording
 from gvo.errors import GvoError
 from gvo.geometry import se3
-from gvo.io.recording import RecordingInfo, Sensor, StampedImage
+from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.run import run_recording
 from gvo.testing.faults import FaultyImage, FaultySource
 from gvo.trajectory.formats import read_covariances, read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
+from tests.conftest import run_of
+from tests.recordings import Held, hold
 from tests.testing.catalogue import NamedFault
 
 _SCALE = 0.4
 
 
-@dataclass(frozen=True)
-class Held:
-    """A recording as a list of images, each rendered once at most."""
-
-    info: RecordingInfo
-    items: tuple[StampedImage, ...]
-    truth: Trajectory
-
-    def images(self) -> Iterator[StampedImage]:
-        yield from self.items
-
-    def ground_truth(self) -> Trajectory:
-        return self.truth
-
-    def cut(self, n_frames: int) -> Held:
-        """Return the first frames."""
-        return Held(
-            info=replace(self.info, n_images=n_frames),
-            items=self.items[: 2 * n_frames],
-            truth=self.truth.select(slice(0, n_frames)),
-        )
-
-
 @cache
 def _rendered(sensor: Sensor) -> Held:
-    source = SyntheticRecording("handheld", sensor, n_frames=330, scale=_SCALE)
-    items = tuple(replace(image, load=cache(image.load)) for image in source.images())
-    return Held(info=source.info, items=items, truth=source.ground_truth())
+    return hold(SyntheticRecording("handheld", sensor, n_frames=330, scale=_SCALE))
 
 
 def sound(sensor: Sensor, n_frames: int = 20) -> Held:
@@ -86,14 +61,14 @@ class Outcome:
     deviations: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def n(self, status: str) -> int:
-        """Count the frames of a status."""
         return sum(row["status"] == status for row in self.rows)
 
 
-def run(source: FaultySource, truth: Trajectory, out: Path) -> Outcome:
+def run(source: FaultySource, truth: Trajectory | None, out: Path) -> Outcome:
     """Run odometry; only a GvoError may come out of it, as the command line catches it."""
+    assert truth is not None
     try:
-        result = run_recording(source, out, outputs=RunOutputs(report=False))
+        result = run_of(source, out)
     except GvoError as error:
         return Outcome(exit_code=2, message=str(error))
     with (out / "frames.csv").open(newline="") as file:

@@ -17,15 +17,8 @@ from gvo.geometry import se3
 from gvo.io.recording import Sensor
 from gvo.testing import ContractError, check_frontend
 from gvo.testing.frontend import fingerprint
-from gvo.types import (
-    Failure,
-    FaultyFrame,
-    FloatArray,
-    Frame,
-    MotionPrior,
-    Observations,
-    RelativePose,
-)
+from gvo.types import Failure, FloatArray, Frame, MotionPrior, Observations, RelativePose
+from tests.recordings import frames_of
 
 Result = RelativePose | Failure
 
@@ -37,11 +30,7 @@ def recording(sensor: Sensor) -> gvo.SyntheticRecording:
 
 @cache
 def frames(sensor: Sensor) -> list[Frame]:
-    return [
-        frame
-        for frame in gvo.frames(recording(sensor), Config())
-        if not isinstance(frame, FaultyFrame)
-    ]
+    return frames_of(recording(sensor))
 
 
 def configure(kind: str = "klt") -> Config:

@@ -22,12 +22,10 @@ def random_trajectory(seed: int, n: int = 12, *, size_m: float = 1.0) -> Traject
 
 
 def unturned(positions: FloatArray) -> FloatArray:
-    """Return poses (n, 4, 4) at these positions (n, 3)."""
     return se3.make_transform(np.tile(np.eye(3), (len(positions), 1, 1)), positions)
 
 
 def straight(n: int, step_m: float = 1.0) -> Trajectory:
-    """Return steps along z at 10 Hz."""
     positions = step_m * np.outer(np.arange(n), [0.0, 0.0, 1.0])
     return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=unturned(positions))
 
@@ -37,3 +35,10 @@ def still(stamps_ns: list[int], stamps_from: StampsFrom = "file") -> Trajectory:
     return Trajectory(
         stamps_ns=np.array(stamps_ns, dtype=np.int64), T_world_frame=poses, stamps_from=stamps_from
     )
+
+
+def circle(n: int, seed: int = 0) -> Trajectory:
+    twist = np.array([0.0, 0.02, 0.0, 0.1, 0.0, 1.0])
+    T = np.array([se3.exp(k * twist) for k in range(n)])
+    start = se3.exp(np.random.default_rng(seed).normal(size=6))
+    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=start @ T)

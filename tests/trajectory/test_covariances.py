@@ -7,16 +7,10 @@ from gvo.geometry import se3
 from gvo.trajectory.evaluation import Motions, consistency, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
+from tests.trajectory.paths import circle
 
 # Of a step of 0.1 s, at its end.
 COVARIANCE = np.diag([1e-6, 4e-6, 1e-6, 1e-4, 1e-4, 9e-4])
-
-
-def circle(n: int, seed: int = 0) -> Trajectory:
-    twist = np.array([0.0, 0.02, 0.0, 0.1, 0.0, 1.0])
-    T = np.array([se3.exp(k * twist) for k in range(n)])
-    start = se3.exp(np.random.default_rng(seed).normal(size=6))
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=start @ T)
 
 
 def chain_along(truth: Trajectory, *, stated: float = 1.0) -> Trajectory:
@@ -91,9 +85,7 @@ def test_the_truth_is_interpolated_at_the_stamps_of_the_estimate() -> None:
     between = truth.interpolate(truth.stamps_ns[:-1] + 50_000_000)
     covariances = np.tile(COVARIANCE, (len(between), 1, 1))
     estimate = Trajectory(
-        stamps_ns=between.stamps_ns,
-        T_world_frame=between.T_world_frame,
-        covariances=covariances,
+        stamps_ns=between.stamps_ns, T_world_frame=between.T_world_frame, covariances=covariances
     )
     stamps_ns = between.stamps_ns
     motions = Motions(

@@ -1,6 +1,5 @@
 """What is explained is what happened in a run."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
@@ -8,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from gvo._trace import Event, Trace
 from gvo.backend.keyframe_policy import choose_links
@@ -17,12 +17,12 @@ from gvo.diagnostics.explain.steps import explain_consensus, explain_refinement
 from gvo.errors import GvoError
 from gvo.geometry import se3
 from gvo.io.frames import frames
-from gvo.io.recording import RecordingInfo, Sensor, Source, StampedImage
+from gvo.io.recording import Sensor, Source, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.odometry.keyframes import Keyframes
 from gvo.odometry.odometry import Odometry
-from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FaultyFrame, FrameResult, Progress
+from tests.recordings import Held, hold
 
 KINDS = ("klt", "descriptor")
 SENSORS: tuple[Sensor, ...] = ("stereo", "rgbd")
@@ -31,29 +31,16 @@ LAST = 4
 BLACK = 2
 
 
-class Spoiled:
-    """A rendered recording with a black frame, or one whose images cannot be read."""
+def spoiled(*, is_faulty: bool = False) -> Held:
+    """Return a recording with a black frame, or one whose images cannot be read."""
 
-    def __init__(self, inner: SyntheticRecording, *, is_faulty: bool = False) -> None:
-        self._inner = inner
-        self._is_faulty = is_faulty
+    def spoil(image: StampedImage) -> NDArray[Any]:
+        return np.zeros((3, 3), np.uint8) if is_faulty else np.zeros_like(image.load())
 
-    @property
-    def info(self) -> RecordingInfo:
-        return self._inner.info
-
-    def images(self) -> Iterator[StampedImage]:
-        for index, image in enumerate(self._inner.images()):
-            if index // 2 != BLACK:
-                yield image
-            elif self._is_faulty:
-                yield replace(image, load=lambda: np.zeros((3, 3), np.uint8))
-            else:
-                black = np.zeros_like(image.load())
-                yield replace(image, load=partial(np.copy, black))
-
-    def ground_truth(self) -> Trajectory | None:
-        return None
+    whole = hold(recording("stereo"))
+    return replace(whole, truth=None).mapped(
+        lambda image, n: replace(image, load=partial(spoil, image)) if n == BLACK else image
+    )
 
 
 def configuration(kind: str) -> Config:
@@ -94,11 +81,7 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
     assert np.array_equal(se3.invert(T_end), registration.T_reference_current)
     assert explanation.result.registration is not None
     for name in (
-        "T_reference_current",
-        "covariance",
-        "inliers",
-        "matches",
-        "pixels_reference",
+        *("T_reference_current", "covariance", "inliers", "matches", "pixels_reference"),
         "pixels_current",
     ):
         shown = getattr(explanation.result.registration, name)
@@ -111,9 +94,7 @@ def test_the_explained_registration_is_that_of_a_run_bit_for_bit(kind: str, sens
 
 
 @EACH
-def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
-    kind: str, sensor: Sensor
-) -> None:
+def test_each_keypoint_has_one_reason_and_those_kept_are_points(kind: str, sensor: Sensor) -> None:
     explanation = explained(kind, sensor)
     counts = explanation.measured.counts()
     assert sum(counts.values()) == explanation.result.n_keypoints
@@ -121,9 +102,7 @@ def test_each_keypoint_has_one_reason_and_the_kept_ones_are_the_points(
 
 
 @EACH
-def test_the_keypoints_within_the_budget_are_those_that_were_measured(
-    kind: str, sensor: Sensor
-) -> None:
+def test_the_keypoints_in_the_budget_are_those_measured(kind: str, sensor: Sensor) -> None:
     explanation = explained(kind, sensor)
     keypoints, measured = explanation.keypoints, explanation.measured.pixels
     kept = keypoints.pixels[keypoints.are_kept]
@@ -134,9 +113,7 @@ def test_the_keypoints_within_the_budget_are_those_that_were_measured(
 
 
 @pytest.mark.parametrize(("kind", "reach_px"), [("klt", 1.0 - 1e-6), ("descriptor", 0.5 + 1e-6)])
-def test_the_search_for_a_fraction_of_a_pixel_ends_at_the_match_near_the_least_difference(
-    kind: str, reach_px: float
-) -> None:
+def test_subpixel_search_ends_near_the_least_difference(kind: str, reach_px: float) -> None:
     step = explained(kind, "stereo").subpixel
     assert step is not None
     assert step.iterates_px[-1] == step.disparity_px
@@ -144,9 +121,7 @@ def test_the_search_for_a_fraction_of_a_pixel_ends_at_the_match_near_the_least_d
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_scores_of_keyframes_are_those_that_the_odometry_chose_by(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scores_of_keyframes_are_the_odometrys(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[dict[int, float]] = []
     original = Keyframes.scores
 
@@ -275,7 +250,7 @@ def test_a_first_frame_is_explained_without_a_motion() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_black_frame_and_the_one_after_are_explained_as_far_as_they_got(kind: str) -> None:
-    source = Spoiled(recording("stereo"))
+    source = spoiled()
     black = explain_frame(source, BLACK, config=configuration(kind))
     assert black.result.registration is None
     assert black.result.reason
@@ -287,7 +262,7 @@ def test_a_black_frame_and_the_one_after_are_explained_as_far_as_they_got(kind: 
 
 
 def test_a_faulty_frame_is_refused_in_one_line_and_counts() -> None:
-    source = Spoiled(recording("stereo"), is_faulty=True)
+    source = spoiled(is_faulty=True)
     with pytest.raises(GvoError, match=f"frame {BLACK} is faulty") as error:
         explain_frame(source, BLACK)
     assert "\n" not in str(error.value)
@@ -300,8 +275,6 @@ def test_a_faulty_frame_is_refused_in_one_line_and_counts() -> None:
     ("index", "kind", "words"),
     [(LAST + 1, GvoError, f"no frame {LAST + 1}.*up to {LAST}"), (-1, ValueError, "0 or more")],
 )
-def test_a_frame_that_is_not_there_is_refused(
-    index: int, kind: type[Exception], words: str
-) -> None:
+def test_a_frame_not_there_is_refused(index: int, kind: type[Exception], words: str) -> None:
     with pytest.raises(kind, match=words):
         explain_frame(recording("stereo"), index)

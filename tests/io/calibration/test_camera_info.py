@@ -98,12 +98,9 @@ def test_depth_is_not_rectified_by_a_camera_that_turns() -> None:
         np.testing.assert_array_equal(calibration.R, np.eye(3))
 
 
-def test_the_distortion_model_of_rectified_images_does_not_matter() -> None:
+def test_the_model_of_rectified_images_or_without_distortion_does_not_matter() -> None:
     fields = _fields(model="rational_polynomial", D=[0.1] * 8)
     assert not np.any(make_calibration(fields, is_rectified=True).D)
-
-
-def test_a_model_without_distortion_does_not_matter_either() -> None:
     fields = _fields(model="Brown Conrady", D=np.zeros(5))
     assert not np.any(make_calibration(fields, is_rectified=False).D)
 

@@ -34,7 +34,6 @@ def noise_texture() -> Texture:
 
 
 def screen(z: float, *, half: float = 2.0, texture: str = "t", **options: Any) -> Rectangle:
-    """Return a rectangle square to the optical axis."""
     return Rectangle(
         corner=(-half, -half, z),
         edge_s=(2 * half, 0, 0),
@@ -66,7 +65,7 @@ def intersect_one_by_one(
     return depth, margin
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     angles=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
     position=st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)),
@@ -90,8 +89,8 @@ def test_depth_is_that_of_rays_intersected_one_by_one(angles: Triple, position: 
 
 
 def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() -> None:
-    ground = Rectangle(corner=(-50, 1.5, -50), edge_s=(100, 0, 0), edge_t=(0, 0, 100), texture="t")
-    depth = render_depth(scene_of(_turned_up(ground)), np.eye(4), CAMERA)
+    ground = Rectangle(corner=(-50, 1.5, 50), edge_s=(100, 0, 0), edge_t=(0, 0, -100), texture="t")
+    depth = render_depth(scene_of(ground), np.eye(4), CAMERA)
     rows = np.arange(CAMERA.height)
     expected = 1.5 * CAMERA.fy / (rows[30:] - CAMERA.cy)
     np.testing.assert_allclose(depth[30:], np.broadcast_to(expected[:, None], (18, 64)), rtol=1e-6)
@@ -119,15 +118,6 @@ def test_in_a_whole_world_nothing_is_nearer_than_what_is_seen(build: Any, move: 
     seen = depth[v, u]
     assert np.all(seen <= nearest * (1 + 1e-5))
     assert np.mean(np.abs(seen - nearest) < 1e-5 * nearest) > 0.8  # the rest: behind cut-outs
-
-
-def _turned_up(ground: Rectangle) -> Rectangle:
-    return Rectangle(
-        corner=np.add(ground.corner, ground.edge_t),
-        edge_s=ground.edge_s,
-        edge_t=np.negative(ground.edge_t),
-        texture=ground.texture,
-    )
 
 
 def test_the_nearer_surface_hides_the_farther_in_any_order() -> None:

@@ -9,6 +9,7 @@ import gvo
 from gvo.errors import ConfigurationError
 from gvo.io.poses.base_frame import BaseFrame
 from gvo.runs.outputs.options import name_frames
+from tests.conftest import run_of
 from tests.rendered_walk import CAMERA, T_BASE_CAM, Walk
 
 
@@ -35,6 +36,6 @@ def test_plots_without_a_report_are_refused() -> None:
 
 
 def test_without_a_report_nothing_is_drawn(tmp_path: Path) -> None:
-    gvo.run_recording(Walk(), tmp_path, outputs=gvo.RunOutputs(report=False))
+    run_of(Walk(), tmp_path)
     suffixes = {path.suffix for path in tmp_path.iterdir()}
     assert suffixes == {".txt", ".csv", ".json", ".g2o"}

@@ -138,7 +138,10 @@ def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
     camera = recording.info.camera
     loop = loop_of(pairs[2][0].stamp_ns, pairs[0][0].stamp_ns)
     ends_ns = loop.stamp_ns + 1_000_000_000
-    late = [(_shifted(frame, ends_ns + n), result) for n, (frame, result) in enumerate(pairs[5:7])]
+    late = [
+        (replace(frame, stamp_ns=ends_ns + n), result)
+        for n, (frame, result) in enumerate(pairs[5:7])
+    ]
     shown = [*pairs[:4], *late]
     with RunOverlay(tmp_path / "frames", camera) as output:
         for n, (frame, result) in enumerate(shown):
@@ -151,10 +154,6 @@ def test_a_loop_is_marked_for_a_second(drive: _Run, tmp_path: Path) -> None:
         plain = compose_overlay(frame, result, camera, index=n, max_width=film_width(camera))
         is_marked.append(bool(np.any(cv2.imread(str(file)) != plain)))
     assert is_marked == [False, False, True, True, True, False]
-
-
-def _shifted(frame: Frame, stamp_ns: int) -> Frame:
-    return replace(frame, stamp_ns=stamp_ns)
 
 
 def test_what_cannot_be_written_is_told_to_the_run(drive: _Run, tmp_path: Path) -> None:

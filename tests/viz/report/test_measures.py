@@ -10,21 +10,10 @@ from gvo.geometry import se3
 from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, chi2_bound, evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from gvo.viz.report.measures import (
-    chi2_density,
-    compare,
-    drift,
-    drift_lengths,
-)
+from gvo.viz.report.measures import chi2_density, compare, drift, drift_lengths
+from tests.trajectory.paths import circle
 
 COVARIANCE = np.diag([1e-4, 4e-4, 1e-4, 1e-2, 1e-2, 9e-2])
-
-
-def circle(n: int, seed: int = 0) -> Trajectory:
-    twist = np.array([0.0, 0.02, 0.0, 0.1, 0.0, 1.0])
-    T = np.array([se3.exp(k * twist) for k in range(n)])
-    start = se3.exp(np.random.default_rng(seed).normal(size=6))
-    return Trajectory(stamps_ns=np.arange(n) * 100_000_000, T_world_frame=start @ T)
 
 
 def disturbed(truth: Trajectory, covariance: FloatArray, *, stated: float = 1.0) -> Trajectory:

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -14,28 +13,18 @@ from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs.outputs.options import RunOutputs
-from gvo.runs.run import run_recording
 from gvo.trajectory.evaluation import evaluate
 from gvo.trajectory.formats import write_covariances, write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.palette import Style
 from gvo.viz.report import write_comparison_report, write_run_report
 from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure
+from tests.conftest import run_of
+from tests.viz.report_page import Page
 
 SECTIONS = [
-    "above",
-    "side",
-    "space",
-    "errors_over_time",
-    "errors_over_distance",
-    "drift",
-    "covariance",
-    "status",
-    "counts",
-    "timings",
-    "chi2",
-    "chi2_histogram",
+    *("above", "side", "space", "errors_over_time", "errors_over_distance", "drift", "covariance"),
+    *("status", "counts", "timings", "chi2", "chi2_histogram"),
 ]
 
 
@@ -43,7 +32,7 @@ SECTIONS = [
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run")
     recording = SyntheticRecording("driving", "stereo", n_frames=12, scale=0.25)
-    run_recording(recording, path, outputs=RunOutputs(report=False))
+    run_of(recording, path)
     return path
 
 
@@ -61,33 +50,8 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 
 
 def rewrite_summary(folder: Path, **fields: object) -> None:
-    """Replace fields of the summary of a run."""
     path = folder / "summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
-
-
-class _Page(HTMLParser):
-    """Collects ids, links and the sections that hold a drawing."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.ids: list[str] = []
-        self.links: list[str] = []
-        self.drawn: list[str] = []
-        self.scripts = 0
-        self._section = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = {name: value or "" for name, value in attrs}
-        if "id" in values:
-            self.ids.append(values["id"])
-        self.links += [values[n] for n in ("href", "src", "xlink:href") if n in values]
-        self.scripts += tag == "script"
-        if tag == "section":
-            self._section = values.get("id", "")
-        if tag == "svg" and values.get("role") == "img":
-            self.drawn.append(self._section)
 
 
 def page_of(folder: Path) -> str:
@@ -97,23 +61,13 @@ def page_of(folder: Path) -> str:
 
 
 def test_each_section_is_there_and_drawn(page: Path) -> None:
-    content = _Page(page.read_text())
+    content = Page(page.read_text())
     assert [name for name in content.ids if name in SECTIONS] == SECTIONS
     assert content.drawn == SECTIONS
 
 
 def test_nothing_outside_is_referred_to_and_no_id_is_there_twice(page: Path) -> None:
-    text = page.read_text()
-    content = _Page(text)
-    assert len(content.ids) == len({*content.ids})
-    assert "http" not in text
-    assert "@import" not in text
-    references = [link[1:] for link in content.links if link.startswith("#")]
-    references += re.findall(r"url\(#([^)]*)\)", text)
-    assert references
-    assert {*references} <= {*content.ids}
-    assert [link for link in content.links if not link.startswith("#")] == ["data:,"]
-    assert not re.search(r"url\((?!#)", text)
+    assert Page(page.read_text()).assert_nothing_outside()
 
 
 def test_equal_input_gives_equal_files(page: Path, folder: Path, tmp_path: Path) -> None:
@@ -129,7 +83,7 @@ def test_equal_input_gives_equal_files(page: Path, folder: Path, tmp_path: Path)
 
 def test_texts_of_the_recording_are_escaped(page: Path, copy: Path) -> None:
     evil = "</title></script><script>alert(1)</script>\"'><img onload='x'>&"
-    n_scripts = _Page(page.read_text()).scripts
+    n_scripts = Page(page.read_text()).tags.count("script")
     rewrite_summary(copy, recording=evil, warnings=[evil], decisions=[evil], sensor=evil)
     rewrite_summary(copy, ground_truth=f"none: {evil}", configuration={"frontend": {"kind": evil}})
     (copy / "ground_truth.txt").unlink()
@@ -139,7 +93,7 @@ def test_texts_of_the_recording_are_escaped(page: Path, copy: Path) -> None:
     assert "<script>alert" not in text
     assert "<img onload" not in text
     assert text.count("&lt;script&gt;alert(1)") >= 6
-    assert _Page(text).scripts == n_scripts
+    assert Page(text).tags.count("script") == n_scripts
 
 
 def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
@@ -152,8 +106,8 @@ def test_names_of_estimates_are_escaped_everywhere(tmp_path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert "<script>alert" not in text
     assert "<img onload" not in text
-    assert _Page(text).scripts == 2
-    assert _Page(text).drawn == SECTIONS[:6]
+    assert Page(text).tags.count("script") == 2
+    assert Page(text).drawn == SECTIONS[:6]
 
 
 def write_loops(folder: Path, n: int, *, reason: str) -> None:
@@ -170,7 +124,7 @@ def write_loops(folder: Path, n: int, *, reason: str) -> None:
 def test_loops_are_counted_drawn_and_listed(copy: Path, page: Path) -> None:
     assert "no loop found; global is the batch optimum of the same edges." in page.read_text()
     assert "Thin lines" not in page.read_text()
-    assert "loops" not in _Page(page.read_text()).ids
+    assert "loops" not in Page(page.read_text()).ids
     write_loops(copy, 90, reason="odd & <b>")
     text = page_of(copy)
     assert "<p>45 loops closed, 45 refused (45: odd &amp; &lt;b&gt;).</p>" in text
@@ -203,7 +157,7 @@ def test_without_truth_a_sentence_says_why(copy: Path) -> None:
     rewrite_summary(copy, ground_truth="none: nobody measured it", errors=[])
     text = page_of(copy)
     assert text.count("nobody measured it") == 1 + len(SECTIONS[3:7])
-    assert _Page(text).drawn == SECTIONS[:3] + SECTIONS[7:]
+    assert Page(text).drawn == SECTIONS[:3] + SECTIONS[7:]
 
 
 def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) -> None:
@@ -215,13 +169,11 @@ def test_positions_without_rotations_leave_out_what_needs_rotations(copy: Path) 
     table = "\n".join(["stamp_ns,x_m,y_m,z_m", *rows, ""])
     (copy / "ground_truth_positions.csv").write_text(table)
     text = page_of(copy)
-    assert {*SECTIONS} - {*_Page(text).drawn} == {"drift", "covariance"}
+    assert {*SECTIONS} - {*Page(text).drawn} == {"drift", "covariance"}
     assert "rotation error [deg]" not in text
 
 
-def test_the_page_begins_with_the_verdict_and_says_whether_the_covariances_fit(
-    page: Path, copy: Path
-) -> None:
+def test_the_page_begins_with_the_verdict_and_how_covariances_fit(page: Path, copy: Path) -> None:
     head = page.read_text().partition("<h2>")[0]
     assert '<p class="verdict">' in head
     assert "m in 12 frames, all tracked; " in head
@@ -236,11 +188,11 @@ def test_an_interrupted_run_is_shown_as_far_as_it_went(copy: Path) -> None:
         (copy / name).unlink()
     text = page_of(copy)
     assert "has not ended" in text
-    assert _Page(text).drawn == [*SECTIONS[:3], "status", "counts"]
+    assert Page(text).drawn == [*SECTIONS[:3], "status", "counts"]
     for path in copy.glob("*.txt"):
         path.write_text("")
     (copy / "frames.csv").write_text("stamp_ns,status,reason\n")
-    assert _Page(page_of(copy)).drawn == []
+    assert Page(page_of(copy)).drawn == []
 
 
 def test_each_status_has_a_row_with_its_count(copy: Path) -> None:
@@ -277,12 +229,10 @@ def test_labels_are_text_and_keep_their_digits(page: Path, folder: Path) -> None
         (3, {"drift", "covariance"}),
     ],
 )
-def test_few_frames_are_enough_and_three_for_errors(
-    n_frames: int, missing: set[str], tmp_path: Path
-) -> None:
+def test_few_frames_do_and_3_for_errors(n_frames: int, missing: set[str], tmp_path: Path) -> None:
     recording = SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=0.25)
-    run_recording(recording, tmp_path, outputs=RunOutputs(report=False))
-    assert {*SECTIONS} - {*_Page(page_of(tmp_path)).drawn} <= missing
+    run_of(recording, tmp_path)
+    assert {*SECTIONS} - {*Page(page_of(tmp_path)).drawn} <= missing
 
 
 def test_a_lone_point_between_gaps_is_drawn() -> None:

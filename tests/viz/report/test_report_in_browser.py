@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import gvo
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.report import write_run_report
+from tests.conftest import run_of
 from tests.runs.outputs.long_run import make_long_run
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, cut_texts, n_colours, overlapping_texts
@@ -39,17 +38,15 @@ return [...document.querySelectorAll('.panel > svg text')]
 
 @pytest.fixture(scope="module")
 def short_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the report of a short rendered run with truth."""
     out = tmp_path_factory.mktemp("short")
     source = SyntheticRecording("handheld", "rgbd", n_frames=20, scale=0.5)
-    gvo.run_recording(source, out, outputs=RunOutputs(report=False))
+    run_of(source, out)
     write_run_report(out / "report.html", read_run(out))
     return out / "report.html"
 
 
 @pytest.fixture(scope="module")
 def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the report of 10,000 frames."""
     out = tmp_path_factory.mktemp("long")
     write_run_report(out / "report.html", make_long_run(out, 10_000))
     return out / "report.html"
@@ -57,7 +54,6 @@ def long_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(params=["short", pytest.param("long", marks=pytest.mark.acceptance)])
 def report(request: pytest.FixtureRequest) -> Path:
-    """Return either report."""
     path: Path = request.getfixturevalue(f"{request.param}_report")
     return path
 

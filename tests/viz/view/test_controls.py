@@ -1,6 +1,5 @@
 """Each parameter has a control with its range; refused values go back."""
 
-from functools import cache
 from typing import Any
 
 import pytest
@@ -39,14 +38,12 @@ class Desk:
         self.applied.append(config)
 
     def set(self, section: str, key: str, value: Any) -> None:
-        """Do what a client does."""
         self.controls.handle(section, key).value = value
         self.controls.flush()
 
 
 @pytest.fixture
 def desk(view: ViewServer) -> Desk:
-    """Controls of the defaults."""
     return Desk(view.viser.gui)
 
 
@@ -79,9 +76,7 @@ def test_controls_that_nobody_touched_change_nothing(desk: Desk) -> None:
         ("window", "size", 9),
     ],
 )
-def test_a_changed_control_changes_that_parameter_alone(
-    desk: Desk, section: str, key: str, value: Any
-) -> None:
+def test_a_control_changes_one_parameter(desk: Desk, section: str, key: str, value: Any) -> None:
     desk.set(section, key, value)
     (config,) = desk.applied
     assert config == load_configuration(settings=[f"{section}.{key}={value}"])
@@ -145,16 +140,12 @@ def test_the_line_goes_with_the_next_press_of_a_button(desk: Desk) -> None:
 PARAMETERS = [parameter for group in list_parameters().values() for parameter in group]
 
 
-@cache
-def whole_schema() -> dict[str, Any]:
-    """What pydantic tells of the configuration."""
-    return Config.model_json_schema()
+SCHEMA = Config.model_json_schema()
 
 
 def schema_of(parameter: Parameter) -> dict[str, Any]:
     """The range of a parameter as pydantic states it in its JSON schema."""
-    schema = whole_schema()
-    section = schema["$defs"][schema["properties"][parameter.section]["$ref"].split("/")[-1]]
+    section = SCHEMA["$defs"][SCHEMA["properties"][parameter.section]["$ref"].split("/")[-1]]
     described = section["properties"][parameter.key]
     plain = [option for option in described.get("anyOf", []) if option.get("type") != "null"]
     return {**described, **(plain[0] if plain else {})}

@@ -8,9 +8,9 @@ import pytest
 import gvo
 from gvo.config import Config, load_configuration
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.runs.outputs.options import RunOutputs
 from gvo.viz.view import serve
 from gvo.viz.view.player import Player
+from tests.conftest import run_of
 from tests.live.pipe import LiveCommand, names_of, sent_image
 from tests.viz.browser import Browser
 from tests.viz.browser_checks import changed_share, n_colours
@@ -104,7 +104,7 @@ def test_a_parameter_changes_the_next_frame_and_is_saved(page: ViewPage, player:
 
 def test_the_page_of_a_finished_run_plays_and_seeks(browser: Browser, tmp_path: Path) -> None:
     source = SyntheticRecording("driving", "stereo", n_frames=N_FRAMES, scale=0.5)
-    gvo.run_recording(source, tmp_path, outputs=RunOutputs(report=False))
+    run_of(source, tmp_path)
     with serve(tmp_path, port=0) as view:
         page = ViewPage(browser, view.url)
         page.wait_for_frame(N_FRAMES - 1)  # all of the run is shown at first

@@ -23,6 +23,7 @@ from gvo.viz.view.live import LiveHistory, LivePlayer
 from gvo.viz.view.page import Page
 from gvo.viz.view.player import Player
 from gvo.viz.view.server import ViewServer
+from tests.recordings import Held
 from tests.viz.view.fakes import PERIOD_NS, cells, pose_of, result_of
 
 STEREO = StereoCamera(width=160, height=120, fx=120.0, fy=120.0, cx=80.0, cy=60.0, baseline=0.1)
@@ -66,7 +67,6 @@ def page(view: ViewServer, player: LivePlayer) -> Iterator[Page]:
 
 
 def add(player: LivePlayer, window: FakeWindow, index: int) -> None:
-    """Give the player a frame, as the thread of a run does."""
     result = result_of(index)
     window.stamps_ns = [*window.stamps_ns[-2:], result.stamp_ns]
     grey = np.full((STEREO.height, STEREO.width), index, dtype=np.uint8)
@@ -119,9 +119,7 @@ def test_while_it_is_paused_or_nobody_looks_only_poses_are_noted(
     assert len(player.history.causal_path()[0]) == 3
 
 
-def test_a_new_run_begins_without_the_paths_of_the_last(
-    player: LivePlayer, window: FakeWindow
-) -> None:
+def test_a_new_run_begins_without_former_paths(player: LivePlayer, window: FakeWindow) -> None:
     add(player, window, 0)
     add(player, window, 1)
     player.begin(cast(Any, window))
@@ -195,33 +193,23 @@ def test_parameters_are_set_refused_and_followed(page: Page, player: LivePlayer)
     assert (parameters.config.klt.n_corners, parameters.config.klt.n_levels) == (250, 1)
 
 
-class Wall:
-    """A stereo camera that moves along a wall."""
-
-    def __init__(self, n_frames: int) -> None:
-        camera = PinholeCamera(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
-        calibrations = tuple(Calibration.from_camera(camera, baseline=b) for b in (0.0, 0.1))
-        self.info = RecordingInfo(
-            name="wall", sensor="stereo", calibrations=calibrations, n_images=n_frames
-        )
-        self._n_frames = n_frames
-
-    def images(self) -> Iterator[StampedImage]:
-        width, height = self.info.camera.width, self.info.camera.height
-        noise = np.random.default_rng(0).integers(0, 256, (height, width + 100)).astype(np.float32)
-        texture = cv2.normalize(cv2.GaussianBlur(noise, None, 2.0), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
-        for index in range(self._n_frames):
-            for stream, start in enumerate((3 * index, 3 * index + 8)):
-                pixels = texture[:, start : start + width].astype(np.uint8)
-                load = partial(np.copy, pixels)
-                yield StampedImage(stream=stream, stamp_ns=index * PERIOD_NS, load=load)
-
-    def ground_truth(self) -> None:
-        return None
+def wall(n_frames: int) -> Held:
+    """Return what a stereo camera sees that moves along a wall."""
+    camera = PinholeCamera(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
+    pair = tuple(Calibration.from_camera(camera, baseline=b) for b in (0.0, 0.1))
+    info = RecordingInfo(name="wall", sensor="stereo", calibrations=pair, n_images=n_frames)
+    noise = np.random.default_rng(0).integers(0, 256, (240, 420)).astype(np.float32)
+    texture = cv2.normalize(cv2.GaussianBlur(noise, None, 2.0), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    items = []
+    for index in range(n_frames):
+        for stream, start in enumerate((3 * index, 3 * index + 8)):
+            load = partial(np.copy, texture[:, start : start + 320].astype(np.uint8))
+            items.append(StampedImage(stream=stream, stamp_ns=index * PERIOD_NS, load=load))
+    return Held(info=info, items=items)
 
 
 def test_a_run_is_shown_as_a_recording_is(tmp_path: Path) -> None:
-    source: Source = Wall(4)
+    source: Source = wall(4)
     odometry = LiveOdometry(source, max_waiting=100)
     shown = odometry.viewer = LivePlayer(source, odometry.parameters)
     odometry.run(tmp_path, outputs=RunOutputs(report=False))

@@ -11,22 +11,7 @@ import pytest
 from gvo.errors import ConfigurationError
 from gvo.viz.view import serve
 from gvo.viz.view.server import ViewServer, find_port, is_own_page, open_server
-
-
-def listeners(port: int) -> set[str]:
-    """Local addresses that listen on a port, as the kernel lists them."""
-    lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()
-    rows = [line.split() for line in lines[1:]]
-    found = [row[1].split(":") for row in rows if row[3] == "0A"]
-    return {address for address, hexadecimal in found if int(hexadecimal, 16) == port}
-
-
-def taken_port() -> socket.socket:
-    """A socket that holds a port of this machine."""
-    holder = socket.socket()
-    holder.bind(("127.0.0.1", 0))
-    holder.listen()
-    return holder
+from tests.conftest import listeners
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -57,7 +42,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_taken_port_is_told_with_the_one_that_serves() -> None:
-    with taken_port() as holder:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
         with open_server("127.0.0.1", port, title="gvo") as view:
             assert view.viser.get_port() > port
@@ -120,9 +105,7 @@ def test_no_client_gets_a_tunnel_to_a_public_address(view: ViewServer) -> None:
     assert view.viser.request_share_url() is None
 
 
-def test_without_viser_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_viser_it_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ConfigurationError, match=r"pip install \S+\[view\]'"):
         serve(tmp_path)

@@ -1,0 +1,89 @@
+"""Recordings in memory, whose images and stamps can be changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+from numpy.typing import NDArray
+
+import gvo
+from gvo.errors import RecordingError
+from gvo.io.recording import RecordingInfo, Source, StampedImage
+from gvo.io.synthetic.recording import SyntheticRecording
+from gvo.trajectory.trajectory import Trajectory
+from gvo.types import FaultyFrame, Frame
+
+Change = Callable[[NDArray[Any]], NDArray[Any]]
+
+
+@dataclass(eq=False)
+class Held:
+    """A recording as a list of images; where damage is told of, it ends with that."""
+
+    info: RecordingInfo
+    items: list[StampedImage]
+    truth: Trajectory | None = None
+    damage: str = ""
+
+    def images(self) -> Iterator[StampedImage]:
+        yield from self.items
+        if self.damage:
+            raise RecordingError(self.damage)
+
+    def ground_truth(self) -> Trajectory | None:
+        return self.truth
+
+    def stream(self, number: int) -> list[StampedImage]:
+        return [image for image in self.items if image.stream == number]
+
+    def mapped(self, change: Callable[[StampedImage, int], StampedImage | None]) -> Held:
+        """Return the recording with each image changed; the number counts within its stream."""
+        numbers = [0, 0]
+        items = []
+        for image in self.items:
+            changed = change(image, numbers[image.stream])
+            numbers[image.stream] += 1
+            if changed is not None:
+                items.append(changed)
+        return replace(self, items=items)
+
+    def with_pixels(self, change: Change, *, stream: int | None = None) -> Held:
+        """Return the recording with the pixels of one stream (or both) changed."""
+
+        def alter(image: StampedImage, _: int) -> StampedImage:
+            if stream not in (None, image.stream):
+                return image
+            return replace(image, load=lambda: change(image.load()))
+
+        return self.mapped(alter)
+
+    def with_stamps(self, change: Callable[[int, int], int], *, stream: int | None = None) -> Held:
+        """Return the recording with the stamps changed, given stamp and number."""
+
+        def alter(image: StampedImage, number: int) -> StampedImage:
+            if stream not in (None, image.stream):
+                return image
+            return replace(image, stamp_ns=change(image.stamp_ns, number))
+
+        return self.mapped(alter)
+
+    def cut(self, n_frames: int) -> Held:
+        truth = None if self.truth is None else self.truth.select(slice(0, n_frames))
+        info = replace(self.info, n_images=n_frames)
+        return Held(info=info, items=self.items[: 2 * n_frames], truth=truth)
+
+
+def frames_of(source: Source) -> list[Frame]:
+    """Return all frames that are not faulty."""
+    return [each for each in gvo.frames(source) if not isinstance(each, FaultyFrame)]
+
+
+def hold(source: SyntheticRecording, *, every: int = 1) -> Held:
+    """Return every so many frames of a recording, each image rendered once at most."""
+    images = [replace(image, load=cache(image.load)) for image in source.images()]
+    items = [image for index, image in enumerate(images) if index // 2 % every == 0]
+    truth = source.ground_truth().select(slice(None, None, every))
+    return Held(info=replace(source.info, n_images=len(truth)), items=items, truth=truth)
