@@ -75,18 +75,15 @@ class Network:
         self.is_closed = True
 
     def announce(self, topics: Iterable[Topic]) -> None:
-        """Let others announce topics."""
         self.announced += [Topic(name=t.name, type=t.type, n_messages=1) for t in topics]
 
     def send(self, message: BagMessage) -> None:
-        """Send a message, once its topic is subscribed to."""
         name = message.topic.name
         with self.changed:
             assert self.changed.wait_for(lambda: name in self._callbacks, timeout=60)
         self._callbacks[name](message.data, message.log_time_ns)
 
     def wait_for(self, topic: str, n: int) -> list[tuple[int, Any]]:
-        """Wait until so many messages came on a topic."""
         with self.changed:
             assert self.changed.wait_for(lambda: len(self.sent[topic]) >= n, timeout=60)
             return [*self.sent[topic]]

@@ -6,8 +6,7 @@ import json
 import subprocess
 import threading
 from pathlib import Path
-from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -25,46 +24,36 @@ class LiveCommand:
         self.out = folder / "out"
         given = [f"--calibration={path}" for path in write_calibration(info, folder)]
         fixed = ["--rectified", "--no-report", "--queue=1000", f"--out={self.out}"]
-        self._process = subprocess.Popen(
-            [*GVO, "live", "-", *given, *fixed, *options],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        self._timer = threading.Timer(LIMIT_S, self._process.kill)
+        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process = subprocess.Popen([*GVO, "live", "-", *given, *fixed, *options], **pipes)
+        self._timer = threading.Timer(LIMIT_S, self.process.kill)
         self._timer.start()
 
     def __enter__(self) -> LiveCommand:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self._timer.cancel()
-        self._process.kill()
-        self._process.communicate()
+        self.process.kill()
+        self.process.communicate()
 
     def said(self, ending: str) -> str:
         """Return what is before the end of the next line on stderr that ends so."""
-        for line in _open(self._process.stderr):
+        for line in _open(self.process.stderr):
             before, found, _ = line.decode().rstrip().rpartition(ending)
             if found:
                 return before.strip()
         raise AssertionError(f"gvo live ended and did not say: {ending}")
 
     def send(self, images: bytes) -> None:
-        """Write into its standard input."""
-        stdin = _open(self._process.stdin)
+        stdin = _open(self.process.stdin)
         stdin.write(images)
         stdin.flush()
 
     def end(self) -> tuple[int, str, str]:
         """Close its standard input; return its exit code, and what else it says."""
-        out, err = self._process.communicate()
-        return self._process.returncode, out.decode(), err.decode()
+        out, err = self.process.communicate()
+        return self.process.returncode, out.decode(), err.decode()
 
 
 def _open(stream: IO[bytes] | None) -> IO[bytes]:
@@ -102,7 +91,6 @@ def sent_image(image: StampedImage, stream: str, compressed: str = "") -> bytes:
 
 
 def write_calibration(info: RecordingInfo, folder: Path) -> list[Path]:
-    """Write the calibration files of a rectified camera."""
     paths = []
     for side, camera in zip("lr", info.calibrations, strict=True):
         content = {

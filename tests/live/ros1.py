@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 from xmlrpc.client import ServerProxy
 
-import pytest
-
 from tests.conftest import ENVIRONMENT
 from tests.viz.browser import give_up
 
@@ -30,14 +28,8 @@ class Program:
     """A process whose lines of standard output can be waited for; killed where none come."""
 
     def __init__(self, command: list[str], environment: dict[str, str]) -> None:
-        self.process = subprocess.Popen(
-            command,
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process = subprocess.Popen(command, env=environment, text=True, **pipes)
         self.lines: list[str] = []
         self.errors: list[str] = []
         self._come = threading.Condition()
@@ -55,12 +47,13 @@ class Program:
                     lines.append(line)
                     self._come.notify_all()
 
-    def wait_for(self, text: str, *, n: int = 1) -> str:
+    def wait_for(self, text: str, *, n: int = 1, is_output: bool = False) -> str:
         """Return the n-th line that holds a text, of either stream."""
         found: list[str] = []
 
         def has_come() -> bool:
-            found[:] = [line for line in (*self.lines, *self.errors) if text in line]
+            lines = self.lines if is_output else (*self.lines, *self.errors)
+            found[:] = [line for line in lines if text in line]
             return len(found) >= n
 
         with self._come:
@@ -69,13 +62,11 @@ class Program:
         return found[n - 1]
 
     def tell(self, line: str) -> None:
-        """Write a line to its standard input."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
 
     def send(self, number: signal.Signals) -> int:
-        """Send a signal, and return the exit code."""
         self.process.send_signal(number)
         return self.end()
 
@@ -117,7 +108,6 @@ class Ros:
             node.shutdown("/test", "a test")
 
     def start(self, *command: object) -> Program:
-        """Start a program in Python."""
         program = Program([sys.executable, *map(str, command)], self.environment)
         self._programs.append(program)
         return program
@@ -130,7 +120,6 @@ class Ros:
         return json.loads("".join(program.lines) or "null")
 
     def kill(self) -> None:
-        """Kill what still runs."""
         for program in self._programs:
             program.process.kill()
             program.end()
@@ -162,11 +151,3 @@ def master(folder: Path) -> Iterator[Ros]:
         finally:
             ros.kill()
             process.kill()
-
-
-@pytest.fixture(scope="module")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
-    """Return a master of ROS 1; its nodes use a simulated clock."""
-    with master(tmp_path_factory.mktemp("ros")) as running:
-        running.use_simulated_clock()
-        yield running

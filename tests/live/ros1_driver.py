@@ -26,6 +26,11 @@ from scripts.ros.play import Answers, Writer, introduce, until
 PATIENCE_S = 60.0
 
 
+def tell(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
 def numbers(position: Any, orientation: Any) -> list[float]:
     return [getattr(position, name) for name in "xyz"] + [
         getattr(orientation, name) for name in "xyzw"
@@ -126,8 +131,7 @@ def drive(recording: str) -> None:
         writer.open(stream.info_topic, CAMERA_INFO_TYPE, is_latched=True)
         header = Header(pairs[0][0].stamp_ns, stream.frame_id)
         write_camera_info(writer, stream.info_topic, stream.calibration, header)
-    sys.stdout.write("introduced\n")
-    sys.stdout.flush()
+    tell("introduced")
     introduce(source, streams, writer, pairs[0][0].stamp_ns)
     for index, pair in enumerate(pairs[:40]):
         interfere(index, pair[0].stamp_ns, writer.open(streams[0].topic, IMAGE_TYPE))
@@ -140,17 +144,15 @@ def drive(recording: str) -> None:
             until(lambda: answers.are_heard, "nobody announces the odometry")
         elif index != 30:
             answers.wait([pair[0].stamp_ns], 0)
-    sys.stdout.write("driven\n")
-    sys.stdout.flush()
+    tell("driven")
     sys.stdin.read()
 
 
 def watch() -> None:
     watch = Watch()
-    sys.stdout.write("watching\n")
-    sys.stdout.flush()
+    tell("watching")
     watch.wait_for(int(sys.stdin.readline()))
-    sys.stdout.write(json.dumps(watch.noted) + "\n")
+    tell(json.dumps(watch.noted))
 
 
 rospy.init_node("driver", anonymous=True)

@@ -6,6 +6,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 sys.path.append("/usr/lib/python3/dist-packages")
@@ -84,13 +85,17 @@ class Got:
         return self.message
 
 
+def until(is_true: Callable[[], Any], what: object) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not is_true():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.005)
+
+
 def publisher(topic: str, type_: Any, *, latch: bool = False) -> Any:
     """Return a publisher to whom somebody listens."""
     made = rospy.Publisher(topic, type_, queue_size=10, latch=latch)
-    end_s = time.monotonic() + PATIENCE_S
-    while not made.get_num_connections():
-        assert time.monotonic() < end_s, topic
-        time.sleep(0.005)
+    until(made.get_num_connections, topic)
     return made
 
 
@@ -162,10 +167,7 @@ def parameters() -> dict[str, Any]:
         client.update_configuration({"camera__readout_ms__null": False})["camera__readout_ms"],
         client.update_configuration({"features__kind": "sift"})["features__kind"],
     ]
-    end_s = time.monotonic() + PATIENCE_S
-    while not any("window.size" in line for line in logged):
-        assert time.monotonic() < end_s, logged
-        time.sleep(0.005)
+    until(lambda: any("window.size" in line for line in logged), logged)
     log.unregister()
     return {
         "n": len(first) - 1,  # but the groups
@@ -183,10 +185,7 @@ def hostile() -> dict[str, Any]:
     for data in (b"", b"\xff" * 5, b"\xff" * 4096, bytes(11)):
         garbage.publish(Garbage(data))
     queue = garbage.impl.connections[0]
-    end_s = time.monotonic() + PATIENCE_S
-    while queue._queue:
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
+    until(lambda: not queue._queue, "a queue")
     n_sent = 0
     try:
         queue.socket.sendall(b"\xff\xff\xff\xff")

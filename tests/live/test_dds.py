@@ -24,7 +24,8 @@ from gvo.live.transport import Parameters, Service, ServiceType, decode
 pytest.importorskip("cyclonedds")
 
 from gvo.live.dds import Dds, message_class, sockets
-from tests.conftest import GVO, TABLES, Command, is_one_line
+from tests.conftest import GVO, Command, assert_same_files, refused, run_of
+from tests.live.ros1 import Program
 
 HOLD_S = 60.0
 STRING = "std_msgs/msg/String"
@@ -43,116 +44,35 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-@dataclass
-class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
-    data: str
+def struct(package, name, /, **fields):
+    return make_idl_struct(name, f"{package}::msg::dds_::{name}_", fields)
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    sec: int32
-    nanosec: uint32
-
-@dataclass
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    stamp: Time
-    frame_id: str
-
-@dataclass
-class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
-    header: Header
-    height: uint32
-    width: uint32
-    encoding: str
-    is_bigendian: uint8
-    step: uint32
-    data: sequence[uint8]
-
-@dataclass
-class Region(IdlStruct, typename="sensor_msgs::msg::dds_::RegionOfInterest_"):
-    x_offset: uint32
-    y_offset: uint32
-    height: uint32
-    width: uint32
-    do_rectify: bool
-
-@dataclass
-class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
-    header: Header
-    height: uint32
-    width: uint32
-    distortion_model: str
-    d: sequence[float64]
-    k: array[float64, 9]
-    r: array[float64, 9]
-    p: array[float64, 12]
-    binning_x: uint32
-    binning_y: uint32
-    roi: Region
-
-@dataclass
-class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
-    x: float64
-    y: float64
-    z: float64
-
-@dataclass
-class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
-    x: float64
-    y: float64
-    z: float64
-
-@dataclass
-class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-@dataclass
-class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    position: Point
-    orientation: Quaternion
-
-@dataclass
-class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
-    linear: Vector3
-    angular: Vector3
-
-@dataclass
-class CovariantPose(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
-    pose: Pose
-    covariance: array[float64, 36]
-
-@dataclass
-class CovariantTwist(IdlStruct, typename="geometry_msgs::msg::dds_::TwistWithCovariance_"):
-    twist: Twist
-    covariance: array[float64, 36]
-
-@dataclass
-class Odometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
-    header: Header
-    child_frame_id: str
-    pose: CovariantPose
-    twist: CovariantTwist
-
-@dataclass
-class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
-    translation: Vector3
-    rotation: Quaternion
-
-@dataclass
-class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-@dataclass
-class Transforms(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
-    transforms: sequence[TransformStamped]
-
-@dataclass
-class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
-    clock: Time
+String = struct("std_msgs", "String", data=str)
+Time = struct("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
+Header = struct("std_msgs", "Header", stamp=Time, frame_id=str)
+Image = struct("sensor_msgs", "Image", header=Header, height=uint32, width=uint32,
+    encoding=str, is_bigendian=uint8, step=uint32, data=sequence[uint8])
+Region = struct("sensor_msgs", "RegionOfInterest",
+    x_offset=uint32, y_offset=uint32, height=uint32, width=uint32, do_rectify=bool)
+CameraInfo = struct("sensor_msgs", "CameraInfo", header=Header, height=uint32, width=uint32,
+    distortion_model=str, d=sequence[float64], k=array[float64, 9], r=array[float64, 9],
+    p=array[float64, 12], binning_x=uint32, binning_y=uint32, roi=Region)
+Vector3 = struct("geometry_msgs", "Vector3", x=float64, y=float64, z=float64)
+Point = struct("geometry_msgs", "Point", x=float64, y=float64, z=float64)
+Quaternion = struct("geometry_msgs", "Quaternion", x=float64, y=float64, z=float64, w=float64)
+Pose = struct("geometry_msgs", "Pose", position=Point, orientation=Quaternion)
+Twist = struct("geometry_msgs", "Twist", linear=Vector3, angular=Vector3)
+CovariantPose = struct(
+    "geometry_msgs", "PoseWithCovariance", pose=Pose, covariance=array[float64, 36])
+CovariantTwist = struct(
+    "geometry_msgs", "TwistWithCovariance", twist=Twist, covariance=array[float64, 36])
+Odometry = struct("nav_msgs", "Odometry",
+    header=Header, child_frame_id=str, pose=CovariantPose, twist=CovariantTwist)
+Transform = struct("geometry_msgs", "Transform", translation=Vector3, rotation=Quaternion)
+TransformStamped = struct("geometry_msgs", "TransformStamped",
+    header=Header, child_frame_id=str, transform=Transform)
+Transforms = struct("tf2_msgs", "TFMessage", transforms=sequence[TransformStamped])
+Clock = struct("rosgraph_msgs", "Clock", clock=Time)
 
 NETWORK = Domain(DOMAIN, '<CycloneDDS><Domain><General><Interfaces>'
     '<NetworkInterface address="127.0.0.1"/></Interfaces></General></Domain></CycloneDDS>')
@@ -211,43 +131,17 @@ def client(name, package, type_, answered):
 '''
 
 
-class Peer:
+class Peer(Program):
     """A process of plain CycloneDDS; it ends where its standard input does."""
 
     def __init__(self, domain: int, source: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", f"DOMAIN = {domain}\n{PEER}\n{source}\nEND.wait()\n"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._lines: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
+        content = f"DOMAIN = {domain}\n{PEER}\n{source}\nEND.wait()\n"
+        super().__init__([sys.executable, "-c", content], {**os.environ})
+        self._n_read = 0
 
     def line(self) -> str:
-        return self._lines.get(timeout=HOLD_S)
-
-    def go_on(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-
-    def close(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        try:
-            self._process.wait(timeout=HOLD_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-            raise
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for line in lines:
-                self._lines.put(line.rstrip("\n"))
-        self._lines.put("(it has ended)")
+        self._n_read += 1
+        return self.wait_for("", n=self._n_read, is_output=True).rstrip("\n")
 
 
 @pytest.fixture
@@ -271,7 +165,7 @@ def peer(domain: int) -> Iterator[Callable[[str], Peer]]:
 
     yield start
     for made in peers:
-        made.close()
+        made.end()
 
 
 @pytest.fixture
@@ -336,9 +230,7 @@ for i in range(5):
 
 
 @pytest.mark.acceptance
-def test_what_is_held_for_those_who_come_late_is_received(
-    dds: Dds, peer: Callable[[str], Peer]
-) -> None:
+def test_what_is_held_for_late_ones_is_received(dds: Dds, peer: Callable[[str], Peer]) -> None:
     other = peer("""
 out = writer("rt/held", String, RELIABLE, HELD)
 out.write(String("early"))
@@ -411,11 +303,7 @@ def test_a_service_answers_who_asked_and_survives_what_is_no_request(
     type_ = ServiceType(name="gvo_test/srv/Echo", request="string text", response="string text")
     dds.serve(Service(name="/gvo/echo", type=type_, answer=lambda asked: {"text": asked.text * 2}))
     other = peer("""
-@dataclass
-class Text(IdlStruct):
-    guid: uint64
-    sequence: int64
-    text: str
+Text = struct("gvo_test", "Text", **HEADER, text=str)
 
 class Damaged:
     def serialize(self, **_):
@@ -448,94 +336,22 @@ class Value(IdlStruct):
     double_array_value: sequence[float64] = ()
     string_array_value: sequence[str] = ()
 
-@dataclass
-class Parameter(IdlStruct):
-    name: str
-    value: Value
-
-@dataclass
-class Result(IdlStruct):
-    successful: bool
-    reason: str
-
-@dataclass
-class FloatRange(IdlStruct):
-    from_value: float64
-    to_value: float64
-    step: float64
-
-@dataclass
-class IntegerRange(IdlStruct):
-    from_value: int64
-    to_value: int64
-    step: uint64
-
-@dataclass
-class Descriptor(IdlStruct):
-    name: str
-    type: uint8
-    description: str
-    additional_constraints: str
-    read_only: bool
-    dynamic_typing: bool
-    floating_point_range: sequence[FloatRange, 1]
-    integer_range: sequence[IntegerRange, 1]
-
-@dataclass
-class Names(IdlStruct):
-    guid: uint64
-    sequence: int64
-    names: sequence[str]
-
-@dataclass
-class Under(IdlStruct):
-    guid: uint64
-    sequence: int64
-    prefixes: sequence[str]
-    depth: uint64
-
-@dataclass
-class Listed(IdlStruct):
-    guid: uint64
-    sequence: int64
-    names: sequence[str]
-    prefixes: sequence[str]
-
-@dataclass
-class Values(IdlStruct):
-    guid: uint64
-    sequence: int64
-    values: sequence[Value]
-
-@dataclass
-class Types(IdlStruct):
-    guid: uint64
-    sequence: int64
-    types: sequence[uint8]
-
-@dataclass
-class Descriptors(IdlStruct):
-    guid: uint64
-    sequence: int64
-    descriptors: sequence[Descriptor]
-
-@dataclass
-class New(IdlStruct):
-    guid: uint64
-    sequence: int64
-    parameters: sequence[Parameter]
-
-@dataclass
-class Results(IdlStruct):
-    guid: uint64
-    sequence: int64
-    results: sequence[Result]
-
-@dataclass
-class One(IdlStruct):
-    guid: uint64
-    sequence: int64
-    result: Result
+Parameter = struct("test", "Parameter", name=str, value=Value)
+Result = struct("test", "Result", successful=bool, reason=str)
+FloatRange = struct("test", "Floats", from_value=float64, to_value=float64, step=float64)
+IntegerRange = struct("test", "Integers", from_value=int64, to_value=int64, step=uint64)
+Descriptor = struct("test", "Descriptor", name=str, type=uint8, description=str,
+    additional_constraints=str, read_only=bool, dynamic_typing=bool,
+    floating_point_range=sequence[FloatRange, 1], integer_range=sequence[IntegerRange, 1])
+Names = struct("test", "Names", **HEADER, names=sequence[str])
+Under = struct("test", "Under", **HEADER, prefixes=sequence[str], depth=uint64)
+Listed = struct("test", "Listed", **HEADER, names=sequence[str], prefixes=sequence[str])
+Values = struct("test", "Values", **HEADER, values=sequence[Value])
+Types = struct("test", "Types", **HEADER, types=sequence[uint8])
+Descriptors = struct("test", "Descriptors", **HEADER, descriptors=sequence[Descriptor])
+New = struct("test", "New", **HEADER, parameters=sequence[Parameter])
+Results = struct("test", "Results", **HEADER, results=sequence[Result])
+One = struct("test", "One", **HEADER, result=Result)
 
 def call(name, type_, asked, answered):
     send, answer = client(f"/gvo/{name}", "rcl_interfaces", type_, answered)
@@ -585,10 +401,10 @@ for changes in (both, both[:1]):
     assert other.line() == "no parameter is an array"
     assert other.line() == "False"
     assert (parameters.config.klt.n_corners, parameters.config.camera.readout_ms) == (100, 12.5)
-    other.go_on()
+    other.tell("")
     assert other.line() == "True"
     assert parameters.config.camera.readout_ms is None
-    other.go_on()
+    other.tell("")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -613,10 +429,8 @@ def test_a_domain_that_cannot_be_joined_is_told(
     with pytest.raises(ConfigurationError, match=f"ROS_DOMAIN_ID={domain} cannot be joined"):
         Dds()
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
-    answer = command("live", "ros2", "--out", tmp_path / "run")
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert "expected a number from 0 to 232, got 233" in answer.err
+    said = refused(command("live", "ros2", "--out", tmp_path / "run"))
+    assert "expected a number from 0 to 232, got 233" in said
 
 
 # Plays a bag: each pair once the pose of the last has come, with all transforms of its stamp.
@@ -667,19 +481,10 @@ def test_a_drive_that_another_program_plays_is_tracked_as_in_its_bag(
 ) -> None:
     bag = tmp_path / "drive.mcap"
     gvo.convert(gvo.open_recording(gvo_data / "kitti_06_start"), bag)
-    gvo.run_recording(
-        gvo.open_recording(bag), tmp_path / "run", outputs=gvo.RunOutputs(report=False)
-    )
-    arguments = [
-        "live",
-        "ros2",
-        "--qos",
-        "reliable",
-        "--out",
-        str(tmp_path / "live"),
-        "--no-report",
-    ]
-    with subprocess.Popen([*GVO, *arguments], stderr=subprocess.PIPE, text=True) as live:
+    run_of(bag, tmp_path / "run")
+    options = ["--qos", "reliable", "--out", str(tmp_path / "live"), "--no-report"]
+    command = [*GVO, "live", "ros2", *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as live:
         try:
             player = peer(f"BAG = {str(bag)!r}\n{PLAYER}")
             assert player.line() == "51 gvo/odom gvo/odom/camera_left_optical"
@@ -688,5 +493,4 @@ def test_a_drive_that_another_program_plays_is_tracked_as_in_its_bag(
             live.send_signal(signal.SIGINT)
             _, errors = live.communicate(timeout=HOLD_S)
     assert live.returncode == 0, errors
-    for name in TABLES:
-        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    assert_same_files(tmp_path / "live", tmp_path / "run")

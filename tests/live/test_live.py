@@ -3,7 +3,6 @@
 import io
 import json
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,8 +19,8 @@ from gvo.io.sync import Pair
 from gvo.live.odometry import LiveOdometry, WaitingPairs
 from gvo.live.sources import Device, StandardInput
 from gvo.types import FaultyFrame, Progress
-from tests.conftest import GVO, TABLES, Command, is_one_line
-from tests.live.pipe import sent, write_calibration
+from tests.conftest import TABLES, Command, assert_same_files, refused, run_of
+from tests.live.pipe import LiveCommand, sent, write_calibration
 
 TIED = Progress(n_done=3, n_total=0, n_tracked=2)
 NO_REPORT = gvo.RunOutputs(report=False)
@@ -153,21 +152,18 @@ def test_where_nothing_is_dropped_the_poses_are_those_of_a_run(
     bag: str, compressed: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     source = gvo.open_recording(request.getfixturevalue(bag))
-    gvo.run_recording(source, tmp_path / "run", outputs=NO_REPORT)
+    run_of(request.getfixturevalue(bag), tmp_path / "run")
     pipe = StandardInput(io.BytesIO(sent(source, compressed=compressed)), source.info)
     live = LiveOdometry(pipe, max_waiting=1000)
     ((folder, result),) = live.run(tmp_path / "live", outputs=NO_REPORT)
     assert result.is_complete
     assert folder == tmp_path / "live"
     assert live.n_dropped == 0
-    for name in (*TABLES, "global.txt", "graph.g2o"):
-        written = (tmp_path / "live" / name).read_bytes()
-        assert written == (tmp_path / "run" / name).read_bytes(), name
+    assert_same_files(folder, tmp_path / "run", (*TABLES, "global.txt", "graph.g2o"))
 
 
 @pytest.fixture(scope="session")
 def calibration(drive_bag: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return the calibration files of the rendered stereo camera."""
     return write_calibration(
         gvo.open_recording(drive_bag).info, tmp_path_factory.mktemp("calibration")
     )
@@ -183,26 +179,19 @@ def live(*arguments: object, calibration: list[Path], out: Path) -> list[str]:
     return [*map(str, arguments), *given, "--rectified", "--no-report", f"--out={out}"]
 
 
-def test_the_command_tracks_what_comes_through_a_pipe_until_a_signal(
-    drive_bag: Path, calibration: list[Path], tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    command = [*GVO, "live", *live("-", "--queue=1000", calibration=calibration, out=out)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=False
-    ) as process:
-        assert process.stdin is not None
-        process.stdin.write(sent(gvo.open_recording(drive_bag)))
-        process.stdin.flush()
-        while n_poses(out) < 20:  # the pipe stays open
-            assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        answer, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert b"20 frames, all tracked" in answer
-    summary = json.loads((out / "summary.json").read_text())
+def test_a_pipe_is_tracked_until_a_signal(drive_bag: Path, tmp_path: Path) -> None:
+    source = gvo.open_recording(drive_bag)
+    with LiveCommand(source.info, tmp_path) as run:
+        run.send(sent(source))
+        while n_poses(run.out) < 20:  # the pipe stays open
+            assert run.process.poll() is None
+        run.process.send_signal(signal.SIGINT)
+        code, answer, errors = run.end()
+    assert code == 0, errors
+    assert "20 frames, all tracked" in answer
+    summary = json.loads((run.out / "summary.json").read_text())
     assert summary["state"] == "complete"
-    assert (out / "global.txt").exists()
+    assert (run.out / "global.txt").exists()
 
 
 @pytest.mark.parametrize(
@@ -240,10 +229,9 @@ def test_what_is_no_image_ends_in_one_line(
         list(pipe.images())
     assert len(str(raised.value)) < 400
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(header)))
-    answer = command("live", *live("-", calibration=calibration, out=tmp_path / "out"))
-    assert answer.code == 2
-    assert is_one_line(answer.err)
-    assert fault in answer.err
+    assert fault in refused(
+        command("live", *live("-", calibration=calibration, out=tmp_path / "out"))
+    )
 
 
 def test_a_stream_that_breaks_off_keeps_what_was_tracked(drive_bag: Path, tmp_path: Path) -> None:
@@ -282,7 +270,7 @@ def test_a_device_gives_the_images_of_both_cameras(
     answer = command("live", *options)
     assert answer.code == 0, answer.err
     assert "20 frames, all tracked" in answer.out
-    gvo.run_recording(gvo.open_recording(drive_bag), tmp_path / "run", outputs=NO_REPORT)
+    run_of(drive_bag, tmp_path / "run")
     tracked, expected = (
         gvo.read_trajectory(folder / "raw.txt") for folder in (out, tmp_path / "run")
     )
@@ -305,10 +293,8 @@ def test_what_cannot_be_opened_is_refused(
     words: tuple[str, ...], fault: str, calibration: list[Path], tmp_path: Path, command: Command
 ) -> None:
     one = calibration[:1] if "--sensor=rgbd" in words else calibration
-    answer = command("live", *live(*words, calibration=one, out=tmp_path / "out"))
-    assert answer.code == 2
-    assert fault in answer.err
-    assert is_one_line(answer.err)
+    said = refused(command("live", *live(*words, calibration=one, out=tmp_path / "out")))
+    assert fault in said
     assert not (tmp_path / "out").exists()
 
 

@@ -27,7 +27,6 @@ KINDS = {
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return the script as a module."""
     monkeypatch.syspath_prepend(SCRIPTS)
     import feed_realsense  # type: ignore[import-not-found]
 

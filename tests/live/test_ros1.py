@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 import gvo
 from gvo.config import list_parameters
 from gvo.types import FloatArray
-from tests.conftest import GVO, TABLES, is_one_line, python
-from tests.live.ros1 import PATIENCE_S, Program, Ros, ros  # noqa: F401 - the fixture
+from tests.conftest import GVO, assert_same_files, python, refused, run_of
+from tests.live.ros1 import PATIENCE_S, Program, Ros
 
 FOLDER = Path(__file__).parent
 PEER, DRIVER = FOLDER / "ros1_peer.py", FOLDER / "ros1_driver.py"
@@ -31,7 +31,7 @@ def events(node: Program, name: str) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def node(ros: Ros) -> Iterator[Program]:  # noqa: F811
+def node(ros: Ros) -> Iterator[Program]:
     program = ros.start(FOLDER / "ros1_node.py")
     program.wait_for('"ready"')
     yield program
@@ -41,7 +41,7 @@ def node(ros: Ros) -> Iterator[Program]:  # noqa: F811
 
 
 @pytest.mark.acceptance
-def test_messages_travel_both_ways_as_rospy_has_them(ros: Ros, node: Program) -> None:  # noqa: F811
+def test_messages_travel_both_ways_as_rospy_has_them(ros: Ros, node: Program) -> None:
     peer = ros.ask(PEER, "messages")
     node.end()
     *_, image = events(node, "image")
@@ -57,7 +57,7 @@ def test_messages_travel_both_ways_as_rospy_has_them(ros: Ros, node: Program) ->
 
 
 @pytest.mark.acceptance
-def test_services_refuse_in_words(ros: Ros, node: Program) -> None:  # noqa: F811
+def test_services_refuse_in_words(ros: Ros, node: Program) -> None:
     peer = ros.ask(PEER, "services")
     node.end()
     assert events(node, "pose") == [{"event": "pose", "x": 1.5}]
@@ -66,10 +66,7 @@ def test_services_refuse_in_words(ros: Ros, node: Program) -> None:  # noqa: F81
 
 
 @pytest.mark.acceptance
-def test_parameters_change_by_the_client_of_dynamic_reconfigure(
-    ros: Ros,  # noqa: F811
-    node: Program,
-) -> None:
+def test_parameters_change_by_the_client_of_dynamic_reconfigure(ros: Ros, node: Program) -> None:
     peer = ros.ask(PEER, "parameters")
     node.end()
     optional = [one for listed in list_parameters().values() for one in listed if one.is_optional]
@@ -90,7 +87,7 @@ def test_parameters_change_by_the_client_of_dynamic_reconfigure(
 
 
 @pytest.mark.acceptance
-def test_a_hostile_node_is_survived(ros: Ros, node: Program) -> None:  # noqa: F811
+def test_a_hostile_node_is_survived(ros: Ros, node: Program) -> None:
     assert ros.ask(PEER, "hostile")["n_sent"] < 1 << 25
     other = ros.start(PEER, "of_another_type")
     other.wait_for("types do not match")
@@ -117,10 +114,9 @@ class Transforms:
 
     def __init__(self, noted: dict[str, Any]) -> None:
         self._fixed = {child: (parent, pose(q)) for _, parent, child, q in noted["static"]}
-        moving = {
+        self._moving = {
             (stamp_ns, child): (parent, pose(q)) for stamp_ns, parent, child, q in noted["tf"]
         }
-        self._moving = moving
 
     def to_map(self, frame: str, stamp_ns: int) -> FloatArray:
         """Return T_map_frame at exactly this stamp."""
@@ -132,12 +128,7 @@ class Transforms:
         return T_map_frame
 
 
-def assert_same(out: Path, run: Path) -> None:
-    for table in TABLES:
-        assert (out / table).read_bytes() == (run / table).read_bytes(), table
-
-
-def live(ros: Ros, out: Path, *options: str) -> Program:  # noqa: F811
+def live(ros: Ros, out: Path, *options: str) -> Program:
     return ros.start(*GVO[1:], "live", "ros1", "--no-report", "--out", out, *options)
 
 
@@ -145,12 +136,9 @@ def live(ros: Ros, out: Path, *options: str) -> Program:  # noqa: F811
 @pytest.mark.recorded
 @pytest.mark.parametrize("name", ["kitti_06_start", "rgbd_dataset_freiburg1_xyz_start"])
 def test_what_is_played_is_tracked_as_from_its_files(
-    name: str,
-    ros: Ros,  # noqa: F811
-    gvo_data: Path,
-    tmp_path: Path,
+    name: str, ros: Ros, gvo_data: Path, tmp_path: Path
 ) -> None:
-    gvo.run_recording(gvo.open_recording(gvo_data / name), tmp_path / "run", outputs=NO_REPORT)
+    run_of(gvo_data / name, tmp_path / "run")
     expected = gvo.read_trajectory(tmp_path / "run" / "causal.txt")
     odometry = live(ros, tmp_path / "out")
     watcher = ros.start(DRIVER)
@@ -159,7 +147,7 @@ def test_what_is_played_is_tracked_as_from_its_files(
     player.wait_for("pairs sent")
     assert player.end() == 0
     assert odometry.send(signal.SIGINT) == 0, odometry.errors
-    assert_same(tmp_path / "out", tmp_path / "run")
+    assert_same_files(tmp_path / "out", tmp_path / "run")
     watcher.tell(str(expected.stamps_ns[-1]))
     assert watcher.end() == 0, watcher.errors
     noted = json.loads(watcher.lines[-1])
@@ -185,7 +173,7 @@ def test_what_is_played_is_tracked_as_from_its_files(
 
 @pytest.mark.acceptance
 @pytest.mark.recorded
-def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Path) -> None:
     recording = gvo_data / "kitti_06_start"
     driver = ros.start(DRIVER, recording)
     driver.wait_for("introduced")  # CameraInfo is sent once, and not again
@@ -199,18 +187,14 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
     ros.end_node("/gvo")
     assert odometry.end() == 3, odometry.errors  # some frames are faulty
     # The parameter that was set after ten frames; the one out of its range was not.
-    rows = [
-        line.split(",") for line in (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
-    ]
+    lines = (tmp_path / "out" / "frames.csv").read_text().splitlines()[1:]
+    rows = [line.split(",") for line in lines]
     counts = [int(row[3]) for row in rows if row[1] == "ok"]
     assert (counts[:10], counts[10:]) == ([250] * 10, [120] * 20)
     assert len(rows) == 30 + 5  # and five messages that were no images
     assert (tmp_path / "out-2" / "causal.txt").read_text().count("\n") == 10
-    config = gvo.Config(klt={"n_corners": 120})
-    gvo.run_recording(
-        gvo.open_recording(recording), tmp_path / "run", config=config, outputs=NO_REPORT
-    )
-    assert_same(tmp_path / "out-3", tmp_path / "run")
+    run_of(recording, tmp_path / "run", config=gvo.Config(klt={"n_corners": 120}))
+    assert_same_files(tmp_path / "out-3", tmp_path / "run")
     said = "".join(odometry.errors)
     for words in (
         "dynamic_reconfigure: klt.n_corners=-1",
@@ -234,18 +218,12 @@ def test_a_session_goes_on_whatever_comes(ros: Ros, gvo_data: Path, tmp_path: Pa
     ],
 )
 def test_what_cannot_begin_ends_in_one_line(
-    uri: str,
-    words: list[str],
-    fault: str,
-    ros: Ros,  # noqa: F811
-    tmp_path: Path,
+    uri: str, words: list[str], fault: str, ros: Ros, tmp_path: Path
 ) -> None:
     world = ros.environment | ({"ROS_MASTER_URI": uri} if uri else {})
     command = [*GVO[1:], "live", "ros1", *words, "--out", tmp_path / "out"]
     answer = python(*command, env=world, timeout=PATIENCE_S)
-    assert answer.returncode == 2
-    assert is_one_line(answer.stderr), answer.stderr
-    assert fault in answer.stderr
+    assert fault in refused(answer)
     assert not (tmp_path / "out").exists()
 
 
@@ -254,6 +232,4 @@ def test_without_rospy_a_line_says_what_to_install(tmp_path: Path) -> None:
     elsewhere = "import gvo.live.ros1; gvo.live.ros1._DEBIAN = '/nowhere'"
     program = f"{elsewhere}; from gvo.cli import main; main()"
     answer = python("-c", program, "live", "ros1", "--out", tmp_path / "out", timeout=PATIENCE_S)
-    assert answer.returncode == 2
-    assert is_one_line(answer.stderr), answer.stderr
-    assert "apt-get install python3-rospy" in answer.stderr
+    assert "apt-get install python3-rospy" in refused(answer)

@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
-import gvo
 from gvo.io.bag.reader import BagReader
 from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE
-from tests.conftest import TABLES
+from tests.conftest import assert_same_files, run_of
 from tests.live.network import Network, Outlet, recorded
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "ros" / "ros2_node.py"
@@ -117,18 +116,12 @@ def node(monkeypatch: pytest.MonkeyPatch) -> FakeNode:
         "rclpy": {"create_node": lambda _: made},
         "rclpy.callback_groups": {"ReentrantCallbackGroup": object},
         "rclpy.executors": {"MultiThreadedExecutor": FakeExecutor},
-        "rclpy.qos": {
-            "QoSProfile": make_qos,
-            "DurabilityPolicy": policies,
-            "ReliabilityPolicy": policies,
-        },
+        "rclpy.qos": {"QoSProfile": make_qos}
+        | dict.fromkeys(("DurabilityPolicy", "ReliabilityPolicy"), policies),
         "rclpy.signals": {"SignalHandlerOptions": object},
         "rclpy.utilities": {"remove_ros_args": list},
         "rosidl_runtime_py": {},
-        "rosidl_runtime_py.utilities": {
-            "get_message": lambda name: name,
-            "get_service": find_service,
-        },
+        "rosidl_runtime_py.utilities": {"get_message": str, "get_service": find_service},
     }
     for name, content in contents.items():
         module = ModuleType(name)
@@ -174,11 +167,8 @@ def test_a_camera_is_tracked_as_in_its_bag(
     finally:
         is_over.set()
     player.join(timeout=60)
-    gvo.run_recording(
-        gvo.open_recording(drive_bag), tmp_path / "run", outputs=gvo.RunOutputs(report=False)
-    )
-    for name in TABLES:
-        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    run_of(drive_bag, tmp_path / "run")
+    assert_same_files(tmp_path / "live", tmp_path / "run")
     assert [vars(each) for each in saved] == [{"success": True, "message": "20 frames are written"}]
     assert node.answers.keys() == {"/gvo/reset", "/gvo/save"}
     qos = {name: (each.reliability, each.durability) for name, each in node.received_as.items()}

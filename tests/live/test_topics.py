@@ -25,7 +25,7 @@ from gvo.live.transport import SET_POSE, Parameters, decode
 from gvo.runs.outputs.bag import TOPICS
 from gvo.trajectory.formats import read_trajectory
 from gvo.types import FloatArray
-from tests.conftest import TABLES
+from tests.conftest import TABLES, assert_same_files, run_of
 from tests.live.network import Network, recorded
 
 NO_REPORT = gvo.RunOutputs(report=False)
@@ -103,12 +103,11 @@ def test_what_is_sent_in_a_network_is_tracked_as_in_a_bag(
     bag: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     path = request.getfixturevalue(bag)
-    gvo.run_recording(gvo.open_recording(path), tmp_path / "run", outputs=NO_REPORT)
+    run_of(path, tmp_path / "run")
     play = Play(path)
     ((folder, result),) = play.run(tmp_path / "live")
     assert result.is_complete
-    for name in (*TABLES, "global.txt", "graph.g2o"):
-        assert (folder / name).read_bytes() == (tmp_path / "run" / name).read_bytes(), name
+    assert_same_files(folder, tmp_path / "run", (*TABLES, "global.txt", "graph.g2o"))
     assert {name: type_ for name, (type_, _) in play.network.opened.items()} == TOPICS
     assert play.network.opened["/tf_static"][1]
     stamps = [stamp_of(each.header) for each in play.sent(ODOMETRY)]
@@ -128,9 +127,7 @@ def test_what_is_sent_in_a_network_is_tracked_as_in_a_bag(
     assert [stamp_of(each.header) for each in path_poses] == stamps
 
 
-def test_without_tf_none_is_sent_and_nobody_is_drawn_pictures_for(
-    drive_bag: Path, tmp_path: Path
-) -> None:
+def test_without_tf_none_is_sent_and_no_pictures_drawn(drive_bag: Path, tmp_path: Path) -> None:
     play = Play(drive_bag, with_tf=False)
     play.network.unheard = {"/gvo/points", "/gvo/matches/compressed"}
     play.run(tmp_path / "out")
@@ -138,9 +135,7 @@ def test_without_tf_none_is_sent_and_nobody_is_drawn_pictures_for(
     assert len(play.sent(ODOMETRY)) == 20
 
 
-def test_the_frames_are_those_of_a_robot_where_it_says_where_its_camera_is(
-    drive_bag: Path, tmp_path: Path
-) -> None:
+def test_the_frames_are_of_a_robot_that_places_its_camera(drive_bag: Path, tmp_path: Path) -> None:
     base = BaseFrame("base_link", se3.make_transform(np.eye(3), np.array([0.1, 0.0, 0.5])))
     play = Play(drive_bag, base_frame=base)
     play.run(tmp_path / "out")
@@ -159,9 +154,7 @@ def test_the_frames_are_those_of_a_robot_where_it_says_where_its_camera_is(
     )
 
 
-def test_each_drop_is_told_with_its_reason_and_the_newest_are_tracked(
-    drive_bag: Path, tmp_path: Path
-) -> None:
+def test_each_drop_is_told_and_the_newest_are_tracked(drive_bag: Path, tmp_path: Path) -> None:
     def script(play: Play) -> None:
         middle = half(play)
         n_before = min(
@@ -188,7 +181,8 @@ def test_each_drop_is_told_with_its_reason_and_the_newest_are_tracked(
     before: list[int] = []
     play = Play(drive_bag, script, max_waiting=2)
     ((folder, result),) = play.run(tmp_path / "out")
-    stamps = [stamp_of(each.header) for each in recorded_left(play)]
+    left = [each.decode() for each in play.messages if "left/image" in each.topic.name]
+    stamps = [stamp_of(each.header) for each in left]
     n_dropped = 20 - before[0] - 2
     dropped = stamps[before[0] : -2]
     assert play.live.n_dropped == n_dropped == len(dropped)
@@ -207,11 +201,6 @@ def test_each_drop_is_told_with_its_reason_and_the_newest_are_tracked(
     assert result.summary["frames"] == 20
     assert result.summary["status_counts"]["skipped"] == n_dropped
     assert not play.live.arrivals._waiting_s
-
-
-def recorded_left(play: Play) -> list[Any]:
-    """Return the left images, decoded."""
-    return [each.decode() for each in play.messages if "left/image" in each.topic.name]
 
 
 def test_where_the_stamps_go_back_another_run_begins(drive_bag: Path, tmp_path: Path) -> None:
@@ -235,7 +224,6 @@ def test_where_the_stamps_go_back_another_run_begins(drive_bag: Path, tmp_path: 
 
 
 def shifted(message: BagMessage, by_ns: int) -> BagMessage:
-    """Return a message with another stamp."""
     content = message.decode()
     if hasattr(content, "header"):
         stamp = content.header.stamp
@@ -310,7 +298,6 @@ def test_a_pose_that_is_set_moves_the_world_and_not_odom(drive_bag: Path, tmp_pa
 
 
 def set_pose(play: Play, T: FloatArray, frame: str) -> None:
-    """Call the service that sets the pose."""
     writer = play.live._writers[0]
     from gvo.io.convert.bag_messages import Header, pose_numbers
     from gvo.runs.outputs.bag_messages import _pose
