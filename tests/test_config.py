@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -219,7 +219,6 @@ changed = st.fixed_dictionaries(
 )
 
 
-@settings(deadline=None)
 @given(values=changed)
 def test_a_description_read_back_is_the_same_configuration(
     values: dict[str, object], tmp_path_factory: pytest.TempPathFactory

@@ -31,7 +31,6 @@ def parsed(html: str) -> ElementTree.Element:
 
 
 def cells(html: str) -> dict[str, str]:
-    """Return the table."""
     found = {}
     for row in parsed(html).iter("tr"):
         name, value = ("".join(cell.itertext()) for cell in row)
@@ -64,9 +63,7 @@ def test_any_trajectory_is_well_formed(positions: FloatArray, is_of_positions: b
     covariance=arrays(np.float64, (6, 6), elements=_any_number),
     is_rigid=st.booleans(),
 )
-def test_any_estimate_is_well_formed(
-    pose: FloatArray, covariance: FloatArray, is_rigid: bool
-) -> None:
+def test_estimates_are_sound_xml(pose: FloatArray, covariance: FloatArray, is_rigid: bool) -> None:
     estimate = Estimate(
         stamp_ns=5, T_world_frame=np.eye(4) if is_rigid else pose, covariance=covariance
     )

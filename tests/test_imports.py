@@ -61,9 +61,7 @@ def poses(tmp_path: Path) -> Path:
     return path
 
 
-def test_nothing_that_draws_or_distributes_is_loaded_before_it_is_needed(
-    room_bag: Path, poses: Path, tmp_path: Path
-) -> None:
+def test_nothing_large_is_loaded_before_needed(room_bag: Path, poses: Path, tmp_path: Path) -> None:
     options = [room_bag, "--duration", "0.15", "--no-report"]
     film = tmp_path / "film.webm"
     actions = [

@@ -20,25 +20,21 @@ DOCKER = ROOT / "scripts/docker/Dockerfile"
 
 
 def two_commands() -> list[str]:
-    """Return the lines of the README's first block."""
     block = re.search(r"^```\n(.*?)^```", README, re.DOTALL | re.MULTILINE)
     assert block is not None
     return block[1].splitlines()
 
 
 def jobs() -> dict[str, Any]:
-    """Return the jobs of the workflow."""
     text = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
     return dict(yaml.safe_load(text)["jobs"])
 
 
 def lines_of(job: str) -> list[str]:
-    """Return the commands of a job."""
     return [line for step in jobs()[job]["steps"] for line in step.get("run", "").splitlines()]
 
 
 def pythons() -> list[str]:
-    """Return the versions of Python that the metadata name."""
     found = [re.fullmatch(r".* :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
     return [match[1] for match in found if match]
 
@@ -88,7 +84,6 @@ def arguments(name: str) -> list[str]:
 
 
 def copied() -> list[str]:
-    """Return the paths that the Dockerfile copies from the repository."""
     return [source for rest in arguments("COPY") for source in rest.split()[:-1]]
 
 

@@ -112,9 +112,7 @@ def limit_cores(cores: set[int]) -> None:
         os.sched_setaffinity(0, cores)
 
 
-def test_threads_cores_hashes_and_folders_change_no_bit(
-    bags: dict[Sensor, str], tmp_path: Path
-) -> None:
+def test_threads_cores_and_hashes_change_no_bit(bags: dict[Sensor, str], tmp_path: Path) -> None:
     one = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
     many = {"OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "4", "PYTHONHASHSEED": "4711"}
     first_core = set(sorted(affinity())[:1])

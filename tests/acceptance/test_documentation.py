@@ -29,7 +29,6 @@ MODULES = [
 
 
 def blocks(language: str) -> list[tuple[str, str]]:
-    """Return the fenced blocks of a language with the page that holds them."""
     return [
         (page.name, block)
         for page in PAGES

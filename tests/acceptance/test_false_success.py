@@ -13,7 +13,7 @@ from gvo import Config, FrameResult, Odometry, SyntheticRecording, frames
 from gvo.geometry import se3
 from gvo.io.synthetic.worlds.deceptive import bus_path
 from gvo.types import FloatArray, RgbdFrame, Status, StereoFrame
-from tests.diagnostics.check.planted import Held
+from tests.recordings import Held
 
 pytestmark = pytest.mark.acceptance
 
@@ -86,9 +86,7 @@ def test_a_bus_that_fills_two_thirds_of_the_view_does_not_carry_the_camera_along
     ("kind", "speed", "seed"),
     [("klt", 0.5, 0), ("klt", 0.5, 1), ("descriptor", 1.0, 0), ("descriptor", 2.0, 0)],
 )
-def test_a_bus_that_pulls_off_gently_does_not_draw_the_prediction_along(
-    kind: str, speed: float, seed: int
-) -> None:
+def test_a_bus_that_pulls_off_does_not_draw_predictions(kind: str, speed: float, seed: int) -> None:
     tracked = track(rendered("traffic", "stereo", 95, 0.4, seed=seed, speed=speed), kind=kind)
     assert not list(tracked.wrong_steps())
     assert tracked.errors_m().max() < 0.3

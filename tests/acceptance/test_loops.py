@@ -143,7 +143,5 @@ def test_the_table_shows_the_errors_that_the_runs_tell(tmp_path: Path) -> None:
         (["--loops", "x.bag", "--set", "loops.enabled=false"], "expected loops.enabled"),
     ],
 )
-def test_what_cannot_be_judged_is_told_in_one_line(
-    script: Script, options: list[str], message: str
-) -> None:
+def test_what_cannot_be_judged_is_told(script: Script, options: list[str], message: str) -> None:
     assert message in script("benchmark", options)

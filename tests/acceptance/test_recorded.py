@@ -31,9 +31,7 @@ def test_folder_and_bag_give_the_same_frames_and_cameras(
             np.testing.assert_array_equal(getattr(camera, matrix), getattr(copy, matrix))
 
 
-def test_folder_and_bag_give_the_same_bytes(
-    command: Command, gvo_data: Path, tmp_path: Path
-) -> None:
+def test_folder_and_bag_give_equal_bytes(command: Command, gvo_data: Path, tmp_path: Path) -> None:
     assert command("convert", gvo_data / KITTI, tmp_path / "bag.mcap").code == 0
     for out, recording in (("a", gvo_data / KITTI), ("b", tmp_path / "bag.mcap")):
         assert command("run", recording, "--out", tmp_path / out, "--no-report").code == 0

@@ -27,7 +27,6 @@ def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def output(name: str, *arguments: object) -> list[str]:
-    """Return the lines of a script that ends well."""
     answer = run(name, *arguments)
     assert answer.returncode == 0, answer.stderr
     return answer.stdout.splitlines()
@@ -58,7 +57,6 @@ def test_reading_is_timed_against_the_bare_loop(drive_bag: Path, room_bag: Path)
 
 
 def table(lines: list[str], first: str) -> dict[str, list[str]]:
-    """Return the rows of the Markdown table whose first heading is given, by their first cell."""
     start = next(n for n, line in enumerate(lines) if line.startswith(f"| {first} "))
     rows = takewhile(lambda line: line.startswith("|"), lines[start + 2 :])
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
@@ -88,9 +86,7 @@ def test_the_benchmark_prints_errors_and_stages(benchmark_lines: list[str]) -> N
     assert all(float(error) > 0.0 for error in errors[1:4])
 
 
-def test_the_benchmark_compares_the_whole_run_with_the_yardstick(
-    benchmark_lines: list[str],
-) -> None:
+def test_the_benchmark_compares_a_whole_run_with_the_yardstick(benchmark_lines: list[str]) -> None:
     found = [line for line in benchmark_lines if line.startswith(("whole", "memory", "yardstick"))]
     assert len(found) == 4
     spent, memory, yardstick, ratios = [

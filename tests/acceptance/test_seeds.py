@@ -29,7 +29,6 @@ def rows_of(table: str) -> dict[str, list[str]]:
 
 
 def ates_m(source: Source) -> tuple[float, float]:
-    """Return raw and smoothed ATE of a recording."""
     odometry = gvo.Odometry(source.info.camera, gvo.Config())
     raw: list[gvo.Estimate] = []
     smoothed: list[gvo.Estimate] = []
@@ -86,7 +85,5 @@ def test_the_table_shows_the_errors_of_each_seed_again_from_the_kept_bags(tmp_pa
         (["--seeds", "0"], "argument --seeds"),
     ],
 )
-def test_options_out_of_range_end_with_one_line_and_2(
-    script: Script, options: list[str], message: str
-) -> None:
+def test_options_out_of_range_are_refused(script: Script, options: list[str], message: str) -> None:
     assert message in script("benchmark", ["--frames", N_FRAMES, *options])

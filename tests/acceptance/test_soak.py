@@ -96,9 +96,7 @@ def test_a_run_holds_no_more_when_it_goes_on(drive: Any, tmp_path: Path) -> None
     assert n_objects < MAX_GROWTH_OBJECTS
 
 
-def test_frames_that_are_kept_are_seen(
-    drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kept_frames_are_seen(drive: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept, extract = [], KltFrontend.extract
 
     def hoard(self: KltFrontend, frame: Any) -> Any:

@@ -59,9 +59,7 @@ def test_the_cost_of_an_edge_is_that_of_its_kernel(seed: int, size: float, kerne
     for made in (
         Factors(WindowConfig(kernel=kernel)).between(0, 1, Measurement.of(edge)),
         Factors(WindowConfig(kernel="none")).between(
-            0,
-            1,
-            Measurement.of(replace(edge, kernel=kernel)),
+            0, 1, Measurement.of(replace(edge, kernel=kernel))
         ),
     ):
         expected = expected_cost(kernel, size, CONSTANTS.get(kernel, 0.0))

@@ -74,9 +74,7 @@ def test_two_poses_are_as_near_from_either_side(twist: np.ndarray[Any, Any]) -> 
     ("scores", "expected"),
     [({}, True), ({1: 0.74}, True), ({1: 0.2, 2: 0.76}, False), ({1: 0.75}, False)],
 )
-def test_a_keyframe_is_needed_where_all_others_are_too_far(
-    scores: dict[int, float], expected: bool
-) -> None:
+def test_a_keyframe_is_needed_far_from_others(scores: dict[int, float], expected: bool) -> None:
     assert is_needed(scores, configure()) == expected
 
 
@@ -151,9 +149,7 @@ def test_links_are_near_once_each_and_not_to_the_predecessor(
     n_keyframes=st.integers(0, 6),
     n_new=st.integers(0, 1),
 )
-def test_released_are_those_too_far_and_the_farthest_beyond_the_limit(
-    shares: list[float], n_keyframes: int, n_new: int
-) -> None:
+def test_far_and_surplus_are_released(shares: list[float], n_keyframes: int, n_new: int) -> None:
     scores = dict(enumerate(shares))
     released = choose_released(
         scores, configure(n_keyframes=n_keyframes), n_kept=len(scores) + n_new

@@ -330,9 +330,7 @@ def test_without_keyframes_nobody_is_kept() -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [(5, None), (None, 5), (3, 6)])
-def test_an_empty_window_takes_another_size_as_if_it_had_begun_with_it(
-    before: int | None, after: int | None
-) -> None:
+def test_an_empty_window_takes_a_size_as_its_own(before: int | None, after: int | None) -> None:
     window = SlidingWindow(WindowConfig(size=before))
     window.reconfigure(WindowConfig(size=after))
     go_on(window, 0, 12)

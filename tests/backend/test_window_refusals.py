@@ -193,9 +193,7 @@ def test_an_edge_that_contradicts_all_others_is_refused_and_leaves_no_trace(jump
 
 @pytest.mark.parametrize("jump", [0.5, 10.0, 1e3])
 @pytest.mark.parametrize("kind", [PosePrior, PositionPrior])
-def test_a_prior_that_contradicts_a_sure_window_is_believed_and_the_window_goes_on(
-    kind: type[Prior], jump: float
-) -> None:
+def test_a_prior_that_contradicts_a_sure_window_is_believed(kind: type[Prior], jump: float) -> None:
     moved: Prior
     if kind is PosePrior:
         moved = PosePrior(

@@ -14,6 +14,5 @@ def complete(**values: Any) -> BatchRow:
 
 
 def failed(row: BatchRow | None = None, reason: str = "does not exist", **values: Any) -> BatchRow:
-    """Return the row of a failed run, named as another one."""
     named = {name: getattr(row, name) for name in (*_NAMED, "parameters")} if row else _NAMED
     return BatchRow(status="failed", reason=reason, **{**named, **values})

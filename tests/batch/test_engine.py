@@ -70,9 +70,7 @@ def test_no_tasks_give_no_rows(near: Client, options: TaskOptions) -> None:
     assert list(Engine(near, options).run([])) == []
 
 
-def test_nothing_is_kept_and_not_all_is_handed_out_at_once(
-    near: Client, options: TaskOptions
-) -> None:
+def test_nothing_is_kept_nor_all_handed_out_at_once(near: Client, options: TaskOptions) -> None:
     n_held: list[int] = []
     n_known: list[int] = []
 
@@ -106,9 +104,7 @@ def test_an_exception_of_any_kind_is_a_row_with_its_reason(
     assert "does not exist" in rows["r1"].reason
 
 
-def test_a_device_as_recording_stops_nobody(
-    near: Client, options: TaskOptions, tmp_path: Path
-) -> None:
+def test_a_device_stops_nobody(near: Client, options: TaskOptions, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.bag")
     (tmp_path / "closed").mkdir(mode=0)
     (tmp_path / "empty.bag").touch()
@@ -137,9 +133,7 @@ def test_progress_counts_what_is_done(near: Client, options: TaskOptions, bags: 
     assert (again[-1].n_found, again[-1].n_failed, again[-1].frames_per_s) == (2, 1, 0.0)
 
 
-def test_what_a_caller_raises_ends_the_batch_and_gives_up_the_rest(
-    near: Client, options: TaskOptions
-) -> None:
+def test_what_a_caller_raises_ends_the_whole_batch(near: Client, options: TaskOptions) -> None:
     def stop(progress: BatchProgress) -> None:
         if progress.n_done == 3:
             raise KeyboardInterrupt

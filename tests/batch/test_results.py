@@ -46,11 +46,7 @@ def assert_both_give_it_back(frame: pd.DataFrame, folder: Path) -> None:
 
 def test_both_files_give_the_table_back(tmp_path: Path) -> None:
     frame = to_frame(
-        [
-            complete(**MEASURED),
-            failed(),
-            complete(**MEASURED | {"is_found": True, "run_s": None}),
-        ]
+        [complete(**MEASURED), failed(), complete(**MEASURED | {"is_found": True, "run_s": None})]
     )
     assert_both_give_it_back(frame, tmp_path)
     assert pd.read_csv(tmp_path / CSV)["ate_smoothed_m"].tolist()[0] == 0.1 + 0.2

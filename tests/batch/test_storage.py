@@ -131,9 +131,7 @@ def test_the_root_of_a_file_system_can_be_asked_for(memory: str, folder: Path) -
         assert found.name == "place"
 
 
-def test_a_path_is_absolute_but_its_links_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_is_absolute_its_links_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
     monkeypatch.chdir(tmp_path)

@@ -53,9 +53,7 @@ def test_news_are_sent_now_and_then(clock: SimpleNamespace) -> None:
 
 
 @pytest.mark.parametrize("states", [{}, {KEY: "cancelled"}, {("batch", 8): "executing"}])
-def test_a_task_that_nobody_wants_any_more_stops(
-    clock: SimpleNamespace, states: dict[Any, str]
-) -> None:
+def test_a_task_that_nobody_wants_stops(clock: SimpleNamespace, states: dict[Any, str]) -> None:
     worker = Worker({KEY: "executing"})
     tell = _reporter(worker, "topic", KEY)
     tell(progress(1))

@@ -5,7 +5,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -140,7 +140,6 @@ def test_octaves_count_from_the_finest_level(kind: Kind) -> None:
     assert octaves.max() < 10
 
 
-@settings(deadline=None)
 @given(groups=st.lists(st.integers(0, 5), max_size=30))
 def test_ranks_count_within_each_group(groups: list[int]) -> None:
     ordered = sorted(groups)

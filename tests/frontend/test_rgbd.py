@@ -42,7 +42,7 @@ def tilted(seed: int) -> tuple[DepthArray, FloatArray]:
     return inverse_plane(coefficients, u, v).astype(np.float32), coefficients
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=seeds)
 def test_the_depth_of_a_plane_is_exact_between_pixels_and_beside_holes(seed: int) -> None:
     depth, coefficients = tilted(seed)
@@ -58,7 +58,7 @@ def test_the_depth_of_a_plane_is_exact_between_pixels_and_beside_holes(seed: int
     np.testing.assert_allclose(depths[is_fitted], expected[is_fitted], rtol=1e-6)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=seeds)
 def test_noisy_depth_is_that_of_the_least_squares_plane(seed: int) -> None:
     depth, _ = tilted(seed)
@@ -165,7 +165,7 @@ def test_a_radius_of_zero_looks_at_the_pixel_alone() -> None:
     assert not sample_depth(depth, np.array([[10.0, 5.0]]), SETTINGS)[1].any()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=seeds, radius=st.integers(0, 3))
 def test_what_is_valid_is_what_a_plain_loop_finds(seed: int, radius: int) -> None:
     rng = np.random.default_rng(seed)

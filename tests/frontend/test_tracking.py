@@ -13,7 +13,7 @@ from tests.frontend.analytic import SHAPE, grid, image
 CONFIG = KltConfig(window_radius_px=6)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(du=st.floats(-4.0, 4.0), dv=st.floats(-4.0, 4.0))
 def test_pixels_are_followed_to_a_small_fraction(du: float, dv: float) -> None:
     pixels = grid()

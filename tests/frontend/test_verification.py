@@ -42,9 +42,7 @@ def assert_is(result: RelativePose | Failure, twist: FloatArray) -> None:
 
 @pytest.mark.parametrize("n_bus", [90, 150, 300])
 @pytest.mark.parametrize("camera", [STILL, DRIVING])
-def test_a_majority_that_moves_otherwise_than_predicted_does_not_win(
-    camera: FloatArray, n_bus: int
-) -> None:
+def test_a_majority_that_moves_unpredictably_does_not_win(camera: FloatArray, n_bus: int) -> None:
     matches = matches_of((camera, 60), (camera + BUS, n_bus), n_wrong=20)
     assert_is(register(matches, camera + np.array([0.001, -0.001, 0.0, 0.02, 0.0, 0.02])), camera)
 

@@ -149,13 +149,7 @@ def make_messages(*, is_ros1: bool) -> dict[str, Any]:
     pixels = np.arange(48, dtype=np.uint8)
     return {
         IMAGE_TYPE: types[IMAGE_TYPE](
-            header=header,
-            height=6,
-            width=8,
-            encoding="mono8",
-            is_bigendian=0,
-            step=8,
-            data=pixels,
+            header=header, height=6, width=8, encoding="mono8", is_bigendian=0, step=8, data=pixels
         ),
         COMPRESSED_TYPE: types[COMPRESSED_TYPE](header=header, format="png", data=pixels),
         _INFO_TYPE: types[_INFO_TYPE](
@@ -173,7 +167,6 @@ def make_messages(*, is_ros1: bool) -> dict[str, Any]:
 
 
 def serialise(message: Any, type_: str, *, is_ros1: bool) -> bytes:
-    """Return a message as a bag holds it."""
     store = typestore(is_ros1=is_ros1)
     write = store.serialize_ros1 if is_ros1 else store.serialize_cdr
     return bytes(write(message, type_))

@@ -42,7 +42,6 @@ class Target:
     dictionary: Sequence[bytes] = ()
 
     def execute(self, data: bytes) -> None:
-        """Run once; what comes out of here is a finding. Warnings are errors."""
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             try:
@@ -71,7 +70,6 @@ class Folder:
         self.path = Path(self._held.name)
 
     def write(self, name: str, data: bytes) -> Path:
-        """Write a file and return its path."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
@@ -87,7 +85,6 @@ class Choices:
 
     @property
     def rest(self) -> bytes:
-        """What was not used."""
         return self._data[self._position :]
 
     def take(self, n_bytes: int) -> bytes:
@@ -97,13 +94,10 @@ class Choices:
         return found.ljust(n_bytes, b"\0")
 
     def integer(self, n_bytes: int, *, signed: bool = False) -> int:
-        """Return an integer of some bytes."""
         return int.from_bytes(self.take(n_bytes), "little", signed=signed)
 
     def below(self, limit: int) -> int:
-        """Return an integer from 0 to below a limit."""
         return self.integer(2 if limit > 256 else 1) % limit
 
     def pick(self, values: Sequence[T]) -> T:
-        """Return one of some values."""
         return values[self.below(len(values))]

@@ -223,10 +223,7 @@ TARGETS = (
         seeds=lambda: [f"{COVARIANCE_HEADER}\n1,".encode() + _UPPER.replace(b" ", b",") + b"\n"],
     ),
     _text(
-        name="g2o_lines",
-        run=_g2o_line,
-        seeds=lambda: _lines_of(_GRAPH),
-        documented=(ValueError,),
+        name="g2o_lines", run=_g2o_line, seeds=lambda: _lines_of(_GRAPH), documented=(ValueError,)
     ),
     _text(name="g2o_files", run=_g2o_file, seeds=lambda: [_GRAPH]),
     _text(name="edge_files", run=_edge_files, seeds=lambda: [_GRAPH, _TUM, _KITTI, _EUROC]),

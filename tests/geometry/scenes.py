@@ -55,7 +55,6 @@ def random_points(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 def near_a_line(spread_m: float) -> FloatArray:
-    """Return points (30, 3)."""
     line = np.linspace(0.0, 1.0, 30)[:, np.newaxis] * [1.0, 0.3, 4.0] + [0.5, 0.0, 3.0]
     return np.asarray(line + spread_m * np.random.default_rng(1).normal(size=(30, 3)))
 

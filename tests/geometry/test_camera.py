@@ -96,9 +96,7 @@ def test_an_image_of_one_pixel_is_one() -> None:
 
 
 @pytest.mark.parametrize("baseline", [0.0, 0.2])
-def test_the_calibration_of_an_ideal_camera_says_all_that_a_camera_info_says(
-    baseline: float,
-) -> None:
+def test_the_calibration_of_an_ideal_camera_says_all_a_camera_info_says(baseline: float) -> None:
     calibration = Calibration.from_camera(CAMERA, **({"baseline": baseline} if baseline else {}))
     assert (calibration.width, calibration.height) == (640, 480)
     assert calibration.is_rectified
@@ -138,9 +136,7 @@ def test_only_what_lies_between_the_two_cameras_is_their_baseline() -> None:
         (2, 2, -2.1e-6, False),
     ],
 )
-def test_rounding_of_a_projection_is_no_other_camera(
-    row: int, column: int, value: float, is_one: bool
-) -> None:
+def test_a_rounded_camera_is_the_same(row: int, column: int, value: float, is_one: bool) -> None:
     right = with_other_p(RIGHT, row, column, value)
     if is_one:
         assert stereo_camera(ideal(), right).baseline == pytest.approx(0.2, rel=1e-5)
@@ -158,9 +154,7 @@ def test_rounding_of_a_projection_is_no_other_camera(
         (ideal(), replace(RIGHT, width=320, height=240), "640x480.*320x240"),
     ],
 )
-def test_what_is_no_rectified_pair_is_refused(
-    left: Calibration, right: Calibration, match: str
-) -> None:
+def test_what_is_no_pair_is_refused(left: Calibration, right: Calibration, match: str) -> None:
     with pytest.raises(CalibrationError, match=match):
         stereo_camera(left, right)
 

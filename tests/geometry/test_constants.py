@@ -239,9 +239,7 @@ def barely_moved(step_m: float) -> tuple[FloatArray, Correspondences]:
 
 
 @pytest.mark.parametrize(("share", "is_told"), [(1.3e-10, True), (0.75e-10, False)])
-def test_a_motion_too_small_to_tell_the_offset_from_rounding_tells_nothing(
-    share: float, is_told: bool
-) -> None:
+def test_a_motion_too_small_to_tell_an_offset_tells_nothing(share: float, is_told: bool) -> None:
     step = 1e-3 * np.sqrt(share / information_share(*barely_moved(1e-3)))
     T, matches = barely_moved(float(step))
     assert information_share(T, matches) == pytest.approx(share, rel=0.01)

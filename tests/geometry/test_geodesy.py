@@ -58,9 +58,7 @@ def test_the_point_lies_its_height_above_the_ellipsoid_along_the_normal(
 
 
 @given(latitudes, longitudes)
-def test_the_axes_of_enu_are_right_handed_and_point_east_north_up(
-    latitude: float, longitude: float
-) -> None:
+def test_the_axes_of_enu_are_right_handed_and_as_named(latitude: float, longitude: float) -> None:
     R = enu_of_ecef(latitude, longitude)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.cross(R[0], R[1]), R[2], atol=1e-12)

@@ -84,9 +84,7 @@ def visible(calibration: Calibration, rng: np.random.Generator, n: int = 60) -> 
 
 
 @pytest.mark.parametrize(("model", "D"), _LENSES, ids=_IDS)
-def test_the_maps_send_the_pixel_of_a_point_to_its_raw_pixel(
-    model: DistortionModel, D: list[float]
-) -> None:
+def test_the_maps_send_pixels_to_their_raw_pixels(model: DistortionModel, D: list[float]) -> None:
     rng = np.random.default_rng(0)
     camera = raw(model, D)
     R = np.asarray(Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix())
@@ -158,9 +156,7 @@ def test_the_rotations_of_wide_pairs_are_those_that_opencv_chooses() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_fisheye_pair_keeps_the_resolution_of_its_centre_and_has_no_empty_border(
-    seed: int,
-) -> None:
+def test_a_fisheye_pair_keeps_the_resolution_of_its_centre_without_a_border(seed: int) -> None:
     lenses = raw("equidistant", _FISHEYE, focal=190.0), raw("equidistant", _FISHEYE, focal=192.0)
     pair = rectify_stereo(*lenses, mount(seed))
     for rectified in pair:
@@ -274,9 +270,7 @@ def test_rectification_keeps_the_raw_calibrations_but_for_what_they_say_of_it() 
     np.testing.assert_array_equal(left.P[:, :3], right.P[:, :3])
 
 
-def test_a_pair_at_which_opencv_gives_up_is_refused_with_what_to_do(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_pair_at_which_opencv_gives_up_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def give_up(*_: object, **__: object) -> None:
         raise cv2.error("no projection")
 

@@ -261,9 +261,7 @@ def test_the_search_stops_when_a_better_sample_is_no_longer_to_be_expected(
     assert numbers[0] == numbers[60] < numbers[120] < numbers[200] == 1000
 
 
-def test_only_inliers_among_the_near_points_shorten_the_search(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_near_inliers_shorten_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     # All far points agree, two of three near ones do not: samples are drawn of those.
     _, matches, is_inlier = scene(np.random.default_rng(2), 200, 60)
     is_near = ~is_inlier | (np.cumsum(is_inlier) <= 30)
@@ -277,9 +275,7 @@ def test_only_inliers_among_the_near_points_shorten_the_search(
 
 
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 200])
-def test_no_more_hypotheses_are_tried_than_configured(
-    monkeypatch: pytest.MonkeyPatch, n: int
-) -> None:
+def test_hypotheses_are_as_many_as_configured(monkeypatch: pytest.MonkeyPatch, n: int) -> None:
     _, matches, _ = scene(np.random.default_rng(3), 60, 60)
     config = configure(n_hypotheses=n)
     assert count_hypotheses(monkeypatch, matches, config) == n

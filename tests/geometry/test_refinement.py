@@ -12,11 +12,7 @@ from scipy.spatial.transform import Rotation
 from gvo.config import RegistrationConfig
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.refinement import (
-    Refinement,
-    fit_covariance,
-    refine_pose,
-)
+from gvo.geometry.refinement import Refinement, fit_covariance, refine_pose
 from gvo.types import BoolArray, Failure, FloatArray
 from tests.geometry.scenes import (
     CAMERA,

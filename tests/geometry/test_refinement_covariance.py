@@ -90,9 +90,7 @@ def covariance_of(T: FloatArray, matches: Correspondences) -> Refinement:
 
 
 @given(seed=seeds, n=st.integers(8, 60), size=st.sampled_from([0.02, 0.5, 1.0, 1.5]))
-def test_the_covariance_is_that_of_the_robust_cost_match_by_match(
-    seed: int, n: int, size: float
-) -> None:
+def test_the_covariance_is_of_the_robust_cost_by_match(seed: int, n: int, size: float) -> None:
     # Some residuals are beyond the kernel's threshold, along all axes.
     rng = np.random.default_rng(seed)
     T, matches = measure(rng, size * rng.normal(size=(n, 3)))
@@ -135,9 +133,7 @@ def wrong_depths(length: float) -> tuple[FloatArray, Correspondences]:
 
 
 @pytest.mark.parametrize(("loss", "is_curved"), [(9.9, True), (10.1, False)])
-def test_the_curvature_counts_where_it_loses_less_than_nine_tenths(
-    loss: float, is_curved: bool
-) -> None:
+def test_the_curvature_counts_where_it_loses_under_90_percent(loss: float, is_curved: bool) -> None:
     length = brentq(lambda length: loss_of(*wrong_depths(length)) - loss, 1.0001 * HUBER, 100.0)
     T, matches = wrong_depths(float(length))
     assert loss_of(T, matches) == pytest.approx(loss, rel=1e-6)
@@ -162,9 +158,7 @@ def inflation_of(matches: Correspondences) -> float:
 
 
 @pytest.mark.parametrize(("inflation", "is_open"), [(0.7e10, False), (1.4e10, True)])
-def test_a_direction_is_open_beyond_a_hundred_thousand_sigmas(
-    inflation: float, is_open: bool
-) -> None:
+def test_a_direction_is_open_beyond_100000_sigmas(inflation: float, is_open: bool) -> None:
     spread = 1e-4 * np.sqrt(inflation_of(seen_near_a_line(1e-4)) / inflation)
     matches = seen_near_a_line(float(spread))
     assert inflation_of(matches) == pytest.approx(inflation, rel=0.05)
@@ -183,9 +177,7 @@ def steps_before_and_after(events: list[Event]) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("n_iterations", [1, 2, 3])
-def test_the_first_round_is_of_two_steps_and_none_has_more_than_configured(
-    n_iterations: int,
-) -> None:
+def test_the_first_round_has_two_steps_and_none_more_than_configured(n_iterations: int) -> None:
     rng = np.random.default_rng(0)
     T, matches = measure(rng, rng.normal(size=(40, 3)))
     # So far away, and so narrow a kernel, that no step is small.
@@ -210,9 +202,7 @@ def test_steps_end_where_they_are_a_thirtieth_of_a_sigma() -> None:
 
 
 @pytest.mark.parametrize(("n_wrong", "n_kept"), [(0, 10), (10, 10), (11, 10), (12, 22), (25, 35)])
-def test_a_choice_that_loses_more_than_half_of_the_inliers_is_not_taken(
-    n_wrong: int, n_kept: int
-) -> None:
+def test_a_choice_that_loses_half_of_the_inliers_is_not_taken(n_wrong: int, n_kept: int) -> None:
     # The wrong ones are so unsure that they do not move the pose, and beyond the gate.
     rng = np.random.default_rng(3)
     errors = np.zeros((10 + n_wrong, 3))

@@ -7,12 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gvo.geometry import se3
 from gvo.geometry.correspondences import Correspondences
-from gvo.geometry.residuals import (
-    Linearization,
-    StereoResiduals,
-    pose_jacobian,
-    source_jacobian,
-)
+from gvo.geometry.residuals import Linearization, StereoResiduals, pose_jacobian, source_jacobian
 from gvo.types import Failure, FloatArray
 from tests.geometry.scenes import (
     CAMERA,
@@ -93,9 +88,7 @@ def test_normal_equations_are_those_of_the_inverse_covariances(seed: int) -> Non
 
 
 @given(seed=seeds)
-def test_a_gradient_has_new_residuals_and_weights_and_the_derivatives_it_is_given(
-    seed: int,
-) -> None:
+def test_a_gradient_has_new_residuals_and_weights_with_given_derivatives(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T = random_motion(rng)
     residuals = StereoResiduals.of(T, random_matches(rng, T, 9), CAMERA, huber=1.5)

@@ -56,7 +56,6 @@ class Tiny:
     camera = PinholeCamera(fx=50.0, fy=50.0, cx=23.5, cy=15.5, width=_WIDTH, height=_HEIGHT)
 
     def texture(self, seed: int, *, is_color: bool = False) -> NDArray[np.uint8]:
-        """Return noise: no two images are alike."""
         shape = (_HEIGHT, _WIDTH, 3) if is_color else (_HEIGHT, _WIDTH)
         return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
@@ -68,19 +67,16 @@ class Tiny:
         return values
 
     def depth(self, seed: int) -> NDArray[np.float32]:
-        """Return the same depth in metres."""
         depth = self.counts(seed).astype(np.float32) / np.float32(5000)
         depth[0, :2] = np.nan
         return depth
 
     def stereo(self, items: Sequence[Item], **options: Any) -> ListSource:
-        """Return a rectified stereo recording."""
         left = Calibration.from_camera(self.camera)
         right = Calibration.from_camera(self.camera, baseline=0.5)
         return ListSource("stereo", items, **({"calibrations": (left, right)} | options))
 
     def rgbd(self, items: Sequence[Item], **options: Any) -> ListSource:
-        """Return an undistorted RGB-D recording."""
         calibration = Calibration.from_camera(self.camera)
         return ListSource("rgbd", items, **({"calibrations": (calibration,)} | options))
 
@@ -96,7 +92,6 @@ class Tiny:
         return {key: value for key, value in (content | changes).items() if value is not None}
 
     def write_image(self, path: Path, pixels: NDArray[Any]) -> None:
-        """Write an image file, and the folders above it."""
         path.parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(path), pixels)
 

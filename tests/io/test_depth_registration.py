@@ -26,11 +26,7 @@ _TURN = Rotation.from_rotvec([0.005, -0.01, 0.004]).as_matrix()
 
 _DEPTH_CAMERAS = pytest.mark.parametrize(
     "camera",
-    [
-        _COLOR,
-        _HALF,
-        PinholeCamera(fx=920.0, fy=920.0, cx=639.5, cy=359.5, width=1280, height=720),
-    ],
+    [_COLOR, _HALF, PinholeCamera(fx=920.0, fy=920.0, cx=639.5, cy=359.5, width=1280, height=720)],
     ids=["as fine", "coarser", "finer"],
 )
 _PLACES = pytest.mark.parametrize(
@@ -78,7 +74,7 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(
     assert np.mean(is_off) < 2e-4
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     t=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
     coarseness=st.floats(0.5, 3.0),
@@ -86,10 +82,7 @@ def test_registered_depth_is_what_the_colour_camera_would_measure(
     turn=st.tuples(*[st.floats(-0.02, 0.02)] * 3),
 )
 def test_no_background_shines_through_a_nearer_surface(
-    t: tuple[float, float, float],
-    coarseness: float,
-    near: float,
-    turn: tuple[float, float, float],
+    t: tuple[float, float, float], coarseness: float, near: float, turn: tuple[float, float, float]
 ) -> None:
     color = PinholeCamera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
     width, height = int(160 / coarseness), int(120 / coarseness)

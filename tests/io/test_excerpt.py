@@ -75,9 +75,7 @@ def test_every_third_frame_is_the_first_and_then_each_third() -> None:
 
 
 @given(items=_recordings, cut=st.integers(1, 100), every=st.integers(1, 5))
-def test_an_excerpt_is_what_its_definition_says(
-    items: list[Pair | FaultyFrame], cut: int, every: int
-) -> None:
+def test_an_excerpt_is_as_defined(items: list[Pair | FaultyFrame], cut: int, every: int) -> None:
     excerpt = Excerpt(start_s=cut / 10, duration_s=cut / 7, every=every)
     since = [_stamp_ns(item) - _FIRST_NS for item in items]
     inside = [

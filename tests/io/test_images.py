@@ -160,9 +160,7 @@ def test_a_jpeg_may_be_padded_by_zeros_and_fill_bytes(tiny: Any, n_zeros: int) -
 
 
 @given(black=st.integers(0, 65534), span=st.integers(1, 65535), seed=st.integers(0, 1000))
-def test_a_range_keeps_the_order_and_reaches_black_and_white(
-    black: int, span: int, seed: int
-) -> None:
+def test_a_range_keeps_order_and_has_black_and_white(black: int, span: int, seed: int) -> None:
     white = min(black + span, 65535)
     values = np.sort(np.random.default_rng(seed).integers(0, 65536, 50)).astype(np.uint16)
     values[[0, -1]] = black, white
@@ -235,9 +233,7 @@ _SCALES = st.sampled_from([1000.0, 5000.0, 256.0])
 
 
 @given(counts=_COUNTS, scale=_SCALES)
-def test_counts_come_back_as_they_were_but_for_what_is_unknown(
-    counts: np.ndarray, scale: float
-) -> None:
+def test_counts_come_back_but_for_what_is_unknown(counts: np.ndarray, scale: float) -> None:
     depth = depth_from_counts(counts, scale, "test")
     found, n_too_far = to_counts(depth, scale)
     np.testing.assert_array_equal(found, np.where(counts == 65535, 0, counts))

@@ -100,18 +100,14 @@ def test_pairs_keep_the_limit_and_the_order_and_use_each_image_once(
 
 
 @given(first=_rising_stamps, second=_rising_stamps)
-def test_one_of_a_pair_has_the_neighbour_before_or_after_it(
-    first: list[int], second: list[int]
-) -> None:
+def test_one_of_a_pair_is_next_to_the_other(first: list[int], second: list[int]) -> None:
     for pair in _pairs(first, second):
         between = [[t for t in stream if min(pair) < t < max(pair)] for stream in (first, second)]
         assert not all(between)
 
 
 @given(first=_rising_stamps, second=_rising_stamps)
-def test_no_two_images_are_left_alone_that_would_make_a_pair_between_others(
-    first: list[int], second: list[int]
-) -> None:
+def test_no_two_images_that_make_a_pair_are_left_alone(first: list[int], second: list[int]) -> None:
     pairs = [(-(10**6), -(10**6)), *_pairs(first, second), (10**6, 10**6)]
     for before, after in pairwise(pairs):
         alone = [stamp for stamp in first if before[0] < stamp < after[0]]
@@ -327,9 +323,7 @@ def test_an_image_says_that_another_one_got_its_partner() -> None:
 
 @pytest.mark.parametrize("limit_ns", [0, _LIMIT])
 @pytest.mark.parametrize(("late", "word"), [(200, "repeats"), (150, "goes back from 200 to 150")])
-def test_a_pair_whose_stamp_repeats_or_goes_back_makes_a_faulty_frame(
-    late: int, word: str, limit_ns: int
-) -> None:
+def test_a_pair_whose_stamp_does_not_advance_is_faulty(late: int, word: str, limit_ns: int) -> None:
     stamps = [100, 200, late, 300]
     pairs = _pair(stamps, stamps, [False, True] * 4, limit_ns=limit_ns)
     assert pairs[:2] == [(100, 100), (200, 200)]
@@ -400,9 +394,7 @@ def test_few_images_are_kept_where_the_other_stream_ends(stream: int, limit_ns: 
 
 
 @pytest.mark.parametrize("options", [{"limit_ns": -1}, {"queue_size": 0}, {"age_penalty": -0.1}])
-def test_parameters_out_of_range_are_refused_before_anything_is_read(
-    options: dict[str, float],
-) -> None:
+def test_parameters_out_of_range_are_refused_before_reading(options: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected limit_ns >= 0, queue_size >= 1"):
         pair_images([], **({"limit_ns": 1, "partner": "depth"} | options))  # type: ignore[arg-type]
 
@@ -416,9 +408,7 @@ def _pairs_of(source: Source) -> list[tuple[int, int] | str]:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
-def test_the_clock_of_the_recording_does_not_matter(
-    tiny: Tiny, tmp_path: Path, delay_s: float
-) -> None:
+def test_the_recording_clock_does_not_matter(tiny: Tiny, tmp_path: Path, delay_s: float) -> None:
     """Log times two years off, by a slow clock, depth later than colour."""
     items: list[Item] = []
     for n in range(20):

@@ -207,7 +207,7 @@ _messages = st.one_of(
 )
 
 
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=1500)
 @given(messages=_messages, unit=_units, limit=_limits, age_penalty=_penalties)
 def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
     reference: Reference, messages: list[Message], unit: int, limit: int, age_penalty: float
@@ -217,28 +217,17 @@ def test_the_pairs_are_those_of_message_filters_and_come_after_the_same_image(
 
 
 @pytest.mark.acceptance
-@settings(max_examples=1500, deadline=None)
-@given(
-    messages=_messages,
-    limit=_limits,
-    age_penalty=_penalties,
-    queue_size=st.integers(1, 6),
-)
+@settings(max_examples=1500)
+@given(messages=_messages, limit=_limits, age_penalty=_penalties, queue_size=st.integers(1, 6))
 def test_queues_overflow_as_those_of_message_filters(
-    reference: Reference,
-    messages: list[Message],
-    limit: int,
-    age_penalty: float,
-    queue_size: int,
+    reference: Reference, messages: list[Message], limit: int, age_penalty: float, queue_size: int
 ) -> None:
     _check(reference, messages, queue_size, limit, age_penalty, is_overflowing=True)
 
 
 @pytest.mark.acceptance
 @pytest.mark.parametrize("age_penalty", [0.1, 0.25, 0.5])
-def test_durations_are_scaled_to_the_same_nanosecond(
-    reference: Reference, age_penalty: float
-) -> None:
+def test_durations_scale_to_the_same_nanosecond(reference: Reference, age_penalty: float) -> None:
     for later_ns in range(1, 50):
         for earlier_ns in range(later_ns, 2 * later_ns):
             messages = [(0, 1000), (1, 1000 - earlier_ns), (1, 1000 + later_ns)]

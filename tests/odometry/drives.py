@@ -98,7 +98,6 @@ class Drive:
             self.keyframes.append(j)
 
     def run(self) -> Drive:
-        """Add all frames."""
         for j in range(len(self.truth)):
             self.step(j)
         return self
@@ -117,7 +116,6 @@ class Drive:
 
 
 def poses(optimum: Optimum) -> FloatArray:
-    """Return T_world_frame of all frames, shape (n, 4, 4)."""
     return np.array([each.T_world_frame for each in optimum.estimates])
 
 
@@ -145,11 +143,9 @@ class MadeUpPlaces:
         )
 
     def extract(self, frame: int) -> int:
-        """Return the number of a frame."""
         return frame
 
     def describe(self, observations: int) -> SimpleNamespace:
-        """Return the place of a frame."""
         words = self.descriptors[observations % self.n_per_lap]
         flipped = self.rng.random((len(words), 256)) < 0.1
         return SimpleNamespace(

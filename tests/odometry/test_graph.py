@@ -34,12 +34,7 @@ N_LAP = 100
 
 
 def looped(
-    seed: int | None,
-    *,
-    n_loops: int = 5,
-    n_laps: float = 1.3,
-    bias: Bias = None,
-    n_links: int = 2,
+    seed: int | None, *, n_loops: int = 5, n_laps: float = 1.3, bias: Bias = None, n_links: int = 2
 ) -> Drive:
     """Return a drive around the block and a bit more, with loops where it came back."""
     rng = None if seed is None else np.random.default_rng(seed)
@@ -94,13 +89,11 @@ def test_the_covariances_tell_the_errors() -> None:
     assert 3.5 < np.mean(found) < 7.0
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(
     twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6), order=st.permutations(range(5))
 )
-def test_neither_the_world_nor_the_order_of_loops_matters(
-    twist: list[float], order: list[int]
-) -> None:
+def test_the_world_and_the_order_of_loops_are_free(twist: list[float], order: list[int]) -> None:
     T = se3.exp(np.array(twist))
     drive, moved = looped(1), RunGraph(WindowConfig())
     for j, edges in enumerate(drive.edges):

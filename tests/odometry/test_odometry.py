@@ -138,7 +138,6 @@ def with_known_readout(config: Config) -> Config:
 def run(
     frames: Iterable[Frame], config: Config, camera: StereoCamera | PinholeCamera = CAMERA
 ) -> tuple[list[FrameResult], list[Estimate]]:
-    """Return the results by frame and the smoothed estimates in the order of their stamps."""
     odometry = Odometry(camera, config)
     results = [odometry.track(frame) for frame in frames]
     smoothed = [estimate for result in results for estimate in result.finished]
@@ -644,9 +643,7 @@ def registration_with(flow_px: float | None) -> RelativePose:
         ({"covariance": 1e-9 * np.eye(6)}, False),
     ],
 )
-def test_standstill_is_no_flow_and_no_significant_motion(
-    changes: dict[str, Any], is_still: bool
-) -> None:
+def test_standstill_is_no_flow_nor_motion(changes: dict[str, Any], is_still: bool) -> None:
     estimate = Estimate(stamp_ns=7, T_world_frame=np.eye(4), covariance=np.eye(6))
     step = RawStep(
         estimate=estimate,

@@ -20,16 +20,8 @@ from gvo.types import Estimate, Frame, FrameResult, RgbdFrame, StereoFrame
 
 N_FRAMES = 8
 SECTIONS = (
-    "depth",
-    "frontend",
-    "klt",
-    "features",
-    "stereo",
-    "temporal",
-    "ransac",
-    "registration",
-    "window",
-    "runtime",
+    *("depth", "frontend", "klt", "features", "stereo", "temporal", "ransac", "registration"),
+    *("window", "runtime"),
 )
 
 
@@ -107,9 +99,7 @@ def test_the_next_frame_is_registered_against_what_the_new_parameters_find() -> 
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
 @pytest.mark.parametrize("kinds", [("klt", "descriptor"), ("descriptor", "klt")])
-def test_the_chain_goes_on_without_a_break_over_another_kind_of_front_end(
-    sensor: Sensor, kinds: tuple[str, str]
-) -> None:
+def test_the_chain_goes_on_over_another_front_end(sensor: Sensor, kinds: tuple[str, str]) -> None:
     former, later = (change(Config(), frontend={"kind": kind}) for kind in kinds)
     odometry = odometry_of(sensor, former)
     results = []
@@ -157,9 +147,7 @@ def test_keyframes_of_other_descriptors_are_released() -> None:
 @pytest.mark.parametrize(
     "section", [{"stereo": {"patch_radius_px": 4}}, {"camera": {"readout_ms": 9.0}}]
 )
-def test_what_is_learnt_goes_on_unless_its_sections_change(
-    kind: str, section: dict[str, Any]
-) -> None:
+def test_what_is_learnt_stays_until_its_sections_change(kind: str, section: dict[str, Any]) -> None:
     config = change(Config(), frontend={"kind": kind})
     odometry = odometry_of("stereo", config)
     for frame in recorded("stereo")[:4]:
@@ -246,7 +234,7 @@ def steps(draw: st.DrawFn, config: Config) -> Config:
 
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
 @given(data=st.data())
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_no_sequence_of_configurations_breaks_it(sensor: Sensor, data: st.DataObject) -> None:
     config = Config()
     odometry = odometry_of(sensor)

@@ -200,9 +200,7 @@ def test_a_join_is_no_step_and_each_step_is_of_one_state_of_the_window() -> None
     np.testing.assert_array_equal(told, [step for step, _ in pairs])
 
 
-def test_after_a_frame_that_no_window_took_the_step_is_that_of_the_raw_chain(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_frame_without_a_window_the_step_is_raw(monkeypatch: pytest.MonkeyPatch) -> None:
     places = walk(n_dark=0, n_after=0, away=np.eye(4))
     insert = WindowGraph.insert
 

@@ -112,15 +112,7 @@ def measure_mutation(arguments: argparse.Namespace) -> int:
         again=arguments.again,
     )
     options = [
-        "-q",
-        "-s",
-        "-p",
-        "no:cacheprovider",
-        "-n",
-        "0",
-        "-m",
-        "not acceptance",
-        "--tb=native",
+        *("-q", "-s", "-p", "no:cacheprovider", "-n", "0", "-m", "not acceptance", "--tb=native"),
     ]
     with redirect_stdout(sys.stderr):
         pytest.main([*options, *(arguments.tests or TESTS)], plugins=[plugin])

@@ -34,7 +34,6 @@ SLACK_S = 300.0  # to start, on a busy machine, and to end
 
 
 def main() -> int:
-    """Do what the command line asks for."""
     options = parse()
     sys.path.insert(0, str(ROOT))
     if options.worker:
@@ -67,7 +66,6 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    """Return the options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--list", action="store_true", help="print the names of the targets")
     parser.add_argument("--target", help="one of them")
@@ -125,10 +123,7 @@ def run_target(name: str, seconds: float | None, options: argparse.Namespace) ->
 
 
 def run_worker(
-    name: str,
-    folder: Path,
-    left: tuple[float | None, int | None],
-    options: argparse.Namespace,
+    name: str, folder: Path, left: tuple[float | None, int | None], options: argparse.Namespace
 ) -> tuple[int, set[str]]:
     """Run one process; return its executions and findings."""
     left_s, left_runs = left
@@ -176,7 +171,6 @@ def keep_finding(name: str, path: Path, findings: Path) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the counts as a table."""
     lines = [f"{'target':20} {'executions':>11} {'seconds':>8} {'per s':>7} {'findings':>9}"]
     total = {
         "target": "all",
@@ -245,7 +239,6 @@ class Counter:
         self._n_executions = 0
 
     def run(self, data: bytes) -> None:
-        """Run once."""
         self._n_executions += 1
         if self._n_executions % 1000 == 0:
             self._report()

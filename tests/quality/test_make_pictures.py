@@ -40,9 +40,7 @@ def test_fewer_colours_keep_their_meaning(pictures: Path) -> None:
         assert np.abs(header - bgr).max(axis=1).min() <= 32
 
 
-def test_a_frame_beyond_the_end_is_told_without_a_traceback(
-    drive_bag: Path, tmp_path: Path
-) -> None:
+def test_a_frame_beyond_the_end_is_told_with_no_traceback(drive_bag: Path, tmp_path: Path) -> None:
     options = ["--recording", drive_bag, "--frame", 20, "--only", "overlay"]
     answer = run("make_pictures", "--out", tmp_path, *options)
     assert answer.returncode == 2

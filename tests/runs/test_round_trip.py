@@ -21,7 +21,7 @@ from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.round_trip import format_round_trip_errors
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import Progress
-from tests.diagnostics.check.planted import Held
+from tests.recordings import Held
 
 _N_FRAMES = 6
 

@@ -75,7 +75,6 @@ class Numbered:
 
 
 def content(item: Frame | FaultyFrame) -> tuple[int, str]:
-    """Return the stamp and what the frame holds."""
     if isinstance(item, FaultyFrame):
         return item.stamp_ns, f"{item.reason}, unpaired: {item.is_unpaired}"
     assert isinstance(item, StereoFrame)
@@ -83,7 +82,6 @@ def content(item: Frame | FaultyFrame) -> tuple[int, str]:
 
 
 def read(items: Iterator[Frame | FaultyFrame]) -> tuple[list[tuple[int, str]], list[bool], str]:
-    """Return the contents, which of them are sound, and why the recording ends too early."""
     found: list[tuple[int, str]] = []
     is_sound: list[bool] = []
     try:

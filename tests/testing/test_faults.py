@@ -76,7 +76,6 @@ def stamps(source: FaultySource, stream: int = 0) -> list[int]:
 
 
 def load(source: FaultySource, frame: int, stream: int = 0) -> NDArray[Any]:
-    """Return the pixels of a frame as the faulty recording gives them."""
     (found,) = [
         i.given for i in source.faulty_images() if (i.frame, i.given.stream) == (frame, stream)
     ]

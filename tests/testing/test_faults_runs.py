@@ -142,9 +142,7 @@ def test_a_run_over_a_bad_recording_does_what_the_table_says(
 
 @pytest.mark.acceptance
 @pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
-def test_rows_that_lost_their_place_hardly_ever_give_a_wrong_pose(
-    sensor: Sensor, tmp_path: Path
-) -> None:
+def test_rows_that_lost_their_place_hardly_give_false_poses(sensor: Sensor, tmp_path: Path) -> None:
     recording = sound(sensor, 20)
     n_wrong = 0
     for number in range(12):

@@ -300,9 +300,7 @@ def test_pairs_as_far_apart_as_the_trajectory_is_long_are_none() -> None:
 
 
 @pytest.mark.parametrize(("align", "option"), [("se3", "-a"), ("sim3", "-as")])
-def test_ate_and_rpe_are_those_of_evo_on_tum_files(
-    tmp_path: Path, align: AlignMode, option: str
-) -> None:
+def test_ate_and_rpe_are_of_evo_on_tum_files(tmp_path: Path, align: AlignMode, option: str) -> None:
     reference = drive(200)
     estimate = disturbed(reference).select(np.arange(5, 200, 3))
     shifted = Trajectory(
@@ -315,7 +313,7 @@ def test_ate_and_rpe_are_those_of_evo_on_tum_files(
     assert_as_evo(evaluation, "tum", files, [option], ["-d", "1", "-u", "f", option])
 
 
-def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
+def test_ate_and_rpe_are_of_evo_on_kitti_files(tmp_path: Path) -> None:
     reference = drive(150)
     files = tmp_path / "reference.txt", tmp_path / "estimate.txt"
     write_kitti(files[0], reference)
@@ -329,10 +327,7 @@ def test_ate_and_rpe_are_those_of_evo_on_kitti_files(tmp_path: Path) -> None:
 @pytest.mark.acceptance
 @pytest.mark.parametrize(
     ("reference", "estimate", "kind"),
-    [
-        ("KITTI_00_gt", "KITTI_00_ORB", "kitti"),
-        ("fr2_desk_groundtruth", "fr2_desk_ORB", "tum"),
-    ],
+    [("KITTI_00_gt", "KITTI_00_ORB", "kitti"), ("fr2_desk_groundtruth", "fr2_desk_ORB", "tum")],
 )
 def test_ate_and_rpe_of_published_trajectories_are_those_of_evo(
     gvo_data: Path, tmp_path: Path, reference: str, estimate: str, kind: str

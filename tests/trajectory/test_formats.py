@@ -129,17 +129,10 @@ def test_stamps_are_read_in_decimal_arithmetic(tmp_path: Path, text: str, stamp_
     assert read_trajectory(path).stamps_ns.tolist() == [stamp_ns]
 
 
-def test_commas_comments_blank_lines_and_a_byte_order_mark_are_no_hindrance(
-    tmp_path: Path,
-) -> None:
+def test_commas_comments_blank_lines_and_a_byte_order_mark_are_read(tmp_path: Path) -> None:
     path = tmp_path / "loose.csv"
     lines = [
-        "\ufeff# stamp tx",
-        "",
-        "1,1,2,3,0,0,0,1",
-        "# more",
-        " 2.5\t1, 2 ,3 0 0 0 -1 # end",
-        "",
+        *("\ufeff# stamp tx", "", "1,1,2,3,0,0,0,1", "# more", " 2.5\t1, 2 ,3 0 0 0 -1 # end", ""),
     ]
     path.write_bytes("\r\n".join(lines).encode())
     trajectory = read_trajectory(path)
@@ -172,9 +165,7 @@ def test_a_euroc_file_is_told_by_its_header_or_its_17_columns(tmp_path: Path, co
 
 
 @pytest.mark.parametrize("place", ["poses/times.txt", "sequences/00/times.txt"])
-def test_kitti_poses_take_the_stamps_of_a_times_file_of_as_many_rows(
-    tmp_path: Path, place: str
-) -> None:
+def test_kitti_poses_take_stamps_of_a_file_of_as_many_rows(tmp_path: Path, place: str) -> None:
     poses, times = tmp_path / "poses" / "00.txt", tmp_path / place
     poses.parent.mkdir()
     times.parent.mkdir(parents=True, exist_ok=True)
@@ -260,9 +251,7 @@ def test_a_folder_that_is_missing_is_named_when_writing(tmp_path: Path) -> None:
         ("euroc_mh01_start/mav0/state_groundtruth_estimate0/data.csv", 510, "file"),
     ],
 )
-def test_published_files_are_read_whole(
-    gvo_data: Path, name: str, n: int, stamps_from: str
-) -> None:
+def test_published_files_are_whole(gvo_data: Path, name: str, n: int, stamps_from: str) -> None:
     trajectory = read_trajectory(gvo_data / name)
     assert (len(trajectory), trajectory.stamps_from) == (n, stamps_from)
 

@@ -27,9 +27,7 @@ def round_trip(
     back = (poses[:-1] @ errors)[::-1]
     stamps_ns = _TURN_NS + _STEP_NS * np.arange(1 - n, n)
     return Trajectory(
-        stamps_ns=stamps_ns,
-        T_world_frame=np.concatenate([poses, back]),
-        covariances=covariances,
+        stamps_ns=stamps_ns, T_world_frame=np.concatenate([poses, back]), covariances=covariances
     )
 
 

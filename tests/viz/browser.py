@@ -83,7 +83,6 @@ class Browser:
         self.driver.get(url)
 
     def open_file(self, path: Path) -> None:
-        """Open a page from disk."""
         self.open(path.resolve().as_uri())
 
     def requests(self) -> list[str]:
@@ -117,7 +116,6 @@ class Browser:
     def wait(
         self, condition: Callable[[], Value], *, message: str = "", seconds: float = 30.0
     ) -> Value:
-        """Wait until a condition gives something true, and return that."""
         from selenium.common.exceptions import StaleElementReferenceException
         from selenium.webdriver.support.ui import WebDriverWait
 
@@ -134,7 +132,6 @@ class Browser:
         return self.driver.find_elements("css selector", selector)
 
     def text(self) -> str:
-        """Return all text of the page as it is seen."""
         return str(self.driver.execute_script("return document.body.innerText"))
 
     def run(self, script: str, *arguments: object) -> object:

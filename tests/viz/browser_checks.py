@@ -96,7 +96,6 @@ def overlap(first: Corners, second: Corners) -> float:
 
 
 def n_colours(picture: Picture) -> int:
-    """Count the colours of a picture, in steps of 16 so that a gradient is few."""
     levels = (picture // 16).reshape(-1, 3).astype(np.int64)
     return len(np.unique(levels @ np.array([1, 16, 256])))
 

@@ -84,9 +84,7 @@ def test_only_addresses_of_this_machine_stay_on_it(url: str, is_outside: bool) -
     assert leaves_the_machine(url) is is_outside
 
 
-def test_texts_on_one_another_are_named_and_slanted_neighbours_are_not(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_overlapping_texts_are_named_slanted_ones_are_not(browser: Browser, tmp_path: Path) -> None:
     page = tmp_path / "texts.html"
     page.write_text(TEXTS)
     browser.open_file(page)
@@ -115,9 +113,7 @@ def test_a_blank_canvas_is_told_from_a_drawn_one(browser: Browser, tmp_path: Pat
     np.testing.assert_allclose(changed_share(blank, drawn), 0.25, atol=0.01)
 
 
-def test_without_a_browser_the_tests_fail_where_they_must_be_complete(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_no_browser_is_a_failure_in_ci(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("CI", "true")
     with pytest.raises(pytest.fail.Exception, match="apt-get install"):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -61,7 +61,6 @@ def test_a_match_is_drawn_in_its_colour_from_where_it_was_to_where_it_is(
     assert np.ptp(changed_rows[changed_columns < 50]) < np.ptp(changed_rows[changed_columns > 50])
 
 
-@settings(deadline=None)
 @given(matches=_matches)
 def test_nothing_is_drawn_away_from_the_matches(
     matches: list[tuple[tuple[float, float], tuple[float, float], bool]],

@@ -63,9 +63,7 @@ def test_a_drive_that_goes_nowhere_can_be_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "still.png").stat().st_size > 0
 
 
-def test_a_file_that_cannot_be_written_is_named(
-    errors: dict[str, RoundTripError], tmp_path: Path
-) -> None:
+def test_an_unwritable_file_is_named(errors: dict[str, RoundTripError], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(TrajectoryError, match=r"file/a\.png: cannot be written"):
         plot_round_trip(tmp_path / "file/a.png", errors)

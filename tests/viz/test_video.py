@@ -57,9 +57,7 @@ def test_a_film_holds_each_picture_once_in_its_order(tmp_path: Path, suffix: str
 
 @_SUFFIXES
 @pytest.mark.parametrize("rate_hz", [0.7, 9.63, 30.0, 60.0])
-def test_a_film_plays_as_fast_as_its_pictures_were_taken(
-    tmp_path: Path, suffix: str, rate_hz: float
-) -> None:
+def test_a_film_plays_as_fast_as_it_was_taken(tmp_path: Path, suffix: str, rate_hz: float) -> None:
     path = tmp_path / f"film{suffix}"
     _write(path, round(_SECOND_NS / rate_hz))
     capture = cv2.VideoCapture(str(path))
@@ -132,9 +130,7 @@ except RecordingError as error:
 
 
 @_SUFFIXES
-def test_a_film_that_does_not_fit_on_the_disk_is_told_and_not_left(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_a_film_too_large_for_the_disk_is_told_and_not_left(tmp_path: Path, suffix: str) -> None:
     pytest.importorskip("resource")  # of Unix, where a file may be forbidden to grow
     name = f"film{suffix}"
     answer = _in_a_process(_ON_A_FULL_DISK, tmp_path, name)

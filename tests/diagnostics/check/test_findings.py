@@ -69,12 +69,7 @@ def test_farther_out_is_never_judged_milder(value: float, limit: float, fault: f
 def test_the_limits_themselves_are_still_within() -> None:
     limits = Limits(low=1.0, high=2.0, fault_high=3.0)
     assert [limits.judge(value) for value in (1.0, 2.0, 2.1, 3.0, 3.1, 0.9)] == [
-        "ok",
-        "ok",
-        "warning",
-        "warning",
-        "fault",
-        "warning",
+        *("ok", "ok", "warning", "warning", "fault", "warning"),
     ]
     assert limits.judge(math.nan) == "unknown"
     assert limits.describe("m") == "1 .. 2 m"
@@ -131,14 +126,7 @@ def test_line_ends_in_damaged_names_do_not_break_the_table() -> None:
     assert (finding.name, finding.value, finding.fix) == ("tf: a b", "c d", "e")
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"name": ""},
-        {"name": " \n"},
-        {"verdict": "fault"},
-    ],
-)
+@pytest.mark.parametrize("content", [{"name": ""}, {"name": " \n"}, {"verdict": "fault"}])
 def test_what_would_break_a_table_is_refused(content: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"finding|needs a fix"):
         Finding(**({"name": "rows", "value": 1.0} | content))  # type: ignore[arg-type]

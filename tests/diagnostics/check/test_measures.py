@@ -123,7 +123,7 @@ def test_steps_are_the_last_pixels_of_what_is_near_also_across_a_shadow() -> Non
     assert set(np.nonzero(after)[1]) == {10}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(1.0, 3.0), st.floats(0.4, 1.0), st.integers(0, 1000))
 def test_blur_is_measured_whatever_the_contrast(sigma: float, contrast: float, seed: int) -> None:
     grey, _ = squares(seed)

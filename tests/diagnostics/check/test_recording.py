@@ -19,7 +19,8 @@ from gvo.io.bag.source import BagSource
 from gvo.io.opening import open_recording
 from gvo.testing import faults as made
 from gvo.testing.faults import FaultySource
-from tests.diagnostics.check.planted import Held, check, complaints, find, render
+from tests.diagnostics.check.planted import check, complaints, find, render
+from tests.recordings import Held
 
 Fault = made.Fault | Callable[[Held], Held]
 _RNG = np.random.default_rng(5)
@@ -44,9 +45,7 @@ def planted(fault: Fault, recording: Held) -> FaultySource | Held:
         pytest.param("handheld", "rgbd", 2, marks=pytest.mark.acceptance),
     ],
 )
-def test_clean_recordings_have_nothing_to_complain_about(
-    world: str, sensor: str, seed: int
-) -> None:
+def test_clean_recordings_give_no_complaints(world: str, sensor: str, seed: int) -> None:
     result = check(render(world, sensor, seed))
     assert complaints(result) == set()
     assert not result.with_verdict("unknown")
@@ -98,9 +97,7 @@ def moved(image: NDArray[Any], du: float, dv: float) -> NDArray[Any]:
     ],
 )
 @pytest.mark.parametrize("world", WORLDS)
-def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
-    world: str, fault: Fault, expected: set[str]
-) -> None:
+def test_stereo_faults_alone_are_found(world: str, fault: Fault, expected: set[str]) -> None:
     result = check(planted(fault, render(world, "stereo")))
     found = complaints(result)
     # A turn of the image moves its rows at the middle hardly, but not by exactly nothing.
@@ -112,9 +109,7 @@ def test_faults_of_a_stereo_pair_are_found_and_nothing_else(
 
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize(("n_frames", "word"), [(1, "late"), (-1, "early")])
-def test_a_stream_that_lags_by_a_frame_is_found_although_its_stamps_are_right(
-    world: str, n_frames: int, word: str
-) -> None:
+def test_a_stream_a_frame_late_is_found_in_its_images(world: str, n_frames: int, word: str) -> None:
     result = check(out_of_step(n_frames)(render(world, "stereo")))
     finding = find(result, "left/right: same moment")
     assert finding.verdict == "fault"
@@ -138,9 +133,7 @@ def test_a_baseline_in_another_unit_is_found(factor: float, verdict: str) -> Non
 
 @pytest.mark.parametrize("k1", [-0.3, pytest.param(0.25, marks=pytest.mark.acceptance)])
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_lens_that_was_not_rectified_is_found_though_rows_hardly_differ(
-    world: str, k1: float
-) -> None:
+def test_a_lens_not_rectified_is_found_though_rows_hardly_differ(world: str, k1: float) -> None:
     recording = render(world, "stereo")
     camera = recording.info.camera
     distorted = recording.with_pixels(lambda image: through_lens(image, camera.K, k1))
@@ -319,8 +312,7 @@ def test_only_the_samples_are_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.recorded
 @pytest.mark.parametrize(
-    "name",
-    ["kitti_06_start", pytest.param("euroc_mh01_start", marks=pytest.mark.acceptance)],
+    "name", ["kitti_06_start", pytest.param("euroc_mh01_start", marks=pytest.mark.acceptance)]
 )
 def test_recorded_stereo_is_healthy(gvo_data: Path, name: str) -> None:
     result = check_recording(open_recording(gvo_data / name), Config(), n_samples=6)

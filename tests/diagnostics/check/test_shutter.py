@@ -11,7 +11,8 @@ from gvo.diagnostics.check import Finding, check_recording
 from gvo.errors import RecordingError
 from gvo.io.recording import Sensor, StampedImage
 from gvo.io.synthetic.recording import SyntheticRecording
-from tests.diagnostics.check.planted import N_FRAMES, Held, render
+from tests.diagnostics.check.planted import N_FRAMES, render
+from tests.recordings import Held
 
 PLANTED_MS = 25.0
 

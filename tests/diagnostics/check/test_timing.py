@@ -59,15 +59,8 @@ def timing(
     return {finding.name: finding for finding in check_timing(survey, INFO, Config())}
 
 
-@given(
-    st.integers(10, 400),
-    st.integers(1, 200),
-    st.floats(0, 0.08),
-    st.integers(0, 2**32 - 1),
-)
-def test_regular_stamps_of_any_rate_are_in_order(
-    n: int, period_ms: int, jitter: float, seed: int
-) -> None:
+@given(st.integers(10, 400), st.integers(1, 200), st.floats(0, 0.08), st.integers(0, 2**32 - 1))
+def test_regular_stamps_are_in_order(n: int, period_ms: int, jitter: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     noise = rng.uniform(-jitter, jitter, n) * period_ms * MS
     stamps_ns = np.arange(n, dtype=np.int64) * period_ms * MS + noise.astype(np.int64)

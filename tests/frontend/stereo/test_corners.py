@@ -30,7 +30,7 @@ def measure(
     return measure_corners(images, chosen, config, max_disparity=40.0, row_offset_px=row_offset_px)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(disparity=st.floats(0.0, 20.0), gain=st.floats(0.95, 1.0))
 def test_they_are_right_to_hundredths_without_a_prediction(disparity: float, gain: float) -> None:
     found = measure((image(), image(-disparity, gain=gain)))
@@ -154,7 +154,7 @@ def pair(disparity: FloatArray | float) -> tuple[ImageArray, ImageArray]:
     return image(), image(-disparity)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(disparity=st.floats(0.0, 60.0))
 def test_the_coarse_search_finds_any_disparity_to_a_few_pixels(disparity: float) -> None:
     pixels = grid(border=12)

@@ -26,12 +26,8 @@ def test_flat_images_hold_no_disparities() -> None:
     assert not is_valid.any()
 
 
-@settings(deadline=None, max_examples=15)
-@given(
-    disparity=st.floats(0.0, 20.0),
-    error=st.floats(-2.0, 2.0),
-    fraction=st.floats(0.0, 1.0),
-)
+@settings(max_examples=15)
+@given(disparity=st.floats(0.0, 20.0), error=st.floats(-2.0, 2.0), fraction=st.floats(0.0, 1.0))
 def test_the_fine_search_is_right_to_hundredths_wherever_it_starts(
     disparity: float, error: float, fraction: float
 ) -> None:
@@ -75,8 +71,7 @@ def test_a_best_step_at_the_end_of_the_search_is_no_answer() -> None:
 
 
 @pytest.mark.parametrize(
-    "pixel",
-    [(4.0, 60.0), (235.5, 60.0), (100.0, 4.9), (100.0, 114.5), (14.0, 60.0)],
+    "pixel", [(4.0, 60.0), (235.5, 60.0), (100.0, 4.9), (100.0, 114.5), (14.0, 60.0)]
 )
 def test_patches_that_leave_an_image_are_not_measured(pixel: tuple[float, float]) -> None:
     pixels, predicted = np.array([pixel, (100.0, 60.0)]), np.full(2, 10.0)
@@ -98,15 +93,9 @@ def test_no_pixels_give_no_disparities() -> None:
     assert measure_disparities(pair(3.0), nothing, np.zeros(0), CONFIG, reach_px=3)[0].shape == (0,)
 
 
-@settings(deadline=None, max_examples=15)
-@given(
-    disparity=st.floats(0.0, 20.0),
-    error=st.floats(-1.5, 1.5),
-    fraction=st.floats(0.0, 1.0),
-)
-def test_from_a_prediction_steps_alone_lead_to_the_same(
-    disparity: float, error: float, fraction: float
-) -> None:
+@settings(max_examples=15)
+@given(disparity=st.floats(0.0, 20.0), error=st.floats(-1.5, 1.5), fraction=st.floats(0.0, 1.0))
+def test_predicted_steps_lead_to_the_same(disparity: float, error: float, fraction: float) -> None:
     pixels = grid() + fraction
     predicted = np.full(len(pixels), disparity + error)
     found, is_valid = follow_disparities(
@@ -119,9 +108,7 @@ def test_from_a_prediction_steps_alone_lead_to_the_same(
 
 
 @pytest.mark.parametrize("slopes", [(0.0, 0.33), (0.25, 0.0), (-0.2, 0.2)])
-def test_on_slanted_surfaces_they_are_right_with_the_slopes_and_wrong_without(
-    slopes: tuple[float, float],
-) -> None:
+def test_slanted_surfaces_are_right_with_slopes_wrong_without(slopes: tuple[float, float]) -> None:
     images, _ = slanted_pair(20.0, slopes)
     # At fractions of a pixel, as tracks are.
     pixels = grid() + np.array([0.37, 0.61])

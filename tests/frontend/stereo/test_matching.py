@@ -51,7 +51,7 @@ def keypoints_on_a_lattice(rng: np.random.Generator, n: int) -> FloatArray:
     return np.asarray(rng.integers(0, [int(63 / fraction), int(31 / fraction)], (n, 2)) * fraction)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(
     seed=seeds,
     n=st.integers(0, 25),
@@ -66,11 +66,7 @@ def test_candidates_are_all_pairs_that_obey_rows_and_depth(
     rng = np.random.default_rng(seed)
     left, right = keypoints_on_a_lattice(rng, n), keypoints_on_a_lattice(rng, m)
     config = SETTINGS.model_copy(
-        update={
-            "row_tolerance_px": tolerance,
-            "min_depth_m": min_depth,
-            "max_depth_m": max_depth,
-        }
+        update={"row_tolerance_px": tolerance, "min_depth_m": min_depth, "max_depth_m": max_depth}
     )
     pairs = candidate_pairs(features(left), features(right), CAMERA, config)
     expected = set()
@@ -112,11 +108,9 @@ def test_octaves_may_differ_by_one() -> None:
     assert match_stereo(left, right, CAMERA, SETTINGS).tolist() == [[0, 0]]
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(seed=seeds, n=st.integers(0, 30), m=st.integers(0, 30))
-def test_no_keypoint_is_matched_twice_and_every_match_is_a_candidate(
-    seed: int, n: int, m: int
-) -> None:
+def test_no_keypoint_is_matched_twice_all_matches_are_candidates(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     codes = rng.integers(0, 256, (5, 32), dtype=np.uint8)
     left = features(keypoints_on_a_lattice(rng, n), codes[rng.integers(0, 5, n)])
@@ -242,15 +236,8 @@ def test_without_subpixel_the_disparity_is_that_of_the_keypoints() -> None:
     assert is_valid.all()
 
 
-@settings(deadline=None)
-@given(
-    minimum=st.floats(0.51, 5.49),
-    curvature=st.floats(1e-3, 1e3),
-    height=st.floats(-1e3, 1e3),
-)
-def test_the_minimum_of_a_parabola_is_found_exactly(
-    minimum: float, curvature: float, height: float
-) -> None:
+@given(minimum=st.floats(0.51, 5.49), curvature=st.floats(1e-3, 1e3), height=st.floats(-1e3, 1e3))
+def test_a_parabola_has_its_minimum_found(minimum: float, curvature: float, height: float) -> None:
     values = curvature * (np.arange(7) - minimum) ** 2 + height
     positions, is_minimum = parabola_minimum(values[np.newaxis].astype(np.float64))
     assert is_minimum.all()

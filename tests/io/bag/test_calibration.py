@@ -13,18 +13,9 @@ from scipy.spatial.transform import Rotation
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.geometry.camera import rectification_maps
-from gvo.io.bag.calibration import (
-    BagCalibration,
-    calibrations_of_file,
-    calibrations_of_messages,
-)
+from gvo.io.bag.calibration import BagCalibration, calibrations_of_file, calibrations_of_messages
 from gvo.io.bag.reader import TF_TYPE, BagReader
-from gvo.io.bag.topics import (
-    COMPRESSED_TYPE,
-    IMAGE_TYPE,
-    TopicChoice,
-    choose_topics,
-)
+from gvo.io.bag.topics import COMPRESSED_TYPE, IMAGE_TYPE, TopicChoice, choose_topics
 from gvo.io.calibration.camera_info import stereo_baseline
 from gvo.types import FloatArray
 from tests.io.camera_bags import Message, camera_info, header, image, make, write
@@ -95,8 +86,7 @@ def _mounts(topic: str = "/tf_static", stamp_ns: int = 0) -> list[Message]:
 
 
 @pytest.mark.parametrize(
-    ("model", "D"),
-    [("plumb_bob", _D), ("equidistant", [0.01, -0.002, 0.001, 0.0])],
+    ("model", "D"), [("plumb_bob", _D), ("equidistant", [0.01, -0.002, 0.001, 0.0])]
 )
 @pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf_static", 0), ("/tf", 7_000_000_000)])
 def test_raw_cameras_without_baseline_are_rectified_by_tf(

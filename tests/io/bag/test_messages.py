@@ -47,12 +47,7 @@ def test_padding_after_the_rows_is_left_out(tiny: Any, encoding: str, padding: i
     np.testing.assert_array_equal(decode_grey_or_color(message, "/image"), pixels)
 
 
-_CHANNELS = {
-    "bgr": [0, 1, 2],
-    "rgb": [2, 1, 0],
-    "bgra": [0, 1, 2, 0],
-    "rgba": [2, 1, 0, 1],
-}
+_CHANNELS = {"bgr": [0, 1, 2], "rgb": [2, 1, 0], "bgra": [0, 1, 2, 0], "rgba": [2, 1, 0, 1]}
 _COLOURS = [
     *[(f"{name}{bits}", channels) for name, channels in _CHANNELS.items() for bits in (8, 16)],
     *[(f"{bits}UC3", _CHANNELS["bgr"]) for bits in (8, 16)],
@@ -128,9 +123,7 @@ def _bgr_of_yuv(yuv: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
-def test_pixels_that_share_their_colour_by_twos_follow_the_formula(
-    encoding: str, padding: int
-) -> None:
+def test_pixels_that_share_colour_by_twos_follow_the_formula(encoding: str, padding: int) -> None:
     yuv = np.random.default_rng(0).integers(16, 236, (6, 8, 3), dtype=np.uint8)
     yuv[:, 1::2, 1:] = yuv[:, ::2, 1:]
     luma = 1 if encoding in ("yuv422", "uyvy") else 0
@@ -143,9 +136,7 @@ def test_pixels_that_share_their_colour_by_twos_follow_the_formula(
 
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("encoding", ["nv12", "nv21"])
-def test_planes_of_colour_below_the_grey_one_follow_the_formula(
-    encoding: str, padding: int
-) -> None:
+def test_planes_of_colour_below_grey_follow_the_formula(encoding: str, padding: int) -> None:
     rng = np.random.default_rng(0)
     grey = rng.integers(16, 236, (6, 8), dtype=np.uint8)
     chroma = rng.integers(0, 256, (3, 4, 2), dtype=np.uint8)
@@ -320,9 +311,7 @@ def test_depth_as_jpeg_is_refused(tiny: Any) -> None:
 @pytest.mark.parametrize("data", [b"", b"x", bytes(12), bytes(40)])
 @pytest.mark.parametrize("coder", ["png", "rvl"])
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_compressed_depth_without_an_image_is_refused(
-    encoding: str, coder: str, data: bytes
-) -> None:
+def test_compressed_depth_without_image_is_refused(encoding: str, coder: str, data: bytes) -> None:
     message: Any = SimpleNamespace(
         format=f"{encoding}; compressedDepth {coder}", data=np.frombuffer(data, np.uint8)
     )

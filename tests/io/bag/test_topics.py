@@ -20,11 +20,7 @@ def _topics(*names: str, n_messages: int = 5) -> list[Topic]:
     types = {"compressed": COMPRESSED_TYPE, "compressedDepth": COMPRESSED_TYPE}
     types |= {"camera_info": CAMERA_INFO_TYPE, "tf": "tf2_msgs/msg/TFMessage"}
     return [
-        Topic(
-            name=name,
-            type=types.get(name.rpartition("/")[2], IMAGE_TYPE),
-            n_messages=n_messages,
-        )
+        Topic(name=name, type=types.get(name.rpartition("/")[2], IMAGE_TYPE), n_messages=n_messages)
         for name in names
     ]
 
@@ -83,8 +79,7 @@ def test_rectified_topics_are_taken_before_raw_ones_and_these_before_compressed_
 
 @pytest.mark.parametrize("own", ["/camera/depth/image_rect_raw", "/camera/depth/image_raw"])
 @pytest.mark.parametrize(
-    "registered",
-    ["/camera/aligned_depth_to_color/image_raw", "/camera/depth_registered/image_raw"],
+    "registered", ["/camera/aligned_depth_to_color/image_raw", "/camera/depth_registered/image_raw"]
 )
 def test_registered_depth_is_taken_before_the_depth_camera_s_own(own: str, registered: str) -> None:
     for names in permutations(["/camera/color/image_raw", own, registered]):

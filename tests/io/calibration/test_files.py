@@ -195,9 +195,7 @@ def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path) ->
 _UNTURNED = {"rectification_matrix": {"data": np.eye(3).ravel().tolist()}}
 
 
-def test_a_pair_without_distortion_side_by_side_is_rectified_already(
-    tmp_path: Path,
-) -> None:
+def test_a_pair_without_distortion_side_by_side_is_rectified_already(tmp_path: Path) -> None:
     T = np.eye(4)
     T[0, 3] = -0.12
     ideal: dict[str, Any] = {
@@ -257,8 +255,7 @@ def test_what_opencv_calibrates_is_read(
 @pytest.mark.parametrize("names", ["kdrp", "KDRP"])
 def test_both_spellings_of_a_file_say_the_same(tmp_path: Path, tiny: Any, names: str) -> None:
     long = tiny.ros_camera(
-        rectification_matrix={"data": np.eye(3).ravel().tolist()},
-        projection_matrix={"data": _P},
+        rectification_matrix={"data": np.eye(3).ravel().tolist()}, projection_matrix={"data": _P}
     )
     k, d, r, p = list(names)
     short = {
@@ -444,11 +441,9 @@ def _outcome(path: Path, sensor: Any) -> CameraSet | str:
         return str(error)
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_whatever_stands_at_any_place_gives_cameras_or_one_line(
-    tmp_path: Path, data: st.DataObject
-) -> None:
+def test_any_value_anywhere_gives_cameras_or_a_line(tmp_path: Path, data: st.DataObject) -> None:
     content = _valid(data, tmp_path)
     for _ in range(data.draw(st.integers(1, 2))):
         _spoil(data, content)

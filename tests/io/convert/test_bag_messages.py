@@ -83,9 +83,7 @@ def _messages(path: Path, topic: str) -> list[Any]:
 
 @_NAMES
 @pytest.mark.parametrize("is_color", [False, True])
-def test_png_images_are_what_opencv_decodes(
-    tiny: Tiny, tmp_path: Path, name: str, is_color: bool
-) -> None:
+def test_png_images_are_as_decoded(tiny: Tiny, tmp_path: Path, name: str, is_color: bool) -> None:
     images = [tiny.texture(n, is_color=is_color) for n in range(4)]
     items: list[Item] = [(n % 2, 10 + n // 2, pixels) for n, pixels in enumerate(images)]
     write_bag(tiny.stereo(items), tmp_path / name, compress=True)
@@ -101,9 +99,7 @@ def test_png_images_are_what_opencv_decodes(
 
 
 @_NAMES
-def test_depth_comes_back_bit_by_bit_whatever_the_later_images_hold(
-    tiny: Tiny, tmp_path: Path, name: str
-) -> None:
+def test_depth_comes_back_whatever_later_images_hold(tiny: Tiny, tmp_path: Path, name: str) -> None:
     rng = np.random.default_rng(1)
     millimetres = (rng.integers(1, 9000, (32, 48)) / 1000).astype(np.float32)
     millimetres[:4] = np.nan
@@ -131,9 +127,7 @@ def test_depth_comes_back_bit_by_bit_whatever_the_later_images_hold(
 
 
 @_NAMES
-def test_depth_that_is_not_of_millimetres_stays_as_it_is(
-    tiny: Tiny, tmp_path: Path, name: str
-) -> None:
+def test_depth_not_of_millimetres_stays_as_it_is(tiny: Tiny, tmp_path: Path, name: str) -> None:
     fault = RecordingError("depth.png: damaged")
     items: list[Item] = [(0, 1, tiny.texture(0)), (1, 1, fault), (0, 2, tiny.texture(1))]
     write_bag(tiny.rgbd([*items, (1, 2, tiny.depth(0))]), tmp_path / name, compress=True)

@@ -110,9 +110,7 @@ def _assert_same(source: Source, copy: Source) -> None:
     ],
     ids=["rectified stereo", "raw stereo", "ideal rgbd", "raw rgbd"],
 )
-def test_what_is_read_back_is_the_recording_bit_by_bit(
-    tmp_path: Path, name: str, source: Source
-) -> None:
+def test_what_is_read_back_is_the_recording(tmp_path: Path, name: str, source: Source) -> None:
     conversion = write_bag(source, tmp_path / name)
     _assert_same(source, open_recording(tmp_path / name))
     assert conversion.n_images == 8
@@ -223,7 +221,6 @@ def test_other_suffixes_and_missing_folders_are_refused(tmp_path: Path) -> None:
 
 
 def _transforms(path: Path, topic: str) -> list[tuple[int, str, str, NDArray[np.float64]]]:
-    """Return log time, parent, child and T_parent_child of all transforms of a topic."""
     found = []
     with AnyReader([path]) as reader:
         connections = [one for one in reader.connections if one.topic == topic]

@@ -123,9 +123,7 @@ def _assert_same_truth(copy: Source, source: Source, *, atol: float) -> None:
 
 
 @pytest.mark.parametrize("cameras", [(0, 1), (2, 3)], ids=["grey", "colour"])
-def test_kitti_comes_back_from_a_bag_as_it_was(
-    tiny: Tiny, tmp_path: Path, cameras: tuple[int, int]
-) -> None:
+def test_kitti_comes_back_from_a_bag(tiny: Tiny, tmp_path: Path, cameras: tuple[int, int]) -> None:
     origin = tiny.write_kitti(tmp_path / "origin", n_frames=4, cameras=cameras)
     write_bag(open_recording(origin), tmp_path / "a.bag")
     written = write_folder(open_recording(tmp_path / "a.bag"), tmp_path / "copy")
@@ -147,9 +145,7 @@ def test_kitti_comes_back_from_a_bag_as_it_was(
 
 @pytest.mark.parametrize("model", sorted(_LENSES))
 @pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
-def test_euroc_comes_back_from_a_bag_as_it_was(
-    tiny: Tiny, tmp_path: Path, model: str, name: str
-) -> None:
+def test_euroc_comes_back_from_a_bag(tiny: Tiny, tmp_path: Path, model: str, name: str) -> None:
     source = open_recording(_write_euroc(tiny, tmp_path / "origin", model))
     write_bag(source, tmp_path / name)
     write_folder(open_recording(tmp_path / name), tmp_path / "copy")
@@ -174,9 +170,7 @@ def test_euroc_comes_back_from_a_bag_as_it_was(
         np.testing.assert_allclose(mine_T["T_BS"]["data"], their_T["T_BS"]["data"], atol=1e-9)
 
 
-def test_a_pair_that_knows_no_body_is_written_on_its_left_camera(
-    tiny: Tiny, tmp_path: Path
-) -> None:
+def test_a_pair_without_a_body_is_written_on_its_left_camera(tiny: Tiny, tmp_path: Path) -> None:
     source = tiny.stereo(_pairs(tiny), truth=_truth(3))
     write_folder(source, tmp_path / "copy", layout="euroc")
     copy = open_recording(tmp_path / "copy")
@@ -242,9 +236,7 @@ def test_millimetres_stay_millimetres(
     np.testing.assert_array_equal(last, counts / np.float32(1000))
 
 
-def test_depth_that_no_count_can_hold_becomes_unknown_and_is_told(
-    tiny: Tiny, tmp_path: Path
-) -> None:
+def test_depth_that_no_count_holds_becomes_unknown_and_told(tiny: Tiny, tmp_path: Path) -> None:
     depth = tiny.depth(0)
     depth[4, :3] = 70.0
     items: list[Item] = [(0, 5, tiny.texture(0)), (1, 5, tiny.depth(1)), (1, 6, depth)]
@@ -290,9 +282,7 @@ def test_depth_of_another_camera_is_registered_on_writing(
     assert colors == ([2, 2] if is_raw else [3, 3])
 
 
-def test_depth_of_a_rectified_camera_with_other_intrinsics_of_its_raw_image_stays(
-    tiny: Tiny, tmp_path: Path
-) -> None:
+def test_depth_of_a_camera_with_other_raw_intrinsics_stays(tiny: Tiny, tmp_path: Path) -> None:
     # As drivers do: CameraInfo of image_rect_color keeps K of the raw camera.
     K = tiny.camera.K + np.array([[9.0, 0, 3.0], [0, 9.0, -2.0], [0, 0, 0]])
     calibration = replace(Calibration.from_camera(tiny.camera), K=K)
@@ -316,9 +306,7 @@ def _source_for(tiny: Tiny, layout: str, truth: Trajectory | None = None) -> Lis
 
 
 @pytest.mark.parametrize("target", [*_LAYOUTS, "a.bag"])
-def test_positions_without_rotations_are_left_out_and_told(
-    tiny: Tiny, tmp_path: Path, target: str
-) -> None:
+def test_positions_without_rotations_are_told(tiny: Tiny, tmp_path: Path, target: str) -> None:
     truth = _truth(3)
     positions = Trajectory.of_positions(truth.stamps_ns, truth.positions)
     source = _source_for(tiny, target, positions)
@@ -333,9 +321,7 @@ def test_positions_without_rotations_are_left_out_and_told(
 
 
 @pytest.mark.parametrize("target", [*_LAYOUTS, "a.bag", "a.mcap"])
-def test_what_comes_before_damage_is_kept_and_the_damage_is_told(
-    tiny: Tiny, tmp_path: Path, target: str
-) -> None:
+def test_what_precedes_damage_is_kept_and_told(tiny: Tiny, tmp_path: Path, target: str) -> None:
     whole = _source_for(tiny, target, _truth(3))
     source = _Damaged(
         whole.info.sensor, whole._items, calibrations=whole.info.calibrations, truth=_truth(3)
@@ -350,9 +336,7 @@ def test_what_comes_before_damage_is_kept_and_the_damage_is_told(
 
 
 @pytest.mark.parametrize("target", ["euroc", "a.bag"])
-def test_truth_that_cannot_be_read_does_not_cost_the_images(
-    tiny: Tiny, tmp_path: Path, target: str
-) -> None:
+def test_unreadable_truth_does_not_cost_the_images(tiny: Tiny, tmp_path: Path, target: str) -> None:
     source = _Damaged("stereo", _pairs(tiny), calibrations=tiny.stereo([]).info.calibrations)
     source.truth_fault = "data.csv:7: expected 8 numbers"
     path = tmp_path / target
@@ -362,9 +346,7 @@ def test_truth_that_cannot_be_read_does_not_cost_the_images(
 
 
 @pytest.mark.parametrize("target", ["kitti", "euroc", "a.bag"])
-def test_nothing_is_left_behind_where_no_image_can_be_written(
-    tiny: Tiny, tmp_path: Path, target: str
-) -> None:
+def test_without_an_image_nothing_is_left_behind(tiny: Tiny, tmp_path: Path, target: str) -> None:
     fault = RecordingError("a.png: empty")
     items: list[Item] = [(0, 1, tiny.texture(1)), (1, 1, fault), (0, 2, tiny.texture(2))]
     source = tiny.stereo([*items, (1, 2, fault)])
@@ -398,9 +380,7 @@ def test_the_tolerance_makes_pairs_of_kitti(tiny: Tiny, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["euroc", "tum"])
-def test_images_whose_stamp_does_not_advance_are_left_out(
-    tiny: Tiny, tmp_path: Path, layout: Layout
-) -> None:
+def test_images_that_do_not_advance_are_out(tiny: Tiny, tmp_path: Path, layout: Layout) -> None:
     source = _source_for(tiny, layout)
     stamp_ns = _START_NS + _STEP_NS
     source._items = [*source._items, (0, stamp_ns, tiny.texture(77))]

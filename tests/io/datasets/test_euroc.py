@@ -146,9 +146,7 @@ def test_the_pose_on_the_body_is_that_of_the_rectified_camera(tmp_path: Path, ti
     assert "rectification: the poses of both on the body of 0.yaml + 1.yaml" in info.decisions
 
 
-def test_a_folder_without_poses_on_the_body_needs_none_of_the_pair(
-    tmp_path: Path, tiny: Any
-) -> None:
+def test_a_folder_without_poses_on_the_body_needs_a_baseline(tmp_path: Path, tiny: Any) -> None:
     folder = _write(tmp_path / "m", tiny, T_BS=None)
     with pytest.raises(CalibrationError, match=r"sensor\.yaml: the baseline must be positive"):
         EurocSource(folder)

@@ -32,9 +32,7 @@ def test_the_camera_is_that_of_the_projections(tmp_path: Path, tiny: Any) -> Non
     assert all(calibration.is_rectified for calibration in info.calibrations)
 
 
-def test_the_colour_cameras_are_read_where_the_grey_ones_are_missing(
-    tmp_path: Path, tiny: Any
-) -> None:
+def test_colour_cameras_are_read_where_grey_ones_are_missing(tmp_path: Path, tiny: Any) -> None:
     source = KittiSource(tiny.write_kitti(tmp_path / "00", cameras=(2, 3)))
     np.testing.assert_array_equal(next(source.images()).load(), tiny.texture(2, is_color=True))
     assert getattr(source.info.camera, "baseline", None) == 0.5

@@ -138,9 +138,7 @@ def test_depth_that_only_makes_sense_in_millimetres_is_read_so(tmp_path: Path, t
     assert _depth_decision(insisted) == "depth: 5000 counts per metre, by depth.scale"
 
 
-def test_a_published_camera_keeps_its_scale_however_near_the_scene(
-    tmp_path: Path, tiny: Any
-) -> None:
+def test_a_published_camera_keeps_its_scale_for_near_scenes(tmp_path: Path, tiny: Any) -> None:
     folder = tiny.write_tum(tmp_path / "fr2_near", _COLOR, _DEPTH)
     for stamp in _DEPTH:
         tiny.write_image(folder / "depth" / f"{stamp}.png", tiny.counts(0) // 5)

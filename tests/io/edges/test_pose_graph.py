@@ -95,9 +95,7 @@ def test_edges_between_unknown_poses_wait_until_they_are_connected(tmp_path: Pat
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 @given(st.lists(st.tuples(st.integers(-3, 12), st.integers(-3, 12)), min_size=1, max_size=40))
-def test_every_connected_edge_comes_once_and_refers_to_poses_that_came_before(
-    tmp_path: Path, ends: list[tuple[int, int]]
-) -> None:
+def test_connected_edges_come_once_after_poses(tmp_path: Path, ends: list[tuple[int, int]]) -> None:
     source = PoseGraphSource(write(tmp_path, *(edge_line(*pair) for pair in ends)))
     known: set[object] = set()
     n_edges = 0
@@ -199,9 +197,7 @@ def test_gtsams_examples_are_connected(name: str) -> None:
         (["<xml>"], "graph.g2o:1"),
     ],
 )
-def test_what_is_no_graph_is_refused_in_one_line(
-    tmp_path: Path, lines: list[str], words: str
-) -> None:
+def test_what_is_no_graph_is_refused(tmp_path: Path, lines: list[str], words: str) -> None:
     with pytest.raises(TrajectoryError, match=words) as caught:
         PoseGraphSource(write(tmp_path, *lines))
     assert "\n" not in str(caught.value)

@@ -171,9 +171,7 @@ def test_the_covariance_between_independent_fixes_is_that_of_samples(seed: int) 
 
 
 @pytest.mark.parametrize("covariance", [None, np.zeros((6, 6)), np.full((6, 6), np.nan)])
-def test_a_pose_without_covariance_gives_a_step_of_the_stated_sigma(
-    covariance: FloatArray | None,
-) -> None:
+def test_a_pose_without_covariance_has_the_stated_sigma(covariance: FloatArray | None) -> None:
     before, after = (
         PoseSample(stamp_ns=n, T_world_frame=motion(n), covariance=covariance) for n in (0, 1)
     )

@@ -23,7 +23,6 @@ seeds = st.integers(min_value=0, max_value=2**32 - 1)
 
 
 def motion(n: int = 30, seed: int = 0) -> FloatArray:
-    """Return T_map_base, winding."""
     twists = np.random.default_rng(seed).normal(size=(n, 6)) * [0.1, 0.1, 0.3, 0.1, 0.1, 0.1]
     twists[:, 3] += 0.5
     poses = [np.eye(4)]
@@ -113,9 +112,7 @@ def test_poses_that_name_no_frame_are_taken_for_the_one_asked_for() -> None:
 @pytest.mark.parametrize(
     ("camera_frame", "reason"), [("cam", "tf holds no frame"), ("", "does not name: tf cannot")]
 )
-def test_poses_of_a_frame_that_nothing_connects_are_not_compared(
-    camera_frame: str, reason: str
-) -> None:
+def test_poses_of_a_frame_out_of_reach_are_not_compared(camera_frame: str, reason: str) -> None:
     truth = truth_of(trajectory(motion()), "vicon/drone")
     found = in_frame(truth, TfBuffer(), camera_frame=camera_frame)
     assert isinstance(found, Failure)

@@ -154,9 +154,7 @@ def test_a_truth_of_its_own_rate_form_and_frame_gives_the_errors_of_the_exact_on
     assert mistaken.ate_m == pytest.approx(ate_by_hand(points[0], points[1]), abs=5e-5)
 
 
-def test_an_antenna_whose_place_is_unknown_is_compared_with_a_warning(
-    walk_bag: Path, tmp_path: Path
-) -> None:
+def test_an_antenna_of_unknown_place_is_warned_of(walk_bag: Path, tmp_path: Path) -> None:
     bag = PoseBag(tmp_path / "fix.mcap")
     for stamp_ns, place in zip(STAMPS_NS.tolist(), geodetic(np.zeros((16, 3))), strict=True):
         bag.fix(stamp_ns, place)

@@ -12,8 +12,6 @@ HEADER = "stamp,x\n"
 
 
 class SmallDisk(io.FileIO):
-    """A file that takes a few bytes at a time, and no more than there is room for."""
-
     room = 100
 
     def write(self, data: Any) -> int:
@@ -42,9 +40,7 @@ def test_a_file_that_is_there_is_replaced(tmp_path: Path) -> None:
     assert path.read_text() == HEADER + "0,0\n"
 
 
-def test_a_text_is_replaced_whole_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_text_is_replaced_whole_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "summary.json"
     replace_text(path, "first")
     with monkeypatch.context() as patch:

@@ -45,12 +45,7 @@ def test_a_folder_is_read_as_its_files_say(folder: Path) -> None:
     assert len(record.edges.chi2) == len((folder / "edges.csv").read_text().splitlines()) - 1
     assert record.timings is not None
     assert [*record.timings.stages_ms] == [
-        "read",
-        "extract",
-        "register",
-        "links",
-        "window",
-        "loops",
+        *("read", "extract", "register", "links", "window", "loops"),
     ]
     assert record.truth is not None
 

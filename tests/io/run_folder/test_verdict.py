@@ -51,14 +51,8 @@ CLOSED = [
 LOOK = "frames.csv, which says why frames are not tracked"
 LEARNT = "(learnt and corrected)"
 CASES = [
-    (
-        summary(),
-        "298 m in 393 frames, all tracked; 0.3 m from the truth; covariances fit.",
-    ),
-    (
-        without_truth(),
-        "298 m in 393 frames, all tracked; no truth to compare with.",
-    ),
+    (summary(), "298 m in 393 frames, all tracked; 0.3 m from the truth; covariances fit."),
+    (without_truth(), "298 m in 393 frames, all tracked; no truth to compare with."),
     (
         without_truth(warnings=["not compared with the ground truth: x"]),
         "298 m in 393 frames, all tracked; not compared with the truth.",
@@ -117,10 +111,7 @@ CASES = [
         "298 m in 393 frames, all tracked; 0.3 m from the truth.",
     ),
     # positions without rotations say nothing of covariances
-    (
-        summary(covariances=[]),
-        "298 m in 393 frames, all tracked; 0.3 m from the truth.",
-    ),
+    (summary(covariances=[]), "298 m in 393 frames, all tracked; 0.3 m from the truth."),
 ]
 
 
@@ -203,9 +194,7 @@ def test_the_verdict_judges_the_covariances(found: dict[str, Any], words: str) -
         ),
     ],
 )
-def test_the_verdict_names_what_was_learnt_of_the_camera(
-    offsets: dict[str, Any], looks: list[str]
-) -> None:
+def test_the_verdict_names_what_was_learnt(offsets: dict[str, Any], looks: list[str]) -> None:
     said = verdict(summary(rig_offsets=offsets))
     text = "; ".join(f"{look} {LEARNT}" for look in looks)
     assert said.partition(FIT)[2] == (f". Worth a look: {text}." if looks else ".")

@@ -72,9 +72,7 @@ def test_a_link_leads_nowhere(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["summary.json", "smoothed.txt", "frames.csv", "report.html", "explanation.json"]
 )
-def test_a_folder_with_an_earlier_result_is_refused_with_the_way_out(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_folder_with_an_earlier_result_is_refused(tmp_path: Path, name: str) -> None:
     check_unused(tmp_path)
     (tmp_path / name).write_text("")
     said = rf"{tmp_path}: holds an earlier result \({name}\); .*--out, or --force"

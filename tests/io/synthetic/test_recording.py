@@ -377,9 +377,7 @@ def test_sloping_planes_are_no_steps() -> None:
         ({"scale": float("nan")}, "scale must be in"),
     ],
 )
-def test_a_recording_that_cannot_be_rendered_is_refused(
-    options: dict[str, Any], message: str
-) -> None:
+def test_a_recording_nobody_can_render_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SyntheticRecording(**options)
 

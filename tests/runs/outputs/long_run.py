@@ -64,8 +64,7 @@ def make_long_run(folder: Path, n_frames: int) -> RunRecord:
         ),
         loops=None,
         timings=TimingTable(
-            stamps_ns=stamps_ns,
-            stages_ms={name: rng.gamma(8.0, 0.5, n_frames) for name in STAGES},
+            stamps_ns=stamps_ns, stages_ms={name: rng.gamma(8.0, 0.5, n_frames) for name in STAGES}
         ),
         trajectories={
             name: _trajectory(stamps_ns, rng, noise_m=noise, has_covariances=True)

@@ -208,9 +208,7 @@ def _points(cloud: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 @_KINDS
-def test_every_topic_comes_once_a_frame_with_the_stamp_of_the_frame(
-    tmp_path: Path, any_run: _Run, name: str
-) -> None:
+def test_every_topic_comes_once_a_frame_stamped(tmp_path: Path, any_run: _Run, name: str) -> None:
     _write(tmp_path / name, any_run, _MOUNTED)
     messages = _read(tmp_path / name)
     stamps = [frame.stamp_ns for frame in any_run.frames]
@@ -285,9 +283,7 @@ def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: 
 
 
 @_KINDS
-def test_the_camera_hangs_on_the_robot_under_every_estimate(
-    tmp_path: Path, stereo_run: _Run, name: str
-) -> None:
+def test_a_camera_hangs_on_every_estimate(tmp_path: Path, stereo_run: _Run, name: str) -> None:
     _write(tmp_path / name, stereo_run, _MOUNTED)
     buffer = _buffer(_read(tmp_path / name))
     for kind, poses in stereo_run.estimates(_T_BASE_CAM).items():
@@ -298,9 +294,7 @@ def test_the_camera_hangs_on_the_robot_under_every_estimate(
     assert not {"base_link", "left_optical"} & set(buffer.frames)
 
 
-def test_a_camera_that_moves_on_the_robot_is_placed_at_each_stamp(
-    tmp_path: Path, stereo_run: _Run
-) -> None:
+def test_a_camera_moving_on_the_robot_is_placed_anew(tmp_path: Path, stereo_run: _Run) -> None:
     stamps = [frame.stamp_ns for frame in stereo_run.frames]
 
     def mount(stamp_ns: int) -> FloatArray:
@@ -359,9 +353,7 @@ def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_correc
 
 
 @_KINDS
-def test_loops_are_drawn_when_they_are_confirmed_and_at_the_end_between_global_poses(
-    tmp_path: Path, name: str
-) -> None:
+def test_loops_are_drawn_when_confirmed_and_last_in_global_poses(tmp_path: Path, name: str) -> None:
     stamps = [_START_NS + k * _SECOND_NS for k in range(4)]
     loop = loop_of(stamps[2], stamps[0])
     aside = np.eye(4)
@@ -478,9 +470,7 @@ def test_the_covariance_of_the_raw_velocity_is_that_of_the_registration(
 
 
 @_KINDS
-def test_points_are_those_matched_with_their_grey_values(
-    tmp_path: Path, any_run: _Run, name: str
-) -> None:
+def test_points_are_those_matched_in_grey(tmp_path: Path, any_run: _Run, name: str) -> None:
     _write(tmp_path / name, any_run, _MOUNTED)
     clouds = _read(tmp_path / name)["/gvo/points"]
     assert sum(m.content.width for m in clouds) > 50 * len(clouds)

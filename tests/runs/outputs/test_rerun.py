@@ -110,7 +110,6 @@ class _Read:
         return [row for row in self.rows[entity] if row.frame <= frame][-1].values
 
     def numbers(self, entity: str) -> dict[int, float]:
-        """Return scalars by stamp."""
         return {row.stamp_ns: row.values["Scalars:scalars"][0] for row in self.rows[entity]}
 
 
@@ -375,9 +374,7 @@ def test_up_is_where_the_frame_has_it(room_run: _Run, robot_run: _Run) -> None:
 
 
 @pytest.mark.parametrize(("down", "axes"), [("y", _RIGHT_DOWN_FORWARD), ("z", _FORWARD_LEFT_UP)])
-def test_a_placed_camera_tells_by_its_pose_where_up_is(
-    tmp_path: Path, down: str, axes: list[int]
-) -> None:
+def test_a_placed_camera_tells_where_up_is(tmp_path: Path, down: str, axes: list[int]) -> None:
     turn = [-100.0, 0.0, 0.0] if down == "z" else [10.0, 5.0, 0.0]
     R = np.asarray(Rotation.from_euler("xyz", turn, degrees=True).as_matrix())
     start = make_transform(R, np.array([4.0, 5.0, 6.0]))
@@ -385,7 +382,7 @@ def test_a_placed_camera_tells_by_its_pose_where_up_is(
     assert read.fixed["/world"]["ViewCoordinates:xyz"][0] == axes
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     numbers=st.lists(st.floats(-1.0, 1.0), min_size=36, max_size=36),
     twist=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6),
@@ -434,9 +431,7 @@ def _write_made(folder: Path, results: list[FrameResult], names: RunFrames | Non
 @pytest.mark.parametrize(
     ("start_ns", "kind"), [(0, pa.duration("ns")), (_UNIX_NS, pa.timestamp("ns"))]
 )
-def test_stamps_are_dates_where_they_can_be(
-    tmp_path: Path, start_ns: int, kind: pa.DataType
-) -> None:
+def test_stamps_are_dates_if_they_can_be(tmp_path: Path, start_ns: int, kind: pa.DataType) -> None:
     read = _write_made(tmp_path, [_made(start_ns), _made(start_ns + 1)])
     assert read.stamp_types == {kind}
     assert [row.stamp_ns for row in read.rows["/status"]] == [start_ns, start_ns + 1]
@@ -465,9 +460,7 @@ def test_a_pose_that_cannot_be_tied_to_a_known_frame_has_no_link(tmp_path: Path)
     assert len(set(drawn["LineStrips3D:colors"])) == 2  # refused ones stand out
 
 
-def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(
-    tmp_path: Path,
-) -> None:
+def test_loops_run_between_causal_poses_and_at_the_end_between_global_ones(tmp_path: Path) -> None:
     def at(x: float) -> FloatArray:
         return make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
 

@@ -24,15 +24,8 @@ from gvo.viz.explanation.sheet import Sheet
 from tests.viz.browser import Browser
 
 STEREO = [
-    "01_keypoints",
-    "02_stereo",
-    "03_subpixel",
-    "04_disparity_and_depth",
-    "05_matches",
-    "06_consensus",
-    "07_residuals",
-    "08_pose",
-    "09_links",
+    *("01_keypoints", "02_stereo", "03_subpixel", "04_disparity_and_depth", "05_matches"),
+    *("06_consensus", "07_residuals", "08_pose", "09_links"),
 ]
 RGBD = [STEREO[0], "02_depth", "03_depth_keypoints", *STEREO[3:]]
 

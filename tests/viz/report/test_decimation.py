@@ -10,18 +10,11 @@ from hypothesis import strategies as st
 from gvo.geometry import se3
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from gvo.viz.report.sheets import (
-    display_path,
-    kept_of_curve,
-    kept_of_dots,
-    simplified,
-)
+from gvo.viz.report.sheets import display_path, kept_of_curve, kept_of_dots, simplified
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 3000))
-def test_each_column_keeps_its_smallest_and_largest_value(
-    seed: int, n_columns: int, n: int
-) -> None:
+def test_each_column_keeps_its_least_and_largest_value(seed: int, n_columns: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     x, y = np.cumsum(rng.exponential(size=n)), rng.standard_cauchy(size=n)
     kept = kept_of_curve(x, y, n_columns=n_columns)

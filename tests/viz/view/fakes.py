@@ -28,7 +28,6 @@ def pose_of(index: int) -> FloatArray:
 
 
 def stamps_of(n: int) -> IntArray:
-    """Of the first n frames, nanoseconds."""
     return PERIOD_NS * np.arange(n, dtype=np.int64)
 
 
@@ -81,8 +80,6 @@ def cells(numbers: str) -> dict[str, str]:
 
 
 class FakeHistory:
-    """The paths of a camera that drives ahead."""
-
     def __init__(self) -> None:
         self.n = 0
 

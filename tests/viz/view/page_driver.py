@@ -47,7 +47,6 @@ class ViewPage:
         return int(first) if first.isdigit() else -1
 
     def press(self, text: str) -> None:
-        """Press a button."""
         self._click("button", text)
 
     def unfold(self, *titles: str) -> None:
@@ -80,7 +79,6 @@ class ViewPage:
         self.browser.wait(click, message=f"nothing to click with the text {text}")
 
     def control(self, label: str) -> "WebElement":
-        """Return the element of a control by its label."""
         found = self.browser.wait(
             lambda: self._with_text("label", label), message=f"no control {label}"
         )[0]
@@ -102,7 +100,6 @@ class ViewPage:
         self.browser.driver.execute_cdp_cmd("Input.insertText", {"text": value})
 
     def move_slider(self, label: str, n_steps: int) -> None:
-        """Move a slider by steps with the arrow keys."""
         from selenium.webdriver import Keys
 
         thumb = self.control(label).find_element("css selector", "[role=slider]")
@@ -111,7 +108,6 @@ class ViewPage:
             thumb.send_keys(key)
 
     def canvas(self) -> "WebElement":
-        """Return the canvas of the scene."""
         return max(self.browser.all("canvas"), key=lambda canvas: canvas.size["width"])
 
     def scene(self) -> Picture:
@@ -120,7 +116,6 @@ class ViewPage:
         return seen[len(seen) // 4 :]
 
     def wait_for_frame(self, index: int) -> None:
-        """Wait until a frame is shown."""
         self.browser.wait(
             lambda: self.number("frame") == index,
             message=f"frame {index} was not shown, but {self.cell('frame')}",

@@ -49,20 +49,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def record(folder: Path) -> RunRecord:
-    """The run read back."""
     return read_run(folder)
 
 
 @pytest.fixture
 def page(view: ViewServer, record: RunRecord) -> Iterator[FinishedPage]:
-    """Its page."""
     opened = FinishedPage(view.viser, record)
     yield opened
     opened.close()
 
 
 def drawn(view: ViewServer, path: str) -> float:
-    """Metres of a path as it is drawn."""
     nodes: list[Any] = [
         view.viser.scene.get_handle_by_name(f"/paths/{path}/{number}") for number in range(3)
     ]
@@ -95,9 +92,7 @@ def test_the_paths_end_at_the_frame(page: FinishedPage, view: ViewServer, folder
         assert drawn(view, "causal") == pytest.approx(np.linalg.norm(steps, axis=1).sum(), rel=1e-4)
 
 
-def test_global_poses_and_loops_are_drawn_up_to_the_frame(
-    view: ViewServer, record: RunRecord
-) -> None:
+def test_global_poses_and_loops_are_drawn_to_the_frame(view: ViewServer, record: RunRecord) -> None:
     assert "global" not in record.trajectories
     ends = np.array([[8, 2], [10, 2]]) * int(stamps_of(2)[1])
     loops = LoopTable(
@@ -174,9 +169,7 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     # 0.07 of 11 m by the largest sigma: that of the last frame, 0.03 m times the root of 12
     [(1.0, 7), (1e-4, 10), (1e4, 1), (4.0, 3)],
 )
-def test_ellipsoids_do_not_hide_the_path_at_first(
-    record: RunRecord, factor: float, n_sigmas: int
-) -> None:
+def test_ellipsoids_hide_no_path_at_first(record: RunRecord, factor: float, n_sigmas: int) -> None:
     smoothed = record.trajectories["smoothed"]
     assert smoothed.covariances is not None
     wider = replace(smoothed, covariances=factor * smoothed.covariances)
@@ -189,7 +182,6 @@ STAMPS = np.array([0, 100, 200, 500, 600], dtype=np.int64) * 1_000_000
 
 @pytest.fixture
 def shown() -> list[int]:
-    """Frames in the order in which they were shown."""
     return []
 
 

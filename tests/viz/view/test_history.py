@@ -74,7 +74,6 @@ def faulty(frame: int) -> FrameRecord:
 
 @pytest.fixture
 def history() -> History:
-    """Return frames 2 to 6, of which 4 is faulty; 2 is final with 5, 3 with the end."""
     history = History(2)
     history.add(record(2, window=(2,)))
     history.add(record(3, window=(2, 3)))

@@ -16,9 +16,7 @@ rows_of_one_number = st.lists(st.integers(0, 3), max_size=20).map(
 
 
 @given(st.lists(rows_of_one_number, min_size=1, max_size=5), st.integers(1, 4), st.booleans())
-def test_pieces_put_together_are_the_rows(
-    states: list[FloatArray], size: int, is_line: bool
-) -> None:
+def test_pieces_together_are_the_rows(states: list[FloatArray], size: int, is_line: bool) -> None:
     pieces = ChunkedArray(size, n_shared=int(is_line))
     held: dict[int, FloatArray] = {}
     for rows in states:

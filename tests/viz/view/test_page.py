@@ -26,33 +26,28 @@ from tests.viz.view.fakes import FakePlayer, cells, frame_view_of, pose_of, stam
 
 @pytest.fixture
 def player() -> FakePlayer:
-    """At no frame yet."""
     return FakePlayer()
 
 
 @pytest.fixture
 def page(view: ViewServer, player: FakePlayer) -> Iterator[Page]:
-    """The page of a fake player."""
     opened = Page(view.viser, cast(Any, player))
     yield opened
     opened.close()
 
 
 def show(page: Page, player: FakePlayer, index: int, **options: Any) -> None:
-    """Be at a frame, drawn."""
     player.show(frame_view_of(index, **options))
     page.settle()
 
 
 def nodes(view: ViewServer, prefix: str) -> list[Any]:
-    """Scene nodes whose name begins so."""
     names = [*view.viser.scene._handle_from_node_name]
     found = [view.viser.scene.get_handle_by_name(name) for name in names if name.startswith(prefix)]
     return [node for node in found if node is not None]
 
 
 def length(view: ViewServer, path: str) -> float:
-    """Metres of a path as it is drawn."""
     points = [node.points for node in nodes(view, f"/paths/{path}/")]
     return float(sum(np.linalg.norm(p[:, 1] - p[:, 0], axis=1).sum() for p in points))
 
@@ -75,9 +70,7 @@ def test_a_faulty_frame_tells_its_reason_and_no_counts(page: Page, player: FakeP
     assert "matches" not in numbers
 
 
-def test_the_paths_grow_and_shrink_with_the_frame(
-    page: Page, player: FakePlayer, view: ViewServer
-) -> None:
+def test_paths_grow_and_shrink_by_frame(page: Page, player: FakePlayer, view: ViewServer) -> None:
     for index in (10, 30, 5):
         show(page, player, index)
         assert length(view, "causal") == pytest.approx(index, abs=1e-4)
@@ -100,9 +93,7 @@ def test_the_camera_stands_at_the_pose(page: Page, player: FakePlayer, view: Vie
     np.testing.assert_allclose(camera.position, [0.0, 0.0, 12.0])
 
 
-def test_a_frame_without_points_sends_no_cloud(
-    page: Page, player: FakePlayer, view: ViewServer
-) -> None:
+def test_a_frame_of_no_points_sends_none(page: Page, player: FakePlayer, view: ViewServer) -> None:
     """Browsers complain of an empty one."""
     for index, n_clouds in ((1, 1), (2, 0), (3, 1)):
         frame = frame_view_of(index)
@@ -126,9 +117,7 @@ def test_buttons_take_the_parameters_first(page: Page, player: FakePlayer) -> No
     assert player.config == load_configuration(settings=["klt.n_corners=300"])
 
 
-def test_a_client_seeks_by_the_slider_and_the_program_does_not(
-    page: Page, player: FakePlayer
-) -> None:
+def test_a_client_seeks_by_the_slider_a_program_does_not(page: Page, player: FakePlayer) -> None:
     show(page, player, 9)
     assert page.playback.frame.value == 9
     assert player.calls == []

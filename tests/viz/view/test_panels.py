@@ -29,7 +29,6 @@ class FakeServer:
         return self.clients
 
     def connect(self, number: int) -> Any:
-        """Open one more browser."""
         # as it stands before it has heard of any view
         camera = SimpleNamespace(position=np.full(3, 3.0), look_at=np.zeros(3))
         self.clients[number] = client = SimpleNamespace(client_id=number, camera=camera)
@@ -55,9 +54,7 @@ def seen(client: Any, index: int) -> tuple[FloatArray, FloatArray]:
     return client.camera.position - place, client.camera.look_at - place
 
 
-def test_a_browser_that_tells_its_view_late_is_not_left_behind(
-    server: FakeServer, view: ViewPoint
-) -> None:
+def test_a_browser_that_tells_late_is_not_left_behind(server: FakeServer, view: ViewPoint) -> None:
     client = server.connect(0)
     start = seen(client, 0)
     for index in range(1, 30):

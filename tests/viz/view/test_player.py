@@ -167,9 +167,7 @@ def test_the_way_to_a_frame_can_be_interrupted(player: Player, tell: str) -> Non
     assert (player.index, player.n_done) == (4 if tell == "pause" else 1, 5)
 
 
-def test_a_seek_beyond_an_end_shows_the_frame_there(
-    player: Player,
-) -> None:
+def test_a_seek_beyond_an_end_shows_the_frame_there(player: Player) -> None:
     go(player, 10_000)
     assert (player.index, player.n_frames, player.is_finished) == (N_FRAMES - 1, N_FRAMES, True)
     go(player, -5)

@@ -116,7 +116,6 @@ def _text(text: str) -> bytes:
 
 
 def damaged(path: Path, change: Callable[[bytes], bytes]) -> Path:
-    """Return a copy of a file with other bytes."""
     copy = path.with_name(f"damaged-{path.name}")
     copy.write_bytes(change(path.read_bytes()))
     return copy
