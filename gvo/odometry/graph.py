@@ -80,7 +80,7 @@ _STATUSES: Final = tuple(Status)
 _KEYFRAME: Final = np.dtype(
     [
         *(("T_first_keyframe", "f8", *_T), ("covariance", "f8", *_COVARIANCE)),
-        *(("drift", "f8", *_COVARIANCE), ("n_steps", "i8"), ("part", "i8")),  # its way
+        *(("drift", "f8", *_COVARIANCE), ("n_steps", "i8")),  # its way
         *(("status", "i8"), ("is_guess", "i8"), ("n_frames", "i8")),
         *(("T_step", "f8", *_T), ("step_covariance", "f8", *_COVARIANCE)),
     ]
@@ -164,17 +164,14 @@ class _Way(NamedTuple):
         In the axes of the first one, where they add up. The drift is that of the steps as if they
         drifted each on its own: they do so all alike, and their sigmas add up.
     n_steps : int
-    part : int
-        The number of guesses before.
     """
 
     T_first_keyframe: FloatArray
     covariance: FloatArray
     drift: FloatArray
     n_steps: int
-    part: int
 
-    def then(self, step: Edge, *, is_guess: bool) -> _Way:
+    def then(self, step: Edge) -> _Way:
         """Return the way to the next keyframe."""
         T_first_keyframe = self.T_first_keyframe @ step.T_reference_frame
         Ad = se3.adjoint(T_first_keyframe)
@@ -183,7 +180,6 @@ class _Way(NamedTuple):
             self.covariance + Ad @ step.covariance @ Ad.T,
             self.drift + Ad @ _drift(step, _DRIFT) @ Ad.T,
             self.n_steps + 1,
-            self.part + is_guess,
         )
 
     def covariance_since(self, other: _Way, *, drifts: bool) -> FloatArray:
@@ -245,7 +241,7 @@ class RunGraph:
         self._known, self._merged, self._frames = map(_Table, (_KEYFRAME, _FRAME, _FRAME))
         self._merged_at = array("q")
         self._open: list[tuple[Any, ...]] = []
-        self._way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0, 0)
+        self._way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0)
         self._arrivals: list[tuple[Estimate, list[Edge]]] = []
         self._last: Estimate | None = None
         # Where nothing measured connects a keyframe with those before: the one before it.
@@ -266,10 +262,6 @@ class RunGraph:
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self._keyframes)
-
-    def __contains__(self, stamp_ns: int) -> bool:
-        """Tell whether a frame is a keyframe."""
-        return stamp_ns in self._keyframes
 
     def add_frame(self, estimate: Estimate, edges: Sequence[Edge], *, is_keyframe: bool) -> None:
         """Add a frame with the edges that measure it from earlier ones.
@@ -317,7 +309,7 @@ class RunGraph:
         frames, step = self._condense(newest)
         for row in frames:
             self._frames.append(row[1], *row)
-        self._way = self._way.then(step, is_guess=is_guess)
+        self._way = self._way.then(step)
         self._know(newest, step, n_frames=len(frames))
         self._arrivals, self._adrift = [], set()
 
@@ -343,11 +335,10 @@ class RunGraph:
         """Return a loop as an edge from another keyframe, by the way between; None if guessed."""
         if stamp_ns == loop.reference_ns:
             return loop.edge
-        if stamp_ns not in self._known or loop.reference_ns not in self._known:
+        is_known = stamp_ns in self._known and loop.reference_ns in self._known
+        if not is_known or self._part(stamp_ns) != self._part(loop.reference_ns):
             return None
         first, second = self._way_to(stamp_ns), self._way_to(loop.reference_ns)
-        if first.part != second.part:
-            return None
         T = se3.invert(first.T_first_keyframe) @ second.T_first_keyframe
         return _join(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
 
@@ -414,11 +405,15 @@ class RunGraph:
                 del self._touching[stamp_ns][number]
             yield frame_ns, edge
 
+    def _part(self, stamp_ns: int) -> int:
+        """Return the number of guesses on the way to a keyframe."""
+        return bisect(list(self._guesses), stamp_ns)
+
     def _way_to(self, stamp_ns: int) -> _Way:
         """Return the way to a keyframe."""
         row = self._known[self._known.number(stamp_ns)]
         T, covariance, drift = (row[key] for key in ("T_first_keyframe", "covariance", "drift"))
-        return _Way(T, covariance, drift, int(row["n_steps"]), int(row["part"]))
+        return _Way(T, covariance, drift, int(row["n_steps"]))
 
     def _from_keyframe(self, edge: Edge) -> Edge:
         """Return an edge from a frame that hangs on a keyframe as one from the keyframe."""
@@ -660,11 +655,10 @@ class RunGraph:
         for stamp_ns, estimate in self._keyframes.items():
             graph.add_pose(stamp_ns, stamp_ns, origin if estimate is first else None)
             graph.given[stamp_ns] = estimate.T_world_frame
-        starts_ns = list(self._guesses)
         for stamp_ns, edge in self._edges.values():
             reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
             is_guess = self._guesses.get(stamp_ns) == reference_ns
-            is_inside = bisect(starts_ns, stamp_ns) == bisect(starts_ns, reference_ns)
+            is_inside = self._part(stamp_ns) == self._part(reference_ns)
             if drift if is_guess else (reference_ns, stamp_ns) not in refused or is_inside:
                 is_trusted = is_inside or is_guess
                 graph.add_edges(
@@ -704,10 +698,10 @@ class RunGraph:
         Odometry is trusted but for its drift over the whole way, however many of them agree.
         """
         across: dict[tuple[int, int], list[tuple[int, Edge]]] = {}
-        starts_ns, edges = list(self._guesses), [(loop.stamp_ns, loop.edge) for loop in loops]
-        for frame_ns, edge in [*edges, *self._edges.values()]:
+        looped = [(loop.stamp_ns, loop.edge) for loop in loops]
+        for frame_ns, edge in [*looped, *self._edges.values()]:
             reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
-            parts = bisect(starts_ns, reference_ns), bisect(starts_ns, frame_ns)
+            parts = self._part(reference_ns), self._part(frame_ns)
             if parts[0] != parts[1] and self._guesses.get(frame_ns) != reference_ns:
                 across.setdefault(parts, []).append((frame_ns, edge))
         refused: set[tuple[object, int]] = set()
@@ -740,11 +734,11 @@ class RunGraph:
 
         The median over the loops of what each contradicts it by, unless that may be chance.
         """
-        starts_ns, ratios = list(self._guesses), []
-        for loop in loops:
-            is_inside = bisect(starts_ns, loop.stamp_ns) == bisect(starts_ns, loop.reference_ns)
-            if not loop.reason and is_inside:
-                ratios.append(self._chi2(loop, drifts=False) / 6.0)
+        ratios = [
+            self._chi2(loop, drifts=False) / 6.0
+            for loop in loops
+            if not loop.reason and self._part(loop.stamp_ns) == self._part(loop.reference_ns)
+        ]
         factor = float(np.median(ratios)) if ratios else 1.0
         return factor if factor > INLIER_CHI2 / 6.0 else 1.0
 
