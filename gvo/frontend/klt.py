@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo._trace import note
-from gvo.config import Config
+from gvo.config import Config, KltConfig
 from gvo.frontend.calibration import CalibratedCamera, Measurements, RigOffsets
 from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
@@ -66,6 +66,8 @@ _N_SAMPLED = 40
 _MIN_SHARE_TRACKED = 0.25
 # Patches of a place are described in another size too: it is seen again from farther, or nearer.
 _WIDE = 1.5
+# By how much more corners of a lost camera are looked for.
+_DENSITY = 3
 # How tracks are found: over more levels of the pyramid; near the predicted pixels; by alignment
 # alone, where the prediction is that of poses that are known.
 _Search: TypeAlias = Literal["wide", "near", "aligned"]
@@ -118,8 +120,10 @@ class KltFrontend:
         corners = self._find_corners(frame, *offsets_px)
         return KltObservations(frame=frame, find_corners=lambda: corners)
 
-    def _find_corners(self, frame: Frame, offset_px: float, row_offset_px: float) -> KltCorners:
-        corners = detect_corners(image_of(frame), self._config.klt)
+    def _find_corners(
+        self, frame: Frame, offset_px: float, row_offset_px: float, klt: KltConfig | None = None
+    ) -> KltCorners:
+        corners = detect_corners(image_of(frame), klt or self._config.klt)
         row_shift_px = None
         if isinstance(frame, StereoFrame):
             config, images = self._config.stereo, (frame.left, frame.right)
@@ -260,7 +264,22 @@ class KltFrontend:
 
     def describe(self, observations: KltObservations) -> KltPlace:
         """Return a frame as a place: small, but for its image all that `recognize` needs."""
-        frame, corners = observations.frame, observations.find_corners()
+        return self._describe(observations, observations.find_corners())
+
+    def describe_densely(self, observations: KltObservations) -> KltPlace:
+        """Return a frame as a place with more corners, which find more of another place's."""
+        klt = self._config.klt
+        dense = klt.model_copy(
+            update={
+                "n_corners": _DENSITY * klt.n_corners,
+                "min_distance_px": 2 * klt.min_distance_px // 3,
+            }
+        )
+        corners = self._find_corners(observations.frame, *self._offsets_px(), dense)
+        return self._describe(observations, corners)
+
+    def _describe(self, observations: KltObservations, corners: KltCorners) -> KltPlace:
+        frame = observations.frame
         image, chosen = observations.image, thin(len(corners.keypoints))
         keypoints = corners.keypoints[chosen]
         depth_points = None
@@ -269,7 +288,7 @@ class KltFrontend:
             depth_points = points.astype(np.float32)
         place = KltPlace(
             stamp_ns=observations.stamp_ns,
-            pixels=observations.uvd[chosen].astype(np.float32),
+            pixels=np.column_stack([keypoints, corners.disparities[chosen]]).astype(np.float32),
             points=corners.points_cam[chosen].astype(np.float32),
             slopes=corners.slopes[chosen].astype(np.float32),
             patches=cut_patches(image, keypoints, RADIUS_PX + 1),

@@ -99,7 +99,8 @@ class Recognizer(Protocol):
     """A front-end that knows frames again that it keeps small: loops and lost cameras need one.
 
     A place has `stamp_ns`, `points_cam` (n, 3) and `descriptors_left` (n, m); what else
-    `recognize` needs is the front-end's own affair.
+    `recognize` needs is the front-end's own affair. Where there is `describe_densely` beside
+    `describe`, it describes the frames of a lost camera, which are few.
     """
 
     @property

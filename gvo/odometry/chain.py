@@ -186,9 +186,9 @@ class RawChain(Generic[ObservationsT]):
         self._recent = _RecentVelocities()
 
     @property
-    def anchor_ns(self) -> int | None:
-        """Stamp of the last registered frame, which the next one may be tied to."""
-        return self._nodes[-1].estimate.stamp_ns if self._nodes else None
+    def anchor(self) -> ObservationsT | None:
+        """The last registered frame, which the next one may be tied to."""
+        return self._nodes[-1].observations if self._nodes else None
 
     def reconfigure(
         self,

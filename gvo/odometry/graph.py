@@ -263,6 +263,10 @@ class RunGraph:
         """Return the number of keyframes."""
         return len(self._keyframes)
 
+    def __contains__(self, stamp_ns: int) -> bool:
+        """Tell whether a frame is a keyframe."""
+        return stamp_ns in self._keyframes
+
     def add_frame(self, estimate: Estimate, edges: Sequence[Edge], *, is_keyframe: bool) -> None:
         """Add a frame with the edges that measure it from earlier ones.
 
@@ -290,7 +294,8 @@ class RunGraph:
             self._n_worlds = max(self._n_worlds, world + 1)
         near = {latest_ns, *(each.stamp_ns for each, _ in self._arrivals)}
         ties = [edge for edge in edges if edge.reference_id in near]
-        if ties and ties[0].reference_id in self._adrift:
+        is_back = bool(ties) and ties[0].reference_id in self._adrift
+        if self._arrivals and (is_back or not (ties or self._adrift)):
             self._close(last.stamp_ns)  # so that the guess is an edge of its own
         is_linked = len(ties) < len(edges)
         guess = [] if ties else [self._unmeasured(last, estimate)]

@@ -90,6 +90,7 @@ class LoopDetector:
         self._recent: list[_Visit] = []
         self._waiting: list[tuple[int, Loop]] = []
         self._n_visits = 0
+        self._world = 0
         self._connected: set[int] = set()
         self._n_searches: dict[int, int] = {}
         self._n_paused = 0
@@ -141,26 +142,40 @@ class LoopDetector:
         Those that are no keyframes are looked at only in a `world` that is not connected with the
         others, and are places where they are found.
         """
-        if self._recent and self._recent[-1].world != world:
+        if world != self._world:
             self._leave_world()
+        self._world = world
         is_search = self._is_search(world)
         is_place = is_keyframe and not self._shows_latest(T_world_frame)
         if not (is_search or is_place):
             return ()
-        place = self._frontend.describe(observations)
+        place = self._describe(observations, is_dense=is_search)
         scores = self._index.scores(place.descriptors_left)
         numbers = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
         loop = self._register(numbers, place, observations)
         if not is_place and loop is None:
             return ()
-        visit = _Visit(number=self._n_visits, place=place, T_world_frame=T_world_frame, world=world)
-        self._n_visits += 1
+        self._add(place, T_world_frame)
+        return () if loop is None else tuple(self._confirm(loop))
+
+    def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
+        """Add a frame of the latest world as a place, without looking."""
+        self._add(self._describe(observations, is_dense=True), T_world_frame)
+
+    def _describe(self, observations: Any, *, is_dense: bool) -> Any:  # noqa: ANN401
+        """Return a frame as a place, with more points where the front-end can."""
+        describe = self._frontend.describe
+        if is_dense:
+            describe = getattr(self._frontend, "describe_densely", describe)
+        return describe(observations)
+
+    def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
+        number, self._n_visits = self._n_visits, self._n_visits + 1
+        visit = _Visit(number=number, place=place, T_world_frame=T_world_frame, world=self._world)
         self._visits[place.stamp_ns] = visit
         self._recent.append(visit)
-        confirmed = () if loop is None else tuple(self._confirm(loop))
         if len(self._recent) > _N_RECENT:
             self._keep_oldest_recent()
-        return confirmed
 
     def _leave_world(self) -> None:
         """Add all places to the index: odometry does not know where they are any more."""

@@ -539,13 +539,26 @@ class Odometry:
             loops = self._look(observations, T_world_frame, edges, is_keyframe=is_keyframe)
         is_keyframe = is_keyframe or (self._loops is not None and stamp_ns in self._loops)
         self._graph.add_frame(causal, edges, is_keyframe=is_keyframe)
+        if not edges:
+            self._keep_last_seen()
         if is_keyframe and loops is not None and self._loops is not None:
             self._graph.advance(loops, self._loops)
         return loops or ()
 
+    def _keep_last_seen(self) -> None:
+        """Make the last registered frame a place: it is what a lost camera may see again."""
+        anchor = self._chain.anchor
+        if self._loops is None or anchor is None:
+            return
+        stamp_ns = anchor.stamp_ns
+        is_there = stamp_ns in self._graph and stamp_ns in self._window
+        if is_there and stamp_ns not in self._loops:
+            self._loops.keep(anchor, self._window.pose(stamp_ns))
+
     def _keep_anchor(self) -> None:
         """Keep the frame that the chain comes back to, however long it coasts."""
-        previous, self._anchor_ns = self._anchor_ns, self._chain.anchor_ns
+        anchor, previous = self._chain.anchor, self._anchor_ns
+        self._anchor_ns = None if anchor is None else anchor.stamp_ns
         if previous not in self._keyframes.stamps_ns and previous in self._window:
             self._window.release(previous)
         if self._anchor_ns in self._window:

@@ -298,6 +298,17 @@ def test_a_place_is_small_and_recognized(sensor: Sensor, kind: str) -> None:
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
+def test_more_corners_of_a_place_are_described_where_it_matters(sensor: Sensor) -> None:
+    klt, (first, *_, last) = frontend(sensor), observations(sensor)
+    places = klt.describe(first), klt.describe_densely(last)
+    assert len(places[1].points_cam) > 1.5 * len(klt.describe(last).points_cam)
+    result = klt.recognize(*places, last)
+    assert isinstance(result, RelativePose)
+    error = se3.invert(true_motion(sensor, 0, N_FRAMES - 1)) @ result.T_reference_current
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
 def test_another_place_is_not_recognized(sensor: Sensor) -> None:
     klt, frame = frontend(sensor), frames(sensor)[-1]
     turned: Frame = (

@@ -308,3 +308,24 @@ def test_segments_that_are_joined_to_the_same_one_are_joined_to_each_other() -> 
     assert segments.join(32, 15) is not None
     assert segments.unjoined([5, 15, 25, 35]) == [25]
     assert segments.join(33, 5) is None
+
+
+def test_what_was_seen_last_is_known_again_though_it_is_no_keyframe() -> None:
+    poses = (
+        [at(0.1 * n) for n in range(8)] + [at(1.0)] * 6 + [at(1.25 + 0.02 * n) for n in range(8)]
+    )
+    places = [
+        Place(stamp_ns=n * STEP_NS, T_world_frame=T, is_dark=8 <= n < 14)
+        for n, T in enumerate(poses)
+    ]
+    # The last keyframe is 0.85 m behind, the last frame 0.55 m.
+    frontend = Beacon(see=lambda T: T if np.linalg.norm(T[:3, 3]) < 0.75 else None)
+    window = {"lost_after_s": 0.35, "keyframe_distance_m": 0.3}
+    odometry = Odometry(config=Config.model_validate({"window": window}), frontend=frontend)
+    results = [odometry.track(place) for place in places]
+    assert 7 * STEP_NS not in results[7].keyframes_ns
+    loops = [loop for result in results for loop in result.loops]
+    assert {loop.reference_ns for loop in loops} == {7 * STEP_NS}
+    found = odometry.optimize().estimates
+    error = [each.T_world_frame - T for each, T in zip(found[15:], poses[15:], strict=True)]
+    assert np.abs(error).max() < 0.02
