@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -417,7 +418,7 @@ def draw_links(explanation: FrameExplanation) -> Picture:
     n_columns = min(_N_COLUMNS, max(len(shown), 3))
     n_rows = -(-len(shown) // n_columns)
     rows, columns = explanation.image.shape
-    height = n_rows * (12.6 / n_columns * rows / columns + 0.65)
+    height = n_rows * (12.6 / n_columns * rows / columns + 0.8)
     sheet = Sheet("09_links", _links_caption(explanation), height)
     panels = sheet.panels.subplots(n_rows, n_columns, squeeze=False).ravel()
     for axes, link in zip(panels, shown, strict=False):
@@ -445,15 +446,15 @@ def _draw_link(axes: Axes, link: Step) -> None:
             KEPT if link.is_accepted else BEFORE if link.kind == "not linked" else REFUSED
         )
         spine.set_linewidth(3)
-    text = f"frame {link.frame}, {what[link.kind]}{overlap}\n{answer}"
-    axes.set_title(text, fontsize=8, loc="left")
+    lines = [f"frame {link.frame}, {what[link.kind]}{overlap}", *textwrap.wrap(answer, 48)]
+    axes.set_title("\n".join(lines), fontsize=8, loc="left")
 
 
 def _links_caption(explanation: FrameExplanation) -> str:
     window, links = explanation.config.window, explanation.links
     text = (
-        f"{sum(link.is_accepted for link in links)} edges connect the frame to earlier ones (blue "
-        f"frames); at most {window.n_links} keyframes are registered (window.n_links). Overlap is "
+        f"Edges to earlier frames (blue): {sum(link.is_accepted for link in links)}; keyframes "
+        f"registered: at most {window.n_links} (window.n_links). Overlap is "
         f"the share of a keyframe's points in view. Below {window.min_overlap:g} the keyframe is "
         "not linked (window.min_overlap); it is where overlap times the number of steps since its "
         f"last link reaches {window.link_gain:g} (window.link_gain), or where the step is in "

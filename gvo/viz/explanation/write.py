@@ -91,7 +91,7 @@ def _summary(explanation: FrameExplanation) -> str:
         f"Stamp {result.stamp_ns} ns, front-end {explanation.config.frontend.kind}, status "
         f"{result.status.value}. {result.n_keypoints} keypoints, {result.n_points} of them "
         f"measured in 3-D; {result.n_matches} matches, {result.n_inliers} inliers; "
-        f"{result.n_links} edges in the window."
+        f"edges in the window: {result.n_links}."
     )
     return f"{text} Not registered: {result.reason}." if result.reason else text
 
@@ -101,9 +101,7 @@ def _section(picture: Picture) -> str:
     title, image = html_text(picture.title), ""
     if picture.panels_png is not None:
         data = b64encode(picture.panels_png).decode()
-        style = "display: block; width: 100%; height: auto"
-        image = f'<div class="panel"><img src="data:image/png;base64,{data}" alt="{title}" '
-        image += f'style="{style}"></div>\n'
+        image = f'<div class="panel"><img src="data:image/png;base64,{data}" alt="{title}"></div>\n'
     caption = "<br>".join(map(html_text, picture.caption.split("\n")))
     heading = f"{int(picture.name[:2])}. {title}"
     return f"<section>\n<h2>{heading}</h2>\n{image}<p>{caption}</p>\n</section>"

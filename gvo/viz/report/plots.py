@@ -40,6 +40,7 @@ from gvo.viz.report.sheets import (
     columns_of,
     draw_curve,
     elapsed,
+    fit_left,
     kept_of_curve,
     kept_of_dots,
     new_figure,
@@ -228,6 +229,7 @@ def _bands(item: Consistency, first_ns: int) -> Figure:
         panel.set_xlabel("elapsed [s]")
     arrange(figure, panels[0, 0])
     figure.subplots_adjust(wspace=0.4, hspace=0.1)
+    fit_left(figure)
     figure.align_ylabels()
     return figure
 

@@ -13,12 +13,13 @@ from gvo.errors import ConfigurationError
 from gvo.geometry import se3
 from gvo.io.run_folder.reader import read_run
 from gvo.io.synthetic.recording import SyntheticRecording
-from gvo.trajectory.evaluation import evaluate
+from gvo.trajectory.evaluation import Consistency, evaluate
 from gvo.trajectory.formats import write_covariances, write_tum
 from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.palette import Style
 from gvo.viz.report import write_comparison_report, write_run_report
-from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure
+from gvo.viz.report.plots import covariance_plot
+from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure, settings
 from tests.conftest import run_of
 from tests.viz.report_page import Page
 
@@ -241,6 +242,25 @@ def test_a_lone_point_between_gaps_is_drawn() -> None:
     draw_curve(axes, np.arange(6.0), y, Style(color="black"))
     assert [np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]] == [[0.0, 2.0]]
     assert axes.lines[1].get_marker() == "."
+
+
+def test_no_label_of_errors_within_their_covariances_is_cut() -> None:
+    n = 100
+    end_ns = np.arange(n, dtype=np.int64) * 100_000_000 + 1_000_000_000
+    sigmas = np.array([1e-4, 1e-4, 1e-4, 2.88e-3, 2.88e-3, 2.88e-3])
+    item = Consistency(
+        name="raw over 1 s",
+        start_ns=end_ns - 1_000_000_000,
+        end_ns=end_ns,
+        errors=np.zeros((n, 6)),
+        covariances=np.tile(np.diag(sigmas**2), (n, 1, 1)),
+    )
+    with settings():
+        figure = covariance_plot(item, 0).figure
+        assert figure is not None
+        figure.draw_without_rendering()  # type: ignore[no-untyped-call,unused-ignore]
+        lefts = [axes.yaxis.label.get_window_extent().x0 for axes in figure.axes]
+    assert min(lefts) > 0.0
 
 
 def test_a_long_run_gives_a_small_page_that_shows_an_outlier_of_one_frame(copy: Path) -> None:
