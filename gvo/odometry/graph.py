@@ -108,7 +108,6 @@ class _Table:
         self.stamps_ns = array("q")
         self._dtype = dtype
         self._file: io.FileIO | None = None
-        self._is_file_full = False
         # How many rows are in the file, and those after them; replaced at once, for other threads.
         self._rest: tuple[int, list[NDArray[Any]]] = (0, [])
 
@@ -127,7 +126,7 @@ class _Table:
         rest = self._rest[1]
         rest.append(np.array(values, dtype=self._dtype))
         self.stamps_ns.append(stamp_ns)
-        if len(rest) >= _N_IN_MEMORY and not self._is_file_full:
+        if len(rest) == _N_IN_MEMORY:  # once, if it cannot be written
             self._write(rest)
 
     def __getitem__(self, index: int) -> NDArray[Any]:
@@ -145,10 +144,9 @@ class _Table:
                 weakref.finalize(self, self._file.close)
             append_whole(self._file, b"".join(row.tobytes() for row in rest))
         except OSError as error:
-            self._is_file_full = True
             _LOGGER.warning("the graph of the run stays in memory: %s", error)
-            return
-        self._rest = self._rest[0] + len(rest), []
+        else:
+            self._rest = self._rest[0] + len(rest), []
 
 
 _NO_STEP: Final = Edge(reference_id=0, T_reference_frame=np.eye(4), covariance=np.eye(6))
