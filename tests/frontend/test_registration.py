@@ -209,15 +209,15 @@ def forbid_search(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_prediction_that_most_matches_confirm_is_refined_without_samples(seed: int) -> None:
     T, reference, current, matches = two_frames(seed, n_outliers=20)
     start = T @ se3.exp(np.random.default_rng(seed).normal(size=6) * np.repeat([0.0005, 0.002], 3))
-    searched = register_matches(reference, current, matches, CAMERA, configure())
     with pytest.MonkeyPatch.context() as patch:
         forbid_search(patch)
         known = register_matches(reference, current, matches, CAMERA, configure(), start=start)
-    assert isinstance(searched, RelativePose)
+        # From the truth, without the wrong ones: samples may end at worse than that.
+        best = register_matches(reference, current, matches[20:], CAMERA, configure(), start=T)
     assert isinstance(known, RelativePose)
-    difference = se3.log(np.linalg.inv(searched.T_reference_current) @ known.T_reference_current)
-    # The same optimum, but for a match or two that the gate decides otherwise.
-    assert difference @ np.linalg.solve(searched.covariance, difference) / 6 < 2.0
+    assert isinstance(best, RelativePose)
+    difference = se3.log(np.linalg.inv(best.T_reference_current) @ known.T_reference_current)
+    assert difference @ np.linalg.solve(best.covariance, difference) / 6 < 1.0
     assert known.inliers[20:].mean() > 0.8
     assert known.inliers[:20].mean() < 0.2
 
