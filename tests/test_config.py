@@ -101,8 +101,7 @@ def test_an_unknown_section_names_the_nearest(tmp_path: Path, section: str, near
     ],
 )
 def test_values_out_of_range_are_refused_by_name(setting: str, key: str) -> None:
-    message = refusal(settings=(setting,))
-    assert message.startswith(f"{key}=")
+    assert refusal(settings=(setting,)).startswith(f"{key}=")
 
 
 def test_a_choice_names_its_alternatives() -> None:
@@ -120,8 +119,7 @@ def test_nearest_depth_must_lie_below_the_farthest(section: str) -> None:
 
 @pytest.mark.parametrize("setting", ["n_links=3", "window.n_links", "window", "", "=3"])
 def test_settings_of_another_form_are_refused_with_an_example(setting: str) -> None:
-    message = refusal(settings=(setting,))
-    assert "section.key=value" in message
+    assert "section.key=value" in refusal(settings=(setting,))
 
 
 @pytest.mark.parametrize("value", ["[1", "{a", "2024-99-99", "'"])

@@ -103,5 +103,4 @@ def test_an_estimate_shows_its_position_along_the_axes_of_the_world() -> None:
 
 @given(st.text(st.characters(exclude_categories=["Cs", "Cc"])))
 def test_text_is_escaped(text: str) -> None:
-    root = parsed(card(text, [(text, text)]))
-    assert "".join(root.itertext()) == 3 * visible(text)
+    assert "".join(parsed(card(text, [(text, text)])).itertext()) == 3 * visible(text)

@@ -43,8 +43,7 @@ print(json.dumps(found))
 
 def loaded_by(*actions: str) -> list[list[object]]:
     """Return exit code and libraries loaded of each line of Python, in a process of their own."""
-    program = _PROGRAM.format(heavy=HEAVY)
-    done = python("-c", program, *actions)
+    done = python("-c", _PROGRAM.format(heavy=HEAVY), *actions)
     assert (done.returncode, done.stderr) == (0, "")
     found: list[list[object]] = json.loads(done.stdout)
     return found

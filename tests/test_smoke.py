@@ -23,5 +23,4 @@ def test_the_demo_its_comparison_and_its_smoothing(
     assert answer.code == 0
     assert "smoothed" in answer.out
     assert command("smooth", estimates[0], "--out", tmp_path / "again").code == 0
-    smoothed = gvo.read_trajectory(tmp_path / "again/smoothed.txt")
-    assert len(smoothed) == 12
+    assert len(gvo.read_trajectory(tmp_path / "again/smoothed.txt")) == 12

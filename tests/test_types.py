@@ -77,5 +77,4 @@ def test_edges_and_estimates_keep_copies_that_nobody_can_write_to() -> None:
 
 
 def test_observations_count_their_points() -> None:
-    observations = observations_of(0, np.zeros((4, 3)), n_keypoints=9)
-    assert len(observations) == 4
+    assert len(observations_of(0, np.zeros((4, 3)), n_keypoints=9)) == 4

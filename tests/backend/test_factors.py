@@ -151,8 +151,7 @@ def test_residuals_are_those_of_gtsam_in_the_axes_of_the_frame(seed: int) -> Non
 
 
 def test_a_residual_is_whitened_by_the_upper_root_of_the_information() -> None:
-    rng = np.random.default_rng(2)
-    factor = rng.normal(size=(3, 3))
+    factor = np.random.default_rng(2).normal(size=(3, 3))
     covariance = factor @ factor.T
     place = PositionPrior(position_world=np.zeros(3), covariance=covariance)
     T = np.eye(4)

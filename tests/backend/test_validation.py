@@ -125,8 +125,7 @@ def assert_both_doors_say(one: Edge, is_good: bool) -> None:
 
 @given(seed=seeds, size=st.sampled_from([2e-5, -2e-5]))
 def test_a_rotation_that_is_off_in_any_one_way_is_refused(seed: int, size: float) -> None:
-    rng = np.random.default_rng(seed)
-    T = se3.exp(rng.normal(size=6))
+    T = se3.exp(np.random.default_rng(seed).normal(size=6))
     for row in range(3):
         for column in range(3):
             # A row too long or too short; two rows that are not square to each other.

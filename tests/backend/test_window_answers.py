@@ -242,8 +242,7 @@ def test_a_keyframe_forgets_edges_to_poses_that_left() -> None:
     assert 2 in window
     assert not {0, 1, 3} & set(window.poses())
     for again, frame in zip((0, 1), (8, 9), strict=True):
-        previous = edge(7 if again == 0 else 0, STEP, 0.01)
-        window.add_pose(again, frame * STEP_NS, [previous])
+        window.add_pose(again, frame * STEP_NS, [edge(7 if again == 0 else 0, STEP, 0.01)])
         told = [(each.reference_id, each.frame_id) for each in window.graph()]
         assert (again, 2) not in told
         assert ((7, 0) if again == 0 else (0, 1)) in told

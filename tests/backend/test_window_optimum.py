@@ -302,8 +302,7 @@ def test_late_measurements_are_polished_with_the_others_and_the_gain_is_told() -
 def test_a_late_loop_answers_with_the_pose_it_moved() -> None:
     rng = np.random.default_rng(1)
     poses = wander(rng, 30)
-    edges = net(poses, rng, 1e-4)
-    problem = Problem(poses=poses, edges=edges)
+    problem = Problem(poses=poses, edges=net(poses, rng, 1e-4))
     window = SlidingWindow(WindowConfig(size=None, kernel="none"))
     feed(window, problem)
     before = window.pose(29)
@@ -351,8 +350,7 @@ def relative_covariance(marginals: gtsam.Marginals, values: gtsam.Values, a: int
     H_a, H_b = np.zeros((6, 6), order="F"), np.zeros((6, 6), order="F")
     values.atPose3(a).between(values.atPose3(b), H_a, H_b)
     H = np.hstack([H_a, H_b])
-    full = np.block([[joint.at(i, j) for j in (a, b)] for i in (a, b)])
-    return H @ full @ H.T
+    return H @ np.block([[joint.at(i, j) for j in (a, b)] for i in (a, b)]) @ H.T
 
 
 @pytest.mark.parametrize("size", [5, None])
@@ -557,8 +555,7 @@ def drifting(seed: int, n: int) -> tuple[list[FloatArray], list[list[Edge]], Edg
     """Return poses, a noisy chain with short links, and a good edge from the first to the last."""
     rng = np.random.default_rng(seed)
     poses = wander(rng, n)
-    edges = net(poses, rng, 0.01, n_back=2)
-    return poses, edges, measure(poses, 0, n - 1, rng, 1e-3)
+    return poses, net(poses, rng, 0.01, n_back=2), measure(poses, 0, n - 1, rng, 1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -722,8 +719,7 @@ def drifted_chain(turn_rad: float) -> tuple[SlidingWindow, list[tuple[int, Edge]
     wrong_step = se3.normalize(STEP @ se3.exp(np.array([0.0, turn_rad / N, 0.0, 0.0, 0.0, 0.0])))
     edges = [(frame, edge(frame - 1, wrong_step, 0.1)) for frame in range(1, N)]
     config = WindowConfig(size=N + 3, kernel="none", gate=None)
-    window = walk(config, N, wrong_step, 0.1)
-    return window, edges, power(N - 1)
+    return walk(config, N, wrong_step, 0.1), edges, power(N - 1)
 
 
 @pytest.mark.parametrize("turn_rad", [0.6, -1.2])

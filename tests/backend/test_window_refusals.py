@@ -130,8 +130,7 @@ def test_a_pose_whose_edges_are_all_bad_is_a_pose_without_edges(fault: str) -> N
 
 @pytest.mark.parametrize("fault", BAD_EDGES)
 def test_a_bad_edge_between_known_poses_is_refused_and_leaves_no_trace(fault: str) -> None:
-    good = good_edges()[NEWEST][0]
-    bad = bad_edge(fault, good, NEWEST)
+    bad = bad_edge(fault, good_edges()[NEWEST][0], NEWEST)
     found = run(lambda window: window.add_edge(NEWEST, bad))
     assert_names(found.answer, NEWEST, stamp_of(NEWEST), bad.reference_id)
     assert_as_twin(found, plain_twin())

@@ -221,8 +221,7 @@ def test_stopped_on_this_machine_it_leaves_no_process_and_goes_on(
         process.wait()
         if process.stderr is not None:
             process.stderr.close()
-    codes = {signal.SIGTERM: 143, signal.SIGKILL: -9}
-    assert process.returncode == codes[number]
+    assert process.returncode == {signal.SIGTERM: 143, signal.SIGKILL: -9}[number]
     if number != signal.SIGKILL:
         *rows, last = said.splitlines()
         # The first may have ended before its row was written.

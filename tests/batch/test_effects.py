@@ -62,8 +62,7 @@ def test_planted_ratios_come_back_those_of_the_largest_change_first() -> None:
 
 
 def test_quartiles_are_those_of_numpy_over_all_runs_of_a_value() -> None:
-    rng = np.random.default_rng(3)
-    errors = np.exp(rng.normal(size=(5, 3, 2)))
+    errors = np.exp(np.random.default_rng(3).normal(size=(5, 3, 2)))
     rows = [
         replace(row, ate_smoothed_m=float(error))
         for row, error in zip(crossed(5), errors.ravel(), strict=True)

@@ -80,8 +80,7 @@ def test_nothing_is_kept_nor_all_handed_out_at_once(near: Client, options: TaskO
             n_known.append(known_to_scheduler(near))
 
     engine = Engine(near, options, count)
-    rows = list(engine.run(missing(N_MANY)))
-    assert len(rows) == N_MANY
+    assert len(list(engine.run(missing(N_MANY)))) == N_MANY
     assert max(n_held) <= 101
     assert max(n_known) <= 110
     assert min(n_held[-5:]) < 10
@@ -179,8 +178,7 @@ class Killer:
 def test_who_kills_each_worker_fails_and_the_neighbours_complete(
     options: TaskOptions, bags: Path, blocked: Path
 ) -> None:
-    sources = [bags / f"walk{n}.mcap" for n in range(3)]
-    tasks = tasks_of(blocked, *sources, "/none.bag")
+    tasks = tasks_of(blocked, *[bags / f"walk{n}.mcap" for n in range(3)], "/none.bag")
     with forgiving(0), connected(None, 2) as client:
         killer = Killer(client, blocked)
         killer.engine = Engine(client, options, killer)

@@ -113,8 +113,7 @@ def test_what_is_no_character_in_the_name_of_a_file_is_escaped(tmp_path: Path) -
 def test_the_values_of_a_parameter_are_one_kind(
     tmp_path: Path, values: list[Value], kind: str, expected: list[Value]
 ) -> None:
-    rows = [complete(parameters={"x.y": value}) for value in values]
-    frame = to_frame(rows)
+    frame = to_frame([complete(parameters={"x.y": value}) for value in values])
     assert str(frame["x.y"].dtype) == kind
     found = [None if pd.isna(value) else value for value in frame["x.y"]]
     assert found == expected

@@ -400,8 +400,7 @@ def test_a_body_has_errors_of_its_camera(command: Command, gvo_data: Path, tmp_p
     for name, options in (("cam", []), ("body", ["--frame", "body"])):
         answer = command("run", "--no-report", folder, "--out", tmp_path / name, *options)
         assert (answer.code, answer.err) == (0, "")
-        summary = json.loads((tmp_path / name / "summary.json").read_text())
-        errors[name] = summary["errors"]
+        errors[name] = json.loads((tmp_path / name / "summary.json").read_text())["errors"]
     truth = folder / "mav0/state_groundtruth_estimate0/data.csv"
     files = [tmp_path / "body" / f"{name}.txt" for name in (*TRAJECTORIES, GLOBAL)]
     compared = json.loads(command("compare", truth, *files, "--json").out)["estimates"]

@@ -278,8 +278,7 @@ def test_verbose_logs_what_is_done(command: Command, room_bag: Path, tmp_path: P
 def test_a_run_warns_of_a_calibration_that_changes(
     command: Command, monkeypatch: pytest.MonkeyPatch, room_bag: Path, tmp_path: Path
 ) -> None:
-    changes = {"/camera/color/camera_info": 7}
-    monkeypatch.setattr(BagSource, "camera_info_changes", changes)
+    monkeypatch.setattr(BagSource, "camera_info_changes", {"/camera/color/camera_info": 7})
     arguments = ["run", room_bag, "--out", tmp_path / "out", "--no-report", "--duration", "0.1"]
     answer = command(*arguments)
     assert answer.code == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import GVO, Command, is_one_line, line_of_poses, refused
+from tests.conftest import GVO, Command, line_of_poses, python, refused
 
 # The most memory of a child is no less than that of the process that started it: a small one.
 MEASURED = """
@@ -126,17 +126,9 @@ def test_a_line_of_a_pose_graph_without_an_end_is_refused(command: Command, pose
 )
 def test_endless_input_without_poses_is_refused(tmp_path: Path, given: str, reason: str) -> None:
     with subprocess.Popen(given.split(), stdout=subprocess.PIPE) as source:
-        answer = subprocess.run(
-            [*GVO, "smooth", "-", "--out", str(tmp_path / "out")],
-            stdin=source.stdout,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        answer = python(*GVO[1:], "smooth", "-", "--out", tmp_path / "out", stdin=source.stdout)
         source.kill()
-    assert answer.returncode == 2
-    assert is_one_line(answer.stderr)
-    assert reason in answer.stderr
+    assert reason in refused(answer)
 
 
 @pytest.mark.acceptance
@@ -144,16 +136,9 @@ def test_endless_input_without_poses_is_refused(tmp_path: Path, given: str, reas
 @pytest.mark.parametrize("endless", ["/dev/zero", "/dev/stdin"])
 def test_what_has_no_end_needs_no_memory(poses: Path, words: tuple[str, ...], endless: str) -> None:
     with subprocess.Popen(["yes"], stdout=subprocess.PIPE) as source:
-        answer = subprocess.run(
-            [sys.executable, "-c", MEASURED, *GVO, *filled(words, endless, poses)],
-            stdin=source.stdout,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        answer = python("-c", MEASURED, *GVO, *filled(words, endless, poses), stdin=source.stdout)
         source.kill()
-    assert answer.returncode == 2
-    assert is_one_line(answer.stderr)
+    refused(answer)
     assert int(answer.stdout) * (1 if sys.platform == "darwin" else 1024) < 1 << 30
 
 

@@ -66,8 +66,7 @@ def test_a_brighter_image_moves_no_patch() -> None:
 def test_what_does_not_look_like_the_patch_is_not_found() -> None:
     pixels, warps = analytic.grid(), np.tile(np.eye(2), (len(analytic.grid()), 1, 1))
     templates = Templates.of(analytic.image(), pixels)
-    rng = np.random.default_rng(0)
-    noise = rng.integers(0, 256, analytic.SHAPE, dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, analytic.SHAPE, dtype=np.uint8)
     flat = np.full(analytic.SHAPE, 120, dtype=np.uint8)
     for other in (noise, flat, analytic.image()[::-1].copy()):
         _, is_found = templates.align(other, pixels, warps, n_steps=4)

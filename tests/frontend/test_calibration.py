@@ -349,8 +349,7 @@ def rolling_frames(sensor: Sensor) -> tuple[gvo.SyntheticRecording, list[Frame]]
     recording = gvo.SyntheticRecording(
         "handheld", sensor, n_frames=6, scale=0.5, seed=2, readout_ms=25.0
     )
-    found = frames_of(recording)
-    return recording, found
+    return recording, frames_of(recording)
 
 
 def motions(kind: str, sensor: Sensor, readout_ms: float) -> list[RelativePose]:
@@ -429,8 +428,7 @@ def frames(offset_px: float, row_px: int = 0) -> list[StereoFrame]:
     for frame in gvo.frames(recording, Config()):
         assert not isinstance(frame, FaultyFrame)
         assert isinstance(frame, StereoFrame)
-        right = np.roll(frame.right, row_px, axis=0)
-        found.append(replace(frame, right=right))
+        found.append(replace(frame, right=np.roll(frame.right, row_px, axis=0)))
     return found
 
 

@@ -122,8 +122,7 @@ def test_sigmas_grow_with_the_octave_from_that_of_the_image(kind: Kind) -> None:
     np.testing.assert_array_equal(sigmas[:, 2], 0.3)
     # SIFT's octaves halve the image, and the first of them is of twice its size.
     steps = 0.35 * 2.0 ** np.arange(7) if kind == "sift" else 0.7 * 1.5 ** np.arange(4)
-    gaps = np.abs(sigmas[:, :1] - steps).min(axis=1)
-    assert gaps.max() < 1e-9
+    assert np.abs(sigmas[:, :1] - steps).min(axis=1).max() < 1e-9
     assert len(np.unique(sigmas[:, 0])) > 1 or kind in ("fast", "gftt")
 
 
@@ -148,8 +147,7 @@ def test_the_limits_hold_for_the_refined_depth() -> None:
 
 
 def test_depth_points_lie_where_the_depth_image_says() -> None:
-    config = configure()
-    frontend = DescriptorFrontend(COLOUR, config)
+    frontend = DescriptorFrontend(COLOUR, configure())
     observations = frontend.extract(rgbd_frame(stamp_ns=9))
     assert observations.stamp_ns == 9
     assert len(observations) > 100

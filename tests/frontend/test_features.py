@@ -212,8 +212,7 @@ def test_pixels_are_described_alike_when_the_image_is_turned_or_enlarged() -> No
     large = np.asarray(cv2.resize(image, (2 * width, 2 * height)), dtype=np.uint8)
     wide = describe_pixels(large, 2.0 * pixels + 0.5, 2.0)
     for other in (again, wide):
-        n_bits = np.bitwise_count(first[:2] ^ other[:2]).sum(axis=1)
-        assert n_bits.max() < 64
+        assert np.bitwise_count(first[:2] ^ other[:2]).sum(axis=1).max() < 64
         assert np.bitwise_count(first[0] ^ other[1]).sum() > 80
 
 

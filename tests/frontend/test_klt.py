@@ -138,8 +138,7 @@ def test_what_a_registration_rests_on_is_told(sensor: Sensor) -> None:
     T_current_reference = se3.invert(true_motion(sensor, 0, 1))
     points = se3.transform_points(T_current_reference, first.points_cam[chosen])
     flow = frontend(sensor).camera.project(points) - first.keypoints[chosen]
-    expected = np.median(np.linalg.norm(flow, axis=1))
-    assert result.flow_px == pytest.approx(expected, abs=0.1)
+    assert result.flow_px == pytest.approx(np.median(np.linalg.norm(flow, axis=1)), abs=0.1)
     np.testing.assert_array_equal(result.pixels_reference, first.keypoints[indices])
     seen = result.pixels_current[result.inliers]
     assert np.median(np.linalg.norm(seen - first.keypoints[chosen] - flow, axis=1)) < 0.2

@@ -99,8 +99,7 @@ def test_binary_distances_reach_from_zero_to_one() -> None:
 
 
 def test_binary_descriptors_may_be_a_part_of_a_larger_array() -> None:
-    rng = np.random.default_rng(0)
-    wide = rng.integers(0, 256, (6, 64), dtype=np.uint8)
+    wide = np.random.default_rng(0).integers(0, 256, (6, 64), dtype=np.uint8)
     part, copy = wide[::2, :32], wide[::2, :32].copy()
     pairs = np.array([[0, 1], [2, 0]])
     np.testing.assert_array_equal(
@@ -269,8 +268,7 @@ def test_frames_without_right_descriptors_are_matched_by_the_left_ones() -> None
 def test_nothing_to_match_gives_no_matches(n: int, m: int) -> None:
     rng = np.random.default_rng(0)
     reference = observe(np.zeros((n, 2)), random_codes(rng, n))
-    current = observe(np.zeros((m, 2)), random_codes(rng, m))
-    assert match(reference, current).shape == (0, 2)
+    assert match(reference, observe(np.zeros((m, 2)), random_codes(rng, m))).shape == (0, 2)
 
 
 @settings(max_examples=40)
@@ -292,8 +290,7 @@ def test_a_prediction_is_the_projection_into_the_current_camera(seed: int) -> No
 
 
 def test_matches_of_a_prediction_keep_the_indices_of_the_reference() -> None:
-    rng = np.random.default_rng(4)
-    codes = random_codes(rng, 3)
+    codes = random_codes(np.random.default_rng(4), 3)
     points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 6.0], [0.0, 0.5, 8.0]])
     reference = observe(np.zeros((3, 2)), codes, points=points)
     T_reference_current = np.eye(4)

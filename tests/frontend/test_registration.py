@@ -337,8 +337,7 @@ def seen_at(rows: FloatArray, inliers: list[bool]) -> RelativePose:
 
 def test_inliers_of_a_band_of_rows_are_no_consensus_of_matches_all_over_the_image() -> None:
     rows = np.linspace(-1.0, 480.0, 97)
-    band = seen_at(rows, [240.0 <= row < 300.0 for row in rows])
-    failure = check_rows(band, CAMERA)
+    failure = check_rows(seen_at(rows, [240.0 <= row < 300.0 for row in rows]), CAMERA)
     assert isinstance(failure, Failure)
     assert "12 of 97 matches agree, but in few rows" in failure.reason
     assert (failure.n_matches, failure.n_inliers) == (97, 12)

@@ -49,16 +49,14 @@ def test_a_majority_that_moves_unpredictably_does_not_win(camera: FloatArray, n_
 
 @pytest.mark.parametrize("speed", [0.02, 0.04, 0.06, 0.1, 0.2])
 def test_a_bus_that_hardly_moves_yet_is_told_from_the_world(speed: float) -> None:
-    matches = matches_of((STILL, 70), (speed * BUS / 0.4, 140))
-    result = register(matches, STILL)
+    result = register(matches_of((STILL, 70), (speed * BUS / 0.4, 140)), STILL)
     assert isinstance(result, RelativePose)
     # Where the two differ by less than the noise of a pixel, the error is less than that as well.
     assert np.linalg.norm(result.T_reference_current[:3, 3]) < 0.012
 
 
 def test_the_world_wins_as_the_majority_even_where_something_moves_as_predicted() -> None:
-    few = matches_of((DRIVING, 150), (STILL, 14))
-    assert_is(register(few, STILL), DRIVING)
+    assert_is(register(matches_of((DRIVING, 150), (STILL, 14)), STILL), DRIVING)
 
 
 @pytest.mark.parametrize("prior", [None, BUS / 2])

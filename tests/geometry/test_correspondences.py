@@ -37,8 +37,7 @@ def test_pixels_of_both_frames_become_points_of_their_own_frames(seed: int) -> N
 
 @given(seed=seeds)
 def test_an_offset_that_is_taken_off_was_in_both_disparities(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    true = random_correspondences(rng, 7)
+    true = random_correspondences(np.random.default_rng(seed), 7)
     offset = np.array([0.0, 0.0, 0.4])
     measured = Correspondences.of_pixels(
         (true.source_uvd + offset, true.target_uvd + offset),

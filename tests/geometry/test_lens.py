@@ -197,8 +197,7 @@ def test_lenses_that_see_behind_the_plane_of_the_pair_are_still_rectified() -> N
     for rectified in rectify_stereo(lens, lens, T_left_right):
         # No enlargement up to twice leaves the border full: the resolution of the centre stays.
         assert rectified.P[0, 0] == 60.0
-        maps = maps_of(rectified)
-        assert 0.0 < maps[0][240, 256] < 511.0
+        assert 0.0 < maps_of(rectified)[0][240, 256] < 511.0
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -48,8 +48,7 @@ def scene(
     missed_px = np.linalg.norm(
         project(wrong.reshape(-1, 3)).reshape(wrong.shape) - project(target[~is_inlier]), axis=2
     )
-    missed_m = np.linalg.norm(wrong - target[~is_inlier], axis=2)
-    is_far = (missed_px > 10.0) & (missed_m > 0.5)
+    is_far = (missed_px > 10.0) & (np.linalg.norm(wrong - target[~is_inlier], axis=2) > 0.5)
     assert is_far.any(axis=0).all()
     target[~is_inlier] = wrong[is_far.argmax(axis=0), np.arange(n_outliers)]
     return T, matched(source, target), is_inlier
@@ -63,8 +62,7 @@ def run(matches: Correspondences, config: RansacConfig, seed: int = 0) -> Consen
 @given(seed=seeds, metric=st.sampled_from(["reprojection", "distance"]))
 def test_the_motion_is_found_among_six_outliers_in_ten(seed: int, metric: str) -> None:
     T, matches, is_inlier = scene(np.random.default_rng(seed), 150, 90)
-    config = configure(inlier_metric=metric)
-    result = run(matches, config)
+    result = run(matches, configure(inlier_metric=metric))
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=0.025)
     assert result.inliers[is_inlier].mean() > 0.95
@@ -130,8 +128,7 @@ def test_samples_are_drawn_of_near_points() -> None:
     measured = matches.source_uvd.copy()
     measured[:, 2] = np.where(is_near, 40.0, 5.0)
     far = replace(matches, target_points=spoilt, source_uvd=measured)
-    config = configure(min_disparity_px=10.0, n_hypotheses=3)
-    result = run(far, config)
+    result = run(far, configure(min_disparity_px=10.0, n_hypotheses=3))
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
 
@@ -191,18 +188,15 @@ def test_as_many_inliers_as_are_needed_are_enough(metric: str) -> None:
 
 
 def test_points_on_a_line_are_a_failure() -> None:
-    steps = np.linspace(2.0, 9.0, 30)[:, np.newaxis]
-    line = steps * [0.1, 0.05, 1.0]
+    line = np.linspace(2.0, 9.0, 30)[:, np.newaxis] * [0.1, 0.05, 1.0]
     farther = line + np.array([0.0, 0.0, 0.5])
-    matches = matched(line, farther)
-    result = run(matches, SETTINGS)
+    result = run(matched(line, farther), SETTINGS)
     assert isinstance(result, Failure)
     assert result.n_matches == 30
 
 
 def test_far_points_are_counted_but_not_fitted() -> None:
-    rng = np.random.default_rng(4)
-    T, matches, _ = scene(rng, 80, 0)
+    T, matches, _ = scene(np.random.default_rng(4), 80, 0)
     depths = matches.source_points[:, 2]
     is_far = matches.source_uvd[:, 2] < 25.0
     assert 20 < is_far.sum() < 60
@@ -210,16 +204,14 @@ def test_far_points_are_counted_but_not_fitted() -> None:
     spoilt = matches.target_points.copy()
     spoilt[is_far] *= 0.9
     spoilt_matches = replace(matches, target_points=spoilt)
-    config = configure(min_disparity_px=30.0, inlier_threshold_px=5.0)
-    result = run(spoilt_matches, config)
+    result = run(spoilt_matches, configure(min_disparity_px=30.0, inlier_threshold_px=5.0))
     assert isinstance(result, Consensus)
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-8)
     assert result.inliers[depths > 5.0].all()
 
 
 def test_weights_enter_the_last_fit() -> None:
-    rng = np.random.default_rng(6)
-    T, matches, _ = scene(rng, 60, 0)
+    T, matches, _ = scene(np.random.default_rng(6), 60, 0)
     shifted = matches.target_points.copy()
     shifted[30:] += 0.05
     noisy = replace(matches, target_points=shifted)
@@ -277,8 +269,7 @@ def test_only_near_inliers_shorten_the_search(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("n", [1, 63, 64, 65, 200])
 def test_hypotheses_are_as_many_as_configured(monkeypatch: pytest.MonkeyPatch, n: int) -> None:
     _, matches, _ = scene(np.random.default_rng(3), 60, 60)
-    config = configure(n_hypotheses=n)
-    assert count_hypotheses(monkeypatch, matches, config) == n
+    assert count_hypotheses(monkeypatch, matches, configure(n_hypotheses=n)) == n
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -291,8 +282,7 @@ def test_the_sample_that_is_no_line_is_found_however_late(seed: int) -> None:
     )
     source[rng.integers(400)] += [0.0, 2.0, 1.0]
     target = move(T, source)
-    matches = matched(source, target)
-    result = run(matches, configure(n_hypotheses=3000), 100 + seed)
+    result = run(matched(source, target), configure(n_hypotheses=3000), 100 + seed)
     assert isinstance(result, Consensus)
     assert result.inliers.all()
     np.testing.assert_allclose(result.T_target_source, T, atol=1e-6)
@@ -354,8 +344,7 @@ def test_near_points_are_fitted_alone_where_they_are_as_many_as_are_needed(
     n_near: int, is_fitted_alone: bool
 ) -> None:
     # Of disparities at the bound and a little less; the far ones are all a little off.
-    rng = np.random.default_rng(9)
-    T, matches, _ = scene(rng, 40, 0)
+    T, matches, _ = scene(np.random.default_rng(9), 40, 0)
     is_near = np.arange(40) < n_near
     measured = matches.source_uvd.copy()
     measured[:, 2] = np.where(is_near, 20.0, 19.999)
@@ -369,5 +358,4 @@ def test_near_points_are_fitted_alone_where_they_are_as_many_as_are_needed(
         result = run(each, config)
         assert isinstance(result, Consensus)
         assert result.inliers.all()
-        error = np.abs(result.T_target_source - T).max()
-        assert (error < 1e-8) == is_fitted_alone
+        assert (np.abs(result.T_target_source - T).max() < 1e-8) == is_fitted_alone

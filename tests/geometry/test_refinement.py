@@ -112,8 +112,7 @@ def test_the_result_is_the_optimum_that_scipy_finds(seed: int) -> None:
     R = Rotation.from_rotvec(optimum.x[:3]).as_matrix()
     np.testing.assert_allclose(result.T_target_source[:3, :3], R, atol=2e-6)
     np.testing.assert_allclose(result.T_target_source[:3, 3], optimum.x[3:], atol=2e-6)
-    expected_scale = np.sqrt(2 * optimum.cost / (3 * 40 - 6))
-    assert result.scale == pytest.approx(expected_scale, rel=1e-4)
+    assert result.scale == pytest.approx(np.sqrt(2 * optimum.cost / (3 * 40 - 6)), rel=1e-4)
 
 
 @pytest.mark.parametrize("noise", [0.5, 1.0])
@@ -125,8 +124,7 @@ def test_the_covariance_tells_the_errors_that_are_made(noise: float) -> None:
         T, matches = measure(rng, 60, noise, sigmas=np.array([0.3, 0.3, 0.6]))
         result = refine(T, matches)
         whitened.append(np.linalg.solve(np.linalg.cholesky(result.covariance), error_of(result, T)))
-    covariance = np.cov(np.array(whitened).T)
-    np.testing.assert_allclose(covariance, np.eye(6), atol=0.35)
+    np.testing.assert_allclose(np.cov(np.array(whitened).T), np.eye(6), atol=0.35)
     assert 0.8 < np.mean(np.square(whitened)) < 1.25
 
 
@@ -149,8 +147,7 @@ def test_outliers_among_the_inliers_are_left_out(seed: int) -> None:
 
 
 def test_inliers_that_the_sample_missed_are_chosen_again() -> None:
-    rng = np.random.default_rng(3)
-    T, matches = measure(rng, 100)
+    T, matches = measure(np.random.default_rng(3), 100)
     few = np.arange(100) < 20
     result = refine(T, matches, inliers=few)
     assert result.inliers.sum() > 90

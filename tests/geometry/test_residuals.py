@@ -169,15 +169,13 @@ def test_noise_is_carried_for_points_well_in_front_alone() -> None:
     # What lies a millimetre in front has a derivative by the pose, what lies nearer has none.
     for depth, is_good in ((1.01e-3, True), (0.99e-3, False)):
         near = np.array([[0.0, 0.0, depth]])
-        matches = matched(near, near)
-        residuals = StereoResiduals.of(T, matches, CAMERA, huber=2.0)
+        residuals = StereoResiduals.of(T, matched(near, near), CAMERA, huber=2.0)
         assert isinstance(residuals.linearize(T), Linearization) == is_good
         assert residuals.within(T, 1e9).tolist() == [is_good]
 
 
 def test_points_behind_the_camera_are_in_no_gate_and_have_no_derivative() -> None:
-    rng = np.random.default_rng(0)
-    matches = random_matches(rng, np.eye(4), 30)
+    matches = random_matches(np.random.default_rng(0), np.eye(4), 30)
     back = se3.make_transform(np.eye(3), np.array([0.0, 0.0, -6.0]))
     is_behind = matches.source_points[:, 2] < 6.0
     assert 0 < is_behind.sum() < 30
@@ -185,5 +183,4 @@ def test_points_behind_the_camera_are_in_no_gate_and_have_no_derivative() -> Non
     assert np.isfinite(residuals.columns).all()
     np.testing.assert_array_equal(residuals.within(back, 1e9), ~is_behind)
     assert isinstance(residuals.linearize(back), Failure)
-    near = linearize(residuals, np.eye(4))
-    assert isinstance(residuals.gradient(back, near), Failure)
+    assert isinstance(residuals.gradient(back, linearize(residuals, np.eye(4))), Failure)

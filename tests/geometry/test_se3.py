@@ -64,8 +64,7 @@ def test_exp_undoes_log_at_half_a_turn(seed: int) -> None:
 def test_quaternions_are_those_of_scipy(angle: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rotations = Rotation.from_rotvec([angle * random_direction(rng) for _ in range(6)])
-    R = rotations.as_matrix().reshape(2, 3, 3, 3)
-    q = se3.quaternions(R)
+    q = se3.quaternions(rotations.as_matrix().reshape(2, 3, 3, 3))
     assert q.shape == (2, 3, 4)
     assert np.all(q[..., 3] >= 0.0)
     theirs = rotations.as_quat(canonical=True).reshape(2, 3, 4)
@@ -113,8 +112,7 @@ def test_batches_equal_one_by_one(seed: int) -> None:
 
 
 def test_skew_is_the_cross_product() -> None:
-    rng = np.random.default_rng(0)
-    v, w = rng.normal(size=(2, 7, 3))
+    v, w = np.random.default_rng(0).normal(size=(2, 7, 3))
     np.testing.assert_allclose((se3.skew(v) @ w[..., None])[..., 0], np.cross(v, w), atol=1e-14)
 
 
@@ -223,8 +221,7 @@ def test_the_twist_of_a_small_turn_is_that_of_bernoullis_series(share: float) ->
 
 @pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])
 def test_any_number_of_transforms_goes_through_every_function(shape: tuple[int, ...]) -> None:
-    xi = np.random.default_rng(1).normal(size=(*shape, 6))
-    T = se3.exp(xi)
+    T = se3.exp(np.random.default_rng(1).normal(size=(*shape, 6)))
     for found, tail in (
         (T, (4, 4)),
         (se3.log(T), (6,)),

@@ -54,8 +54,7 @@ def test_what_is_only_nearly_symmetric_is_not_plain() -> None:
 
 @given(seed=seeds)
 def test_a_rigid_transform_is_told_from_others(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    T = se3.exp(rng.normal(size=6))
+    T = se3.exp(np.random.default_rng(seed).normal(size=6))
     assert is_rigid(T)
     for row, column in np.ndindex(4, 4):
         for wrong in WRONG:

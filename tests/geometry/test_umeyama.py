@@ -148,8 +148,7 @@ def test_a_mirrored_target_gets_a_rotation(seed: int) -> None:
 
 
 def test_unknown_points_are_refused_and_leave_the_others_alone() -> None:
-    rng = np.random.default_rng(2)
-    source = rng.normal(size=(3, 5, 3))
+    source = np.random.default_rng(2).normal(size=(3, 5, 3))
     target = source + 1.0
     target[1, 2, 0] = np.nan
     T, is_valid = fit_rigid_batch(source, target)
@@ -189,8 +188,7 @@ def test_the_fit_to_triples_is_that_of_scipy(seed: int, noise: float) -> None:
 
 
 def test_triples_without_an_answer_are_told_from_the_others() -> None:
-    rng = np.random.default_rng(4)
-    source = 100.0 * rng.normal(size=(6, 3, 3))
+    source = 100.0 * np.random.default_rng(4).normal(size=(6, 3, 3))
     target = source + 1.0
     source[1] = source[1, 0] + np.outer([0.0, 1.0, 2.5], [1.0, 2.0, 3.0])
     target[2] = target[2, 0] + np.outer([0.0, 1.0, -2.5], [1.0, 2.0, 3.0])

@@ -196,8 +196,7 @@ def test_unknown_depth_stays_unknown_and_moves_with_what_surrounds_it() -> None:
 def test_points_behind_the_colour_camera_are_left_out() -> None:
     T_color_depth = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
     depth = np.full((480, 640), 0.5, np.float32)
-    registered = _registration(_COLOR, T_color_depth)(depth)
-    assert np.all(np.isnan(registered))
+    assert np.all(np.isnan(_registration(_COLOR, T_color_depth)(depth)))
 
 
 def test_registration_and_its_inverse_give_back_the_depth() -> None:

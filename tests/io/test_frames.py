@@ -108,8 +108,7 @@ def test_raw_images_are_rectified(tiny: Any) -> None:
     raw = replace(ideal, D=D, is_rectified=False)
     right = replace(Calibration.from_camera(tiny.camera, baseline=0.5), D=D, is_rectified=False)
     ramp = np.tile(np.arange(48, dtype=np.uint8) * 5, (32, 1))
-    source = tiny.stereo([(0, 0, ramp), (1, 0, ramp)], calibrations=(raw, right))
-    (frame,) = _read(source)
+    (frame,) = _read(tiny.stereo([(0, 0, ramp), (1, 0, ramp)], calibrations=(raw, right)))
     expected = np.asarray(cv2.undistort(ramp, raw.K, D), dtype=np.float64)
     assert np.abs(frame.left - expected).max() <= 1.0
     np.testing.assert_array_equal(frame.left, frame.right)

@@ -89,8 +89,7 @@ def test_a_png_of_any_kind_is_decoded_as_opencv_does(
 ) -> None:
     largest = np.iinfo(dtype).max
     pixels = np.random.default_rng(5).integers(0, largest, shape, dtype, endpoint=True)
-    data = cv2.imencode(".png", pixels, options)[1].ravel()
-    decoded = decode_image(data, "image")
+    decoded = decode_image(cv2.imencode(".png", pixels, options)[1].ravel(), "image")
     assert (decoded.dtype, decoded.shape) == (pixels.dtype, pixels.shape)
     np.testing.assert_array_equal(decoded, pixels)
 

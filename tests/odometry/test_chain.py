@@ -70,8 +70,7 @@ class Unpredictable:
 
 
 def steady(stamp_ns: int) -> FloatArray:
-    twist = np.array([0.05, 0.3, -0.1, 0.2, 0.1, 1.5])
-    return se3.exp(twist * (1e-9 * stamp_ns))
+    return se3.exp(np.array([0.05, 0.3, -0.1, 0.2, 0.1, 1.5]) * (1e-9 * stamp_ns))
 
 
 def run(
@@ -152,8 +151,7 @@ def test_coasting_inflates_the_covariance_by_its_duration(gap_ns: int) -> None:
     steps, _ = run(stamps, {stamps[2]})
     sigmas = np.repeat([np.radians(20.0), 4.0], 3) * 1e-9 * gap_ns
     np.testing.assert_allclose(steps[2].covariance, np.diag(sigmas**2))
-    growth = np.sqrt(np.diag(steps[2].estimate.covariance))
-    assert np.all(growth >= sigmas)
+    assert np.all(np.sqrt(np.diag(steps[2].estimate.covariance)) >= sigmas)
     # Tied to the last good frame again, the chain is as sure as if nothing had been.
     assert np.diag(steps[3].estimate.covariance).max() < 0.01
 
@@ -183,8 +181,7 @@ def test_a_velocity_is_not_carried_over_a_long_gap() -> None:
 
 
 def test_the_prior_is_constant_velocity_from_the_raw_chain() -> None:
-    stamps = [0, STEP_NS, 3 * STEP_NS, 4 * STEP_NS]
-    _, frontend = run(stamps, set())
+    _, frontend = run([0, STEP_NS, 3 * STEP_NS, 4 * STEP_NS], set())
     assert frontend.asked[0][2] is None  # nothing known yet
     assert len(frontend.asked) == 3
     for a, b, prior in frontend.asked[1:]:
@@ -195,8 +192,7 @@ def test_the_prior_is_constant_velocity_from_the_raw_chain() -> None:
 
 def test_a_prediction_that_leads_nowhere_is_dropped_before_the_frame_is_given_up() -> None:
     stamps = stamps_of(4)
-    frontend = TrueFrontend(steady, set())
-    chain = RawChain(Unpredictable(frontend), SETTINGS)
+    chain = RawChain(Unpredictable(TrueFrontend(steady, set())), SETTINGS)
     assert all(chain.advance(observe(stamp)).is_registered for stamp in stamps)
 
 

@@ -110,14 +110,12 @@ def test_frames_between_keyframes_lie_between_both_ends() -> None:
     step = se3.make_transform(np.eye(3), np.array([0.9, 0.0, 0.0]))
     T, edges = np.eye(4), list[Edge]()
     for j in range(21):
-        estimate = estimate_at(j * PERIOD_NS, T)
-        graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
+        graph.add_frame(estimate_at(j * PERIOD_NS, T), edges, is_keyframe=j % 5 == 0)
         T = T @ step
         covariance = np.diag(np.full(6, 0.3) ** 2)
         edges = [Edge(reference_id=j * PERIOD_NS, T_reference_frame=step, covariance=covariance)]
     whole_way = se3.make_transform(np.eye(3), np.array([20.0, 0.0, 0.0]))
-    drive = Drive(np.array([np.eye(4)] * 21))
-    graph.loops = [drive.loop(0, 20, T=whole_way)]
+    graph.loops = [Drive(np.array([np.eye(4)] * 21)).loop(0, 20, T=whole_way)]
     x = poses(graph.optimize(covariances=False))[:, 0, 3]
     np.testing.assert_allclose(np.diff(x), 1.0, atol=0.01)
 

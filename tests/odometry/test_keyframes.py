@@ -19,8 +19,7 @@ CAMERA = StereoCamera(fx=100.0, fy=100.0, cx=50.0, cy=40.0, width=100, height=80
 def wall(n: int = 2000, depth: float = 4.0) -> FloatArray:
     """Return points of a wall that fills the image, in random order."""
     rng = np.random.default_rng(0)
-    rays = CAMERA.unproject(rng.uniform([0, 0], [99, 79], (n, 2)))
-    return np.asarray(depth * rays)
+    return np.asarray(depth * CAMERA.unproject(rng.uniform([0, 0], [99, 79], (n, 2))))
 
 
 def keyframes(*stamps: int, **changes: Any) -> Keyframes[Observations]:
@@ -137,8 +136,7 @@ def test_without_points_or_camera_the_score_is_the_proximity_of_the_poses() -> N
     blind.add(observations_of(7, wall()))
     for kept in (pointless, blind):
         for distance_m, score in ((0.0, 1.0), (2.0, 0.8), (5.0, 0.5), (50.0, 0.0)):
-            scores = kept.scores({7: shifted(dz=distance_m)})
-            assert scores == {7: pytest.approx(score)}
+            assert kept.scores({7: shifted(dz=distance_m)}) == {7: pytest.approx(score)}
 
 
 def test_the_number_of_kept_frames_is_counted() -> None:

@@ -70,8 +70,7 @@ def test_a_loop_takes_what_came_after_the_dark_to_its_place(status: Status) -> N
 
 def test_without_a_loop_it_stays_where_it_was_guessed_as_uncertain_as_that() -> None:
     truth = block(1.0, n_per_lap=N_LAP)
-    drive = lit_again(truth)
-    optimum = drive.graph.optimize()
+    optimum = lit_again(truth).graph.optimize()
     found = se3.invert(poses(optimum)[60]) @ poses(optimum)[-1]
     np.testing.assert_allclose(found, se3.invert(truth[60]) @ truth[-1], atol=1e-6)
     assert float(optimum.estimates[40].covariance[3, 3]) < 0.1
@@ -104,8 +103,7 @@ def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
         estimate = estimate_at(j * PERIOD_NS, T, status=status)
         drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0)
     drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
-    optimum = drive.graph.optimize(covariances=False)
-    assert position_error(poses(optimum), truth) < 0.01
+    assert position_error(poses(drive.graph.optimize(covariances=False)), truth) < 0.01
 
 
 def walk(n: int = 120, step_m: float = 0.1) -> FloatArray:
@@ -191,8 +189,7 @@ def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
     graph, drive = RunGraph(WindowConfig()), Drive(walk(10))
     for j in range(10):
         edges = [] if j in (0, 4) else [measured(drive.truth, j - 1, j, SIGMAS, None)]
-        worlds = graph.world_of(edges)
-        assert worlds == (0 if j < 4 else 1)
+        assert graph.world_of(edges) == (0 if j < 4 else 1)
         graph.add_frame(estimate_at(j * PERIOD_NS, drive.truth[j]), edges, is_keyframe=j == 2)
     back = [measured(drive.truth, k, 9, SIGMAS, None) for k in (2, 8)]
     assert graph.world_of(back) == 0
@@ -200,8 +197,7 @@ def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
 
 
 def test_what_most_contradict_across_a_loss_is_refused_whatever_odometry_could_bend() -> None:
-    truth = block(1.9, n_per_lap=N_LAP)
-    drive = lit_again(truth, dark=range(20, 25))
+    drive = lit_again(block(1.9, n_per_lap=N_LAP), dark=range(20, 25))
     twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
     false = [drive.loop(5 * k, 50 + 5 * k, T=twin) for k in range(4)]
     true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]

@@ -619,8 +619,7 @@ def test_edges_without_motion_still_a_camera_that_stands(kind: str) -> None:
 
 def test_a_creeping_camera_is_not_frozen() -> None:
     steps = 0.005 * np.arange(33)
-    config = configure_klt(zero_motion=True)
-    results, smoothed = walk(steps, config)
+    results, smoothed = walk(steps, configure_klt(zero_motion=True))
     true_length = float(steps[-1] * np.hypot(1.0, 0.5))
     went = np.linalg.norm(smoothed[-1].T_world_frame[:3, 3])
     assert went == pytest.approx(true_length, rel=0.06)

@@ -177,8 +177,7 @@ class OwnFrontend(KltFrontend):
 
 
 def test_an_own_front_end_is_told_and_kept() -> None:
-    camera = recording("rgbd").info.camera
-    frontend = OwnFrontend(camera, Config())
+    frontend = OwnFrontend(recording("rgbd").info.camera, Config())
     frontend.told = []
     odometry = Odometry(frontend=frontend)
     frames_ = recorded("rgbd")

@@ -233,8 +233,7 @@ def test_the_raw_chain_is_never_joined() -> None:
 
 
 def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:
-    frontend = Beacon(see=lambda _: None)
-    results = run(frontend, walk(away=at(1.0)))
+    results = run(Beacon(see=lambda _: None), walk(away=at(1.0)))
     joins = [join for result in results for join in result.joins]
     assert [(join.segment, join.to_segment) for join in joins] == [(1, 0)]
     assert joins[0].stamp_ns == 16 * STEP_NS

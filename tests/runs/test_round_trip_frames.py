@@ -131,8 +131,7 @@ def test_pieces_of_any_size_give_the_reversed_list(
 
 
 def test_a_frame_is_given_with_mirrored_stamp_and_the_turning_one_once() -> None:
-    source = Numbered(["sound"] * 4 + ["broken"])
-    round_trip = RoundTripFrames(source, _CONFIGS[1])
+    round_trip = RoundTripFrames(Numbered(["sound"] * 4 + ["broken"]), _CONFIGS[1])
     found, is_sound, _ = read(iter(round_trip))
     sound = list(itertools.compress(found, is_sound))
     steps = [(stamp_ns - _FIRST_NS) // _STEP_NS for stamp_ns, _ in sound]

@@ -135,14 +135,12 @@ def test_running_again_gives_the_same_bytes(room_bag: Path, tmp_path: Path, thre
 
 
 def test_a_faulty_frame_is_skipped_and_counted(room: SyntheticRecording, tmp_path: Path) -> None:
-    faulty = FaultySource(room, replace(UNREADABLE, first=3, end=5))
-    result = run_of(faulty, tmp_path)
+    result = run_of(FaultySource(room, replace(UNREADABLE, first=3, end=5)), tmp_path)
     assert not result.is_complete
     assert result.summary["status_counts"]["skipped"] == 2
     assert len(gvo.read_trajectory(tmp_path / "raw.txt")) == 10
     assert "zero size" in result.warnings[0]
-    rows = (tmp_path / "frames.csv").read_text().splitlines()[1:]
-    assert len(rows) == 12
+    assert len((tmp_path / "frames.csv").read_text().splitlines()[1:]) == 12
 
 
 def test_a_recording_without_a_frame_is_refused(room: SyntheticRecording, tmp_path: Path) -> None:
@@ -196,8 +194,7 @@ def test_a_run_without_poses_leaves_nothing_also_not_of_an_earlier_one(
 def test_poses_without_stamps_belong_to_the_frames_in_their_order(
     room: SyntheticRecording, tmp_path: Path
 ) -> None:
-    truth = room.ground_truth()
-    write_kitti(tmp_path / "poses.txt", truth)
+    write_kitti(tmp_path / "poses.txt", room.ground_truth())
     expected = run_of(room, tmp_path / "a").evaluations
     poses = gvo.read_trajectory(tmp_path / "poses.txt")
     found = run_of(room, tmp_path / "b", ground_truth=poses).evaluations
@@ -305,8 +302,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
     for stamp_ns, place in zip(stamps_ns.tolist(), geodetic(antenna), strict=True):
         bag.fix(stamp_ns, place)
     source = gvo.open_recording([walk_bag, bag.write()])
-    truth = read_truth(source, "/fix")
-    result = run_of(source, tmp_path / "out", ground_truth=truth)
+    result = run_of(source, tmp_path / "out", ground_truth=read_truth(source, "/fix"))
     assert result.warnings == ()
     exact = true_poses(STAMPS_NS)
     points = exact[:, :3, :3] @ p_cam + exact[:, :3, 3]
@@ -316,8 +312,7 @@ def test_an_antenna_on_a_lever_arm_gives_the_errors_of_its_place(
         # interpolation over 20 ms leaves a tenth of a millimetre
         assert evaluation.ate_m == pytest.approx(ate_by_hand(found, points), abs=2e-4)
         assert evaluation.rpe_deg is None
-        at_camera = ate_by_hand(poses[:, :3, 3], exact[:, :3, 3])
-        assert evaluation.ate_m < 4 * at_camera < 0.02
+        assert evaluation.ate_m < 4 * ate_by_hand(poses[:, :3, 3], exact[:, :3, 3]) < 0.02
 
 
 def test_a_bag_that_is_refused_leaves_no_folder(room: SyntheticRecording, tmp_path: Path) -> None:

@@ -96,8 +96,7 @@ def optimize_file(path: str | Path, out: Path, **options: Any) -> RunResult:
 
 
 def test_a_chain_without_redundant_edges_stays_as_it_is(tmp_path: Path) -> None:
-    result = smooth_edges(ListSource(chain(30)), tmp_path)
-    assert result.is_complete
+    assert smooth_edges(ListSource(chain(30)), tmp_path).is_complete
     raw, causal, smoothed = (gvo.read_trajectory(tmp_path / f"{n}.txt") for n in TRAJECTORIES)
     T = np.eye(4)
     for i in range(1, 30):
@@ -298,7 +297,6 @@ def test_kitti_00_fused_lies_between_its_inputs_or_below(gvo_data: Path, tmp_pat
 @pytest.mark.acceptance
 def test_recorded_odometry_and_fixes_are_fused(gvo_data: Path, tmp_path: Path) -> None:
     path = gvo_data / "bags/good/nav2_turtlebot.mcap"
-    source = open_edges([path], topics=["/odom"])
-    result = smooth_edges(source, tmp_path)
+    result = smooth_edges(open_edges([path], topics=["/odom"]), tmp_path)
     assert result.is_complete
     assert result.summary["frames"] == 2639

@@ -18,8 +18,7 @@ from gvo.runs.smooth import smooth_lines
 
 def run(lines: list[str], out: Path) -> tuple[RunResult, list[str]]:
     answers: list[str] = []
-    result = smooth_lines(iter(lines), answers.append, out, force=True)
-    return result, answers
+    return smooth_lines(iter(lines), answers.append, out, force=True), answers
 
 
 def request(n: int, *references: int, **more: object) -> str:
@@ -29,8 +28,7 @@ def request(n: int, *references: int, **more: object) -> str:
 
 
 def test_each_line_is_answered_by_the_causal_estimate(tmp_path: Path) -> None:
-    lines = [request(0), *(request(n, n - 1) for n in range(1, 9))]
-    result, answers = run(lines, tmp_path)
+    result, answers = run([request(0), *(request(n, n - 1) for n in range(1, 9))], tmp_path)
     assert result.is_complete
     replies = [json.loads(answer) for answer in answers]
     assert [reply["id"] for reply in replies] == list(range(9))
@@ -105,8 +103,7 @@ def test_the_end_of_the_reader_ends_the_stream(tmp_path: Path) -> None:
             raise BrokenPipeError
 
     lines = [request(0), *(request(n, n - 1) for n in range(1, 9))]
-    result = smooth_lines(iter(lines), answer, tmp_path)
-    assert not result.is_complete
+    assert not smooth_lines(iter(lines), answer, tmp_path).is_complete
     assert len(gvo.read_trajectory(tmp_path / "smoothed.txt")) == 4
 
 

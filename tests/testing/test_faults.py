@@ -181,8 +181,7 @@ def test_faults_add_up_in_their_order() -> None:
         assert pixels[:, 24:].max() <= 60
     dropped = FaultySource(sound, made.Dropped(end=3), made.Dropped(first=4, end=5))
     assert stamps(dropped) == [3, 5, 6, 7]  # numbered as in the sound recording
-    brighter_first = FaultySource(sound, darker, *inner.faults)
-    assert (load(brighter_first, 1)[:, :24] == 255).all()
+    assert (load(FaultySource(sound, darker, *inner.faults), 1)[:, :24] == 255).all()
 
 
 def test_delivery() -> None:

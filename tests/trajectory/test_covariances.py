@@ -102,8 +102,7 @@ def test_the_truth_is_interpolated_at_the_stamps_of_the_estimate() -> None:
 
 def test_without_rotations_or_covariances_there_is_nothing_to_compare() -> None:
     truth = circle(30)
-    chain = chain_along(truth)
-    (motions, over_10_s, _) = motions_of_chain(chain)
+    (motions, over_10_s, _) = motions_of_chain(chain_along(truth))
     assert consistency(Trajectory.of_positions(truth.stamps_ns, truth.positions), motions) is None
     assert consistency(truth, motions_of_chain(truth)[0]) is None
     assert consistency(truth.select([0]), motions) is None

@@ -56,8 +56,7 @@ def test_units_stand_in_the_header_and_values_in_the_rows() -> None:
 
 
 def test_one_length_of_segments_is_written_once() -> None:
-    single = replace(FULL, segments_m=(30.0,))
-    assert " 30 " in format_evaluations([single]).splitlines()[2]
+    assert " 30 " in format_evaluations([replace(FULL, segments_m=(30.0,))]).splitlines()[2]
 
 
 def test_a_table_without_evaluations_is_its_header() -> None:

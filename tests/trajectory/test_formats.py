@@ -95,8 +95,7 @@ def test_writing_covariances_needs_some(tmp_path: Path) -> None:
 
 @given(seeds)
 def test_a_line_has_nine_decimals_of_the_stamp_and_no_negative_w(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    T = se3.exp(rng.normal(size=6) * 3)
+    T = se3.exp(np.random.default_rng(seed).normal(size=6) * 3)
     fields = format_tum_line(1_403_636_579_763_555_584, T).split()
     assert fields[0] == "1403636579.763555584"
     assert float(fields[7]) >= 0

@@ -65,8 +65,7 @@ def test_a_match_is_drawn_in_its_colour_from_where_it_was_to_where_it_is(
 def test_nothing_is_drawn_away_from_the_matches(
     matches: list[tuple[tuple[float, float], tuple[float, float], bool]],
 ) -> None:
-    picture = _draw(matches)
-    changed = np.argwhere((picture != _plain()).any(axis=2))[:, ::-1]
+    changed = np.argwhere((_draw(matches) != _plain()).any(axis=2))[:, ::-1]
     distances = [np.full(len(changed), np.inf)]
     for start, end, _ in matches:
         along = np.linspace(start, end, 300)
@@ -175,8 +174,7 @@ def test_all_pictures_of_a_camera_have_one_even_size(max_width: int) -> None:
         frame = RgbdFrame(stamp_ns=1, image=image, depth=depth)
         seen = _pair() if camera is _STEREO else frame
         for result in (_result([], []), _result([(1.0, 1.0)], [2.0])):
-            picture = compose_overlay(seen, result, camera, max_width=max_width)
-            assert picture.shape == shape
+            assert compose_overlay(seen, result, camera, max_width=max_width).shape == shape
 
 
 def test_depth_has_the_colours_of_the_bar_and_what_is_unknown_is_dark() -> None:

@@ -79,8 +79,7 @@ def test_the_view_shows_the_axes_of_most_motion(
 ) -> None:
     reference = curve(0, extents=extents, start=start)
     text = svg_text(tmp_path, reference, {"raw": curve(1, extents=extents)})
-    shown = "".join(axis for axis in "xyz" if f"<!-- {axis} [m] -->" in text)
-    assert shown == axes
+    assert "".join(axis for axis in "xyz" if f"<!-- {axis} [m] -->" in text) == axes
 
 
 def test_labels_carry_units_names_and_errors(tmp_path: Path) -> None:

@@ -58,8 +58,7 @@ def test_equal_input_gives_equal_files(errors: dict[str, RoundTripError], tmp_pa
 
 
 def test_a_drive_that_goes_nowhere_can_be_drawn(tmp_path: Path) -> None:
-    still = round_trip(0.0, n=2)
-    plot_round_trip(tmp_path / "still.png", {"of another name": still})
+    plot_round_trip(tmp_path / "still.png", {"of another name": round_trip(0.0, n=2)})
     assert (tmp_path / "still.png").stat().st_size > 0
 
 

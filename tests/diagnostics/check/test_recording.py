@@ -239,8 +239,7 @@ def test_images_in_another_order_are_not_found_again() -> None:
 
 def test_frozen_images_are_found() -> None:
     frozen = FaultySource(render("handheld", "rgbd"), made.Frozen(first=1))
-    found = complaints(check(frozen))
-    assert {"colour: frozen images", "depth: frozen images"} == found
+    assert {"colour: frozen images", "depth: frozen images"} == complaints(check(frozen))
 
 
 def test_torn_images_are_found() -> None:
@@ -272,8 +271,7 @@ def test_a_calibration_that_changes_on_the_way_is_told(
     changes = {"/camera/camera_info": n_changed} if n_changed else {}
     monkeypatch.setattr(BagSource, "camera_info_changes", changes)
     source = open_recording(room_bag)
-    result = check_recording(source, Config(), n_samples=2)
-    found = find(result, "changed CameraInfo")
+    found = find(check_recording(source, Config(), n_samples=2), "changed CameraInfo")
     assert found.verdict == verdict
     assert ("3 of /camera/camera_info" in str(found.value)) == (n_changed > 0)
 

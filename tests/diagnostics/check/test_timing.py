@@ -61,8 +61,7 @@ def timing(
 
 @given(st.integers(10, 400), st.integers(1, 200), st.floats(0, 0.08), st.integers(0, 2**32 - 1))
 def test_regular_stamps_are_in_order(n: int, period_ms: int, jitter: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    noise = rng.uniform(-jitter, jitter, n) * period_ms * MS
+    noise = np.random.default_rng(seed).uniform(-jitter, jitter, n) * period_ms * MS
     stamps_ns = np.arange(n, dtype=np.int64) * period_ms * MS + noise.astype(np.int64)
     findings = timing(stamps_ns)
     assert complaints(findings) == set()
@@ -97,8 +96,7 @@ def test_each_fault_of_one_stream_has_its_own_finding(fault: Change, expected: s
 
 
 def test_the_numbers_of_drops_and_gaps_are_those_planted() -> None:
-    stamps_ns = np.delete(regular(), [10, 11, 12, 40, 100])
-    findings = timing(stamps_ns)
+    findings = timing(np.delete(regular(), [10, 11, 12, 40, 100]))
     assert findings["colour: dropped frames"].text == "5 of 300"
     assert findings["colour: gaps"].text == "1, longest 0.133 s"
     assert findings["colour: gaps"].value == pytest.approx(4 * PERIOD_NS / 1e9)
@@ -157,8 +155,7 @@ def test_a_tolerance_that_is_too_small_is_named_with_one_that_is_not() -> None:
 def test_dropped_images_of_a_rendered_recording_are_found() -> None:
     recording = render("handheld", "rgbd")
     thinned = recording.mapped(lambda image, number: None if number % 7 == 3 else image)
-    found = complaints(check(thinned))
-    assert found == {"colour: dropped frames", "depth: dropped frames"}
+    assert complaints(check(thinned)) == {"colour: dropped frames", "depth: dropped frames"}
 
 
 @pytest.mark.parametrize("offset_ns", [0, 3 * MS, 86_400_000 * MS, -5_000 * MS])

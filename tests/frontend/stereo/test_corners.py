@@ -79,8 +79,7 @@ def test_nothing_is_measured_in_flat_images() -> None:
 @pytest.mark.parametrize("shape", [(3, 3), (12, 200), (200, 12), (40, 40)])
 def test_no_corners_and_small_images_are_no_fault(shape: tuple[int, int]) -> None:
     tiny = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
-    found = measure((tiny, tiny), np.array([[1.0, 1.0], [2.0, 2.0]]))
-    assert not found.are_reliable.any()
+    assert not measure((tiny, tiny), np.array([[1.0, 1.0], [2.0, 2.0]])).are_reliable.any()
     nothing = measure((tiny, tiny), np.zeros((0, 2)))
     assert nothing.disparities.shape == nothing.are_reliable.shape == (0,)
 
@@ -101,10 +100,8 @@ def test_what_the_right_image_shows_twice_is_not_reliable() -> None:
     stripes += rng.normal(0.0, 1.0, stripes.shape)
     images = stripes.astype(np.uint8), np.roll(stripes, -8, axis=1).astype(np.uint8)
     inner = grid()[(grid()[:, 0] > 60) & (grid()[:, 0] < 180)]
-    found = measure(images, inner)
-    assert found.are_reliable.mean() < 0.1
-    once = measure((image(), image(-8.0)), inner)
-    assert once.are_reliable.mean() > 0.7
+    assert measure(images, inner).are_reliable.mean() < 0.1
+    assert measure((image(), image(-8.0)), inner).are_reliable.mean() > 0.7
 
 
 def test_a_copy_is_found_behind_what_only_resembles_it() -> None:

@@ -82,8 +82,7 @@ def test_patches_across_a_step_of_depth_are_not_alike() -> None:
 
 def test_what_is_shown_twice_is_its_own_rival() -> None:
     """Stripes of a period of 12 pixels, at disparity 5: 17 is as good, 11 half a period off."""
-    columns = np.arange(160.0)
-    stripes = np.tile(128 + 60 * np.sin(2 * np.pi * columns / 12), (120, 1))
+    stripes = np.tile(128 + 60 * np.sin(2 * np.pi * np.arange(160.0) / 12), (120, 1))
     images = stripes.astype(np.uint8), np.roll(stripes, -5, axis=1).astype(np.uint8)
     pixels = np.column_stack([np.linspace(50, 120, 20), np.linspace(30, 90, 20)])
     found, second, between = (compare(images, pixels, d) for d in (5.0, 17.0, 11.0))

@@ -186,8 +186,7 @@ _T_COLOR_DEPTH = _pose([0.01, 0.02, -0.01], [0.015, 0.001, -0.002])
 def test_depth_of_another_camera_comes_with_its_calibration_and_place(tmp_path: Path) -> None:
     # The tf tree is up to the other side: the depth camera is the parent of the colour camera.
     tf = _tf("/tf_static", "depth_optical", "color_optical", se3.invert(_T_COLOR_DEPTH))
-    messages = [*_rgbd(K=_DEPTH_K, width=64, D=_D), tf]
-    found = _found(tmp_path / "a.bag", messages)
+    found = _found(tmp_path / "a.bag", [*_rgbd(K=_DEPTH_K, width=64, D=_D), tf])
     view = found.depth_view
     assert view is not None
     np.testing.assert_allclose(view.T_color_depth, _T_COLOR_DEPTH, atol=1e-9)

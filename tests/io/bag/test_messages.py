@@ -146,8 +146,7 @@ def test_planes_of_colour_below_grey_follow_the_formula(encoding: str, padding: 
     )
     message.height = 6
     yuv = np.dstack([grey, chroma.repeat(2, axis=0).repeat(2, axis=1)])
-    decoded = decode_grey_or_color(message, "/image")
-    assert np.abs(decoded - _bgr_of_yuv(yuv)).max() <= 1.5
+    assert np.abs(decode_grey_or_color(message, "/image") - _bgr_of_yuv(yuv)).max() <= 1.5
 
 
 def test_an_odd_size_has_no_colour_by_twos() -> None:

@@ -132,8 +132,7 @@ def _scan(path: Path) -> Scan:
 
 
 def test_the_old_type_of_transforms_is_decoded(gvo_data: Path) -> None:
-    reader = BagReader(gvo_data / "bags/good/tf_lz4.bag")
-    message = next(reader.messages(["/tf"]))
+    message = next(BagReader(gvo_data / "bags/good/tf_lz4.bag").messages(["/tf"]))
     assert message.topic.type == "tf/msg/tfMessage"
     (transform,) = message.decode().transforms
     assert transform.child_frame_id.startswith("turtle")

@@ -206,8 +206,7 @@ def test_files_of_a_folder_follow_each_other(gap_s: int, is_one: bool) -> None:
 def test_camera_info_that_changes_on_the_way_is_told(tmp_path: Path, tiny: Any) -> None:
     messages = _stereo(tiny)
     wide = _info("/s/left/camera_info", [2.0 * number for number in _P_LEFT])
-    path = write(tmp_path / "a.bag", [*messages, (*wide[:2], 2, wide[3])])
-    source = BagSource(path)
+    source = BagSource(write(tmp_path / "a.bag", [*messages, (*wide[:2], 2, wide[3])]))
     assert describe_camera_changes(source) == ""
     assert len(list(source.images())) == 6
     assert describe_camera_changes(source) == "1 of /s/left/camera_info"

@@ -106,15 +106,13 @@ def test_depth_comes_back_whatever_later_images_hold(tiny: Tiny, tmp_path: Path,
     far = millimetres.copy()
     far[9, 9] = 70.0
     between = rng.uniform(0.3, 4, (32, 48)).astype(np.float32)
-    unknown = np.full((32, 48), np.nan, dtype=np.float32)
-    depths = [millimetres, far, between, unknown]
+    depths = [millimetres, far, between, np.full((32, 48), np.nan, dtype=np.float32)]
     items: list[Item] = [
         item
         for n, depth in enumerate(depths)
         for item in ((0, 10 + n, tiny.texture(n)), (1, 10 + n, depth))
     ]
-    written = write_bag(tiny.rgbd(items), tmp_path / name, compress=True)
-    assert written.skipped == ()
+    assert write_bag(tiny.rgbd(items), tmp_path / name, compress=True).skipped == ()
     read = [image.load() for image in open_recording(tmp_path / name).images() if image.stream]
     for depth, expected in zip(read, depths, strict=True):
         np.testing.assert_array_equal(depth, expected)

@@ -161,8 +161,7 @@ def test_stamps_are_exact_to_the_nanosecond(
 ) -> None:
     path = tmp_path_factory.mktemp("stamps") / name
     items: list[Item] = [(stream, s, _noise(1)) for s in stamps for stream in (0, 1)]
-    source = ListSource("stereo", items, calibrations=_stereo().info.calibrations)
-    write_bag(source, path)
+    write_bag(ListSource("stereo", items, calibrations=_stereo().info.calibrations), path)
     assert [image.stamp_ns for image in open_recording(path).images()] == [
         stamp_ns for stamp_ns in stamps for _ in range(2)
     ]
@@ -255,8 +254,7 @@ def test_the_cameras_stand_in_tf_before_the_first_image(tmp_path: Path, name: st
             assert extension.latching == 1
         else:
             assert extension.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
-        first_ns = min(log_time_ns for _, log_time_ns, _ in reader.messages())
-        assert body[0] == first_ns
+        assert body[0] == min(log_time_ns for _, log_time_ns, _ in reader.messages())
 
 
 @_KINDS
@@ -283,7 +281,6 @@ def test_a_copy_of_a_bag_keeps_the_frame_and_the_body(tmp_path: Path) -> None:
     source.info = replace(source.info, T_body_cam=T_body_cam, frame_id="left_eye")
     write_bag(source, tmp_path / "a.bag")
     write_bag(open_recording(tmp_path / "a.bag"), tmp_path / "b.mcap")
-    copy = open_recording(tmp_path / "b.mcap")
-    assert copy.info.frame_id == "left_eye"
+    assert open_recording(tmp_path / "b.mcap").info.frame_id == "left_eye"
     body, _ = _transforms(tmp_path / "b.mcap", "/tf_static")
     np.testing.assert_allclose(body[3], T_body_cam, atol=1e-15)

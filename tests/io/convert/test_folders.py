@@ -230,8 +230,7 @@ def test_millimetres_stay_millimetres(
     if is_first_empty:
         items = [(1, _START_NS - 10, np.full((32, 48), np.nan, np.float32)), *items]
     path = tmp_path_factory.mktemp("tum") / "a"
-    written = write_folder(tiny.rgbd(items), path)
-    assert written.skipped == ()
+    assert write_folder(tiny.rgbd(items), path).skipped == ()
     *_, last = (image.load() for image in open_recording(path).images() if image.stream == 1)
     np.testing.assert_array_equal(last, counts / np.float32(1000))
 
@@ -402,8 +401,7 @@ def test_poses_of_kitti_are_written_for_all_pairs_or_none(tiny: Tiny, tmp_path: 
 def test_an_unreadable_image_of_kitti_leaves_its_number_free(tiny: Tiny, tmp_path: Path) -> None:
     items = _pairs(tiny)
     items[2] = (0, items[2][1], RecordingError("damaged"))
-    written = write_folder(tiny.stereo(items), tmp_path / "a")
-    assert written.n_images == 5
+    assert write_folder(tiny.stereo(items), tmp_path / "a").n_images == 5
     names = sorted(path.name for path in (tmp_path / "a" / "image_0").iterdir())
     assert names == ["000000.png", "000002.png"]
     assert [i.stamp_ns for i in open_recording(tmp_path / "a").images() if i.stream == 0] == [
@@ -442,8 +440,7 @@ def test_body_and_calibration_of_a_file_are_written(tiny: Tiny, tmp_path: Path) 
     origin = _write_euroc(tiny, tmp_path / "origin", "radial-tangential")
     write_bag(open_recording(origin), tmp_path / "a.bag")
     options = RecordingOptions(calibration=[origin])
-    source = open_recording(tmp_path / "a.bag", options=options)
-    write_folder(source, tmp_path / "copy")
+    write_folder(open_recording(tmp_path / "a.bag", options=options), tmp_path / "copy")
     np.testing.assert_allclose(
         _T_body_cam(open_recording(tmp_path / "copy")),
         _T_body_cam(open_recording(origin)),

@@ -191,8 +191,7 @@ def test_a_missing_list_is_refused(tmp_path: Path, tiny: Any, name: str) -> None
 
 @pytest.mark.recorded
 def test_nearly_all_recorded_images_find_their_depth(gvo_data: Path) -> None:
-    source = TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start")
-    items = list(frames(source, Config()))
+    items = list(frames(TumSource(gvo_data / "rgbd_dataset_freiburg1_xyz_start"), Config()))
     assert len(items) == 80
     assert sum(isinstance(item, RgbdFrame) for item in items) >= 78
 

@@ -55,11 +55,9 @@ def assert_same(first: Request, second: Request) -> None:
 def test_both_formats_say_the_same(seed: int) -> None:
     T, pose, covariance = random_numbers(seed)
     upper = [float(v) for v in covariance[UPPER]]
-    fields = ["b", "7", "a", *map(repr, pose), *map(repr, upper)]
-    by_csv = parse_csv(",".join(fields))
+    by_csv = parse_csv(",".join(["b", "7", "a", *map(repr, pose), *map(repr, upper)]))
     content = {"id": "b", "stamp_ns": 7, "reference": "a", "pose": pose, "covariance": upper}
-    by_json = parse_json(json.dumps(content))
-    assert_same(by_csv, by_json)
+    assert_same(by_csv, parse_json(json.dumps(content)))
     np.testing.assert_allclose(by_csv.edges[0].T_reference_frame, T, atol=1e-12)
     np.testing.assert_allclose(by_csv.edges[0].covariance, covariance)
     assert by_csv.edges[0].reference_id == "a"
@@ -67,8 +65,7 @@ def test_both_formats_say_the_same(seed: int) -> None:
 
 def test_sigmas_are_standard_deviations_rotation_first() -> None:
     edge = parse_csv("b,7,a,0,0,1,0,0,0,1,0.1,0.2,0.3,1,2,3").edges[0]
-    expected = np.diag([0.01, 0.04, 0.09, 1.0, 4.0, 9.0])
-    np.testing.assert_allclose(edge.covariance, expected)
+    np.testing.assert_allclose(edge.covariance, np.diag([0.01, 0.04, 0.09, 1.0, 4.0, 9.0]))
 
 
 def test_without_noise_an_edge_gets_that_of_its_motion() -> None:

@@ -56,8 +56,7 @@ def sampled(seconds: list[float], T_world: FloatArray | None = None) -> ListStre
 
 def fuse(*streams: ListStream) -> tuple[list[PoseEvent], FusedChains]:
     source = FusedChains(streams, [StepSigma()] * len(streams))
-    events = [event for event in source.events() if isinstance(event, PoseEvent)]
-    return events, source
+    return [event for event in source.events() if isinstance(event, PoseEvent)], source
 
 
 def test_one_stream_is_a_chain_in_its_own_world() -> None:
@@ -94,8 +93,7 @@ def test_nothing_is_interpolated_over_a_gap() -> None:
 
 def test_a_step_from_pose_to_pose_over_a_gap_needs_no_interpolation() -> None:
     first = sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
-    other = sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1])
-    events, _ = fuse(first, other)
+    events, _ = fuse(first, sampled([0.0, 0.1, 0.2, 0.3, 2.0, 2.1]))
     assert [len(event.edges) for event in events] == [0, 2, 2, 2, 2, 2]
 
 
@@ -166,8 +164,7 @@ def test_the_covariance_between_independent_fixes_is_that_of_samples(seed: int) 
     errors = se3.log(se3.invert(T_ab) @ se3.invert(T_a @ se3.exp(d_a)) @ (T_b @ se3.exp(d_b)))
     expected = 1e6 * np.cov(errors.T)
     C = step_covariance(before, after, StepSigma())
-    scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))
-    assert np.abs((C - expected) / scale).max() < 0.15
+    assert np.abs((C - expected) / np.sqrt(np.outer(np.diag(C), np.diag(C)))).max() < 0.15
 
 
 @pytest.mark.parametrize("covariance", [None, np.zeros((6, 6)), np.full((6, 6), np.nan)])

@@ -91,8 +91,7 @@ def check_pair(buffer: TfBuffer, edges: dict[str, RawEdge], target: str, source:
     moving = [*moving_above(edges, target), *moving_above(edges, source)]
     stamps = np.unique(np.concatenate([np.array(e.stamps_ns) for e in moving]))
     first = max(min(e.stamps_ns) for e in moving)
-    last = min(max(e.stamps_ns) for e in moving)
-    stamps = stamps[(stamps >= first) & (stamps <= last)]
+    stamps = stamps[(stamps >= first) & (stamps <= min(max(e.stamps_ns) for e in moving))]
     t_target, R_target = in_the_root(edges, target, stamps)
     t_source, R_source = in_the_root(edges, source, stamps)
     T, is_known = buffer.lookup_many(target, source, stamps)

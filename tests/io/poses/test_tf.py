@@ -338,8 +338,7 @@ def write_bag(tmp_path: Path) -> WriteBag:
             }
             for n, (topic, transform) in enumerate(items):
                 message = STORE.types[TF_TYPE](transforms=[transform])
-                data = STORE.serialize_ros1(message, TF_TYPE)
-                writer.write(connections[topic], n, data)
+                writer.write(connections[topic], n, STORE.serialize_ros1(message, TF_TYPE))
         return BagReader(path)
 
     return write

@@ -49,8 +49,7 @@ def test_the_bus_stands_where_its_path_says() -> None:
 
 
 def test_the_bus_fills_most_of_the_view_while_it_stands() -> None:
-    recording = SyntheticRecording("traffic", n_frames=61, scale=0.2)
-    with_bus = recording.render_depth(60)
+    with_bus = SyntheticRecording("traffic", n_frames=61, scale=0.2).render_depth(60)
     assert 0.55 < np.mean(np.abs(with_bus - np.median(with_bus)) < 0.5) < 0.8
 
 
@@ -102,8 +101,7 @@ def test_the_front_of_the_house_repeats_exactly() -> None:
 
 def test_the_tram_moves_by_more_than_half_a_window_per_frame() -> None:
     positions = ride(np.arange(40, 90) / 10.0)[:, :3, 3]
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    assert steps.min() > 0.5 * PERIOD_M
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1).min() > 0.5 * PERIOD_M
 
 
 def test_the_blank_wall_fills_the_view() -> None:

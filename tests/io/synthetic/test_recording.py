@@ -61,8 +61,7 @@ def unoccluded(
     expected_depth: FloatArray, other_depth: DepthArray, u: FloatArray, v: FloatArray
 ) -> BoolArray:
     """Tell the pixels whose point is the nearest one in the other image, with its neighbours."""
-    seen = sample(other_depth, u, v)
-    is_same = np.abs(seen - expected_depth) < 0.01 * expected_depth
+    is_same = np.abs(sample(other_depth, u, v) - expected_depth) < 0.01 * expected_depth
     return shrunk(is_same, 7)
 
 
@@ -117,8 +116,7 @@ def test_disparities_are_unbiased_to_a_few_hundredths_of_a_pixel(world: str) -> 
 def test_a_planted_offset_makes_every_disparity_larger(offset: float) -> None:
     noise = replace(PERFECT, disparity_offset_px=offset)
     recording = perfect("handheld", n_frames=2, noise=noise)
-    honest = perfect("handheld", n_frames=2)
-    assert recording.info.camera == honest.info.camera
+    assert recording.info.camera == perfect("handheld", n_frames=2).info.camera
     assert abs(np.mean(residual_disparities(*right_seen_from_left(recording, 0, offset)))) < 0.02
 
 
@@ -140,8 +138,7 @@ def test_points_of_one_frame_lie_where_the_true_motion_puts_them_in_another(worl
     seen = sample(later_depth, pixels[..., 0], pixels[..., 1])
     assert np.median(np.abs(seen - z)[is_same] / z[is_same]) < 1e-3
     grey = sample(load(recording, 6), pixels[..., 0], pixels[..., 1])
-    differences = np.abs(grey - load(recording, 3))[is_same]
-    assert np.median(differences) < 5.0
+    assert np.median(np.abs(grey - load(recording, 3))[is_same]) < 5.0
 
 
 @pytest.mark.parametrize(
@@ -183,8 +180,7 @@ def test_the_fast_hand_turns_as_fast_as_announced_and_comes_back(seed: int) -> N
     assert lengths.max() < 0.2
     # Two seconds later at the earliest it looks the same way again, within the field of view.
     for index in range(0, 150, 10):
-        later = rotation_angle(invert(T[index]) @ T[index + 60 :])
-        assert np.rad2deg(later.min()) < 20.0
+        assert np.rad2deg(rotation_angle(invert(T[index]) @ T[index + 60 :]).min()) < 20.0
     assert np.rad2deg(rotation_angle(T)).max() > 40.0
 
 
@@ -196,8 +192,7 @@ def test_the_drone_comes_to_rest_for_three_seconds_between_flights(seed: int) ->
         resting = slice(start + 61, start + 150)
         spread = np.linalg.norm(positions[resting] - positions[resting].mean(axis=0), axis=1)
         assert 0.0005 < spread.max() < 0.005
-        turned = np.rad2deg(rotation_angle(invert(T[start + 61]) @ T[resting]))
-        assert turned.max() < 0.7
+        assert np.rad2deg(rotation_angle(invert(T[start + 61]) @ T[resting])).max() < 0.7
         assert 0.05 < np.linalg.norm(positions[start + 62] - positions[start]) < 2.0
     assert steps[:, 1].max() < 0.06  # no jumps
     assert steps[:, 0].max() < 2.5

@@ -91,8 +91,7 @@ def test_depth_is_that_of_rays_intersected_one_by_one(angles: Triple, position: 
 def test_the_ground_under_the_camera_is_seen_to_the_lower_edge_of_the_image() -> None:
     ground = Rectangle(corner=(-50, 1.5, 50), edge_s=(100, 0, 0), edge_t=(0, 0, -100), texture="t")
     depth = render_depth(scene_of(ground), np.eye(4), CAMERA)
-    rows = np.arange(CAMERA.height)
-    expected = 1.5 * CAMERA.fy / (rows[30:] - CAMERA.cy)
+    expected = 1.5 * CAMERA.fy / (np.arange(CAMERA.height)[30:] - CAMERA.cy)
     np.testing.assert_allclose(depth[30:], np.broadcast_to(expected[:, None], (18, 64)), rtol=1e-6)
     assert np.all(np.isnan(depth[:24]))
 
@@ -150,8 +149,7 @@ def test_a_surface_is_not_seen_from_behind_unless_it_has_two_sides() -> None:
     turned = make_transform(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 5.0]))
     for is_two_sided in (False, True):
         scene = scene_of(screen(2.0, is_two_sided=is_two_sided))
-        depth = render_depth(scene, turned, CAMERA)
-        assert np.any(np.isfinite(depth)) == is_two_sided
+        assert np.any(np.isfinite(render_depth(scene, turned, CAMERA))) == is_two_sided
 
 
 def test_a_scene_without_anything_in_view_is_haze() -> None:
@@ -173,8 +171,7 @@ def test_texels_as_large_as_pixels_come_out_unchanged() -> None:
 def test_a_shift_by_parts_of_a_pixel_interpolates_between_texels(shift: float) -> None:
     camera = PinholeCamera(fx=128.0, fy=128.0, cx=31.5 - shift, cy=31.5, width=64, height=64)
     texture = noise_texture()
-    scene = scene_of(screen(2.0, half=1.5), t=texture)
-    image = render_image(scene, np.eye(4), camera)
+    image = render_image(scene_of(screen(2.0, half=1.5), t=texture), np.eye(4), camera)
     following = np.roll(texture.pixels, -1, axis=1)
     expected = (1 - shift) * texture.pixels + shift * following.astype(float)
     # The image shows the period from -0.5 m to 0.5 m, the screen starts one earlier.

@@ -20,7 +20,6 @@ from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.geometry.se3 import make_transform
 from gvo.io.convert.bag_messages import BagWriter
-from gvo.io.frames import frames
 from gvo.io.poses.tf import TfBuffer
 from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
@@ -38,6 +37,7 @@ from gvo.types import (
     Status,
     StereoFrame,
 )
+from tests.recordings import frames_of
 from tests.results import estimate_at, loop_of, optimum_of, result_of
 
 _KINDS = pytest.mark.parametrize("name", ["run.mcap", "run.bag"])
@@ -51,6 +51,7 @@ _T_BASE_CAM = make_transform(
     np.array([0.3, -0.1, 0.5]),
 )
 _MOUNTED = RunFrames(base="base_link", camera="/left_optical", T_base_cam=_T_BASE_CAM)
+_FRAMES = pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
 
 
 class _Message(NamedTuple):
@@ -115,7 +116,7 @@ def _stamp_ns(header: Any) -> int:
 def _track(sensor: Sensor) -> _Run:
     recording = SyntheticRecording("handheld", sensor, n_frames=_N_FRAMES, scale=0.5)
     odometry = Odometry(recording.info.camera, Config())
-    seen = [f for f in frames(recording, Config()) if not isinstance(f, FaultyFrame)]
+    seen = frames_of(recording)
     results = [odometry.track(frame) for frame in seen]
     return _Run(frames=seen, results=results, last=odometry.finish())
 
@@ -130,13 +131,15 @@ def any_run(request: pytest.FixtureRequest, stereo_run: _Run) -> _Run:
     return stereo_run if request.param == "stereo" else _track("rgbd")
 
 
-def _write(path: Path, run: _Run, names: RunFrames | None = None) -> None:
+def _written(path: Path, run: _Run, names: RunFrames | None = None) -> dict[str, list[_Message]]:
+    """Write the bag of a run, and return its messages by topic."""
     names = names or RunFrames()
     poses = run.estimates(names.mount(0))
     with RunBag(path, names) as bag:
         for frame, result in zip(run.frames, run.results, strict=True):
             bag.add_frame(frame, _placed(result, poses))
         bag.add_smoothed(poses["smoothed"][e.stamp_ns] for e in run.last)
+    return _read(path)
 
 
 def _placed(result: FrameResult, poses: dict[str, dict[int, Estimate]]) -> FrameResult:
@@ -162,12 +165,8 @@ def _transforms(messages: dict[str, list[_Message]]) -> Iterator[tuple[str, str,
     for message in messages["/tf"]:
         for transform in message.content.transforms:
             T = _pose_matrix(transform.transform.translation, transform.transform.rotation)
-            yield (
-                transform.header.frame_id,
-                transform.child_frame_id,
-                _stamp_ns(transform.header),
-                T,
-            )
+            header = transform.header
+            yield header.frame_id, transform.child_frame_id, _stamp_ns(header), T
 
 
 def _pose_matrix(t: Any, q: Any) -> FloatArray:
@@ -209,8 +208,7 @@ def _points(cloud: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 @_KINDS
 def test_every_topic_comes_once_a_frame_stamped(tmp_path: Path, any_run: _Run, name: str) -> None:
-    _write(tmp_path / name, any_run, _MOUNTED)
-    messages = _read(tmp_path / name)
+    messages = _written(tmp_path / name, any_run, _MOUNTED)
     stamps = [frame.stamp_ns for frame in any_run.frames]
     once = ["/gvo/points", "/gvo/matches/compressed", "/diagnostics"]
     for topic in [*once, *(f"/gvo/{kind}/odometry" for kind in ("raw", "causal", "odom"))]:
@@ -227,8 +225,7 @@ def test_every_topic_comes_once_a_frame_stamped(tmp_path: Path, any_run: _Run, n
 
 def test_mcap_and_mcap_ros2_read_the_same_as_rosbags(tmp_path: Path, stereo_run: _Run) -> None:
     path = tmp_path / "run.mcap"
-    _write(path, stereo_run, _MOUNTED)
-    expected = _read(path)
+    expected = _written(path, stereo_run, _MOUNTED)
     found = defaultdict(list)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -266,12 +263,12 @@ def _assert_equal(mine: Any, theirs: Any) -> None:
 
 
 @_KINDS
-@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+@_FRAMES
 def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: RunFrames) -> None:
-    _write(tmp_path / name, stereo_run, names)
+    messages = _written(tmp_path / name, stereo_run, names)
     expected = stereo_run.estimates(names.mount(0))
     found: dict[str, set[int]] = defaultdict(set)
-    for parent, child, stamp_ns, T in _transforms(_read(tmp_path / name)):
+    for parent, child, stamp_ns, T in _transforms(messages):
         if "gvo/odom" in (parent, child):
             continue
         gvo, kind, tracked = child.split("/")
@@ -284,8 +281,7 @@ def test_tf_holds_the_poses(tmp_path: Path, stereo_run: _Run, name: str, names: 
 
 @_KINDS
 def test_a_camera_hangs_on_every_estimate(tmp_path: Path, stereo_run: _Run, name: str) -> None:
-    _write(tmp_path / name, stereo_run, _MOUNTED)
-    buffer = _buffer(_read(tmp_path / name))
+    buffer = _buffer(_written(tmp_path / name, stereo_run, _MOUNTED))
     for kind, poses in stereo_run.estimates(_T_BASE_CAM).items():
         for stamp_ns, pose in poses.items():
             T_world_cam = _lookup(buffer, "world", f"gvo/{kind}/left_optical", stamp_ns)
@@ -316,8 +312,7 @@ def test_a_camera_moving_on_the_robot_is_placed_anew(tmp_path: Path, stereo_run:
 
 def test_above_the_world_of_a_camera_stands_one_with_z_up(tmp_path: Path, stereo_run: _Run) -> None:
     names = RunFrames(world="odom", is_world_optical=True)
-    _write(tmp_path / "run.mcap", stereo_run, names)
-    buffer = _buffer(_read(tmp_path / "run.mcap"))
+    buffer = _buffer(_written(tmp_path / "run.mcap", stereo_run, names))
     T_flu_world = _lookup(buffer, "odom_flu", "odom", stereo_run.frames[-1].stamp_ns)
     ahead, left, up = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]]) @ T_flu_world.T
     np.testing.assert_array_equal([ahead, left, up], np.eye(3, 4))
@@ -326,7 +321,7 @@ def test_above_the_world_of_a_camera_stands_one_with_z_up(tmp_path: Path, stereo
 
 
 @_KINDS
-@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+@_FRAMES
 def test_the_frame_of_rep_105_never_jumps_and_its_correction_leads_to_the_corrected_pose(
     tmp_path: Path, name: str, names: RunFrames
 ) -> None:
@@ -388,12 +383,11 @@ def test_loops_are_drawn_when_confirmed_and_last_in_global_poses(tmp_path: Path,
 
 
 @_KINDS
-@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+@_FRAMES
 def test_odometry_holds_pose_and_covariance_in_the_order_of_ros(
     tmp_path: Path, any_run: _Run, name: str, names: RunFrames
 ) -> None:
-    _write(tmp_path / name, any_run, names)
-    messages = _read(tmp_path / name)
+    messages = _written(tmp_path / name, any_run, names)
     for kind, poses in any_run.estimates(names.mount(0)).items():
         for message in messages[f"/gvo/{kind}/odometry"]:
             content, estimate = message.content, poses[message.stamp_ns]
@@ -412,8 +406,7 @@ def test_odometry_holds_pose_and_covariance_in_the_order_of_ros(
 
 def _ros_covariance(estimate: Estimate) -> FloatArray:
     """Move the pose a little along each axis and see what changes in the world's axes."""
-    T = estimate.T_world_frame
-    J = np.zeros((6, 6))
+    T, J = estimate.T_world_frame, np.zeros((6, 6))
     for k, xi in enumerate(1e-6 * np.eye(6)):
         moved = T @ expm(_hat(xi))
         turn = moved @ np.linalg.inv(T)
@@ -421,12 +414,11 @@ def _ros_covariance(estimate: Estimate) -> FloatArray:
     return np.asarray(J @ estimate.covariance @ J.T)
 
 
-@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+@_FRAMES
 def test_the_velocity_leads_from_the_pose_before_to_this_one(
     tmp_path: Path, stereo_run: _Run, names: RunFrames
 ) -> None:
-    _write(tmp_path / "run.mcap", stereo_run, names)
-    messages = _read(tmp_path / "run.mcap")
+    messages = _written(tmp_path / "run.mcap", stereo_run, names)
     for kind, poses in stereo_run.estimates(names.mount(0)).items():
         known: list[int] = []
         for message in messages[f"/gvo/{kind}/odometry"]:
@@ -446,12 +438,11 @@ def _velocity(message: _Message) -> FloatArray:
     return np.array([getattr(v, axis) for v in (twist.angular, twist.linear) for axis in "xyz"])
 
 
-@pytest.mark.parametrize("names", [RunFrames(), _MOUNTED], ids=["camera", "base"])
+@_FRAMES
 def test_the_covariance_of_the_raw_velocity_is_that_of_the_registration(
     tmp_path: Path, stereo_run: _Run, names: RunFrames
 ) -> None:
-    _write(tmp_path / "run.mcap", stereo_run, names)
-    messages = _read(tmp_path / "run.mcap")
+    messages = _written(tmp_path / "run.mcap", stereo_run, names)
     stamps = [frame.stamp_ns for frame in stereo_run.frames]
     order = [3, 4, 5, 0, 1, 2]
     for index, message in enumerate(messages["/gvo/raw/odometry"]):
@@ -471,8 +462,7 @@ def test_the_covariance_of_the_raw_velocity_is_that_of_the_registration(
 
 @_KINDS
 def test_points_are_those_matched_in_grey(tmp_path: Path, any_run: _Run, name: str) -> None:
-    _write(tmp_path / name, any_run, _MOUNTED)
-    clouds = _read(tmp_path / name)["/gvo/points"]
+    clouds = _written(tmp_path / name, any_run, _MOUNTED)["/gvo/points"]
     assert sum(m.content.width for m in clouds) > 50 * len(clouds)
     for message, frame, result in zip(clouds, any_run.frames, any_run.results, strict=True):
         cloud = message.content
@@ -491,10 +481,8 @@ def test_points_are_those_matched_in_grey(tmp_path: Path, any_run: _Run, name: s
 
 
 def test_pictures_show_the_image_with_its_matches(tmp_path: Path, stereo_run: _Run) -> None:
-    _write(tmp_path / "run.mcap", stereo_run)
-    for message, frame in zip(
-        _read(tmp_path / "run.mcap")["/gvo/matches/compressed"], stereo_run.frames, strict=True
-    ):
+    messages = _written(tmp_path / "run.mcap", stereo_run)["/gvo/matches/compressed"]
+    for message, frame in zip(messages, stereo_run.frames, strict=True):
         assert isinstance(frame, StereoFrame)
         assert message.content.format == "jpeg"
         assert message.content.header.frame_id == "gvo/causal/camera_optical"
@@ -506,10 +494,8 @@ def test_pictures_show_the_image_with_its_matches(tmp_path: Path, stereo_run: _R
 
 
 def test_diagnostics_count_and_time_each_frame(tmp_path: Path, stereo_run: _Run) -> None:
-    _write(tmp_path / "run.mcap", stereo_run)
-    for message, result in zip(
-        _read(tmp_path / "run.mcap")["/diagnostics"], stereo_run.results, strict=True
-    ):
+    messages = _written(tmp_path / "run.mcap", stereo_run)["/diagnostics"]
+    for message, result in zip(messages, stereo_run.results, strict=True):
         (status,) = message.content.status
         values = {pair.key: pair.value for pair in status.values}
         assert (status.level, status.hardware_id) == (0, "camera_optical")
@@ -523,8 +509,7 @@ def test_diagnostics_count_and_time_each_frame(tmp_path: Path, stereo_run: _Run)
 
 @_KINDS
 def test_paths_end_with_all_poses(tmp_path: Path, stereo_run: _Run, name: str) -> None:
-    _write(tmp_path / name, stereo_run, _MOUNTED)
-    messages = _read(tmp_path / name)
+    messages = _written(tmp_path / name, stereo_run, _MOUNTED)
     for kind in ("raw", "smoothed"):
         poses = stereo_run.estimates(_T_BASE_CAM)[kind]
         path = messages[f"/gvo/{kind}/path"][-1].content
@@ -581,8 +566,7 @@ def test_paths_on_the_way_come_once_a_second_and_stay_short(tmp_path: Path) -> N
 
 
 def test_smoothed_poses_appear_when_they_were_known(tmp_path: Path, stereo_run: _Run) -> None:
-    _write(tmp_path / "run.mcap", stereo_run)
-    messages = _read(tmp_path / "run.mcap")["/gvo/smoothed/odometry"]
+    messages = _written(tmp_path / "run.mcap", stereo_run)["/gvo/smoothed/odometry"]
     known_ns = {
         estimate.stamp_ns: result.stamp_ns
         for result in stereo_run.results

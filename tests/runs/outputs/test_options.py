@@ -37,5 +37,4 @@ def test_plots_without_a_report_are_refused() -> None:
 
 def test_without_a_report_nothing_is_drawn(tmp_path: Path) -> None:
     run_of(Walk(), tmp_path)
-    suffixes = {path.suffix for path in tmp_path.iterdir()}
-    assert suffixes == {".txt", ".csv", ".json", ".g2o"}
+    assert {path.suffix for path in tmp_path.iterdir()} == {".txt", ".csv", ".json", ".g2o"}

@@ -226,8 +226,7 @@ def test_ellipsoids_are_three_sigma_of_the_position_in_the_world(any_run: _Run, 
     rows = any_run.read.rows[f"/world/{name}/covariance"]
     assert len(rows) == _N_FRAMES
     for row, result in zip(rows, any_run.results, strict=True):
-        estimate = getattr(result, name)
-        _check_ellipsoid(row.values, 0, estimate)
+        _check_ellipsoid(row.values, 0, getattr(result, name))
 
 
 def _check_ellipsoid(values: dict[str, Any], k: int, estimate: Estimate) -> None:
@@ -356,8 +355,7 @@ def test_chi2_is_the_mean_of_the_accepted_edges_of_a_kind(any_run: _Run) -> None
         if edge["kind"] == "keyframe" and edge["is_accepted"] == "1" and edge["chi2"]:
             expected.setdefault(int(edge["stamp_ns"]), []).append(float(edge["chi2"]))
     means = {stamp_ns: np.mean(values) for stamp_ns, values in expected.items()}
-    drawn = any_run.read.numbers("/chi2/keyframe")
-    assert drawn == pytest.approx(means, rel=1e-3)
+    assert any_run.read.numbers("/chi2/keyframe") == pytest.approx(means, rel=1e-3)
     assert means
 
 
@@ -442,8 +440,7 @@ def test_a_camera_that_moves_in_the_frame_is_placed_at_each_stamp(tmp_path: Path
         return make_transform(np.eye(3), np.array([0.0, 1e-3 * stamp_ns, 1.0]))
 
     names = RunFrames(base="base_link", camera="pan", T_base_cam=mount)
-    read = _write_made(tmp_path, [_made(5), _made(9)], names)
-    poses = read.poses(_CAMERA_ENTITY)
+    poses = _write_made(tmp_path, [_made(5), _made(9)], names).poses(_CAMERA_ENTITY)
     assert {ns: pytest.approx(mount(ns)[1, 3]) for ns in (5, 9)} == {
         ns: pose[1, 3] for ns, pose in poses.items()
     }
@@ -494,8 +491,7 @@ def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
         pixels_current=np.full((4, 2), 9.0),
         points_current=points,
     )
-    result = replace(_made(3), registration=found, keyframes_ns=(3,))
-    read = _write_made(tmp_path, [result])
+    read = _write_made(tmp_path, [replace(_made(3), registration=found, keyframes_ns=(3,))])
     drawn = read.latest(f"{_CAMERA_ENTITY}/points", 0)["Points3D:positions"]
     np.testing.assert_allclose(drawn, points[[0, 3]])
     np.testing.assert_allclose(read.latest("/world/cloud", 0)["Points3D:positions"], points[:1])
@@ -534,8 +530,7 @@ def test_paths_on_the_way_are_thinned(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(rerun_run, "N_SHOWN_POSES", 10)
     places = [make_transform(np.eye(3), np.array([float(k), 0.0, 0.0])) for k in range(60)]
     results = [_made(k * _SECOND_NS, T) for k, T in enumerate(places)]
-    read = _write_made(tmp_path, results)
-    rows = read.rows["/world/causal/path"]
+    rows = _write_made(tmp_path, results).rows["/world/causal/path"]
     assert max(len(_strip(row.values)) for row in rows[:-1]) <= 11
     assert [_strip(row.values)[-1][0] for row in rows[:-1]] == list(range(1, 60))
     assert len(_strip(rows[-1].values)) == 60

@@ -63,8 +63,7 @@ def path_of(positions: FloatArray, stamps_ns: FloatArray) -> Trajectory:
 
 
 def test_long_noisy_paths_become_short_ones_that_keep_outliers_and_gaps() -> None:
-    rng = np.random.default_rng(0)
-    positions = rng.normal(size=(100_000, 3))
+    positions = np.random.default_rng(0).normal(size=(100_000, 3))
     positions[40_000] = 100.0, 0.0, 0.0
     stamps_ns = np.arange(100_000.0)
     stamps_ns[60_000:] += 1000.0
@@ -84,8 +83,7 @@ def test_short_paths_are_kept_whole(n: int) -> None:
 
 @given(st.integers(0, 2**32 - 1))
 def test_each_dot_lies_near_one_that_is_drawn(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    x, y = rng.normal(size=(2, 500))
+    x, y = np.random.default_rng(seed).normal(size=(2, 500))
     kept = kept_of_dots(x, y, n_columns=20, n_rows=10)
     assert len(kept) <= 21 * 11
     near_x = np.abs(x[:, np.newaxis] - x[kept]) <= np.ptp(x) / 20 + 1e-12

@@ -32,8 +32,7 @@ SECTIONS = [
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run")
-    recording = SyntheticRecording("driving", "stereo", n_frames=12, scale=0.25)
-    run_of(recording, path)
+    run_of(SyntheticRecording("driving", "stereo", n_frames=12, scale=0.25), path)
     return path
 
 
@@ -231,8 +230,7 @@ def test_labels_are_text_and_keep_their_digits(page: Path, folder: Path) -> None
     ],
 )
 def test_few_frames_do_and_3_for_errors(n_frames: int, missing: set[str], tmp_path: Path) -> None:
-    recording = SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=0.25)
-    run_of(recording, tmp_path)
+    run_of(SyntheticRecording("handheld", "rgbd", n_frames=n_frames, scale=0.25), tmp_path)
     assert {*SECTIONS} - {*Page(page_of(tmp_path)).drawn} <= missing
 
 

@@ -210,5 +210,4 @@ def test_values_come_back_as_the_same_configuration(
     values["klt"]["min_eigenvalue"] = min_eigenvalue
     values["window"] |= {"size": size, "kernel": kernel}
     values["features"]["upright"] = upright
-    config = validate_configuration(values)
-    assert config == Config.model_validate(values)
+    assert validate_configuration(values) == Config.model_validate(values)

@@ -148,8 +148,7 @@ def test_what_a_run_does_not_hold_is_not_named(
     held = dict(record.trajectories)
     held["causal"] = held["causal"].select(slice(0))
     held["smoothed"] = replace(held["smoothed"], covariances=None)
-    page = FinishedPage(view.viser, replace(record, trajectories=held))
-    page.close()
+    FinishedPage(view.viser, replace(record, trajectories=held)).close()
     assert not [text for text in added if "causal" in text or "ellipsoid" in text]
     assert all([text for text in added if name in text] for name in ("raw", "smoothed", "truth"))
 

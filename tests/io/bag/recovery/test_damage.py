@@ -106,8 +106,7 @@ def test_the_walk_finds_all_messages_in_their_order(bags: dict[str, Path], name:
 @pytest.mark.parametrize("name", _KINDS)
 @given(data=st.data())
 def test_a_cut_bag_is_read_so_far(bags: dict[str, Path], name: str, data: st.DataObject) -> None:
-    whole = bags[name].read_bytes()
-    _check_cut(bags[name], data.draw(st.integers(0, len(whole) - 1)))
+    _check_cut(bags[name], data.draw(st.integers(0, len(bags[name].read_bytes()) - 1)))
 
 
 @pytest.mark.parametrize("name", _KINDS)
@@ -268,8 +267,7 @@ def test_a_chunk_that_was_never_closed_is_read(bags: dict[str, Path], name: str)
     file = (
         whole[:size] + bytes(4) + whole[size + 4 : at] + bytes(4) + whole[at + 4 : at + 4 + n_data]
     )
-    bag = BagFile(damaged(bags[name], lambda _: file))
-    assert _read(bag) == _ALL
+    assert _read(BagFile(damaged(bags[name], lambda _: file))) == _ALL
 
 
 def test_messages_out_of_order_are_sorted_within_a_chunk(tmp_path: Path) -> None:
@@ -374,8 +372,7 @@ def test_a_claimed_size_is_not_allocated_in_ros1(
 
 def _check_memory(path: Path) -> None:
     tracemalloc.start()
-    scan = _scan(path)
-    messages = _read(scan)
+    messages = _read(_scan(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert messages[: len(_ALL)] == _ALL
