@@ -310,8 +310,7 @@ class Admission:
     """
 
     def __init__(self, graph: WindowGraph, motion: ConstantVelocity) -> None:
-        self._graph = graph
-        self._motion = motion
+        self._graph, self._motion = graph, motion
 
     def admit(
         self,

@@ -152,9 +152,7 @@ class Engine:
         options: TaskOptions,
         on_progress: Callable[[BatchProgress], None] | None = None,
     ) -> None:
-        self._client = client
-        self._options = options
-        self._on_progress = on_progress
+        self._client, self._options, self._on_progress = client, options, on_progress
         self._id = f"gvo-batch-{uuid.uuid4().hex[:12]}"
         self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
         self._running: dict[Any, tuple[int, Task, Future[BatchRow]]] = {}

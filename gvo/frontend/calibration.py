@@ -99,8 +99,7 @@ class ConstantFilter:
     def __init__(self, prior_sigma: float, drift: float, value: float = 0.0) -> None:
         self._prior_variance = prior_sigma**2
         self._variance = self._prior_variance
-        self._drift = drift
-        self.value = value
+        self._drift, self.value = drift, value
 
     @property
     def sigma(self) -> float:
@@ -484,8 +483,7 @@ class CalibratedCamera:
     """
 
     def __init__(self, camera: StereoCamera, offsets: RigOffsets) -> None:
-        self._camera = camera
-        self._offsets = offsets
+        self._camera, self._offsets = camera, offsets
 
     def correct(self, observations: Stamped, uvd: FloatArray) -> FloatArray:
         """Return measured (u, v, disparity), shape (n, 3), as a camera without errors has them."""

@@ -117,9 +117,7 @@ class _Answers:
     """What becomes of the images of stream 0."""
 
     def __init__(self, limit_ns: int, partner: str, queue_size: int) -> None:
-        self._limit_ns = limit_ns
-        self._partner = partner
-        self._queue_size = queue_size
+        self._limit_ns, self._partner, self._queue_size = limit_ns, partner, queue_size
         self._ready: list[Pair | FaultyFrame] = []
         self._passed_ns: int | None = None  # the last stamp of stream 1 that was dealt with
         self.last_ns: int | None = None  # of the last pair
@@ -174,8 +172,7 @@ class _ExactTime:
     """Images wait by their stamp; a pair ends the wait of all older ones."""
 
     def __init__(self, queue_size: int, answers: _Answers) -> None:
-        self._queue_size = queue_size
-        self._answers = answers
+        self._queue_size, self._answers = queue_size, answers
         self._stamps: list[int] = []  # a heap of the keys of `_waiting`
         self._waiting: dict[int, list[StampedImage | None]] = {}
 
@@ -241,8 +238,7 @@ class _ApproximateTime:
         is_prompt: bool,
     ) -> None:
         self._periods = (_Period(), _Period()) if is_prompt else None
-        self._limit_ns = limit_ns
-        self._queue_size = queue_size
+        self._limit_ns, self._queue_size = limit_ns, queue_size
         self._factor = 1 + age_penalty
         self._answers = answers
         self._queues: tuple[deque[StampedImage], deque[StampedImage]] = (deque(), deque())

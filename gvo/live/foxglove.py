@@ -155,8 +155,7 @@ class _Channel:
     """A publisher of one channel."""
 
     def __init__(self, channel: foxglove.Channel, *, is_latched: bool) -> None:
-        self.channel = channel
-        self._is_latched = is_latched
+        self.channel, self._is_latched = channel, is_latched
         self._last: tuple[bytes, int] | None = None
 
     @property

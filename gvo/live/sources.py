@@ -92,8 +92,7 @@ class StandardInput:
         depth_scale: float | None = None,
     ) -> None:
         config = config or Config()
-        self.info = info
-        self._stream = stream
+        self.info, self._stream = info, stream
         self._scale = config.depth.scale or depth_scale or MILLIMETRES
         self._grey_range = GreyRange(black=config.images.black, white=config.images.white)
 

@@ -178,8 +178,7 @@ class RawChain(Generic[ObservationsT]):
     """
 
     def __init__(self, frontend: Frontend[ObservationsT], config: WindowConfig) -> None:
-        self._frontend = frontend
-        self._config = config
+        self._frontend, self._config = frontend, config
         self._poses: PoseChain | None = None
         # The predecessor, and the last registered frame where that is another.
         self._nodes: list[_Node[ObservationsT]] = []

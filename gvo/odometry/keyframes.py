@@ -61,8 +61,7 @@ class Keyframes(Generic[ObservationsT]):
     """
 
     def __init__(self, camera: StereoCamera | None, config: WindowConfig) -> None:
-        self._camera = camera
-        self._config = config
+        self._camera, self._config = camera, config
         self._kept: dict[int, _Keyframe[ObservationsT]] = {}
         self._attempts: dict[int, _Attempt] = {}
         # Numbers of steps at which keyframes were asked for a link last, and in view last.
@@ -142,8 +141,7 @@ class Keyframes(Generic[ObservationsT]):
 
     def reconfigure(self, camera: StereoCamera | None, config: WindowConfig) -> None:
         """Score with another camera or configuration from now on; what is kept stays."""
-        self._camera = camera
-        self._config = config
+        self._camera, self._config = camera, config
 
     def add(self, observations: ObservationsT, *, n_steps: int = 0) -> None:
         """Keep a frame."""

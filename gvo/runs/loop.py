@@ -91,14 +91,10 @@ class RunLoop:
         items: Iterable[Frame | FaultyFrame] | None = None,
         through: Through | None = None,
     ) -> None:
-        self.source = source
-        self.config = config
-        self.base_frame = base_frame
+        self.source, self.config, self.base_frame = source, config, base_frame
         self.statistics = RunStatistics()
         self._excerpt = excerpt or Excerpt()
-        self._first_pose = first_pose
-        self._items = items
-        self._through = through
+        self._first_pose, self._items, self._through = first_pose, items, through
         self._read_ms = 0.0
         self._first_ns: int | None = None
         self._previous_ns: int | None = None

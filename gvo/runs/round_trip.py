@@ -64,9 +64,7 @@ class RoundTripFrames:
         *,
         max_bytes: int = MAX_PIECE_BYTES,
     ) -> None:
-        self._source = source
-        self._config = config
-        self._excerpt = excerpt
+        self._source, self._config, self._excerpt = source, config, excerpt
         self._max_bytes = max_bytes
         self.turn_ns: int | None = None
 
@@ -161,8 +159,7 @@ class _Windowed:
     """A recording whose images can be loaded between two stamps only: so they cost nothing."""
 
     def __init__(self, source: Source, window_ns: tuple[int, int]) -> None:
-        self._source = source
-        self._window_ns = window_ns
+        self._source, self._window_ns = source, window_ns
 
     @property
     def info(self) -> RecordingInfo:

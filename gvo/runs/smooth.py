@@ -76,8 +76,7 @@ class Smoother:
     ) -> None:
         self.window = SlidingWindow(config.window, keyframes=keyframes)
         self.statuses: Counter[Status] = Counter()
-        self._folder = folder
-        self._graph_file = graph_file
+        self._folder, self._graph_file = folder, graph_file
         self.chain = EdgeChain(config.window)
 
     @property

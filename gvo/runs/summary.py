@@ -235,9 +235,7 @@ class RunningSummary(AbstractContextManager["RunningSummary"]):
         identity: dict[str, Any],
         on_progress: Callable[[Progress], None] | None = None,
     ) -> None:
-        self._loop = loop
-        self._folder = folder
-        self._identity = identity
+        self._loop, self._folder, self._identity = loop, folder, identity
         self._on_progress = on_progress
         self._written_s: float | None = None
 

@@ -220,8 +220,7 @@ class PngFolder:
     """
 
     def __init__(self, path: Path, decisions: tuple[str, ...] = ()) -> None:
-        self.path = path
-        self.decisions = decisions
+        self.path, self.decisions = path, decisions
         self._n = 0
         with write_faults(RecordingError, path):
             path.mkdir(parents=True, exist_ok=True)

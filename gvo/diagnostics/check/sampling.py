@@ -109,8 +109,7 @@ class _Pass:
     """Goes once over the images of a recording."""
 
     def __init__(self, source: Source, sync: SyncConfig, n_samples: int) -> None:
-        self._source = source
-        self._sync = sync
+        self._source, self._sync = source, sync
         last = max(source.info.n_images - 2, 0)
         self._due = sorted({round(index) for index in np.linspace(0, last, n_samples).tolist()})
         self.stamps = (array("q"), array("q"))

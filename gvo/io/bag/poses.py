@@ -116,8 +116,7 @@ class TopicStream:
     """
 
     def __init__(self, reader: MessageReader, topic: Topic) -> None:
-        self._reader = reader
-        self._topic = topic
+        self._reader, self._topic = reader, topic
         self.name = topic.name
         self.decisions = [f"{topic.name}: {topic.type}, {topic.n_messages} messages"]
         self.n_poses = topic.n_messages

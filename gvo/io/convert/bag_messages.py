@@ -79,8 +79,7 @@ class MessageWriter(ABC):
     """
 
     def __init__(self, name: str, *, is_ros1: bool) -> None:
-        self.is_ros1 = is_ros1
-        self._name = name
+        self.is_ros1, self._name = is_ros1, name
         self._store = typestore(is_ros1=is_ros1)
 
     def make(self, type_: str, **fields: object) -> Any:  # noqa: ANN401 - made at run time

@@ -109,8 +109,7 @@ class _Writer:
     """Writes images and poses in the order of their stamps."""
 
     def __init__(self, source: Source, streams: BagStreams) -> None:
-        self._source = source
-        self._streams = streams
+        self._source, self._streams = source, streams
         self.left_out = common.LeftOut()
         truth = common.true_poses(source, self.left_out)
         self._poses: deque[tuple[int, FloatArray]] = deque()

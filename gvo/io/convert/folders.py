@@ -101,8 +101,7 @@ class KittiFolder(FolderStreams):
 
     def __init__(self, folder: Path, source: Source, left_out: LeftOut, sync: SyncConfig) -> None:
         super().__init__(source, left_out, rectify=True)
-        self._folder = folder
-        self._sync = sync
+        self._folder, self._sync = folder, sync
         self._stamps_ns: list[int] = []
         self._folders: tuple[str, str] | None = None
         folder.mkdir()

@@ -170,8 +170,7 @@ class FusedChains:
     """
 
     def __init__(self, streams: Sequence[PoseStream], sigmas: Sequence[StepSigma]) -> None:
-        self._streams = streams
-        self._sigmas = sigmas
+        self._streams, self._sigmas = streams, sigmas
         self.name = streams[0].name
         self.faults = InputFaults()
         self.n_poses = streams[0].n_poses
@@ -232,8 +231,7 @@ class _Follower:
 
     def __init__(self, samples: Iterator[PoseSample], sigma: StepSigma) -> None:
         self.n_edges = 0
-        self._samples = samples
-        self._sigma = sigma
+        self._samples, self._sigma = samples, sigma
         self._before: PoseSample | None = None
         self._after: PoseSample | None = next(samples, None)
         self._steps_ns: deque[int] = deque(maxlen=_N_STEPS)

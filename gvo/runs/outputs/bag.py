@@ -126,8 +126,7 @@ class RunMessages:
     """
 
     def __init__(self, writer: MessageWriter, frames: RunFrames) -> None:
-        self._writer = writer
-        self._frames = frames
+        self._writer, self._frames = writer, frames
         self._tracks = {name: Track() for name in ("raw", "smoothed", GLOBAL)}
         self._causal = Track()
         self._numbers = count()

@@ -68,9 +68,7 @@ class ParameterControls:
         apply: Callable[[Config], None],
         say: Callable[[str], None],
     ) -> None:
-        self.config = config
-        self._apply = apply
-        self._say = say
+        self.config, self._apply, self._say = config, apply, say
         self._refusal = ""
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None

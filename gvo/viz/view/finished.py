@@ -98,8 +98,7 @@ class FinishedPage:
     """
 
     def __init__(self, server: viser.ViserServer, record: RunRecord) -> None:
-        self._server = server
-        self._record = record
+        self._server, self._record = server, record
         self._truth = aligned_truth(record)
         held = record.trajectories
         # Of a graph optimized at once there are no causal poses, and covariances only on request.

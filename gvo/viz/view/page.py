@@ -73,8 +73,7 @@ class Page:
         *,
         truth: Trajectory | None = None,
     ) -> None:
-        self._server = server
-        self._player = player
+        self._server, self._player = server, player
         self._truth = None if truth is None else TruthPath(truth)
         # Refused loops and global poses come at the end of a run.
         self._absent = {"global", "refused loops"} | ({"truth"} if truth is None else set())

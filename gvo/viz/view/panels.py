@@ -297,8 +297,7 @@ class PauseButtons:
         *,
         before: Callable[[], None],
     ) -> None:
-        self._shown = playable
-        self._before = before
+        self._shown, self._before = playable, before
         buttons = gui.add_button_group(self._LABEL, self._NAMES)
         buttons.on_click(self._on_click)
         gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
@@ -378,8 +377,7 @@ class Painter:
     def __init__(
         self, draw: Callable[[], None], *, idle: Callable[[], None] = lambda: None
     ) -> None:
-        self._draw = draw
-        self._idle = idle
+        self._draw, self._idle = draw, idle
         self._state = threading.Condition()
         self._n_offered = self._n_drawn = 0
         self._is_closed = False

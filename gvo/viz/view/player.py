@@ -454,9 +454,7 @@ class RunPlayer:
     def __init__(
         self, stamps_ns: IntArray, show: Callable[[int], None], *, period_s: float = 0.02
     ) -> None:
-        self._stamps_ns = stamps_ns
-        self._period_s = period_s
-        self._show = show
+        self._stamps_ns, self._period_s, self._show = stamps_ns, period_s, show
         self._lock = threading.RLock()
         self.index = 0
         self.is_playing = False

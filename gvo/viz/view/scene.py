@@ -86,8 +86,7 @@ class Segments:
     def __init__(
         self, scene: viser.SceneApi, node: str, colour: str, *, thickness_px: float = 2.0
     ) -> None:
-        self._scene = scene
-        self._node = node
+        self._scene, self._node = scene, node
         self._colour = rgb(colour)
         self._thickness_px = thickness_px
         self._handle: Any = None
@@ -114,9 +113,7 @@ class Path:
     """A line in chunks; the truth is dashed. Parameters as of `Segments`."""
 
     def __init__(self, scene: viser.SceneApi, node: str, colour: str, *, is_dashed: bool) -> None:
-        self._scene = scene
-        self._node = node
-        self._colour = colour
+        self._scene, self._node, self._colour = scene, node, colour
         self._is_dashed = is_dashed
         self._corners = ChunkedArray(_PATH_CHUNK, n_shared=1)
         self._chunks: dict[int, Segments] = {}
@@ -139,8 +136,7 @@ class Cloud:
     """Points in chunks, so that those that stay are sent once."""
 
     def __init__(self, scene: viser.SceneApi, node: str) -> None:
-        self._scene = scene
-        self._node = node
+        self._scene, self._node = scene, node
         self._rows = ChunkedArray(_CLOUD_CHUNK)
         self._handles: dict[int, Any] = {}
 
@@ -177,8 +173,7 @@ class ChunkedArray:
     """
 
     def __init__(self, size: int, *, n_shared: int = 0) -> None:
-        self._size = size
-        self._n_shared = n_shared
+        self._size, self._n_shared = size, n_shared
         self._rows: NDArray[Any] | None = None
 
     def update(self, rows: NDArray[Any]) -> dict[int, NDArray[Any]]:
@@ -216,8 +211,7 @@ class Scene:
     """
 
     def __init__(self, scene: viser.SceneApi, *, up: Up = "-y") -> None:
-        self._scene = scene
-        self.up = up
+        self._scene, self.up = scene, up
         scene.set_up_direction(up)
         scene.world_axes.visible = False
         self._camera = scene.add_frame("/camera", show_axes=False)

@@ -43,8 +43,7 @@ class ViewServer(AbstractContextManager["ViewServer"]):
     """
 
     def __init__(self, server: viser.ViserServer, *, note: str = "") -> None:
-        self.viser = server
-        self.note = note
+        self.viser, self.note = server, note
         self._closing: list[Callable[[], None]] = []
         self._is_closed = threading.Event()
 

@@ -66,9 +66,7 @@ class Tracking:
         *,
         from_ns: int | None = None,
     ) -> None:
-        self._open_source = open_source
-        self._excerpt = excerpt
-        self.config = config
+        self._open_source, self._excerpt, self.config = open_source, excerpt, config
         self.is_finished = False
         source = self.source = open_source(config)
         self.camera = source.info.camera

@@ -53,9 +53,7 @@ class Window:
     """
 
     def __init__(self, file: BinaryIO, start: int, end: int) -> None:
-        self.file = file
-        self.position = start
-        self.end = end
+        self.file, self.position, self.end = file, start, end
 
     @property
     def rest(self) -> int:
