@@ -30,12 +30,7 @@ _MAX_SANE_SIGMA = 1e3
 # A kernel acts on the norm of the whitened 6-vector, typically 2.45: the usual constants, for
 # scalars, would down-weight most inliers. Huber's is the 95 % quantile of chi with six degrees of
 # freedom; the others lose as much asymptotic efficiency as it does, 0.2 %.
-_CONSTANTS: dict[Kernel, float] = {
-    "huber": 3.55,
-    "cauchy": 9.4,
-    "geman_mcclure": 13.6,
-    "dcs": 15.6,
-}
+_CONSTANTS: dict[Kernel, float] = {"huber": 3.55, "cauchy": 9.4, "geman_mcclure": 13.6, "dcs": 15.6}
 _KERNELS: dict[Kernel, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
     "huber": gtsam.noiseModel.mEstimator.Huber.Create,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,

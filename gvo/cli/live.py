@@ -14,14 +14,7 @@ import typer
 
 from gvo._text import cut
 from gvo.cli import options as opt
-from gvo.cli.terminal import (
-    ended_by_a_signal,
-    exit_code,
-    say,
-    tell,
-    told_where_it_stands,
-    warn,
-)
+from gvo.cli.terminal import ended_by_a_signal, exit_code, say, tell, told_where_it_stands, warn
 from gvo.errors import ConfigurationError
 
 if TYPE_CHECKING:

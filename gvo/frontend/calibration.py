@@ -500,12 +500,7 @@ class CalibratedCamera:
         return np.array([0.0, 0.0, self._offsets.disparity_px])
 
     def register(
-        self,
-        measured: Measurements,
-        config: Config,
-        *,
-        prior: MotionPrior | None,
-        is_step: bool,
+        self, measured: Measurements, config: Config, *, prior: MotionPrior | None, is_step: bool
     ) -> RelativePose | Failure:
         """Register what two frames measure.
 

@@ -251,10 +251,7 @@ class KltFrontend:
         return check_view(result, reference.points_cam, self.camera)
 
     def align_depth(
-        self,
-        reference: KltObservations,
-        current: KltObservations,
-        T_reference_current: FloatArray,
+        self, reference: KltObservations, current: KltObservations, T_reference_current: FloatArray
     ) -> RelativePose | Failure:
         """Estimate the motion from a start value by ICP of the depth images of an RGB-D camera."""
         first, second = reference.frame, current.frame
@@ -431,10 +428,7 @@ class KltFrontend:
         return source_uvd[indices[is_valid]], target_uvd, indices[is_valid]
 
     def _predict(
-        self,
-        T_reference_current: FloatArray,
-        reference: _Reference,
-        current: KltObservations,
+        self, T_reference_current: FloatArray, reference: _Reference, current: KltObservations
     ) -> tuple[FloatArray, IntArray]:
         """Return (u, v, disparity), as measured, of the points in view of the current camera."""
         uvd = self._calibrated.correct(reference, reference.uvd)
@@ -506,11 +500,7 @@ class KltFrontend:
         return pixels, is_found & self.camera.is_in_view(pixels)
 
     def _measure(
-        self,
-        frame: Frame,
-        pixels: FloatArray,
-        predicted: FloatArray,
-        slopes: FloatArray | None,
+        self, frame: Frame, pixels: FloatArray, predicted: FloatArray, slopes: FloatArray | None
     ) -> tuple[FloatArray, BoolArray]:
         """Measure the disparities of tracks, virtual ones of RGB-D."""
         if isinstance(frame, RgbdFrame):

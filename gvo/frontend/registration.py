@@ -144,10 +144,7 @@ def _known_consensus(
 
 
 def _refine(
-    consensus: Consensus,
-    correspondences: Correspondences,
-    camera: StereoCamera,
-    config: Config,
+    consensus: Consensus, correspondences: Correspondences, camera: StereoCamera, config: Config
 ) -> Refinement | Failure:
     registration = config.registration
     refined = (fit_covariance if registration.refine == "none" else refine_pose)(

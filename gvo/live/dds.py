@@ -211,10 +211,7 @@ class _Reading:
     """Messages taken in a thread of their own."""
 
     def __init__(
-        self,
-        participant: domain.DomainParticipant,
-        reader: sub.DataReader[Any],
-        receive: Receive,
+        self, participant: domain.DomainParticipant, reader: sub.DataReader[Any], receive: Receive
     ) -> None:
         self._reader, self._receive = reader, receive
         self._end = core.GuardCondition(participant)

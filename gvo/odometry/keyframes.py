@@ -147,8 +147,7 @@ class Keyframes(Generic[ObservationsT]):
         """Keep a frame."""
         points = observations.points_cam if isinstance(observations, HasPoints) else None
         self._kept[observations.stamp_ns] = _Keyframe(
-            observations=observations,
-            points_cam=None if points is None else _sample_points(points),
+            observations=observations, points_cam=None if points is None else _sample_points(points)
         )
         self._asked_at[observations.stamp_ns] = self._seen_at[observations.stamp_ns] = n_steps
 

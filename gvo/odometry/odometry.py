@@ -473,11 +473,7 @@ class Odometry:
         return tuple(join for join in joins if join is not None)
 
     def _select_keyframes(
-        self,
-        observations: _Observations,
-        step: RawStep,
-        scores: dict[int, float],
-        causal: Estimate,
+        self, observations: _Observations, step: RawStep, scores: dict[int, float], causal: Estimate
     ) -> None:
         """Keep and release keyframes; none while the pose is only a guess."""
         is_tied = causal.status in (Status.OK, Status.RESUMED)

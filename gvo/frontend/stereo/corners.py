@@ -130,10 +130,7 @@ def measure_corners(
     note("corners.searched", **searched, are_reliable=are_reliable)
     row_shift_px = measure_row_shift(left, right, np.flatnonzero(is_reliable))
     return CornerDisparities(
-        disparities=disparities,
-        slopes=slopes,
-        are_reliable=are_reliable,
-        row_shift_px=row_shift_px,
+        disparities=disparities, slopes=slopes, are_reliable=are_reliable, row_shift_px=row_shift_px
     )
 
 
