@@ -325,22 +325,20 @@ def _compare(
         return (), f"not compared with the ground truth: {error}"
 
 
-def _warnings(smoother: Smoother) -> list[str]:
+def _warnings(smoother: Smoother) -> Iterator[str]:
     counts = smoother.window.counts
-    warnings = []
     if counts.n_rejected:
-        warnings.append(
+        yield (
             f"{counts.n_rejected} edges or priors were refused, {counts.n_gated} of them because "
             f"others contradict them; the first: {counts.first_rejected}"
         )
     if counts.n_coasting:
-        warnings.append(
+        yield (
             f"{counts.n_coasting} of {smoother.n_poses} poses have no usable edge and continue "
             "the last velocity (frames.csv: coasting, lost)"
         )
     if counts.n_restored:
-        warnings.append(f"{counts.n_restored} updates failed and were done again with less")
-    return warnings
+        yield f"{counts.n_restored} updates failed and were done again with less"
 
 
 def _summary(name: str, smoother: Smoother, notes: SmoothingNotes) -> dict[str, Any]:
@@ -534,19 +532,17 @@ def _rows(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[tuple[object
         yield stamp_ns, frame_id, status, ends[number], n_rejected, reason
 
 
-def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> list[str]:
-    warnings = []
+def _left_out(graph: WholeGraph, optimizer: BatchOptimizer) -> Iterator[str]:
     if graph.rejected:
-        warnings.append(
+        yield (
             f"{len(graph.rejected)} edges or priors were refused; the first: {graph.rejected[0]}"
         )
     n_left_out = len(graph.frame_ids) - len(optimizer.numbers)
     if n_left_out:
-        warnings.append(
+        yield (
             f"{n_left_out} poses are not connected with the first one and were left out "
             "(frames.csv: skipped)"
         )
-    return warnings
 
 
 def smooth_lines(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -200,84 +201,75 @@ class RunStatistics:
 
     def warnings(self) -> list[str]:
         """Return what was skipped or broke off, a line each."""
-        warnings = []
+        return [*self._warnings()]
+
+    def _warnings(self) -> Iterator[str]:
         if self.broken_off:
-            warnings.append(
-                f"not all could be read, {self.n_frames} frames were: {self.broken_off}"
-            )
+            yield (f"not all could be read, {self.n_frames} frames were: {self.broken_off}")
         if self.n_faulty:
-            warnings.append(
+            yield (
                 f"{self.n_faulty} of {self.n_frames} frames are faulty and were skipped; "
                 f"the first: {self.first_fault}"
             )
         if self.n_unpaired:
-            warnings.append(
+            yield (
                 f"{self.n_unpaired} images have no partner and make no frame "
                 "(sync.max_difference_ms)"
             )
-        return [
-            *warnings,
-            *self._warnings_of_poses(),
-            *self._warnings_of_segments(),
-            *self._warnings_of_window(),
-        ]
+        yield from self._warnings_of_poses()
+        yield from self._warnings_of_segments()
+        yield from self._warnings_of_window()
 
-    def _warnings_of_poses(self) -> list[str]:
-        warnings = []
+    def _warnings_of_poses(self) -> Iterator[str]:
         n_untracked = self.n_with_pose - self.n_tracked
         if n_untracked and self.n_tracked < 2:
-            warnings.append(
+            yield (
                 "no frame could be registered against another (are left and right exchanged, is "
                 "the calibration or depth.scale wrong, are the images dark?); the first: "
                 f"{self.first_untracked}"
             )
         elif n_untracked:
-            warnings.append(
+            yield (
                 f"{n_untracked} of {self.n_with_pose} poses continue the last velocity, without a "
                 "registration (frames.csv: coasting, lost)"
             )
         if self.mount_travel_m > _MAX_MOUNT_TRAVEL_M:
-            warnings.append(
+            yield (
                 f"tf moves the camera by {self.mount_travel_m:.1f} m in the base frame: a "
                 "frame that stands in the world has no trajectory; ask for one of the robot, and "
                 "name the fixed one by --world"
             )
         if self.n_guessed:
-            warnings.append(
+            yield (
                 f"tf does not say where the camera is on the base frame at {self.n_guessed} "
                 "stamps: what it says at the nearest one was taken"
             )
-        return warnings
 
-    def _warnings_of_segments(self) -> list[str]:
-        warnings = []
+    def _warnings_of_segments(self) -> Iterator[str]:
         joined = [segment for segment in self.segments.values() if segment.joined_to is not None]
         if joined:
             text = ", ".join(f"{segment.id} to {segment.joined_to}" for segment in joined)
-            warnings.append(
+            yield (
                 f"the camera was lost; where a kept keyframe was seen again, segments were joined "
                 f"({text}): before that, raw and causal poses of a joined one are of a guessed "
                 "place (frames.csv: segment)"
             )
         if len(self.unjoined) > 1:
-            warnings.append(
+            yield (
                 f"the camera was lost; {len(self.unjoined)} segments are not joined: their "
                 "relative poses are unknown, errors over several of them mean little (frames.csv: "
                 "segment)"
             )
-        return warnings
 
-    def _warnings_of_window(self) -> list[str]:
-        warnings = []
+    def _warnings_of_window(self) -> Iterator[str]:
         if self.window.n_restored:
-            warnings.append(
+            yield (
                 f"{self.window.n_restored} updates of the window failed and were done again with "
                 "less"
             )
         # Gating is the window's daily work, and counted in the summary; anything else is a fault.
         n_faulty = self.window.n_rejected - self.window.n_gated
         if n_faulty:
-            warnings.append(
+            yield (
                 f"{n_faulty} edges were refused; the first refusal: {self.window.first_rejected}"
             )
-        return warnings

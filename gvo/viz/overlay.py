@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, TypeAlias
@@ -238,17 +238,12 @@ def _shares(scale: DepthScale) -> FloatArray:
     return np.asarray(np.log(depths / scale.near_m) / np.log(scale.far_m / scale.near_m))
 
 
-def in_groups(
-    levels: ImageArray, n_groups: int = 32
-) -> list[tuple[IntArray, tuple[int, int, int]]]:
+def in_groups(levels: ImageArray, n_groups: int = 32) -> Iterator[tuple[IntArray, Colour]]:
     """Group points of similar level: indices and colour of each group."""
     groups = levels.astype(np.int64) * n_groups // 256
-    found = []
     for group in np.unique(groups):
-        indices = np.flatnonzero(groups == group)
         blue, green, red = table()[int((group + 0.5) * 256 / n_groups)].tolist()
-        found.append((indices, (blue, green, red)))
-    return found
+        yield np.flatnonzero(groups == group), (blue, green, red)
 
 
 INLIER_COLOUR: Final = bgr(INLIERS)

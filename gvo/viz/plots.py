@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from gvo._text import visible
 from gvo.errors import ConfigurationError, TrajectoryError, write_faults
-from gvo.trajectory.alignment import AlignMode, alignment, pair
+from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.round_trip import RoundTripError
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
+from gvo.viz.measures import compare
 from gvo.viz.palette import ESTIMATES, OTHERS, REFERENCE_STYLE, Style, styles_of
 
 if TYPE_CHECKING:
@@ -87,33 +88,24 @@ def plot_trajectories(
     save_figure(figure, path)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Curve:
-    """An aligned estimate and its errors."""
-
-    label: str
-    trajectory: Trajectory
-    stamps_ns: IntArray
-    errors_m: FloatArray
-
-
 def _figure_of_errors(
     reference: Trajectory,
     estimates: Mapping[str, Trajectory],
     styles: Sequence[Style],
     align: AlignMode,
 ) -> Figure:
-    curves = [_aligned(reference, name, estimate, align) for name, estimate in estimates.items()]
-    first_ns = min(int(curve.stamps_ns[0]) for curve in curves)
-    last_ns = max(int(curve.stamps_ns[-1]) for curve in curves)
+    compared = [compare(reference, e, name=name, align=align) for name, e in estimates.items()]
+    first_ns = min(int(each.reference.stamps_ns[0]) for each in compared)
+    last_ns = max(int(each.reference.stamps_ns[-1]) for each in compared)
     shown = _around(reference, first_ns, last_ns)
     figure = _new_figure(_SIZE_INCHES)
     view, errors = figure.subplots(1, 2)
     plane = ground_plane(reference)
     _draw_path(view, shown, plane, REFERENCE_STYLE, "reference")
-    for curve, style in zip(curves, styles, strict=True):
-        _draw_path(view, curve.trajectory, plane, style, curve.label)
-        _draw_values(errors, _elapsed(curve.stamps_ns, shown), curve.errors_m, style)
+    for each, style in zip(compared, styles, strict=True):
+        label = f"{plain(each.name)} (ATE {each.ate_m:.3g} m)"
+        _draw_path(view, each.trajectory, plane, style, label)
+        _draw_values(errors, _elapsed(each.reference.stamps_ns, shown), each.errors_m, style)
     _mark_start(view, shown, plane)
     errors.set(xlabel=_stamp_label(shown), ylabel=f"position error [m], alignment: {align}")
     errors.set_ylim(bottom=0.0)
@@ -141,16 +133,6 @@ def _figure_of_positions(estimates: Mapping[str, Trajectory], styles: Sequence[S
     panels[-1].set_xlabel(_stamp_label(start))
     _place_legend(figure, view)
     return figure
-
-
-def _aligned(reference: Trajectory, name: str, estimate: Trajectory, align: AlignMode) -> _Curve:
-    ref, est = pair(reference, estimate, name=name)
-    similarity = alignment(ref, est, align)
-    moved = similarity.apply(estimate)
-    errors_m = np.linalg.norm(ref.positions - similarity.apply(est).positions, axis=1)
-    rmse = np.sqrt(np.mean(errors_m**2))
-    label = f"{plain(name)} (ATE {rmse:.3g} m)"
-    return _Curve(label=label, trajectory=moved, stamps_ns=ref.stamps_ns, errors_m=errors_m)
 
 
 def _around(reference: Trajectory, first_ns: int, last_ns: int) -> Trajectory:

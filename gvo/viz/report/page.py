@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -55,19 +55,17 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> None:
 
 def plots_html(
     plots: Sequence[Plot], lines: Sequence[Line] = (), world: World | None = None
-) -> list[str]:
-    """Return the sections of the plots; the one in space rotates if lines are given."""
-    parts = []
+) -> Iterator[str]:
+    """Yield the sections of the plots; the one in space rotates if lines are given."""
     is_open = False
     for plot in plots:
         if plot.is_half != is_open:
-            parts.append('<div class="pair">' if plot.is_half else "</div>")
+            yield '<div class="pair">' if plot.is_half else "</div>"
             is_open = plot.is_half
         if plot.slug == "space" and world is not None:
-            parts.append(_turning(plot, lines, world))
+            yield _turning(plot, lines, world)
         else:
-            parts.append(_section(plot))
-    return parts
+            yield _section(plot)
 
 
 def _section(plot: Plot) -> str:

@@ -19,6 +19,7 @@ from gvo.trajectory.evaluation import (
     chi2_bound,
 )
 from gvo.types import FloatArray
+from gvo.viz.measures import Comparison, Drift, chi2_density, drift, drift_lengths
 from gvo.viz.palette import (
     COUNTS,
     ESTIMATES,
@@ -31,7 +32,6 @@ from gvo.viz.palette import (
     styles_of,
 )
 from gvo.viz.plots import plain
-from gvo.viz.report.measures import Comparison, Drift, chi2_density, drift, drift_lengths
 from gvo.viz.report.sheets import (
     N_COLUMNS,
     WIDE,

@@ -16,7 +16,7 @@ from gvo.io.run_folder.reader import LoopTable, RunRecord, loop_words, verdict
 from gvo.trajectory.alignment import AlignMode
 from gvo.trajectory.evaluation import Evaluation, consistency, evaluation_table, motions_of_chain
 from gvo.trajectory.trajectory import Trajectory
-from gvo.viz.report.measures import Comparison, compare
+from gvo.viz.measures import Comparison, compare
 from gvo.viz.report.page import (
     configuration_html,
     facts_html,

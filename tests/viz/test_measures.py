@@ -10,7 +10,7 @@ from gvo.geometry import se3
 from gvo.trajectory.evaluation import KITTI_SEGMENTS_M, chi2_bound, evaluate
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
-from gvo.viz.report.measures import chi2_density, compare, drift, drift_lengths
+from gvo.viz.measures import chi2_density, compare, drift, drift_lengths
 from tests.trajectory.paths import circle
 
 COVARIANCE = np.diag([1e-4, 4e-4, 1e-4, 1e-2, 1e-2, 9e-2])
