@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cbook import boxplot_stats
+from matplotlib.figure import Figure
 from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
 from gvo._text import number_text, visible
@@ -17,11 +20,6 @@ from gvo.types import BoolArray, FloatArray
 from gvo.viz.palette import ESTIMATES, REFUSED
 from gvo.viz.report.page import table_html
 from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 MAX_ROWS = 30
 """Of more only the best and the worst are drawn."""
@@ -235,8 +233,6 @@ def box_of(values: FloatArray, *, is_logarithmic: bool) -> FloatArray:
     .. [1] R. McGill, J. W. Tukey, W. A. Larsen, "Variations of box plots", The American
        Statistician 32(1), 1978, doi:10.1080/00031305.1978.10479236.
     """
-    from matplotlib.cbook import boxplot_stats
-
     [box] = boxplot_stats(np.log(values) if is_logarithmic else values, whis=_WHISKER)
     five = np.array([box[name] for name in ("whislo", "q1", "med", "q3", "whishi")])
     return np.exp(five) if is_logarithmic else five

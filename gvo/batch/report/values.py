@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from gvo._text import visible
 from gvo.batch.effects import ERROR, comparable, variant_means
@@ -18,9 +20,6 @@ from gvo.batch.tasks import BatchRow
 from gvo.config import Config
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.plots import plain
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 N_LABEL = 40
 """Letters of a name in a picture."""
@@ -182,8 +181,6 @@ def logarithmic_axis(
     n_ticks : int
         At most.
     """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
     low, high = log_limits(*ends)
     axis = axes.xaxis if which == "x" else axes.yaxis
     axes.set(**{f"{which}scale": "log", f"{which}lim": (low, high)})
@@ -211,8 +208,6 @@ def log_ticks(low: float, high: float, n_most: int) -> list[float]:
     >>> log_ticks(0.8, 2.1, 6)
     [1.0, 1.5, 2.0]
     """
-    from matplotlib.ticker import MaxNLocator
-
     first, last = int(np.floor(np.log10(low))), int(np.ceil(np.log10(high)))
     for series in reversed(_SERIES):
         ticks = [float(f"{s}e{n}") for n in range(first, last + 1) for s in series]

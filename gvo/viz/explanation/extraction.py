@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Patch
 
 from gvo.config import Config
 from gvo.diagnostics.explain.values import FrameExplanation, Sorting, Step
@@ -28,9 +29,6 @@ from gvo.viz.explanation.sheet import (
     paired_height,
     show_image,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # Cells are given their numbers where they are at least so wide in the picture, pixels.
 _MIN_CELL_PX = 34.0
@@ -215,9 +213,6 @@ def draw_depth(explanation: FrameExplanation) -> Picture:
 
 
 def _draw_mask(axes: Axes, pixels: Sorting, shape: tuple[int, ...]) -> None:
-    from matplotlib.colors import to_rgb
-    from matplotlib.patches import Patch
-
     colours = ["#000000", "#D55E00", "#E69F00", KEPT]
     palette = (255 * np.array([to_rgb(colour) for colour in colours])).astype(np.uint8)
     show_image(axes, palette[pixels.codes.reshape(shape)], "which of it is valid")

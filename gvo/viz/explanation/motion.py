@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Rectangle
 from scipy.spatial.transform import Rotation
 
 from gvo._text import number_text
@@ -34,10 +36,6 @@ from gvo.viz.explanation.sheet import (
     show_image,
     split,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _N_CROPS = 6
 _N_COLUMNS = 4
@@ -136,8 +134,6 @@ def _draw_crops(panels: Sequence[Axes], explanation: FrameExplanation, matches: 
 def _draw_search(
     axes: Axes, predicted: tuple[float, float], found: FloatArray, begin: Mapping[str, Any]
 ) -> None:
-    from matplotlib.patches import Circle, Rectangle
-
     radius = begin["radius_px"]
     dashed: dict[str, Any] = {"fill": False, "ec": LIMIT, "linestyle": "--", "linewidth": 1.2}
     if begin["method"] == "tracks":

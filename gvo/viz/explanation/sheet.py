@@ -6,16 +6,18 @@ import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.font_manager import FontProperties
+from matplotlib.image import imsave
 
 from gvo.types import FloatArray, ImageArray
 from gvo.viz.palette import INLIERS, OUTLIERS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
 
 KEPT: Final = INLIERS
 REFUSED: Final = OUTLIERS
@@ -89,8 +91,6 @@ class Sheet:
     """
 
     def __init__(self, name: str, caption: str, height_inches: float) -> None:
-        from matplotlib.figure import Figure
-
         self._name, self._caption = name, caption
         lines = [line for paragraph in caption.split("\n") for line in _wrap(paragraph)]
         heights = [height_inches + _TITLE_INCHES, _LINE_INCHES * (len(lines) + 0.8)]
@@ -108,8 +108,6 @@ class Sheet:
 
     def picture(self) -> Picture:
         """Return the picture drawn."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
         canvas: Any = FigureCanvasAgg(self._figure)  # has no types
         canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())
@@ -126,8 +124,6 @@ class Sheet:
 
 
 def _encode(pixels: ImageArray) -> bytes:
-    from matplotlib.image import imsave
-
     buffer, metadata = io.BytesIO(), cast("dict[str, str]", {"Software": None})
     imsave(buffer, pixels, format="png", dpi=_DPI, metadata=metadata)
     return buffer.getvalue()
@@ -152,9 +148,6 @@ def _wrap(paragraph: str) -> list[str]:
 
 def _width_inches(line: str) -> float:
     """Return the width of a line of a caption."""
-    from matplotlib.backends.backend_agg import RendererAgg
-    from matplotlib.font_manager import FontProperties
-
     make_renderer: Any = RendererAgg  # has no types
     renderer, font = make_renderer(1, 1, _DPI), FontProperties(size=_FONT_SIZE)
     return float(renderer.get_text_width_height_descent(line, font, ismath=False)[0]) / _DPI
@@ -215,8 +208,6 @@ def draw_segments(
     **options: Any,  # noqa: ANN401 - matplotlib's
 ) -> Any:  # noqa: ANN401
     """Draw lines between pixels (n, 2) and return the collection."""
-    from matplotlib.collections import LineCollection
-
     lines = LineCollection(list(np.stack([starts, ends], axis=1)), **{"linewidths": 1.0, **options})
     axes.add_collection(lines, autolim=False)
     return lines

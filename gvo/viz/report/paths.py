@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.palette import LOOP_STYLES, REFERENCE_STYLE, Style, styles_of
 from gvo.viz.plots import HOLLOW, is_of_camera, plain
 from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _HEIGHT = 4.8
 _MIN_EXTENT_M = 1e-3

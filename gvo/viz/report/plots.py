@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from gvo.io.run_folder.reader import EdgeTable, FrameTable, TimingTable
 from gvo.trajectory.alignment import AlignMode
@@ -47,10 +48,6 @@ from gvo.viz.report.sheets import (
     plain_decades,
     time_axes,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _ROW_HEIGHT = 2.1
 _N_COLUMNS = 350

@@ -9,19 +9,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from gvo.errors import ConfigurationError, named_faults
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray, IntArray
 from gvo.viz.palette import Style
 from gvo.viz.plots import METADATA, add_legend, gaps_before, plain, save_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 TITLES = {
     "above": "From above",
@@ -114,8 +113,6 @@ class Plot:
 @contextmanager
 def settings() -> Iterator[None]:
     """Make and write figures in the style of the report within the context."""
-    from matplotlib import rc_context
-
     with rc_context(_SETTINGS):  # type: ignore[arg-type,unused-ignore]
         yield
 
@@ -171,8 +168,6 @@ def _inlined(svg: str, slug: str, title: str) -> str:
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure of a size in inches."""
-    from matplotlib.figure import Figure
-
     return Figure(figsize=(width, height))
 
 
