@@ -8,7 +8,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -57,13 +57,13 @@ class BatchProgress:
         Of the run that has just ended.
     """
 
-    n_done: int
-    n_total: int
-    n_found: int
-    n_failed: int
-    n_workers: int
-    frames_per_s: float
-    left_s: float | None
+    n_done: int = 0
+    n_total: int = 0
+    n_found: int = 0
+    n_failed: int = 0
+    n_workers: int = 0
+    frames_per_s: float = 0.0
+    left_s: float | None = None
     row: BatchRow | None = None
 
 
@@ -157,10 +157,11 @@ class Engine:
         self._done: SimpleQueue[Future[BatchRow]] = SimpleQueue()
         self._running: dict[Any, tuple[int, Task, Future[BatchRow]]] = {}
         self._frames: dict[int, tuple[int, int]] = {}
-        self._counts = _Counts()
+        self._state = BatchProgress()
+        self._start_s = 0.0
+        self._n_frames = 0  # of the runs that are done
         self._counted_s: float | None = None
         self._n_threads = 0
-        self._n_workers = 0
 
     def run(self, tasks: Sequence[Task]) -> Generator[BatchRow, None, None]:
         """Yield the row of each task as it ends.
@@ -170,7 +171,8 @@ class Engine:
         ClusterError
             When the scheduler is lost.
         """
-        self._counts = _Counts(n_total=len(tasks), start_s=time.monotonic())
+        self._state = BatchProgress(n_total=len(tasks))
+        self._start_s, self._n_frames = time.monotonic(), 0
         self._client.subscribe_topic(self._id, self._on_frames)
         suspects: list[Task] = []
         try:
@@ -191,7 +193,7 @@ class Engine:
                 self._submit(*waiting.popleft())
             row = self._next(suspects)
             if row is not None:
-                self._counts.add(row)
+                self._count(row)
                 yield row
             if self._on_progress is not None:
                 self._on_progress(self._progress(row))
@@ -215,7 +217,8 @@ class Engine:
             threads = self._client.nthreads()
         except OSError as error:
             raise ClusterError(_LOST) from error
-        self._n_workers, self._n_threads = len(threads), sum(threads.values())
+        self._n_threads = sum(threads.values())
+        self._state = replace(self._state, n_workers=len(threads))
 
     def _submit(self, number: int, task: Task) -> None:
         # Tasks whose keys share a prefix are one group, which the scheduler queues until a worker
@@ -243,48 +246,28 @@ class Engine:
         finally:
             future.release()
 
+    def _count(self, row: BatchRow) -> None:
+        state = self._state
+        self._n_frames += 0 if row.is_found else row.frames or 0
+        self._state = replace(
+            state,
+            n_done=state.n_done + 1,
+            n_found=state.n_found + row.is_found,
+            n_failed=state.n_failed + (row.status == "failed"),
+        )
+
     async def _on_frames(self, event: tuple[float, tuple[int, int, int]]) -> None:
         number, n_done, n_total = event[1]
         self._frames[number] = n_done, n_total
 
     def _progress(self, row: BatchRow | None) -> BatchProgress:
         running = [self._frames[n] for n, _, _ in self._running.values() if n in self._frames]
-        return self._counts.progress(running, self._n_workers, row)
-
-
-@dataclass(slots=True, kw_only=True)
-class _Counts:
-    """Counts of a batch."""
-
-    n_total: int = 0
-    start_s: float = 0.0
-    n_done: int = 0
-    n_found: int = 0
-    n_failed: int = 0
-    n_frames: int = 0
-
-    def add(self, row: BatchRow) -> None:
-        self.n_done += 1
-        self.n_found += row.is_found
-        self.n_failed += row.status == "failed"
-        self.n_frames += 0 if row.is_found else row.frames or 0
-
-    def progress(
-        self, running: Sequence[tuple[int, int]], n_workers: int, row: BatchRow | None
-    ) -> BatchProgress:
-        elapsed_s = max(time.monotonic() - self.start_s, 1e-9)
-        n_frames = self.n_frames + sum(n_done for n_done, _ in running)
+        state, elapsed_s = self._state, max(time.monotonic() - self._start_s, 1e-9)
+        n_frames = self._n_frames + sum(n_done for n_done, _ in running)
         shares = sum(min(n_done / max(n_total, 1), 1.0) for n_done, n_total in running)
         # Runs found finished took no time.
-        worked = self.n_done - self.n_found + shares
-        left = self.n_total - self.n_done - shares
-        return BatchProgress(
-            n_done=self.n_done,
-            n_total=self.n_total,
-            n_found=self.n_found,
-            n_failed=self.n_failed,
-            n_workers=n_workers,
-            frames_per_s=n_frames / elapsed_s,
-            left_s=elapsed_s * left / worked if worked > 0 else None,
-            row=row,
+        worked = state.n_done - state.n_found + shares
+        left_s = (
+            elapsed_s * (state.n_total - state.n_done - shares) / worked if worked > 0 else None
         )
+        return replace(state, frames_per_s=n_frames / elapsed_s, left_s=left_s, row=row)
