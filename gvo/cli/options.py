@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from gvo.cli.terminal import Command
+from gvo.cli.terminal import Command, Verbose
 
 if TYPE_CHECKING:
     from gvo.config import Config
@@ -69,14 +69,16 @@ def _ungrouped(run: Callable[..., None]) -> Callable[..., None]:
             options += inner.values()
         else:
             options.append(option)
+    kind = inspect.Parameter.KEYWORD_ONLY
+    options.append(inspect.Parameter("verbose", kind, default=None, annotation=Verbose))
 
     @wraps(run)
-    def command(**given: Any) -> None:  # noqa: ANN401 - options of any type
+    def command(verbose: None = None, **given: Any) -> None:  # noqa: ANN401 - options of any type
         for name, (make, names) in groups.items():
             given[name] = make(**{each: given.pop(each) for each in names})
         run(**given)
 
-    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in options]
+    keywords = [each.replace(kind=kind) for each in options]
     command.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in keywords}
     return command

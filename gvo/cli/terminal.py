@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
 
 import typer
 from typer.core import TyperCommand
-from typer.main import get_command
 
 from gvo._text import cut, visible
 
@@ -44,29 +43,21 @@ def _set_verbosity(value: bool | None) -> None:
         _LOGGER.handlers[0].setFormatter(logging.Formatter("%(name)s: %(message)s"))
 
 
-def _every_command(
-    verbose: Annotated[
-        bool | None,
-        typer.Option(
-            "--verbose/--quiet",
-            "-v/-q",
-            callback=_set_verbosity,
-            expose_value=False,
-            help="Log what is done; or print nothing but errors.",
-        ),
-    ] = None,
-) -> None:
-    """Hold the options of every command."""
+Verbose = Annotated[
+    bool | None,
+    typer.Option(
+        "--verbose/--quiet",
+        "-v/-q",
+        callback=_set_verbosity,
+        expose_value=False,
+        help="Log what is done; or print nothing but errors.",
+    ),
+]
+"""The option of every command."""
 
 
 class Command(TyperCommand):
-    """A command with the options that all of them have."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401 - Typer's
-        super().__init__(*args, **options)
-        shared = typer.Typer(add_completion=False)
-        shared.command()(_every_command)
-        self.params += get_command(shared).params
+    """A command that counts what image libraries print, and does not show it."""
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - Typer's
         """Run the command; a batch's images are decoded by its workers."""
