@@ -113,8 +113,7 @@ def choose_unseen(
         Steps since each was in view.
     n_released : int
     """
-    oldest_first = sorted(scores, key=lambda frame: (-n_unseen[frame], scores[frame]))
-    return oldest_first[:n_released]
+    return sorted(scores, key=lambda frame: (-n_unseen[frame], scores[frame]))[:n_released]
 
 
 def choose_released(scores: Mapping[_Id, float], config: WindowConfig, *, n_kept: int) -> list[_Id]:

@@ -294,8 +294,7 @@ class WindowGraph:
     def add_edge(self, frame_id: FrameId, edge: Edge) -> Estimate:
         """Add an edge between two poses of the window; return the new estimate of the frame."""
         pose, reference = self.poses[frame_id], self.poses[edge.reference_id]
-        measurement = Measurement.of(edge)
-        factor = self._factors.between(reference.key, pose.key, measurement)
+        factor = self._factors.between(reference.key, pose.key, Measurement.of(edge))
         estimate = self._extend(frame_id, factor)
         pose.edges.append(AcceptedEdge(edge, self._factors, reference.key))
         return estimate

@@ -177,8 +177,7 @@ class Engine:
         suspects: list[Task] = []
         try:
             yield from self._run(deque(enumerate(tasks)), suspects)
-            again = deque(enumerate(suspects, start=len(tasks)))
-            yield from self._run(again, None)
+            yield from self._run(deque(enumerate(suspects, start=len(tasks))), None)
         finally:
             self._client.cancel([future for _, _, future in self._running.values()])
             self._client.unsubscribe_topic(self._id)

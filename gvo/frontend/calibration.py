@@ -531,8 +531,7 @@ class CalibratedCamera:
         result = self._register(corrected, measured, config, hints)
         if isinstance(result, Contradiction) and hints.pop("T_start", None) is not None:
             # What was found roughly may be the other one of two motions.
-            T_predicted = None if prior is None else prior.T_predicted
-            velocities.expect(first, second, T_predicted)
+            velocities.expect(first, second, (None if prior is None else prior.T_predicted))
             corrected = self._with_sensitivities(self._corrected(measured), measured)
             result = self._register(corrected, measured, config, hints)
         if isinstance(result, Failure):

@@ -207,7 +207,6 @@ def _mean_distances(reference: Observations, current: Observations, pairs: IntAr
 
 def _pairs_within(first: FloatArray, second: FloatArray, radius: float) -> IntArray:
     """List the pairs of points within a distance, shape (k, 2), in a fixed order."""
-    tree = cKDTree(second)
-    near = cKDTree(first).sparse_distance_matrix(tree, radius, output_type="ndarray")
+    near = cKDTree(first).sparse_distance_matrix(cKDTree(second), radius, output_type="ndarray")
     pairs = np.stack([near["i"], near["j"]], axis=1).astype(np.int64)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]

@@ -164,8 +164,7 @@ class StereoCamera(PinholeCamera):
         ndarray of float64, shape (..., 3)
             Points in the `cam` frame, metres.
         """
-        depths = self.disparity_to_depth(disparities)
-        return self.unproject(keypoints) * depths[..., np.newaxis]
+        return self.unproject(keypoints) * self.disparity_to_depth(disparities)[..., np.newaxis]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

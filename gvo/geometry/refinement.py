@@ -171,8 +171,7 @@ def fit_covariance(
     """
     residuals = StereoResiduals.of(T_target_source, matches, camera, huber=config.huber)
     note("refinement.begin", residuals=residuals)
-    chosen = residuals.select(inliers)
-    return _with_covariance(T_target_source, chosen, (inliers, residuals))
+    return _with_covariance(T_target_source, residuals.select(inliers), (inliers, residuals))
 
 
 def _gauss_newton(

@@ -201,8 +201,7 @@ class StereoResiduals:
 
     def select(self, chosen: BoolArray) -> StereoResiduals:
         """Return the residuals of some matches."""
-        columns = self.columns.take(np.flatnonzero(chosen), axis=1)
-        return replace(self, columns=columns)
+        return replace(self, columns=self.columns.take(np.flatnonzero(chosen), axis=1))
 
     def sensitivities(
         self, T: FloatArray, source_points: FloatArray

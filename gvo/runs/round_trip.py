@@ -115,8 +115,7 @@ class RoundTripFrames:
         margin_ns = round(float(getattr(self._config.sync, key)) * 1e6)
         least_ns, greatest_ns = piece.stamps_ns
         source = _Windowed(self._source, (least_ns - margin_ns, greatest_ns + margin_ns))
-        items = frames(source, self._config, self._excerpt)
-        return list(islice(items, piece.first, piece.end))
+        return list(islice(frames(source, self._config, self._excerpt), piece.first, piece.end))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -279,8 +278,7 @@ def run_round_trip(
     """
     config = config or Config()
     way = RoundTripFrames(source, config, excerpt)
-    base_frame = BaseFrame(source.info.frame_id)
-    loop = RunLoop(source, config, base_frame, excerpt=excerpt, items=way)
+    loop = RunLoop(source, config, BaseFrame(source.info.frame_id), excerpt=excerpt, items=way)
     with written_alone(Path(out), force=force), RunFolder(Path(out)) as folder:
         tell = None if on_progress is None else _doubled(on_progress)
         with RunningSummary(loop, folder, {}, tell) as progress:

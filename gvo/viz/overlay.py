@@ -567,8 +567,7 @@ def _write_footer(canvas: ImageArray, layout: Layout, camera: PinholeCamera, rea
     width, height = layout.size
     middle = width // 2
     canvas[height - FOOTER_PX :, middle:] = colour_bar(DepthScale.of(camera), width - middle)
-    text = shortened(reason, middle - 2 * _MARGIN_PX)
-    write(canvas, text, (_MARGIN_PX, height - 10))
+    write(canvas, shortened(reason, middle - 2 * _MARGIN_PX), (_MARGIN_PX, height - 10))
 
 
 def _write_badge(canvas: ImageArray, status: Status) -> int:

@@ -177,13 +177,11 @@ def _draw_round_trip(errors: Mapping[str, RoundTripError]) -> Figure:
         _draw_gap(axes["end"], error, colour, name)
         _draw_errors(axes["metres"], error, error.errors_m, colour)
         _draw_errors(axes["degrees"], error, error.errors_deg, colour)
-    first = next(iter(errors.values()))
-    _finish_round_trip_view(axes["view"], first)
+    _finish_round_trip_view(axes["view"], next(iter(errors.values())))
     _finish_end(axes["end"], errors)
     _finish_errors(axes["metres"], axes["degrees"])
     handles, labels = axes["end"].get_legend_handles_labels()
-    n_rows = math.ceil(len(labels) / 2)
-    add_legend(figure, handles, labels, n_rows, loc="outside lower center")
+    add_legend(figure, handles, labels, math.ceil(len(labels) / 2), loc="outside lower center")
     return figure
 
 

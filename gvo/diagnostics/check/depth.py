@@ -207,8 +207,7 @@ def _profile(strips: _Strips, zoom: float) -> FloatArray:
     seen = np.nanmean(values[:, is_seen], axis=0).astype(np.float64)
     means = np.full(values.shape[1], np.median(seen))  # outside the image: no peak
     means[is_seen] = seen
-    padded = np.pad(means, 1, mode="edge")
-    smooth = np.convolve(padded, [0.25, 0.5, 0.25], mode="valid")
+    smooth = np.convolve(np.pad(means, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
     return np.asarray(smooth / max(float(np.median(smooth)), 1e-6))
 
 

@@ -370,5 +370,4 @@ def _check_step(samples: Sequence[Sample], matcher: FreeMatcher) -> Finding:
 def _spreads(first: StereoFrame, second: StereoFrame, matcher: FreeMatcher) -> FloatArray:
     """Return the row spread of left 1 and right 1, left 1 and right 2, left 2 and right 1."""
     pairs = ((first.left, first.right), (first.left, second.right), (second.left, first.right))
-    errors = (row_error(matcher.match(*pair)).percentile_95_px for pair in pairs)
-    return np.array(list(errors))
+    return np.array([row_error(matcher.match(*pair)).percentile_95_px for pair in pairs])

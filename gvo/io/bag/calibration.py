@@ -328,8 +328,7 @@ def find_extrinsics(
         return _of_realsense(reader, target, source)
     if frames[0] == frames[1]:
         return Failure(reason=f"both CameraInfo name the frame {frames[0]}")
-    buffer = read_tf(reader, frames=frames)
-    found = _lookup(buffer, frames, target.stamp_ns)
+    found = _lookup(read_tf(reader, frames=frames), frames, target.stamp_ns)
     if isinstance(found, Failure):
         return found
     return Extrinsics(T_target_source=found, origin=f"tf {frames[0]} -> {frames[1]}")

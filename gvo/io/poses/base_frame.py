@@ -126,8 +126,7 @@ class BaseFrame:
             if isinstance(T_base_cam, Failure):
                 raise _not_found(where, frame, camera_frame, buffer, T_base_cam.reason)
             return cls(frame, T_base_cam, T_initial=T_initial)
-        mount = _MovingMount(buffer, frame, camera_frame, where)
-        return cls(frame, mount, T_initial=T_initial)
+        return cls(frame, _MovingMount(buffer, frame, camera_frame, where), T_initial=T_initial)
 
     @property
     def is_placed(self) -> bool:

@@ -162,8 +162,7 @@ def read_bag_truth(
             buffer = read_tf(reader, frames=(spec.parent, spec.child))
         return _of_chain(buffer, spec, where)
     (topic,) = find_topics(reader, [spec.name], where, types=TRUTH_TYPES)
-    read = _of_positions if topic.type in POSITION_TYPES else _of_poses
-    return read(reader, topic)
+    return (_of_positions if topic.type in POSITION_TYPES else _of_poses)(reader, topic)
 
 
 def _reason(buffer: TfBuffer, spec: TfTruth, stamp_ns: int) -> str:

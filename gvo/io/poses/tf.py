@@ -388,8 +388,7 @@ class TfBuffer:
             R = np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
             self._static[child] = (parent, se3.make_transform(R, np.array(pose[:3])))
         else:
-            log = self._moving.setdefault(child, SampleLog())
-            log.append(stamp_ns, pose, number)
+            self._moving.setdefault(child, SampleLog()).append(stamp_ns, pose, number)
             self._n_moving += 1
 
     def _stamps_ns(self, children: Collection[str]) -> IntArray:

@@ -261,8 +261,7 @@ def polyline(canvas: Canvas, points: NDArray[np.float64], grey: float, thickness
 
 def polygon(canvas: Canvas, points: Sequence[Point], grey: float) -> None:
     """Fill a polygon."""
-    corners = np.rint(np.array(points) * N_TEXELS).astype(np.int32)
-    cv2.fillPoly(canvas, [corners], float(grey))
+    cv2.fillPoly(canvas, [np.rint(np.array(points) * N_TEXELS).astype(np.int32)], float(grey))
 
 
 def disc(canvas: Canvas, center: Point, radii: Point, grey: float) -> None:

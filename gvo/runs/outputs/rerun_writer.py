@@ -288,8 +288,7 @@ class RerunWriter:
         for name in ESTIMATES:
             stream.log(f"world/{name}/frame", make_marker(name), is_static=True)
         if text:
-            document = rr.TextDocument(text)
-            stream.log(CONFIGURATION, document, is_static=True)
+            stream.log(CONFIGURATION, rr.TextDocument(text), is_static=True)
 
     def add_frame(self, frame: Frame, result: FrameResult) -> None:
         """Log the result of a frame."""
@@ -357,8 +356,7 @@ class RerunWriter:
 
     def _set_frame(self, stamp_ns: int) -> None:
         # A smoothed pose comes late: its frame is looked up.
-        index = bisect_left(self._stamps_ns, stamp_ns)
-        self.stream.set_frame(stamp_ns, self._indices[index])
+        self.stream.set_frame(stamp_ns, self._indices[bisect_left(self._stamps_ns, stamp_ns)])
 
     def _add_poses(self, result: FrameResult) -> None:
         for name, estimate in (("raw", result.raw), ("causal", result.causal)):
@@ -389,8 +387,7 @@ class RerunWriter:
         kept = list(self._keyframes.values())
         dots = rr.Points3D(_positions(kept), colors=COLOURS[KEYFRAMES], radii=_DOT)
         self.stream.log("world/keyframes", dots)
-        ellipsoids = make_ellipsoids(KEYFRAMES, kept)
-        self.stream.log("world/keyframes/covariance", ellipsoids)
+        self.stream.log("world/keyframes/covariance", make_ellipsoids(KEYFRAMES, kept))
         here = result.causal.T_world_frame[:3, 3]
         track = self._tracks["causal"]
         ends = [(link, track.at(link.reference_ns)) for link in result.links]

@@ -295,8 +295,7 @@ def draw_subpixel(explanation: FrameExplanation) -> Picture:
     axes = sheet.panels.subplots(1, 4, width_ratios=[1, 1, 1, 2.2])
     low, high = float(left.min()), float(left.max())
     show_image(axes[0], left, "left patch", vmin=low, vmax=high)
-    title = f"right, at {step.disparity_px:.2f} px"
-    show_image(axes[1], right, title, vmin=low, vmax=high)
+    show_image(axes[1], right, f"right, at {step.disparity_px:.2f} px", vmin=low, vmax=high)
     difference, limit = right - left, 0.5 * max(high - low, 1.0)
     difference = difference - difference.mean()
     show_image(axes[2], difference, "difference (grey: none)", vmin=-limit, vmax=limit)

@@ -70,8 +70,7 @@ def lines_of(reference: Trajectory | None, estimates: Mapping[str, Trajectory]) 
     """Return the paths of trajectories in one world, the reference first."""
     lines = []
     if reference is not None:
-        points = display_path(reference)
-        lines.append(Line(name="truth", points=points, style=REFERENCE_STYLE))
+        lines.append(Line(name="truth", points=display_path(reference), style=REFERENCE_STYLE))
     for (name, estimate), style in zip(estimates.items(), styles_of(estimates), strict=True):
         lines.append(Line(name=name, points=display_path(estimate), style=style))
     return lines

@@ -123,8 +123,7 @@ def accumulate(clouds: Sequence[tuple[FloatArray, Cloud]]) -> Cloud:
     if sum(len(points) for _, (points, _) in clouds) == 0:
         return empty_cloud()
     points_cam = [points.astype(np.float64) for _, (points, _) in clouds]
-    poses = [T for T, _ in clouds]
-    points = np.concatenate(list(map(se3.transform_points, poses, points_cam)))
+    points = np.concatenate(list(map(se3.transform_points, [T for T, _ in clouds], points_cam)))
     colours = np.concatenate([colours for _, (_, colours) in clouds])
     median_m = float(np.median(np.linalg.norm(np.concatenate(points_cam), axis=1)))
     chosen = thin(points, _VOXEL_SHARE * median_m)

@@ -37,8 +37,7 @@ def serve_record(folder: Path, *, host: str, port: int, name: str = "") -> ViewS
     if len(record.frames.stamps_ns) == 0:
         raise RecordingError(f"{folder}: holds no frames: there is nothing to show; run again")
     view = open_server(host, port, title=f"gvo {name or record.name}")
-    page = FinishedPage(view.viser, record)
-    view.on_close(page.close)
+    view.on_close(FinishedPage(view.viser, record).close)
     return view
 
 

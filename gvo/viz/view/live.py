@@ -91,8 +91,7 @@ class LivePlayer:
             self._recorder.note(result)
             self.history.add(result)
             if frame.stamp_ns in result.keyframes_ns:
-                depth = self.config.depth
-                cloud = frame_cloud(frame, result.registration, self._camera, depth)
+                cloud = frame_cloud(frame, result.registration, self._camera, self.config.depth)
                 self.history.add_keyframe(index, result.causal, cloud)
         if self._window is None or not (self.is_playing and self.is_watched()):
             return

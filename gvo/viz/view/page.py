@@ -46,8 +46,7 @@ def serve_player(
 ) -> ViewServer:
     """Serve a player's page, at its first frame or where it is; see `gvo.viz.view.serve`."""
     view = open_server(host, port, title=f"gvo {name or player.source.info.name}".strip())
-    page = Page(view.viser, player, truth=truth)
-    view.on_close(page.close)
+    view.on_close(Page(view.viser, player, truth=truth).close)
     if isinstance(player, LivePlayer):
         player.is_watched = lambda: bool(view.viser.get_clients())
     elif player.frame_view is None:
@@ -121,8 +120,7 @@ class Page:
             empty = np.full((90, 160, 3), 230, dtype=np.uint8)
             self._overlay = gui.add_image(empty, format="jpeg", jpeg_quality=_JPEG_QUALITY)
             self.message = gui.add_html(panels.message_html(""))  # in sight, whatever is unfolded
-            start = {"frame": "the first is coming"}
-            self.numbers = gui.add_html(panels.numbers_html(start))
+            self.numbers = gui.add_html(panels.numbers_html({"frame": "the first is coming"}))
             hidden = {"standstill", *self._absent}
             gui.add_html(panels.legend_html(name for name in COLOURS if name not in hidden))
 

@@ -298,8 +298,7 @@ class PauseButtons:
         before: Callable[[], None],
     ) -> None:
         self._shown, self._before = playable, before
-        buttons = gui.add_button_group(self._LABEL, self._NAMES)
-        buttons.on_click(self._on_click)
+        gui.add_button_group(self._LABEL, self._NAMES).on_click(self._on_click)
         gui.add_command("play or pause", hotkey="P").on_trigger(lambda _: self.toggle())
 
     def press(self, name: str) -> None:

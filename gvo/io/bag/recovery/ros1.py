@@ -164,8 +164,7 @@ def _read_record(window: Window) -> _Record:
     size = window.number(4)
     if size > _MAX_HEADER:
         raise DamageError(f"a record with a header of {size} bytes")
-    fields = _fields_of(window.take(size))
-    return _Record(fields, window.number(4))
+    return _Record(_fields_of(window.take(size)), window.number(4))
 
 
 def _fields_of(data: bytes) -> dict[bytes, bytes]:

@@ -101,5 +101,4 @@ def box(
     corners = [center - f - r, center - f + r, center + f + r, center + f - r]
     heights = (bottom, bottom + height)
     sides = [wall(corners[k], corners[(k + 1) % 4], heights, texture) for k in range(4)]
-    lid = slab(center - f, center + f, width, bottom + height, top or texture)
-    return [*sides, lid]
+    return [*sides, slab(center - f, center + f, width, bottom + height, top or texture)]
