@@ -19,7 +19,7 @@ from gvo.batch.report.values import N_LABEL, Batch, logarithmic_axis, shown, val
 from gvo.types import BoolArray, FloatArray
 from gvo.viz.palette import ESTIMATES, REFUSED
 from gvo.viz.report.page import table_html
-from gvo.viz.report.sheets import WIDE, Plot, arrange, new_figure
+from gvo.viz.report.sheets import WIDE, Plot, arrange
 
 MAX_ROWS = 30
 """Of more only the best and the worst are drawn."""
@@ -185,7 +185,7 @@ def _capped(
 
 
 def _figure(rows: Sequence[_Row], panels: Sequence[_Panel]) -> Figure:
-    figure = new_figure(WIDE, 0.75 + 0.24 * max(len(rows), 2))
+    figure = Figure(figsize=(WIDE, 0.75 + 0.24 * max(len(rows), 2)))
     many: Any = figure.subplots(1, len(panels), sharey=True, squeeze=False)
     for axes, panel in zip(many[0], panels, strict=True):
         for y, row in enumerate(rows):
@@ -295,7 +295,7 @@ def _values_plot(effects: Mapping[str, pd.DataFrame], kind: str) -> Plot:
 def _values_figure(told: Mapping[str, pd.DataFrame], kind: str) -> Figure:
     n_columns = min(_N_COLUMNS, max(len(told), 2))
     n_rows = -(-len(told) // n_columns)
-    figure = new_figure(WIDE, 0.6 + 2.2 * n_rows)
+    figure = Figure(figsize=(WIDE, 0.6 + 2.2 * n_rows))
     panels: Any = figure.subplots(n_rows, n_columns, sharey=True, squeeze=False)
     for axes, (name, effect) in zip(panels.flat, told.items(), strict=False):
         _draw_values(axes, effect, kind, _N_LETTERS // n_columns)
@@ -404,7 +404,7 @@ def _front_words(batch: Batch, placed: pd.DataFrame) -> str:
 
 
 def _front_figure(batch: Batch, placed: pd.DataFrame, front: pd.DataFrame) -> Figure:
-    figure = new_figure(WIDE, 4.6)
+    figure = Figure(figsize=(WIDE, 4.6))
     axes = figure.subplots()
     is_candidate, is_on_front = placed["is_candidate"], placed["is_on_front"]
     _draw(axes, placed[~is_candidate], "incomplete", color=_GREY, mfc="none")

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
 from gvo.viz.palette import LOOP_STYLES, REFERENCE_STYLE, Style, styles_of
 from gvo.viz.plots import HOLLOW, is_of_camera, plain
-from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left, new_figure
+from gvo.viz.report.sheets import HALF, Plot, arrange, display_path, fit_left
 
 _HEIGHT = 4.8
 _MIN_EXTENT_M = 1e-3
@@ -150,8 +151,8 @@ def _label(axis: str, origin: float) -> str:
     return f"{axis} {'-' if origin > 0 else '+'} {abs(origin):.0f} [m]"
 
 
-def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Any:  # noqa: ANN401
-    figure = new_figure(HALF, _HEIGHT)
+def _view(views: _Views, plane: tuple[int, int], *, is_flipped: bool) -> Figure:
+    figure = Figure(figsize=(HALF, _HEIGHT))
     axes = figure.subplots()
     _draw_lines(axes, views.lines, plane)
     axes.set(xlabel=views.labels[plane[0]], ylabel=views.labels[plane[1]])
@@ -179,8 +180,8 @@ def _set_equal(axes: Axes, size: FloatArray) -> None:
     axes.set_aspect("equal", adjustable="box")
 
 
-def _space(views: _Views, world: World) -> Any:  # noqa: ANN401
-    figure = new_figure(HALF * 1.2, HALF)
+def _space(views: _Views, world: World) -> Figure:
+    figure = Figure(figsize=(HALF * 1.2, HALF))
     axes: Any = figure.add_subplot(projection="3d")
     order = (*world.ground, world.up)
     _draw_lines(axes, views.lines, order)

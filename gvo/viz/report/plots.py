@@ -44,7 +44,6 @@ from gvo.viz.report.sheets import (
     fit_left,
     kept_of_curve,
     kept_of_dots,
-    new_figure,
     plain_decades,
     time_axes,
 )
@@ -111,7 +110,7 @@ def _curves(
 ) -> Figure:
     has_rotations = any(c.errors_rad is not None for c in comparisons)
     n_rows = 2 if has_rotations else 1
-    figure = new_figure(WIDE, 0.9 + n_rows * _ROW_HEIGHT)
+    figure = Figure(figsize=(WIDE, 0.9 + n_rows * _ROW_HEIGHT))
     rows = figure.subplots(n_rows, 1, sharex=True, squeeze=False)[:, 0]
     for c, style in zip(comparisons, styles_of(c.name for c in comparisons), strict=True):
         x, seconds = abscissa(c), c.reference.stamps_ns / 1e9
@@ -168,7 +167,7 @@ def drift_plot(
 
 
 def _drift_figure(found: Sequence[tuple[str, Drift | None]]) -> Figure:
-    figure = new_figure(WIDE, 3.5)
+    figure = Figure(figsize=(WIDE, 3.5))
     panels: Any = figure.subplots(1, 2)
     styles = styles_of(name for name, _ in found)
     for (name, item), style, marker in zip(found, styles, cycle("osD^vP*X"), strict=False):
@@ -212,7 +211,7 @@ def covariance_plot(item: Consistency, first_ns: int) -> Plot:
 
 
 def _bands(item: Consistency, first_ns: int) -> Figure:
-    figure = new_figure(WIDE, 5.2)
+    figure = Figure(figsize=(WIDE, 5.2))
     panels: Any = figure.subplots(2, 3, sharex=True)
     x = elapsed(item.end_ns, first_ns)
     for panel, (index, letter, unit) in zip(panels.flat, _PANELS, strict=True):
@@ -256,7 +255,7 @@ def status_plot(frames: FrameTable) -> Plot:
 def _ribbon(frames: FrameTable) -> Figure:
     counts = Counter(frames.statuses)
     names = [*(s for s in STATUSES if counts[s]), *(s for s in counts if s not in STATUSES)]
-    figure = new_figure(WIDE, 0.85 + 0.32 * len(names))
+    figure = Figure(figsize=(WIDE, 0.85 + 0.32 * len(names)))
     axes = figure.subplots()
     x = elapsed(frames.stamps_ns, int(frames.stamps_ns[0]))
     statuses = np.array(frames.statuses)
@@ -456,7 +455,7 @@ def _scatter(axes: Any, x: FloatArray, y: FloatArray, label: str, **looks: Any) 
 
 
 def _histogram(edges: EdgeTable, bound: float) -> Figure:
-    figure = new_figure(WIDE, 3.0)
+    figure = Figure(figsize=(WIDE, 3.0))
     axes: Any = figure.subplots()
     is_free = _is_free(edges)
     for kind in LINKS:

@@ -166,14 +166,9 @@ def _inlined(svg: str, slug: str, title: str) -> str:
     return svg.replace("@", f'role="img" aria-label="{title}"', 1).strip()
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size in inches."""
-    return Figure(figsize=(width, height))
-
-
 def time_axes(height: float, ylabel: str) -> tuple[Figure, Axes]:
     """Return a figure across the page with one plot over the elapsed time."""
-    figure = new_figure(WIDE, height)
+    figure = Figure(figsize=(WIDE, height))
     axes = figure.subplots()
     axes.margins(x=0.01)
     axes.set(xlabel="elapsed [s]", ylabel=ylabel)

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from gvo.errors import ConfigurationError
 from gvo.geometry import se3
@@ -19,7 +20,7 @@ from gvo.trajectory.trajectory import Trajectory
 from gvo.viz.palette import Style
 from gvo.viz.report import write_comparison_report, write_run_report
 from gvo.viz.report.plots import covariance_plot
-from gvo.viz.report.sheets import draw_curve, kept_of_curve, new_figure, settings
+from gvo.viz.report.sheets import draw_curve, kept_of_curve, settings
 from tests.conftest import run_of
 from tests.viz.report_page import Page
 
@@ -235,7 +236,7 @@ def test_few_frames_do_and_3_for_errors(n_frames: int, missing: set[str], tmp_pa
 
 
 def test_a_lone_point_between_gaps_is_drawn() -> None:
-    axes = new_figure(4.0, 3.0).subplots()
+    axes = Figure(figsize=(4.0, 3.0)).subplots()
     y = np.array([1.0, np.nan, 2.0, np.nan, 3.0, 3.0])
     draw_curve(axes, np.arange(6.0), y, Style(color="black"))
     assert [np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]] == [[0.0, 2.0]]
