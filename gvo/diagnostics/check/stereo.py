@@ -288,7 +288,7 @@ def _check_rows(matches: FreeMatches, check: CheckConfig) -> Iterator[Finding]:
         error.median_px,
         Limits(fault_low=-check.max_row_offset_px, fault_high=check.max_row_offset_px),
         unit="px",
-        text=f"{error.median_px:+.2f} px median",
+        text=f"{error.median_px:+z.2f} px median",
         fix=fix,
     )
     yield measured(
@@ -315,7 +315,7 @@ def _check_lens(matches: FreeMatches, camera: PinholeCamera, check: CheckConfig)
         "left/right: lens distortion",
         error.k1,
         Limits(fault_low=-check.max_lens_k1, fault_high=check.max_lens_k1),
-        text=f"k1 of about {error.k1:+.2f} is left, sigma {error.sigma:.3f}",
+        text=f"k1 of about {error.k1:+z.2f} is left, sigma {error.sigma:.3f}",
         fix="the images are raw or wrongly calibrated: choose the raw topics with their D, or give "
         "a --calibration FILE with D",
     )

@@ -273,7 +273,7 @@ def check_shutter(source: Source, found: Survey, config: Config) -> Iterator[Fin
         name="rolling shutter",
         value=found_ms,
         unit="ms",
-        text=f"readout {found_ms:.1f} ms, sigma {sigma_ms:.1f}",
+        text=f"readout {found_ms:z.1f} ms, sigma {sigma_ms:.1f}",
         threshold="" if given_ms is None else f"{given_ms:g} +/- {limit_ms:.1f} ms",
         verdict="warning" if is_wrong else "info" if given_ms is None else "ok",
         fix="--set camera.readout_ms=null learns it" if is_wrong else "",
