@@ -424,8 +424,10 @@ def settle_rows(
     rates = points @ turn + velocity[3:]
     # The motion is small: its exponential to second order.
     moved = points + dt * (rates + 0.5 * dt * (rates @ turn))
-    settled = uvd.copy()
     in_front = moved[:, 2] > _MIN_DEPTH_M
+    if in_front.all():
+        return camera.project_stereo(moved)
+    settled = uvd.copy()
     settled[in_front] = camera.project_stereo(moved[in_front])
     return settled
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvo.config import DepthConfig
+from gvo.frontend.rgbd import grid_points
 from gvo.geometry import se3
 from gvo.geometry.camera import StereoCamera
 from gvo.types import DepthArray, Failure, FloatArray, RelativePose, RgbdFrame
@@ -232,6 +233,13 @@ class DepthAligner:
         self._camera = camera
         self._config = config
         self._maps: WeakKeyDictionary[RgbdFrame, DepthMap] = WeakKeyDictionary()
+        self._grids: WeakKeyDictionary[RgbdFrame, FloatArray] = WeakKeyDictionary()
+
+    def grid(self, frame: RgbdFrame) -> FloatArray:
+        """Return a grid of points of a depth image, see `grid_points`."""
+        if frame not in self._grids:
+            self._grids[frame] = grid_points(frame.depth, self._camera, self._config)
+        return self._grids[frame]
 
     def align(
         self, reference: RgbdFrame, current: RgbdFrame, T_reference_current: FloatArray

@@ -18,7 +18,7 @@ from gvo.frontend.depth_icp import DepthAligner
 from gvo.frontend.descriptor import as_stereo
 from gvo.frontend.features import describe_pixels, thin
 from gvo.frontend.registration import check_view, match_anywhere, register_anywhere
-from gvo.frontend.rgbd import check_depths, grid_points, sample_depth
+from gvo.frontend.rgbd import check_depths, sample_depth
 from gvo.frontend.stereo.corners import measure_corners
 from gvo.frontend.stereo.disparity import follow_disparities, measure_disparities
 from gvo.frontend.stereo.matching import is_in_depth_range
@@ -30,6 +30,7 @@ from gvo.frontend.tracking import (
     move_slopes,
     patch_warps,
     track_pixels,
+    track_roughly,
 )
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
@@ -68,9 +69,9 @@ _MIN_SHARE_TRACKED = 0.25
 _WIDE = 1.5
 # By how much more corners of a lost camera are looked for.
 _DENSITY = 3
-# How tracks are found: over more levels of the pyramid; near the predicted pixels; by alignment
-# alone, where the prediction is that of poses that are known.
-_Search: TypeAlias = Literal["wide", "near", "aligned"]
+# How tracks are found: over more levels of the pyramid; near the predicted pixels, or without its
+# finest level; by alignment alone, where the prediction is that of poses that are known.
+_Search: TypeAlias = Literal["wide", "near", "rough", "aligned"]
 
 
 class KltFrontend:
@@ -232,7 +233,7 @@ class KltFrontend:
         chosen = slice(None, None, len(indices) // _N_SAMPLED + 1)
         start, indices = predicted[chosen, :2], indices[chosen]
         warps, _ = self._predict_patches(T_predicted, reference, indices)
-        _, is_tracked = self._find_tracks((reference, current), indices, start, warps, "near")
+        _, is_tracked = self._find_tracks((reference, current), indices, start, warps, "rough")
         return bool(np.count_nonzero(is_tracked) >= _MIN_SHARE_TRACKED * len(indices))
 
     def _register_widely(
@@ -281,8 +282,7 @@ class KltFrontend:
         keypoints = corners.keypoints[chosen]
         depth_points = None
         if isinstance(frame, RgbdFrame):
-            points = grid_points(frame.depth, self.camera, self._config.depth)
-            depth_points = points.astype(np.float32)
+            depth_points = self._depths.grid(frame).astype(np.float32)
         place = KltPlace(
             stamp_ns=observations.stamp_ns,
             pixels=np.column_stack([keypoints, corners.disparities[chosen]]).astype(np.float32),
@@ -350,7 +350,7 @@ class KltFrontend:
         """Refuse a motion that the depth images of an RGB-D camera contradict."""
         first, second = reference.frame, current.frame
         if isinstance(first, RgbdFrame) and isinstance(second, RgbdFrame):
-            points = grid_points(first.depth, self.camera, self._config.depth)
+            points = self._depths.grid(first)
             return check_depths(result, points, second.depth, self.camera, self._config.depth)
         return result
 
@@ -468,17 +468,15 @@ class KltFrontend:
         reference, current = frames
         if warps is not None and search == "aligned":
             return self._align(frames, indices, start, warps, n_steps=_N_LINK_STEPS)
-        klt, is_wide = self._config.klt, warps is None
-        pixels, is_tracked = track_pixels(
-            (cast(KltObservations, reference).image, current.image),  # a place is only aligned
-            reference.keypoints[indices],
-            start,
-            klt,
-            n_levels=klt.n_wide_levels if is_wide else klt.n_levels,
-            is_checked=is_wide,
-        )
+        klt = self._config.klt
+        images = cast(KltObservations, reference).image, current.image  # a place is only aligned
+        pairs = images, reference.keypoints[indices], start
         if warps is None:
-            return pixels, is_tracked
+            return track_pixels(*pairs, klt, n_levels=klt.n_wide_levels, is_checked=True)
+        if search == "rough":
+            pixels, is_tracked = track_roughly(*pairs, klt)
+        else:
+            pixels, is_tracked = track_pixels(*pairs, klt, n_levels=klt.n_levels, is_checked=False)
         tracked = np.flatnonzero(is_tracked)
         chosen = indices[tracked], pixels[tracked], warps[tracked]
         aligned, is_found = self._align(frames, *chosen, n_steps=_N_ALIGN_STEPS)

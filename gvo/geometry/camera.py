@@ -70,8 +70,8 @@ class PinholeCamera:
 
     def is_in_view(self, pixels: FloatArray) -> BoolArray:
         """Tell which pixels (u, v), shape (n, 2), lie within the image; shape (n,)."""
-        limits = np.array([self.width, self.height]) - 1
-        return np.asarray(np.all((pixels >= 0) & (pixels <= limits), axis=1))
+        u, v = pixels.T
+        return np.asarray((u >= 0) & (u <= self.width - 1) & (v >= 0) & (v <= self.height - 1))
 
     def unproject(self, pixels: FloatArray) -> FloatArray:
         """Return the rays with unit depth through pixels.

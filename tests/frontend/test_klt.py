@@ -346,7 +346,8 @@ def test_of_a_keyframe_that_is_not_seen_again_only_a_sample_is_tracked(
         n_tracked.append(len(pixels))
         return track_pixels(images, pixels, *rest, **options)
 
-    monkeypatch.setattr("gvo.frontend.klt.track_pixels", spy)
+    for module in ("klt", "tracking"):
+        monkeypatch.setattr(f"gvo.frontend.{module}.track_pixels", spy)
     reference, frame = observations("rgbd")[0], frames("rgbd")[1]
     assert isinstance(frame, RgbdFrame)
     if not is_same_place:
