@@ -81,23 +81,14 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
     Raises
     ------
     ClusterError
-        When no scheduler answers.
+        When no scheduler answers, or no worker can be started.
     ConfigurationError
         When a package is missing that local workers need.
     """
     if scheduler is None:
         with (
             dask.config.set(_LOCAL_WORKERS),
-            LocalCluster(
-                n_workers=n_workers,
-                threads_per_worker=1,
-                # By default it takes port 8787, which another batch may have.
-                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                silence_logs=logging.CRITICAL,
-                preload="gvo.batch.worker",
-                # Without keys any user of this machine could run code on the workers.
-                security=_make_security(),
-            ) as cluster,
+            _start_workers(n_workers) as cluster,
             Client(cluster) as client,
         ):
             yield client
@@ -108,6 +99,22 @@ def connected(scheduler: str | None, n_workers: int | None) -> Iterator[Client]:
         raise ClusterError(f"{scheduler}: no scheduler of Dask answers: {error}") from error
     with _silenced_client(), client:
         yield client
+
+
+def _start_workers(n_workers: int | None) -> LocalCluster:
+    try:
+        return LocalCluster(
+            n_workers=n_workers,
+            threads_per_worker=1,
+            # By default it takes port 8787, which another batch may have.
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            silence_logs=logging.CRITICAL,
+            preload="gvo.batch.worker",
+            # Without keys any user of this machine could run code on the workers.
+            security=_make_security(),
+        )
+    except (OSError, RuntimeError) as error:
+        raise ClusterError(f"workers cannot be started: {error.__cause__ or error}") from error
 
 
 def _make_security() -> Security:

@@ -147,6 +147,19 @@ def test_no_scheduler_is_a_line(
     assert f"{address}: no scheduler of Dask answers" in said
 
 
+def test_workers_that_cannot_be_started_are_a_line(
+    bags: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(**_: object) -> None:
+        raise RuntimeError("Nanny failed to start.") from BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr("gvo.batch.engine.LocalCluster", failing)
+    answer = command("batch", bags, "--out", tmp_path / "out")
+    assert answer.code == 2
+    assert "gvo: error: workers cannot be started: [Errno 32] Broken pipe" in answer.err
+    assert "Traceback" not in answer.err
+
+
 def test_configurations_alone_are_misuse(command: Command, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").touch()
     said = refused(command("batch", tmp_path / "a.yaml", "--out", tmp_path / "out"))
