@@ -59,10 +59,10 @@ _TURN_PER_M = 0.0005
 # Of the edges between two parts, so many are compared with each other.
 _N_VOTERS = 32
 # An optimization begins with a loop when the graph has grown by this share, and by so many
-# keyframes, since the last one, and is taken over so many keyframes later.
-_GROWTH = 0.25
-_N_APART = 20
-_N_LATER = 5
+# keyframes, since the last one, and is taken over so many keyframes later: at least so many, and
+# this share of the graph's, as a larger one takes longer.
+_GROWTH, _N_APART = 0.25, 20
+_SHARE_LATER, _N_LATER = 0.025, 5
 # Keyframes up to which linked frames are keyframes too: some seconds of work at the end. And
 # frames from a keyframe to the next one at most: they are solved at once.
 _MAX_LINKED = 2000
@@ -452,7 +452,7 @@ class RunGraph:
             self._running = None
         if self._running is None and self._is_due and n_keyframes >= self._next:
             self._is_due = False
-            self._due = n_keyframes + _N_LATER
+            self._due = n_keyframes + max(_N_LATER, int(_SHARE_LATER * len(self)))
             self._next = n_keyframes + max(_N_APART, int(_GROWTH * len(self)))
             self._began_with = self._last
             pool = ThreadPoolExecutor(1)
