@@ -65,7 +65,7 @@ def choose_links(
     A link adds what has become uncertain since the last one: the errors of steps accumulate with
     their number, and what is seen of it grows with the overlap. The product has to be at least
     `link_gain`; the largest come first. What is measured again from the same place adds nothing.
-    One that could not be registered waits its turn like the others: else it would be asked with
+    One that could not be registered waits three quarters of its turn: else it would be asked with
     every frame, and in vain.
 
     Parameters

@@ -104,7 +104,9 @@ class Keyframes(Generic[ObservationsT]):
         """Remember from where a keyframe was registered, or could not be."""
         attempt = _Attempt(T_frame_keyframe=T_frame_keyframe, is_linked=is_linked)
         self._attempts[stamp_ns] = attempt
-        self._asked_at[stamp_ns] = n_steps
+        # A quarter of the steps before an attempt in vain counts again.
+        before = n_steps if is_linked else self._asked_at[stamp_ns]
+        self._asked_at[stamp_ns] = (before + 3 * n_steps) // 4
 
     def registrable(self, scores: Mapping[int, float]) -> dict[int, float]:
         """Return the scores without keyframes whose last registration failed."""

@@ -86,14 +86,14 @@ def test_kept_frames_are_known_by_stamp_in_their_order() -> None:
         kept[20]
 
 
-def test_steps_are_counted_from_the_last_attempt_whether_it_gave_a_link_or_not() -> None:
+def test_steps_count_from_the_last_attempt_and_a_quarter_before_one_in_vain() -> None:
     kept = keyframes()
     kept.add(observations_of(7, wall()), n_steps=3)
     assert kept.n_unasked({7: shifted(dx=0.2)}, 5) == {7: 2}
     kept.note_attempt(7, shifted(dx=0.2), 5, is_linked=True)
     assert kept.n_unasked({7: shifted(dx=0.4)}, 9) == {7: 4}
     kept.note_attempt(7, shifted(dx=0.4), 9, is_linked=False)
-    assert kept.n_unasked({7: shifted(dx=0.6)}, 10) == {7: 1}
+    assert kept.n_unasked({7: shifted(dx=0.6)}, 10) == {7: 2}
 
 
 @pytest.mark.parametrize("is_linked", [True, False])
