@@ -82,7 +82,7 @@ class LoopDetector:
     ) -> None:
         if frontend is None and camera is None:
             raise ValueError("LoopDetector needs a camera, or a front-end (frontend=...)")
-        self._frontend: Recognizer = frontend or make_frontend(camera, config)  # type: ignore[arg-type]
+        self._follow(frontend or make_frontend(camera, config))  # type: ignore[arg-type]
         self._index = PlaceIndex()
         # By their stamps; those of the index in its order; the latest ones, which it has not.
         self._visits: dict[int, _Visit] = {}
@@ -98,10 +98,14 @@ class LoopDetector:
 
     def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
         """Go on with another front-end; places of another kind are not searched any more."""
-        self._frontend = frontend
+        self._follow(frontend)
         if not keeps_places:
             self._index, self._visits = PlaceIndex(), {}
             self._indexed, self._recent, self._waiting = [], [], []
+
+    def _follow(self, frontend: Recognizer) -> None:
+        self._frontend = frontend
+        self._describe_densely = getattr(frontend, "describe_densely", frontend.describe)
 
     def __len__(self) -> int:
         """Return the number of places."""
@@ -149,7 +153,8 @@ class LoopDetector:
         is_place = is_keyframe and not self._shows_latest(T_world_frame)
         if not (is_search or is_place):
             return ()
-        place = self._describe(observations, is_dense=is_search)
+        describe = self._describe_densely if is_search else self._frontend.describe
+        place = describe(observations)
         scores = self._index.scores(place.descriptors_left)
         numbers = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
         loop = self._register(numbers, place, observations)
@@ -160,14 +165,7 @@ class LoopDetector:
 
     def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         """Add a frame of the latest world as a place, without looking."""
-        self._add(self._describe(observations, is_dense=True), T_world_frame)
-
-    def _describe(self, observations: Any, *, is_dense: bool) -> Any:  # noqa: ANN401
-        """Return a frame as a place, with more points where the front-end can."""
-        describe = self._frontend.describe
-        if is_dense:
-            describe = getattr(self._frontend, "describe_densely", describe)
-        return describe(observations)
+        self._add(self._describe_densely(observations), T_world_frame)
 
     def _add(self, place: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         number, self._n_visits = self._n_visits, self._n_visits + 1
