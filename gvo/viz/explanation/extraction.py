@@ -151,7 +151,7 @@ def _stereo_caption(explanation: FrameExplanation, stereo: Sorting) -> str:
         + "; each the best of the other (reciprocity); a minimum for the sub-pixel fit."
     )
     if explanation.config.frontend.kind == "klt":
-        rows = f"; rows of the right image are {explanation.row_offset_px:+.3f} px off"
+        rows = f"; rows of the right image are {explanation.row_offset_px:+z.3f} px off"
         tests = (
             "Each corner is searched along its row in small images (correlation), then by "
             "Gauss-Newton steps in the full ones; left and right must look alike there, and the "
@@ -162,7 +162,7 @@ def _stereo_caption(explanation: FrameExplanation, stereo: Sorting) -> str:
         f"Of {len(stereo)} keypoints: {count_text(stereo.counts())}. {tests} Matches lie on equal "
         f"rows and to the left in the right image, by a disparity between {low:.1f} and "
         f"{high:.1f} px, the depth limits {config.max_depth_m:g} and {config.min_depth_m:g} m."
-        f"\nLearnt of the rig before this frame: {explanation.offset_px:+.3f} px are subtracted "
+        f"\nLearnt of the rig before this frame: {explanation.offset_px:+z.3f} px are subtracted "
         f"from all disparities{rows}."
     )
 
@@ -315,7 +315,7 @@ def _subpixel_caption(explanation: FrameExplanation, step: Step) -> str:
         f"the left image: patches of {size} x {size} px and their difference, and the sum of "
         f"squared differences, means removed, over the disparity. {_subpixel_method(step)} It ends "
         f"at {disparity_px:.3f} px, "
-        + (f"less the learnt {offset_px:+.3f} px " if offset_px else "")
+        + (f"less the learnt {offset_px:+z.3f} px " if offset_px else "")
         + f"a depth of {depth:.2f} m; the nearest whole pixel would be {whole} px, "
         f"{whole_depth:.2f} m."
     )
@@ -333,8 +333,8 @@ def _subpixel_method(step: Step) -> str:
     steps = np.diff(iterates_px)
     return (
         f"The coarse search gives {iterates_px[0]:.2f} px; {len(steps)} Gauss-Newton steps "
-        f"follow ({', '.join(f'{each:+.3f}' for each in steps)} px). They use the gradients of the "
-        "left patch: where left and right differ a little, they end beside the minimum of the "
+        f"follow ({', '.join(f'{each:+z.3f}' for each in steps)} px). They use the gradients of "
+        "the left patch: where left and right differ a little, they end beside the minimum of the "
         "curve. Between whole pixels the right image is interpolated, which smooths its noise: "
         "hence the kinks."
     )

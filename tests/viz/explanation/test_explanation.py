@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gvo._text import html_text
 from gvo.config import Config, RegistrationConfig, load_configuration
 from gvo.diagnostics.explain import FrameExplanation, explain_frame
 from gvo.errors import ConfigurationError
@@ -20,7 +21,7 @@ from gvo.io.recording import Sensor
 from gvo.io.synthetic.recording import SyntheticRecording
 from gvo.viz.explanation import write_explanation
 from gvo.viz.explanation.motion import draw_residuals, position_covariance
-from gvo.viz.explanation.sheet import Sheet
+from gvo.viz.explanation.sheet import TITLES, Sheet
 from tests.viz.browser import Browser
 
 STEREO = [
@@ -80,6 +81,10 @@ def test_each_step_has_its_picture_in_order(
     ]
     for image, panels in zip(images, shown, strict=True):
         assert_without_words(panels, image)
+    headings = re.findall(r"<h2>\d\. (.*?)</h2>", page)
+    assert headings == [html_text(TITLES[name]) for name in names]
+    sections = page.split("<section>")[1:]
+    assert [each.count("<p>") for each in sections] == [1] * len(names)  # the caption
     assert not re.search(r"""(?:src|href)=["'](?!data:)""", page)
     numbers = json.loads(written[-2].read_text())
     assert numbers["matches"]["kept"] == numbers["relative_pose"]["n_matches"]
