@@ -30,7 +30,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from itertools import count
+from itertools import chain, count
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -98,7 +98,7 @@ Also of a merged keyframe, in the one that it was merged into.
 """
 
 
-class _Table:
+class Table:
     """Rows by stamps; all but the latest ones are in a temporary file, gone with the object.
 
     Where that cannot be written they stay in memory.
@@ -123,6 +123,7 @@ class _Table:
         return bisect_left(self.stamps_ns, stamp_ns)
 
     def append(self, stamp_ns: int, *values: object) -> None:
+        """Add a row by its values."""
         rest = self._rest[1]
         rest.append(np.array(values, dtype=self._dtype))
         self.stamps_ns.append(stamp_ns)
@@ -136,6 +137,14 @@ class _Table:
         size = self._dtype.itemsize
         row = os.pread(self._file.fileno(), size, index * size)
         return np.frombuffer(row, dtype=self._dtype).reshape(())
+
+    def append_fields(self, stamp_ns: int, value: object) -> None:
+        """Add a row by the fields of an object."""
+        self.append(stamp_ns, *(getattr(value, name) for name in self._dtype.names or ()))
+
+    def fields(self, index: int) -> dict[str, Any]:
+        """Return a row by the names of its fields."""
+        return dict(zip(self._dtype.names or (), self[index].item(), strict=True))
 
     def _write(self, rest: list[NDArray[Any]]) -> None:
         try:
@@ -198,10 +207,11 @@ class _Way(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """The poses of keyframes, and the loops as judged with them."""
+    """The poses of keyframes, their loops that count, and why others between two frames do not."""
 
     poses: dict[int, FloatArray]
-    loops: tuple[Loop, ...]
+    loops: list[Loop]
+    reasons: dict[tuple[object, int], str]
     error_before: float
     optimizer: BatchOptimizer
     firsts: dict[int, int]
@@ -220,7 +230,7 @@ class RunGraph:
     Attributes
     ----------
     loops : sequence of Loop
-        Those with a reason against them do not count.
+        Those with a reason against them do not count. A shallow copy must stay as it is.
     T_map_world : ndarray of float64, shape (4, 4)
         The correction of the newest poses by loops, as last optimized while the run goes.
     """
@@ -236,7 +246,7 @@ class RunGraph:
         self._numbers = count()
         # All keyframes, merged ones too; where these are, and their rows there; the frames before
         # each keyframe, and in a copy those after the last one.
-        self._known, self._merged, self._frames = map(_Table, (_KEYFRAME, _FRAME, _FRAME))
+        self._known, self._merged, self._frames = map(Table, (_KEYFRAME, _FRAME, _FRAME))
         self._merged_at = array("q")
         self._open: list[tuple[Any, ...]] = []
         self._way = _Way(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)), 0)
@@ -470,7 +480,7 @@ class RunGraph:
 
     def _thin(self, loops: Sequence[Loop], places: Container[int]) -> None:
         """Merge keyframes that came back to a place, and those after them without a place."""
-        counting = {loop.stamp_ns: loop for loop in loops if not loop.reason}
+        counting = {loop.stamp_ns: loop for loop in loops}
         references = {loop.reference_ns for loop in counting.values()}
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
         references |= {*self._guesses, *self._guesses.values()}
@@ -520,7 +530,7 @@ class RunGraph:
         graph = copy.copy(self)
         graph._keyframes, graph._guesses = dict(self._keyframes), dict(self._guesses)
         graph._edges, graph._touching = dict(self._edges), {}
-        graph.loops = tuple(self.loops)
+        graph.loops = copy.copy(self.loops)
         if graph._arrivals:
             graph._open, _ = graph._condense()
         return graph
@@ -550,7 +560,11 @@ class RunGraph:
         if not self._keyframes:
             raise ValueError("the graph of the run is empty: no frame has come (loops.enabled)")
         graph = self._copied()
-        poses, loops, error_before, optimizer, firsts = graph._solve(on_step)
+        poses, _, reasons, error_before, optimizer, firsts = graph._solve(on_step)
+        loops = tuple(
+            replace(each, reason=each.reason or reasons.get(_ends(each), ""))
+            for each in graph.loops
+        )
         found = np.broadcast_to(np.eye(6), (len(graph), 6, 6))
         if covariances:
             found = graph._variance_factor(loops) * optimizer.covariances()
@@ -573,47 +587,36 @@ class RunGraph:
         )
 
     def _solve(self, on_step: Callable[[str], None] = lambda _: None) -> _Solution:
-        loops, refused = self._judged(on_step)
+        loops, reasons, refused = self._judged(on_step)
         graph = self._whole(loops, refused=refused)
         firsts = self._bridge(graph)
         optimizer = BatchOptimizer(graph, on_step=on_step)
         error_before = optimizer.starts["odometry"]
         optimizer.run()
         poses = dict(zip(self._keyframes, optimizer.poses(), strict=True))
-        return _Solution(poses, loops, error_before, optimizer, firsts)
+        return _Solution(poses, loops, reasons, error_before, optimizer, firsts)
 
-    def _judged(self, on_step: Callable[[str], None]) -> tuple[tuple[Loop, ...], _Pairs]:
-        """Return the loops, those with a reason that contradict odometry and the other ones.
+    def _judged(
+        self, on_step: Callable[[str], None]
+    ) -> tuple[list[Loop], dict[tuple[object, int], str], _Pairs]:
+        """Return the loops of keyframes that count, and why those between others do not.
 
         And the pairs of keyframes whose loops, or edges between parts, are refused.
         """
-        loops = self._possible()
-        confirmed = [loop for loop in loops if not loop.reason]
-        if not (confirmed or self._guesses):
-            return loops, frozenset()
-        refused = self._outvoted(confirmed)
-        possible = [each for each in confirmed if (each.reference_ns, each.stamp_ns) not in refused]
-        drift = _DRIFT * np.sqrt(len(self._edges))
-        graph = self._whole(possible, drift=drift, refused=refused)
-        optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
-        optimizer.run(only_refuse=True)
-        keyframes = list(self._keyframes)
-        refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
-        # A keyframe that was merged elsewhere had its loop refused.
-        refused |= {
-            (loop.reference_ns, loop.stamp_ns)
-            for loop in confirmed
-            if loop.stamp_ns not in self._keyframes
-            and self._home(loop.stamp_ns).reference_id != loop.reference_ns
-        }
-        reason = "contradicts odometry or the other loops"
-        loops = tuple(
-            replace(loop, reason=loop.reason or reason)
-            if (loop.reference_ns, loop.stamp_ns) in refused
-            else loop
-            for loop in loops
-        )
-        return loops, refused
+        loops, far, refused = self._possible()
+        if loops or self._guesses:
+            confirmed = (loop for loop in self.loops if not loop.reason)
+            refused |= self._outvoted(loop for loop in confirmed if _ends(loop) not in far)
+            possible = [loop for loop in loops if _ends(loop) not in refused]
+            drift = _DRIFT * np.sqrt(len(self._edges))
+            graph = self._whole(possible, drift=drift, refused=refused)
+            optimizer = BatchOptimizer(graph, "gnc", on_step=on_step)
+            optimizer.run(only_refuse=True)
+            keyframes = list(self._keyframes)
+            refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
+        reasons = dict.fromkeys(refused, "contradicts odometry or the other loops")
+        reasons |= dict.fromkeys(far, "farther from odometry than that drifts")
+        return [loop for loop in loops if _ends(loop) not in refused], reasons, refused
 
     def _bridge(self, graph: WholeGraph) -> dict[int, int]:
         """Add the guesses that alone connect keyframes: elsewhere they tell nothing.
@@ -670,39 +673,42 @@ class RunGraph:
                     is_trusted=is_trusted,
                 )
         for loop in loops:
-            is_there = loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes
-            if is_there and not loop.reason:
+            if loop.stamp_ns in self._keyframes and loop.reference_ns in self._keyframes:
                 graph.add_edges(loop.stamp_ns, [loop.edge])
         return graph
 
-    def _possible(self) -> tuple[Loop, ...]:
-        """Return the loops, those with a reason that odometry alone does not allow.
+    def _possible(self) -> tuple[list[Loop], set[tuple[object, int]], set[tuple[object, int]]]:
+        """Return the loops of keyframes that odometry alone allows.
 
-        However many agree with each other: those between equal rooms do.
+        And the ends of those that it does not, however many agree with each other, as those between
+        equal rooms do; and of those whose keyframe was merged elsewhere, which were refused.
         """
-        reason = "farther from odometry than that drifts"
-        return tuple(
-            replace(loop, reason=reason)
-            if not loop.reason
-            and loop.stamp_ns in self._keyframes
-            and self._chi2(loop, drifts=True) > INLIER_CHI2
-            else loop
-            for loop in self.loops
-        )
+        loops, far, elsewhere = [], set(), set()
+        for loop in self.loops:
+            if loop.reason:
+                continue
+            if loop.stamp_ns not in self._keyframes:
+                if self._home(loop.stamp_ns).reference_id != loop.reference_ns:
+                    elsewhere.add(_ends(loop))
+            elif self._chi2(loop, drifts=True) > INLIER_CHI2:
+                far.add(_ends(loop))
+            else:
+                loops.append(loop)
+        return loops, far, elsewhere
 
     def _chi2(self, loop: Loop, *, drifts: bool) -> float:
         """Return by how much a loop contradicts the way between its ends."""
         way, before = self._way_to(loop.stamp_ns), self._way_to(loop.reference_ns)
         return way.chi2(loop, before, drifts=drifts)
 
-    def _outvoted(self, loops: Sequence[Loop]) -> set[tuple[object, int]]:
+    def _outvoted(self, loops: Iterable[Loop]) -> set[tuple[object, int]]:
         """Return which loops and edges between two parts contradict the one with most agreement.
 
         Odometry is trusted but for its drift over the whole way, however many of them agree.
         """
         across: dict[tuple[int, int], list[tuple[int, Edge]]] = {}
-        looped = [(loop.stamp_ns, loop.edge) for loop in loops]
-        for frame_ns, edge in [*looped, *self._edges.values()]:
+        looped = ((loop.stamp_ns, loop.edge) for loop in loops)
+        for frame_ns, edge in chain(looped, self._edges.values()):
             reference_ns = int(edge.reference_id)  # type: ignore[call-overload]
             parts = self._part(reference_ns), self._part(frame_ns)
             if parts[0] != parts[1] and self._guesses.get(frame_ns) != reference_ns:
@@ -858,6 +864,10 @@ def _join(first: Edge, second: Edge) -> Edge:
         T_reference_frame=first.T_reference_frame @ T,
         covariance=se3.compose_covariance(first.covariance, T, second.covariance),
     )
+
+
+def _ends(loop: Loop) -> tuple[object, int]:
+    return loop.reference_ns, loop.stamp_ns
 
 
 def _inverse(frame_id: FrameId, edge: Edge) -> Edge:

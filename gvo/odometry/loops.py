@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from gvo.frontend.features import PlaceIndex
 from gvo.frontend.protocol import Recognizer
 from gvo.geometry import se3
 from gvo.geometry.camera import PinholeCamera, StereoCamera
+from gvo.odometry.graph import Table
 from gvo.odometry.keyframes import view_overlap
 from gvo.types import FloatArray, Frame, Loop, RelativePose, SegmentJoin, Status
 
@@ -37,6 +39,16 @@ _DRIFT = 0.02
 # with growing pauses of at most so many frames.
 _N_EAGER = 15
 _MAX_PAUSE = 30
+_UNCONFIRMED = "no other loop confirms it"
+
+_LOOP: Final = np.dtype(
+    [
+        *(("stamp_ns", "i8"), ("reference_ns", "i8"), ("T_reference_frame", "f8", (4, 4))),
+        *(("covariance", "f8", (6, 6)), ("n_matches", "i8"), ("n_inliers", "i8")),
+        ("reason", f"U{len(_UNCONFIRMED)}"),
+    ]
+)
+"""A loop that nothing confirms any more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,6 +59,35 @@ class _Visit:
     place: Any
     T_world_frame: FloatArray
     world: int
+
+
+class _Loops(Sequence[Loop]):
+    """Loops as they came: rows of a table, and the latest ones, which others may yet confirm.
+
+    A shallow copy stays as it is.
+    """
+
+    def __init__(self) -> None:
+        self._table, self._n_rows = Table(_LOOP), 0
+        self.latest: tuple[Loop, ...] = ()
+
+    def __len__(self) -> int:
+        return self._n_rows + len(self.latest)
+
+    def __getitem__(self, index: Any) -> Any:  # noqa: ANN401 - a loop, or some where it is a slice
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        index = range(len(self))[index]
+        if index >= self._n_rows:
+            return self.latest[index - self._n_rows]
+        return Loop(**self._table.fields(index))
+
+    def settle(self, before_ns: float = math.inf) -> None:
+        """Add those before a stamp to the table."""
+        settled = [loop for loop in self.latest if loop.stamp_ns < before_ns]
+        for loop in settled:
+            self._table.append_fields(loop.stamp_ns, loop)
+        self._n_rows, self.latest = self._n_rows + len(settled), self.latest[len(settled) :]
 
 
 class LoopDetector:
@@ -69,7 +110,7 @@ class LoopDetector:
 
     Attributes
     ----------
-    loops : list of Loop
+    loops : sequence of Loop
         All that were registered; those without a reason against them are confirmed.
     """
 
@@ -88,20 +129,20 @@ class LoopDetector:
         self._visits: dict[int, _Visit] = {}
         self._indexed: list[_Visit] = []
         self._recent: list[_Visit] = []
-        self._waiting: list[tuple[int, Loop]] = []
         self._n_visits = 0
         self._world = 0
         self._connected: set[int] = set()
         self._n_searches: dict[int, int] = {}
         self._n_paused = 0
-        self.loops: list[Loop] = []
+        self.loops = _Loops()
 
     def reconfigure(self, frontend: Recognizer, *, keeps_places: bool) -> None:
         """Go on with another front-end; places of another kind are not searched any more."""
         self._follow(frontend)
         if not keeps_places:
             self._index, self._visits = PlaceIndex(), {}
-            self._indexed, self._recent, self._waiting = [], [], []
+            self._indexed, self._recent = [], []
+            self.loops.settle()
 
     def _follow(self, frontend: Recognizer) -> None:
         self._frontend = frontend
@@ -177,7 +218,7 @@ class LoopDetector:
 
     def _leave_world(self) -> None:
         """Add all places to the index: odometry does not know where they are any more."""
-        self._waiting = []
+        self.loops.settle()
         while self._recent:
             self._keep_oldest_recent()
 
@@ -244,16 +285,13 @@ class LoopDetector:
 
     def _confirm(self, loop: Loop) -> list[Loop]:
         """Return the loops that are confirmed with a new one, this one among them."""
-        newest = self._recent[-1].number
-        self._waiting = [each for each in self._waiting if newest - each[0] <= _N_WAITING]
-        agreeing = [k for k, (_, other) in enumerate(self._waiting) if self._agree(other, loop)]
-        confirmed = []
+        self.loops.settle(self._recent[-1 - _N_WAITING :][0].place.stamp_ns)
+        latest, confirmed = list(self.loops.latest), []
+        agreeing = [k for k, other in enumerate(latest) if self._agree(other, loop)]
         for k in agreeing:
-            number, other = self._waiting[k]
-            if other.reason:
-                self._waiting[k] = number, replace(other, reason="")
-                confirmed.append(self._waiting[k][1])
-                self.loops[self.loops.index(other)] = self._waiting[k][1]
+            if latest[k].reason:
+                latest[k] = replace(latest[k], reason="")
+                confirmed.append(latest[k])
         if agreeing:
             confirmed.append(loop := replace(loop, reason=""))
         world, reference_world = (
@@ -263,8 +301,7 @@ class LoopDetector:
             self._connected.add(world)
         elif world in self._n_searches:  # the next frames may confirm it
             self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
-        self._waiting.append((newest, loop))
-        self.loops.append(loop)
+        self.loops.latest = *latest, loop
         return confirmed
 
     def _agree(self, first: Loop, second: Loop) -> bool:
@@ -353,5 +390,5 @@ def _loop(reference_ns: int, stamp_ns: int, result: RelativePose) -> Loop:
         covariance=result.covariance,
         n_matches=result.n_matches,
         n_inliers=result.n_inliers,
-        reason="no other loop confirms it",
+        reason=_UNCONFIRMED,
     )

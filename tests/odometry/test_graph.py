@@ -1,6 +1,8 @@
 """The graph of a run, by its own truth: simulated drives whose poses are known."""
 
+import copy
 import errno
+import gc
 import logging
 import tracemalloc
 
@@ -10,18 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gvo.odometry.graph as graph_module
+import gvo.odometry.loops as loops_module
 from gvo.backend.batch import BatchOptimizer, WholeGraph
 from gvo.backend.factors import ORIGIN
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
-from gvo.types import Edge, FloatArray, Optimum, PosePrior, Status
+from gvo.odometry.loops import LoopDetector
+from gvo.types import Edge, FloatArray, Loop, Optimum, PosePrior, Status
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
     Bias,
     Drive,
+    MadeUpPlaces,
     block,
     go_round,
     measured,
@@ -310,6 +315,39 @@ def test_what_is_written_comes_back_as_it_was(
         np.testing.assert_array_equal(first.covariance, second.covariance)
         assert first.stamp_ns == second.stamp_ns
     assert ("stays in memory" in caplog.text) == is_full
+
+
+def contents(loop: Loop) -> tuple[object, ...]:
+    numbers = loop.T_reference_frame.tolist(), loop.covariance.tolist()
+    return loop.stamp_ns, loop.reference_ns, *numbers, loop.n_matches, loop.n_inliers, loop.reason
+
+
+@pytest.mark.parametrize("agreement", [0.0, 5.0])
+def test_loops_take_no_memory_and_stay_as_they_were_confirmed(
+    monkeypatch: pytest.MonkeyPatch, agreement: float
+) -> None:
+    monkeypatch.setattr(graph_module, "_N_IN_MEMORY", 7)
+    monkeypatch.setattr(loops_module, "_AGREEMENT", agreement)
+    truth = block(4, n_per_lap=N_LAP)
+    detector = LoopDetector(frontend=MadeUpPlaces(truth, N_LAP))
+    n_before = count_loops()
+    confirmed: dict[int, tuple[object, ...]] = {}
+    copies = []
+    for j in range(0, len(truth), 5):
+        confirmed |= {loop.stamp_ns: contents(loop) for loop in detector.look(j, truth[j])}
+        copies.append((copy.copy(detector.loops), [*map(contents, detector.loops)]))
+    assert all([*map(contents, loops)] == expected for loops, expected in copies)
+    loops = {loop.stamp_ns: contents(loop) for loop in detector.loops}
+    assert len(loops) > 50
+    assert {ns: each for ns, each in loops.items() if not each[-1]} == confirmed
+    assert bool(confirmed) == bool(agreement)
+    assert [*map(contents, detector.loops[-9:-1])] == [*loops.values()][-9:-1]
+    copies.clear()
+    assert count_loops() - n_before < 10
+
+
+def count_loops() -> int:
+    return sum(isinstance(each, Loop) for each in gc.get_objects())
 
 
 def test_a_graph_that_begins_later_leaves_out_what_was_before() -> None:
