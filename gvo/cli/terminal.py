@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn, TextIO
@@ -60,8 +60,8 @@ class Command(TyperCommand):
     """A command that counts what image libraries print, and does not show it."""
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - Typer's
-        """Run the command; a batch's images are decoded by its workers."""
-        with nullcontext() if self.name == "batch" else chatter_counted():
+        """Run the command; the workers of a batch have its standard error, too."""
+        with chatter_counted():
             return super().invoke(ctx)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import pandas as pd
 import pytest
 from distributed import Client
@@ -17,7 +18,7 @@ from gvo.batch import BatchOptions, BatchProgress
 from gvo.batch.running import check_plots
 from gvo.cli.batch import _clock, _words
 from gvo.io.run_folder.reader import read_run
-from tests.batch.conftest import copy_of, is_complete, is_under_way, state_of, wait_until
+from tests.batch.conftest import copy_of, is_complete, is_under_way, state_of, wait_until, walk
 from tests.conftest import GVO, Answer, Command, assert_same_files, is_one_line, python, refused
 
 Batch = Callable[..., Answer]
@@ -200,6 +201,20 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
     assert all(line.startswith("[") for line in answer.stderr.splitlines()), answer.stderr
     bag = bags / "walk0.mcap"
     assert_same_files(tmp_path / bag.stem, run_alone(bag))
+
+
+@pytest.mark.acceptance
+def test_what_image_libraries_write_in_the_workers_is_counted(tmp_path: Path) -> None:
+    gvo.convert(walk(0), tmp_path / "walk", layout="kitti")
+    for path in sorted(tmp_path.glob("walk/image_0/*.png"))[2:4]:
+        encoded = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+        path.write_bytes(encoded[:-30] + b"\xff\xd9" + encoded[-30:])  # libjpeg tells of both
+    options = ["--out", tmp_path / "out", "--workers", "1", "--no-report"]
+    answer = python(*GVO[1:], "batch", tmp_path / "walk", *options)
+    assert answer.returncode == 0, answer.stderr
+    row, told = answer.stderr.splitlines()
+    assert row == "[1/1] walk: complete"
+    assert told.startswith("gvo: warning: 2 lines of image libraries, the first: Corrupt JPEG data")
 
 
 @pytest.mark.acceptance
