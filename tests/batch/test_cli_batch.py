@@ -207,7 +207,9 @@ def test_on_this_machine_it_needs_no_cluster_and_is_the_same(
 def test_what_image_libraries_write_in_the_workers_is_counted(tmp_path: Path) -> None:
     gvo.convert(walk(0), tmp_path / "walk", layout="kitti")
     for path in sorted(tmp_path.glob("walk/image_0/*.png"))[2:4]:
-        encoded = cv2.imencode(".jpg", cv2.imread(str(path)))[1].tobytes()
+        image = cv2.imread(str(path))
+        assert image is not None
+        encoded = cv2.imencode(".jpg", image)[1].tobytes()
         path.write_bytes(encoded[:-30] + b"\xff\xd9" + encoded[-30:])  # libjpeg tells of both
     options = ["--out", tmp_path / "out", "--workers", "1", "--no-report"]
     answer = python(*GVO[1:], "batch", tmp_path / "walk", *options)
