@@ -45,22 +45,21 @@ class PoseGraph:
     is_whole : bool
         Nothing will be marginalized, and the graph may grow large.
     is_hardened : bool
-        Of a whole graph: slower, but works with sigmas many orders of magnitude apart.
+        Slower, but works with sigmas many orders of magnitude apart.
     """
 
     def __init__(self, *, is_whole: bool = False, is_hardened: bool = False) -> None:
         parameters = gtsam.ISAM2Params()
-        self._is_whole, self._is_hardened = is_whole, is_hardened
+        self._is_whole, self.is_hardened = is_whole, is_hardened
+        # QR takes three times as long. Cholesky calls the system indeterminate once the drift's
+        # variance is 4096^2 times that of an edge.
+        parameters.setFactorization("QR" if is_hardened else "CHOLESKY")
         if is_whole:
             # GTSAM's defaults, which trade accuracy for time: the batch optimization at the end
-            # makes up for it. Nothing is marginalized, so Cholesky works for all but odd inputs.
+            # makes up for it.
             parameters.setRelinearizeThreshold(0.1)
             parameters.relinearizeSkip = 10
-            parameters.setFactorization("QR" if is_hardened else "CHOLESKY")
         else:
-            # Cholesky calls the system indeterminate once the drift's variance is 4096^2 times
-            # that of an edge; QR does not.
-            parameters.setFactorization("QR")
             parameters.setRelinearizeThreshold(0.001)
             parameters.relinearizeSkip = 1
             parameters.findUnusedFactorSlots = True
@@ -73,18 +72,13 @@ class PoseGraph:
         self._done: list[_Step] = []
         self._is_guarded = False
 
-    @property
-    def can_be_hardened(self) -> bool:
-        """Tell whether a graph for worse conditioned factors is left to try."""
-        return self._is_whole and not self._is_hardened
-
     def hardened(self) -> PoseGraph:
-        """Return a whole graph of the same factors that takes worse conditioned ones too."""
+        """Return a graph of the same factors that takes worse conditioned ones too."""
         return self._remade(self.values(), is_hardened=True)
 
     def moved(self, values: gtsam.Values) -> PoseGraph:
         """Return a graph of the same factors, linearized at other values."""
-        return self._remade(values, is_hardened=self._is_hardened)
+        return self._remade(values, is_hardened=self.is_hardened)
 
     def _remade(self, values: gtsam.Values, *, is_hardened: bool) -> PoseGraph:
         graph = PoseGraph(is_whole=self._is_whole, is_hardened=is_hardened)

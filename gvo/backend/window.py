@@ -15,7 +15,6 @@ from gvo.backend.factors import ORIGIN, find_faults, prior_fault
 from gvo.backend.gating import Admission, WindowCounter, WindowCounts, disagreement
 from gvo.backend.keyframe_policy import choose_released, is_needed, proximity
 from gvo.backend.motion_model import ConstantVelocity, StatusClock
-from gvo.backend.pose_graph import first_line
 from gvo.backend.window_graph import NewPose, WindowGraph, absence
 from gvo.config import WindowConfig
 from gvo.errors import SmoothingError, write_faults
@@ -419,8 +418,7 @@ class SlidingWindow:
         T_world_frame : ndarray of float64, shape (4, 4)
         covariance : ndarray of float64, shape (6, 6)
         """
-        harden = [self._harden_for] if self._graph.can_be_hardened else []
-        for simplify in (None, *harden, self._refuse_all, self._rebuild_for):
+        for simplify in (None, self._refuse_all, self._rebuild_for):
             try:
                 pose = pose if simplify is None else simplify(pose)
                 return pose, *self._graph.insert(pose)
@@ -431,10 +429,6 @@ class SlidingWindow:
         # Not even alone: it is returned as predicted, and never in the window.
         prediction = self._motion.predict_pose(pose.stamp_ns)
         return pose, *(prediction or (ORIGIN.T_world_frame, ORIGIN.covariance))
-
-    def _harden_for(self, pose: NewPose) -> NewPose:
-        self._graph.harden()
-        return pose
 
     def _refuse_all(self, pose: NewPose) -> NewPose:
         return self._admission.refuse_all(pose, "GTSAM gave up on the update")
@@ -448,26 +442,12 @@ class SlidingWindow:
         self, extend: Callable[[], Estimate], frame_id: FrameId, *, edge: Edge | None = None
     ) -> Estimate | Rejected:
         """Return the estimate after another measurement, or why GTSAM failed."""
-        while True:
-            try:
-                return extend()
-            except SmoothingError as error:
-                self._counter.add(n_restored=1)
-                _LOGGER.warning("%r: %s; the window is restored", frame_id, error)
-                if not self._harden():
-                    reason = f"GTSAM gave up on the update: {error}"
-                    return self._reject(frame_id, reason, edge=edge)
-
-    def _harden(self) -> bool:
-        """Move to a graph for worse conditioned factors; False if there is none."""
-        if not self._graph.can_be_hardened:
-            return False
         try:
-            self._graph.harden()
+            return extend()
         except SmoothingError as error:
-            _LOGGER.warning("the graph stays as it is: %s", first_line(error))
-            return False
-        return True
+            self._counter.add(n_restored=1)
+            _LOGGER.warning("%r: %s; the window is restored", frame_id, error)
+            return self._reject(frame_id, f"GTSAM gave up on the update: {error}", edge=edge)
 
     def _update_motion(self, pose: NewPose, estimate: Estimate) -> None:
         """Update the velocity if edges, and not a prior alone, say how the camera moved."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
@@ -37,6 +38,7 @@ from gvo.types import (
 )
 
 _LOGGER = logging.getLogger(__name__)
+_Result = TypeVar("_Result")
 
 # Poses that leave at once when the window is made smaller: the cost grows with the cube.
 _MAX_LEAVING = 32
@@ -217,7 +219,7 @@ class WindowGraph:
     def _make_sliding(self) -> None:
         """Move the factors to a graph that poses can be marginalized in."""
         self._is_whole = False
-        graph = PoseGraph()
+        graph = PoseGraph(is_hardened=self._isam.is_hardened)
         try:
             with graph.restored_on_error():
                 graph.update(self._isam.factors(), self._isam.values())
@@ -237,6 +239,9 @@ class WindowGraph:
         T_world_frame : ndarray of float64, shape (4, 4)
         covariance : ndarray of float64, shape (6, 6)
         """
+        return self._hardened_on_error(partial(self._insert, pose))
+
+    def _insert(self, pose: NewPose) -> tuple[FloatArray, FloatArray]:
         key = self._n_keys
         edges = [
             AcceptedEdge(m.edge, self._factors, self.poses[m.edge.reference_id].key)
@@ -295,14 +300,15 @@ class WindowGraph:
         """Add an edge between two poses of the window; return the new estimate of the frame."""
         pose, reference = self.poses[frame_id], self.poses[edge.reference_id]
         factor = self._factors.between(reference.key, pose.key, Measurement.of(edge))
-        estimate = self._extend(frame_id, factor)
+        estimate = self._hardened_on_error(partial(self._extend, frame_id, factor))
         pose.edges.append(AcceptedEdge(edge, self._factors, reference.key))
         return estimate
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate:
         """Add a prior to a pose of the window; return its new estimate."""
         pose = self.poses[frame_id]
-        estimate = self._extend(frame_id, self._factors.prior(pose.key, prior))
+        factor = self._factors.prior(pose.key, prior)
+        estimate = self._hardened_on_error(partial(self._extend, frame_id, factor))
         pose.priors.append((prior, self._factors))
         return estimate
 
@@ -327,14 +333,34 @@ class WindowGraph:
 
     # When GTSAM failed
 
-    @property
-    def can_be_hardened(self) -> bool:
-        """Tell whether a graph for worse conditioned measurements is left to try."""
-        return self._isam.can_be_hardened
+    def _read(self, read: Callable[[PoseGraph], _Result]) -> _Result:
+        """Read from the graph; if GTSAM fails, from one that takes worse conditioned factors."""
+        try:
+            return read(self._isam)
+        except (RuntimeError, SmoothingError):
+            if self._isam.is_hardened:
+                raise
+            return read(self._isam.hardened())
 
-    def harden(self) -> None:
-        """Move to a graph that takes worse conditioned measurements."""
-        self._isam = self._isam.hardened()
+    def _hardened_on_error(self, change: Callable[[], _Result]) -> _Result:
+        """Change the graph; if GTSAM fails, move to one that takes worse conditioned factors.
+
+        If it fails there as well, the graph stays what it was.
+        """
+        former = self._isam
+        try:
+            return change()
+        except SmoothingError as error:
+            if former.is_hardened:
+                raise
+            try:
+                self._isam = former.hardened()
+                result = change()
+            except BaseException:
+                self._isam = former
+                raise
+            _LOGGER.info("%s; from here on the graph is solved by QR", first_line(error))
+            return result
 
     def rebuild(self) -> None:
         """Make the graph anew from the poses and their covariances."""
@@ -370,8 +396,10 @@ class WindowGraph:
 
     def estimate(self, frame_id: FrameId) -> Estimate:
         """Return the estimate of a pose; the causal one if GTSAM has none any more."""
+        key = self.poses[frame_id].key
         try:
-            estimate = self._estimate(frame_id)
+            covariance = self._read(lambda graph: graph.covariance(key))
+            estimate = self._estimate(frame_id, covariance)
             _check_result(estimate.T_world_frame)
         except (RuntimeError, SmoothingError) as error:
             pose = self.poses[frame_id]
@@ -399,9 +427,9 @@ class WindowGraph:
         T = se3.invert(self.pose(reference_id)) @ self.pose(frame_id)
         # T exp(d) = (T_r exp(d_r))^-1 T_f exp(d_f)  =>  d = d_f - Ad(T^-1) d_r
         J = np.hstack([-se3.adjoint(se3.invert(T)), np.eye(6)])
+        keys = self.poses[reference_id].key, self.poses[frame_id].key
         try:
-            keys = self.poses[reference_id].key, self.poses[frame_id].key
-            return definite(J @ self._isam.joint_covariance(*keys) @ J.T)
+            return self._read(lambda graph: definite(J @ graph.joint_covariance(*keys) @ J.T))
         except (RuntimeError, SmoothingError):
             # Their correlation is lost in rounding: without it the covariance is no smaller.
             independent = np.zeros((12, 12))

@@ -128,17 +128,19 @@ def test_factors_that_left_make_room_for_others() -> None:
     assert max(sizes[10:]) == max(sizes[-10:]) < 12
 
 
-def test_only_a_whole_graph_can_be_hardened_and_only_once() -> None:
-    for is_whole, is_hardened in ((True, False), (True, True), (False, False), (False, True)):
-        graph = PoseGraph(is_whole=is_whole, is_hardened=is_hardened)
-        assert graph.can_be_hardened is (is_whole and not is_hardened)
-    graph = chain(4, is_whole=True)
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_hardened_graph_has_the_same_poses_and_stays_hardened(is_whole: bool) -> None:
+    graph = chain(4, is_whole=is_whole)
     hardened = graph.hardened()
-    assert not hardened.can_be_hardened
+    assert (graph.is_hardened, hardened.is_hardened) == (False, True)
     np.testing.assert_allclose(hardened.positions(), graph.positions(), atol=1e-9)
+    for key in range(4):
+        np.testing.assert_allclose(
+            hardened.covariance(key), graph.covariance(key), rtol=1e-6, atol=1e-12
+        )
     moved = values_of({key: power(key + 1) for key in range(4)})
     for each in (graph, hardened):
-        assert each.moved(moved).can_be_hardened is each.can_be_hardened
+        assert each.moved(moved).is_hardened is each.is_hardened
 
 
 @pytest.mark.parametrize(
