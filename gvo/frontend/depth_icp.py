@@ -188,8 +188,13 @@ def _linearize(
     chosen = np.flatnonzero(is_near)
     if len(chosen) * every < _MIN_POINTS:
         return Failure(reason=f"{len(chosen)} points of two depth images fit each other")
-    r, points, normals = residuals[chosen], points[:, chosen], normals[:, chosen]
-    J = np.concatenate([np.cross(points, normals, axis=0), normals]) / sigmas[chosen]
+    # Four times as fast as an index in brackets.
+    r, sigmas = residuals.take(chosen), sigmas.take(chosen)
+    x, y, z = points.take(chosen, axis=1)
+    J = np.empty((6, len(chosen)))
+    J[3:] = a, b, c = normals.take(chosen, axis=1)
+    J[:3] = y * c - z * b, z * a - x * c, x * b - y * a
+    J /= sigmas
     weights = np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-9))
     weighted = weights * J
     scale = max(float(np.sqrt(np.mean(r * r))), _MIN_SCALE)
