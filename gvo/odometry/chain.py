@@ -213,7 +213,9 @@ class RawChain(Generic[ObservationsT]):
             for node in self._nodes
         ]
 
-    def advance(self, current: ObservationsT, *, variance_factor: float = 1.0) -> RawStep:
+    def advance(
+        self, current: ObservationsT, *, variance_factor: float = 1.0, seeks_places: bool = False
+    ) -> RawStep:
         """Register the next frame and return its step.
 
         Parameters
@@ -221,6 +223,9 @@ class RawChain(Generic[ObservationsT]):
         current : observations
         variance_factor : float
             Of the step's covariance in that of the chain.
+        seeks_places : bool
+            A camera that was lost looks for places itself: nothing predicts how far it is from the
+            last registered frame, and one registration alone may be of a view that looks alike.
 
         Raises
         ------
@@ -235,7 +240,9 @@ class RawChain(Generic[ObservationsT]):
                 f"stamp {current.stamp_ns} is not after {predecessor_ns}, that of the frame before"
             )
         failures: list[Failure] = []
-        for node in self._nodes:
+        elapsed_s = 1e-9 * (current.stamp_ns - self._nodes[-1].estimate.stamp_ns)
+        is_lost = seeks_places and elapsed_s > self._config.lost_after_s
+        for node in self._nodes[: 1 if is_lost else None]:
             result = self._register(self._poses, node, current)
             if isinstance(result, RelativePose):
                 return self._append(self._poses, node, current, result, variance_factor)

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from gvo.backend.batch import INLIER_CHI2, BatchOptimizer, LocalGraph, WholeGraph
 from gvo.backend.factors import ORIGIN, Factors
-from gvo.backend.motion_model import predict_step
+from gvo.backend.motion_model import MAX_EXTRAPOLATION_S, predict_step
 from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.io.run_folder.line_file import append_whole
@@ -50,12 +50,18 @@ _Pairs: TypeAlias = AbstractSet[tuple[object, int]]
 
 _LOGGER = logging.getLogger(__name__)
 
-# Sigmas of a guess after a loss, and upper bounds of others: rad and m.
-_GUESS_SIGMAS = np.array([3.0, 3.0, 3.0, 100.0, 100.0, 100.0])
+# Upper bounds of the sigmas of a guess: rad and m; and the share of a velocity that is one sigma
+# of it besides.
+_GUESS_SIGMAS = np.array([3.0, 3.0, 3.0, 1000.0, 1000.0, 1000.0])
+_HALT = 0.3
 # Drift that is allowed for when loops are judged, over the whole path: a share of the way and of
 # the turn, and radians per metre.
 _DRIFT = 0.01
 _TURN_PER_M = 0.0005
+# Why loops are refused.
+_TOO_FAR = "farther from odometry than that drifts"
+_CONTRADICTS = "contradicts odometry or the other loops"
+_DOUBTED = "across a loss, where most other loops are refused"
 # Of the edges between two parts, so many are compared with each other.
 _N_VOTERS = 32
 # An optimization begins with a loop when the graph has grown by this share, and by so many
@@ -355,12 +361,21 @@ class RunGraph:
         T = se3.invert(first.T_first_keyframe) @ second.T_first_keyframe
         return _join(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
 
+    def allows(self, loop: Loop) -> bool:
+        """Tell whether a loop is as near as odometry allows, and as far as one comes in the dark."""
+        is_known = loop.stamp_ns in self._known and loop.reference_ns in self._known
+        return not is_known or self._chi2(loop, drifts=True) <= INLIER_CHI2
+
     def _unmeasured(self, last: Estimate, estimate: Estimate) -> Edge:
-        coasted_s, elapsed_s = 1e-9 * np.diff([self._measured_ns, last.stamp_ns, estimate.stamp_ns])
-        _, covariance = predict_step(None, elapsed_s, self._config, coasted_s=coasted_s)
-        if estimate.status is Status.LOST:
-            covariance = np.diag(_GUESS_SIGMAS**2)
+        config, stamps_ns = self._config, [self._measured_ns, last.stamp_ns, estimate.stamp_ns]
+        coasted_s, elapsed_s = 1e-9 * np.diff(stamps_ns)
+        _, covariance = predict_step(None, elapsed_s, config, coasted_s=coasted_s)
         T_last_frame = se3.invert(last.T_world_frame) @ estimate.T_world_frame
+        # Whatever moves may halt: the faster, the less certain is the velocity.
+        velocity = se3.log(T_last_frame) / min(elapsed_s, MAX_EXTRAPOLATION_S)
+        sigmas = np.radians(config.coasting_sigma_deg_per_s), config.coasting_sigma_m_per_s
+        shares = _HALT * np.linalg.norm(velocity.reshape(2, 3), axis=1) / sigmas
+        covariance = covariance * np.repeat(1.0 + shares**2, 3)
         return _edge(last.stamp_ns, T_last_frame, covariance)
 
     def _condense(self, newest: Estimate | None = None) -> tuple[list[tuple[Any, ...]], Edge]:
@@ -614,9 +629,30 @@ class RunGraph:
             optimizer.run(only_refuse=True)
             keyframes = list(self._keyframes)
             refused |= {(keyframes[a], keyframes[b]) for a, b, _ in optimizer.refused}
-        reasons = dict.fromkeys(refused, "contradicts odometry or the other loops")
-        reasons |= dict.fromkeys(far, "farther from odometry than that drifts")
+        reasons = dict.fromkeys(refused, _CONTRADICTS) | dict.fromkeys(far, _TOO_FAR)
+        if doubted := self._doubted(loops, reasons.keys()):
+            refused |= doubted
+            reasons = dict.fromkeys(doubted, _DOUBTED) | reasons
         return [loop for loop in loops if _ends(loop) not in refused], reasons, refused
+
+    def _doubted(
+        self, loops: Sequence[Loop], reasons: AbstractSet[tuple[object, int]]
+    ) -> set[tuple[object, int]]:
+        """Return what leads across a loss, where most loops are refused.
+
+        Such a world repeats itself, and across a loss odometry cannot tell which are false.
+        """
+        lost = [ns for ns in self._guesses if self._keyframes[ns].status is Status.LOST]
+        edges = {(edge.reference_id, frame_ns) for frame_ns, edge in self._edges.values()}
+        n_confirmed = sum(not loop.reason for loop in self.loops) if lost else 0
+        if 2 * len(reasons - edges) <= n_confirmed:
+            return set()
+        return {
+            (reference, frame_ns)
+            for reference, frame_ns in edges.union(map(_ends, loops))
+            if bisect(lost, reference) != bisect(lost, frame_ns)  # type: ignore[call-overload]
+            and self._guesses.get(frame_ns) != reference
+        }
 
     def _bridge(self, graph: WholeGraph) -> dict[int, int]:
         """Add the guesses that alone connect keyframes: elsewhere they tell nothing.
@@ -690,7 +726,7 @@ class RunGraph:
             if loop.stamp_ns not in self._keyframes:
                 if self._home(loop.stamp_ns).reference_id != loop.reference_ns:
                     elsewhere.add(_ends(loop))
-            elif self._chi2(loop, drifts=True) > INLIER_CHI2:
+            elif not self.allows(loop):
                 far.add(_ends(loop))
             else:
                 loops.append(loop)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any, Final
@@ -40,6 +40,7 @@ _DRIFT = 0.02
 _N_EAGER = 15
 _MAX_PAUSE = 30
 _UNCONFIRMED = "no other loop confirms it"
+_AMBIGUOUS = "it fits several places"
 
 _LOOP: Final = np.dtype(
     [
@@ -180,12 +181,14 @@ class LoopDetector:
         near: Container[int] = (),
         world: int = 0,
         is_keyframe: bool = True,
+        allows: Callable[[Loop], bool] = lambda _: True,
     ) -> tuple[Loop, ...]:
         """Detect, by what a front-end extracted; places whose stamps are `near` are no loops.
 
         A frame that shows most of the latest place is none of its own, and nothing is looked for.
         Those that are no keyframes are looked at only in a `world` that is not connected with the
-        others, and are places where they are found.
+        others, and are places where they are found. What confirms a loop to another world is
+        asked of `allows` too: how far the camera may have come in the dark.
         """
         if world != self._world:
             self._leave_world()
@@ -198,11 +201,11 @@ class LoopDetector:
         place = describe(observations)
         scores = self._index.scores(place.descriptors_left)
         numbers = self._elsewhere(scores, world) if is_search else self._candidates(scores, near)
-        loop = self._register(numbers, place, observations)
-        if not is_place and loop is None:
+        loops = self._register(numbers, place, observations)
+        if not is_place and not loops:
             return ()
         self._add(place, T_world_frame)
-        return () if loop is None else tuple(self._confirm(loop))
+        return tuple(self._confirm(loops, allows)) if loops else ()
 
     def keep(self, observations: Any, T_world_frame: FloatArray) -> None:  # noqa: ANN401
         """Add a frame of the latest world as a place, without looking."""
@@ -240,13 +243,17 @@ class LoopDetector:
         numbers: Sequence[int],
         place: Any,  # noqa: ANN401
         observations: Any,  # noqa: ANN401
-    ) -> Loop | None:
+    ) -> list[Loop]:
+        """Return the first loop; from a world that is not connected, all: they may contradict."""
+        loops = []
         for number in numbers:
             reference = self._indexed[number].place
             result = self._frontend.recognize(reference, place, observations)
             if isinstance(result, RelativePose):
-                return _loop(reference.stamp_ns, place.stamp_ns, result)
-        return None
+                loops.append(_loop(reference.stamp_ns, place.stamp_ns, result))
+                if self._world in self._connected:
+                    break
+        return loops
 
     def _keep_oldest_recent(self) -> None:
         """Add the oldest of the latest places to the index, unless another frame knows it."""
@@ -283,30 +290,46 @@ class LoopDetector:
         ]
         return chosen[:_N_CANDIDATES]
 
-    def _confirm(self, loop: Loop) -> list[Loop]:
-        """Return the loops that are confirmed with a new one, this one among them."""
+    def _confirm(self, loops: Sequence[Loop], allows: Callable[[Loop], bool]) -> list[Loop]:
+        """Return the loops that are confirmed with the first of a frame, this one among them."""
+        loop = loops[0]
+        world, reference_world = self._worlds_of(loop)
+        if any(self._contradict(loop, other) for other in loops[1:]):
+            loop = replace(loop, reason=_AMBIGUOUS)
         self.loops.settle(self._recent[-1 - _N_WAITING :][0].place.stamp_ns)
         latest, confirmed = list(self.loops.latest), []
         agreeing = [k for k, other in enumerate(latest) if self._agree(other, loop)]
+        if world != reference_world and world not in self._connected:
+            n_against = sum(self._contradict(other, loop) for other in latest)
+            agreeing = [k for k in agreeing if allows(latest[k])]
+            agreeing = agreeing if len(agreeing) >= n_against else []
         for k in agreeing:
             if latest[k].reason:
                 latest[k] = replace(latest[k], reason="")
                 confirmed.append(latest[k])
         if agreeing:
             confirmed.append(loop := replace(loop, reason=""))
-        world, reference_world = (
-            self._visits[ns].world for ns in (loop.stamp_ns, loop.reference_ns)
-        )
         if agreeing and world != reference_world:
             self._connected.add(world)
-        elif world in self._n_searches:  # the next frames may confirm it
+        elif world in self._n_searches and loop.reason != _AMBIGUOUS:  # the next may confirm it
             self._n_searches[world] = min(self._n_searches[world], _N_EAGER - _N_WAITING)
         self.loops.latest = *latest, loop
         return confirmed
 
+    def _worlds_of(self, loop: Loop) -> tuple[int, int]:
+        """Return the worlds of a loop's frame and of its reference."""
+        return self._visits[loop.stamp_ns].world, self._visits[loop.reference_ns].world
+
+    def _contradict(self, first: Loop, second: Loop) -> bool:
+        """Tell whether two loops between the same worlds disagree: one place looks like another."""
+        is_same = self._worlds_of(first) == self._worlds_of(second)
+        return is_same and not self._agree(first, second)
+
     def _agree(self, first: Loop, second: Loop) -> bool:
         """Tell whether two loops and the odometry between their ends agree."""
-        if self._visits[first.reference_ns].world != self._visits[second.reference_ns].world:
+        if self._worlds_of(first)[1] != self._worlds_of(second)[1]:
+            return False
+        if _AMBIGUOUS in (first.reason, second.reason):
             return False
         T_first_second, drift = self._way(first.stamp_ns, second.stamp_ns)
         T_references, other_drift = self._way(first.reference_ns, second.reference_ns)

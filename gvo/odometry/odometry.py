@@ -185,7 +185,11 @@ class Odometry:
             self._take_over_configuration()
             observations = self._frontend.extract(frame)
         with watch.stage("register"):
-            step = self._chain.advance(observations, variance_factor=self._variance_factor())
+            step = self._chain.advance(
+                observations,
+                variance_factor=self._variance_factor(),
+                seeks_places=self._loops is not None and self._config.loops.enabled,
+            )
             self._note_break(step)
         with watch.stage("links"):
             scores, offered = self._link(observations, step)
@@ -520,6 +524,7 @@ class Odometry:
             near=set(self._keyframes.stamps_ns).difference(self._unjoined()),
             world=self._graph.world_of(edges),
             is_keyframe=is_keyframe,
+            allows=self._graph.allows,
         )
 
     def _close_loops(
