@@ -362,7 +362,7 @@ class RunGraph:
         return _join(_edge(stamp_ns, T, second.covariance_since(first, drifts=True)), loop.edge)
 
     def allows(self, loop: Loop) -> bool:
-        """Tell whether a loop is as near as odometry allows, and as far as one comes in the dark."""
+        """Tell whether a loop leads where odometry, and what was guessed in the dark, allow it."""
         is_known = loop.stamp_ns in self._known and loop.reference_ns in self._known
         return not is_known or self._chi2(loop, drifts=True) <= INLIER_CHI2
 

@@ -70,9 +70,10 @@ class Drive:
         n_links: int = 2,
         bias: Bias = None,
         sigmas: FloatArray = SIGMAS,
+        config: WindowConfig | None = None,
     ) -> None:
         self.truth, self.rng, self.bias, self.sigmas = truth, rng, bias, sigmas
-        self.graph = RunGraph(WindowConfig())
+        self.graph = RunGraph(config or WindowConfig())
         self.every, self.n_links = every, n_links
         self.keyframes = [0]
         self.edges: list[list[Edge]] = []

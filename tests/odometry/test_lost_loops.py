@@ -9,7 +9,7 @@ from gvo.config import WindowConfig
 from gvo.geometry import se3
 from gvo.odometry.graph import RunGraph
 from gvo.odometry.loops import LoopDetector
-from gvo.types import Edge, FloatArray, Optimum, Status
+from gvo.types import Edge, Failure, FloatArray, Optimum, RelativePose, Status
 from tests.odometry.drives import (
     PERIOD_NS,
     SIGMAS,
@@ -26,13 +26,21 @@ N_LAP = 100
 # Dark frames; the guess is wrong by far from the first one on.
 DARK = range(50, 55)
 AWAY = se3.exp(np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5]))
+TWIN = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
+# Of a camera that may have come to the other side of the block.
+FAR = WindowConfig(coasting_sigma_m_per_s=200.0, coasting_sigma_deg_per_s=300.0)
 
 
 def lit_again(
-    truth: FloatArray, *, dark: range = DARK, away: FloatArray = AWAY, status: Status = Status.LOST
+    truth: FloatArray,
+    *,
+    dark: range = DARK,
+    away: FloatArray = AWAY,
+    status: Status = Status.LOST,
+    config: WindowConfig | None = None,
 ) -> Drive:
     """Return a drive without measurements of dark frames, and none across them."""
-    drive = Drive(truth)
+    drive = Drive(truth, config=config)
     T_guess_truth = truth[dark.start] @ away @ se3.invert(truth[dark.start])
     for j, T in enumerate(truth):
         edges: list[Edge] = []
@@ -79,9 +87,8 @@ def test_without_a_loop_it_stays_where_it_was_guessed_as_uncertain_as_that() -> 
 
 def test_false_loops_after_a_loss_are_refused_where_more_true_ones_follow() -> None:
     truth = block(1.4, n_per_lap=N_LAP)
-    drive = lit_again(truth, dark=range(20, 25))
-    twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
-    false = [drive.loop(5 * k, 50 + 5 * k, T=twin) for k in range(3)]
+    drive = lit_again(truth, dark=range(20, 25), config=FAR)
+    false = [drive.loop(5 * k, 50 + 5 * k, T=TWIN) for k in range(3)]
     true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
     drive.graph.loops = false
     # with nothing against them they count
@@ -90,6 +97,48 @@ def test_false_loops_after_a_loss_are_refused_where_more_true_ones_follow() -> N
     optimum = drive.graph.optimize(covariances=False)
     assert [bool(loop.reason) for loop in optimum.loops] == [True] * 3 + [False] * 4
     assert position_error(poses(optimum)[30:], truth[30:]) < 0.01
+
+
+def test_a_twin_that_lies_farther_than_one_drives_in_the_dark_is_refused() -> None:
+    truth = block(1.4, n_per_lap=N_LAP)
+    drive = lit_again(truth, dark=range(20, 25))
+    drive.graph.loops = [drive.loop(5 * k, 50 + 5 * k, T=TWIN) for k in range(3)]
+    loops = drive.graph.optimize(covariances=False).loops
+    assert {loop.reason for loop in loops} == {"farther from odometry than that drifts"}
+    drive.graph.loops = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(3)]
+    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+
+
+@pytest.mark.parametrize(("speed_m", "n_dark"), [(2.0, 20), (3.0, 50), (0.02, 20)])
+def test_whatever_moves_may_halt_in_the_dark(speed_m: float, n_dark: int) -> None:
+    """It was guessed to go on at 20 or 30 m/s, and stood still from the first dark frame on."""
+    halted = np.minimum(np.arange(40 + n_dark), 20) * speed_m
+    halted[20 + n_dark :] -= speed_m * np.arange(20)  # and then backs out
+    truth = np.array([se3.exp(np.array([0, 0, 0, 0, 0, s])) for s in halted])
+    drive = Drive(truth)
+    for j, T in enumerate(truth):
+        is_dark = 20 <= j <= 20 + n_dark
+        edges = [] if j == 0 or is_dark else [measured(truth, j - 1, j, SIGMAS, None)]
+        coasted = min(max(j - 19, 0), n_dark + 1)
+        T_guess = T @ se3.exp(np.array([0, 0, 0, 0, 0, coasted * speed_m]))
+        estimate = estimate_at(j * PERIOD_NS, T_guess, status=Status.LOST if is_dark else Status.OK)
+        drive.graph.add_frame(estimate, edges, is_keyframe=j % 5 == 0 and not is_dark)
+    drive.graph.loops = [drive.loop(20 - 5 * k, 20 + n_dark + 5 * k) for k in range(1, 3)]
+    assert not any(loop.reason for loop in drive.graph.optimize(covariances=False).loops)
+
+
+@pytest.mark.parametrize("n_twins", [3, 8])
+def test_where_most_loops_are_refused_none_leads_across_a_loss(n_twins: int) -> None:
+    truth = walk(200)
+    drive = lit_again(truth, dark=range(50, 55))
+    across = [drive.loop(5 * k, 60 + 5 * k) for k in range(4)]
+    # As between equal rooms: odometry tells that these are 5 m apart.
+    twins = [drive.loop(100 + 5 * k, 150 + 5 * k, T=np.eye(4)) for k in range(n_twins)]
+    drive.graph.loops = [*across, *twins]
+    reasons = [loop.reason for loop in drive.graph.optimize(covariances=False).loops]
+    assert all(reasons[4:])
+    doubt = "across a loss, where most other loops are refused" if n_twins > 4 else ""
+    assert reasons[:4] == [doubt] * 4
 
 
 def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
@@ -175,6 +224,41 @@ def test_two_frames_of_another_world_are_connected_by_two_loops_to_the_same_one(
     assert (N_LAP + 20) * PERIOD_NS not in detector
 
 
+class Repeated(MadeUpPlaces):
+    """Places that look the same from every so many frames on, as a row of equal windows does."""
+
+    def __init__(self, truth: FloatArray, n_per_lap: int, *, period: int) -> None:
+        super().__init__(truth, n_per_lap)
+        self.descriptors = self.descriptors[np.arange(n_per_lap) % period]
+        self.period = period
+
+    def recognize(
+        self, reference: SimpleNamespace, current: SimpleNamespace, observations: int
+    ) -> RelativePose | Failure:
+        i = reference.stamp_ns // PERIOD_NS
+        # The nearest of the equal ones.
+        half = self.period // 2
+        alike = i + (observations - i + half) % self.period - half
+        edge = measured(self.truth, i, alike, SIGMAS, None)
+        return RelativePose(
+            T_reference_current=edge.T_reference_frame,
+            covariance=edge.covariance,
+            matches=np.zeros((80, 2), dtype=np.int64),
+            inliers=np.ones(80, dtype=np.bool_),
+        )
+
+
+@pytest.mark.parametrize(("period", "n_joined"), [(10, 0), (80, 1)])
+def test_a_view_that_fits_several_places_of_a_row_joins_nothing(period: int, n_joined: int) -> None:
+    truth = walk(200, step_m=1.0)
+    detector = LoopDetector(frontend=Repeated(truth, 200, period=period))
+    for j in range(20, 60, 5):
+        detector.look(j, truth[j])
+    looks = [detector.look(j, AWAY @ truth[j], world=1, is_keyframe=False) for j in range(120, 126)]
+    assert sum(bool(loops) for loops in looks[:2]) == n_joined
+    assert any(looks) == bool(n_joined)
+
+
 def test_loops_to_two_different_worlds_confirm_nothing() -> None:
     truth = block(2.0, n_per_lap=N_LAP)
     detector = LoopDetector(frontend=MadeUpPlaces(truth, N_LAP))
@@ -198,8 +282,7 @@ def test_frames_that_nothing_connects_are_worlds_of_their_own() -> None:
 
 def test_what_most_contradict_across_a_loss_is_refused_whatever_odometry_could_bend() -> None:
     drive = lit_again(block(1.9, n_per_lap=N_LAP), dark=range(20, 25))
-    twin = se3.exp(np.array([0.0, 0.01, 0.0, 0.1, 0.0, 0.3]))
-    false = [drive.loop(5 * k, 50 + 5 * k, T=twin) for k in range(4)]
+    false = [drive.loop(5 * k, 50 + 5 * k, T=TWIN) for k in range(4)]
     true = [drive.loop(5 * k, N_LAP + 5 * k) for k in range(4)]
     edges = [(loop.stamp_ns, loop.edge) for loop in false]
     refused = drive.graph._outvoted([*false, *true, *true])

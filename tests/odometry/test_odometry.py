@@ -343,13 +343,13 @@ def test_a_gap_longer_than_the_window_is_bridged(n_keyframes: int) -> None:
 
 def test_coasting_for_long_is_called_lost_until_it_resumes() -> None:
     config = configure(lost_after_s=0.12)
-    results, _ = run(with_blanks(range(3, 8), 10), config)
+    results, _ = run(with_blanks(range(3, 8), 12), config)
     assert [result.status for result in results[3:]] == (
-        [Status.COASTING] * 2 + [Status.LOST] * 3 + [Status.RESUMED, Status.OK]
+        [Status.COASTING] * 2 + [Status.LOST] * 4 + [Status.RESUMED] * 2 + [Status.OK]
     )
-    # The light comes on where it went out: the last registered frame is seen again.
-    assert [result.segment for result in results] == [0] * 5 + [1] * 5
-    assert [len(result.joins) for result in results] == [0] * 8 + [1, 0]
+    # The light comes on where it went out: two frames see the place of the last registered one.
+    assert [result.segment for result in results] == [0] * 5 + [1] * 7
+    assert [len(result.joins) for result in results] == [0] * 10 + [1, 0]
 
 
 def test_a_camera_that_turned_in_the_dark_is_found_again() -> None:

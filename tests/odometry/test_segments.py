@@ -141,7 +141,7 @@ def errors(results: list[FrameResult], places: list[Place]) -> list[float]:
     ]
 
 
-AWAY = at(3.0, turn=2.0)
+AWAY = at(4.0, turn=0.8)
 
 
 def test_a_segment_begins_with_the_first_lost_frame() -> None:
@@ -233,11 +233,23 @@ def test_the_raw_chain_is_never_joined() -> None:
 
 
 def test_the_light_that_comes_on_where_it_went_out_joins_at_once() -> None:
-    results = run(Beacon(see=lambda _: None), walk(away=at(1.0)))
+    results = run(Plain(), walk(away=at(1.0)))
     joins = [join for result in results for join in result.joins]
     assert [(join.segment, join.to_segment) for join in joins] == [(1, 0)]
     assert joins[0].stamp_ns == 16 * STEP_NS
     assert joins[0].reference_ns == 9 * STEP_NS
+
+
+def test_what_looks_for_places_is_not_joined_by_one_frame_that_looks_alike() -> None:
+    results = run(Beacon(see=lambda _: None), walk(away=at(1.0)))
+    assert not any(result.joins for result in results)
+
+
+def test_nobody_comes_farther_in_the_dark_than_the_stated_sigmas_allow() -> None:
+    places = walk(away=at(40.0))
+    assert not any(result.joins for result in run(Beacon(), places))
+    longer = walk(away=at(40.0), n_dark=80)
+    assert sum(len(result.joins) for result in run(Beacon(), longer)) == 1
 
 
 def test_candidates_that_contradict_each_other_join_nothing() -> None:
