@@ -494,14 +494,19 @@ class RunGraph:
         self._thin(solution.loops, places)
 
     def _thin(self, loops: Sequence[Loop], places: Container[int]) -> None:
-        """Merge keyframes that came back to a place, and those after them without a place."""
-        counting = {loop.stamp_ns: loop for loop in loops}
+        """Merge keyframes that came back to a place, and those after them without a place.
+
+        Not across a loss: what is merged stays so, though its loop may be doubted later.
+        """
+        counting, lost = {loop.stamp_ns: loop for loop in loops}, self._losses()
         references = {loop.reference_ns for loop in counting.values()}
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
         references |= {*self._guesses, *self._guesses.values()}
         for ns in list(self._keyframes)[1:-_N_LATEST]:
             loop = counting.get(ns)
             if ns in places or ns in references:
+                continue
+            if loop is not None and bisect(lost, ns) > bisect(lost, loop.reference_ns):
                 continue
             if loop is not None and n_at[loop.reference_ns] > _N_PER_PLACE:
                 n_at[loop.reference_ns] -= 1
@@ -642,7 +647,7 @@ class RunGraph:
 
         Such a world repeats itself, and across a loss odometry cannot tell which are false.
         """
-        lost = [ns for ns in self._guesses if self._keyframes[ns].status is Status.LOST]
+        lost = self._losses()
         edges = {(edge.reference_id, frame_ns) for frame_ns, edge in self._edges.values()}
         n_confirmed = sum(not loop.reason for loop in self.loops) if lost else 0
         if 2 * len(reasons - edges) <= n_confirmed:
@@ -653,6 +658,10 @@ class RunGraph:
             if bisect(lost, reference) != bisect(lost, frame_ns)  # type: ignore[call-overload]
             and self._guesses.get(frame_ns) != reference
         }
+
+    def _losses(self) -> list[int]:
+        """Return the keyframes that a loss is before."""
+        return [ns for ns in self._guesses if self._keyframes[ns].status is Status.LOST]
 
     def _bridge(self, graph: WholeGraph) -> dict[int, int]:
         """Add the guesses that alone connect keyframes: elsewhere they tell nothing.

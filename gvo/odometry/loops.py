@@ -302,7 +302,7 @@ class LoopDetector:
         if world != reference_world and world not in self._connected:
             n_against = sum(self._contradict(other, loop) for other in latest)
             agreeing = [k for k in agreeing if allows(latest[k])]
-            agreeing = agreeing if len(agreeing) >= n_against else []
+            agreeing = agreeing if len(agreeing) > n_against else []
         for k in agreeing:
             if latest[k].reason:
                 latest[k] = replace(latest[k], reason="")

@@ -50,6 +50,15 @@ def test_a_camera_that_was_lost_in_a_room_finds_its_place() -> None:
     )
 
 
+def test_windows_that_repeat_connect_nothing_across_the_dark() -> None:
+    facade = gvo.SyntheticRecording("facade", n_frames=75, seed=0, scale=0.5)
+    odometry, results = follow(FaultySource(facade, Black(first=30, end=50)))
+    assert not any(result.joins for result in results)
+    loops = odometry.optimize().loops
+    assert len(loops) > 3
+    assert all(loop.reason for loop in loops)
+
+
 def test_equal_rooms_are_not_taken_for_each_other() -> None:
     rooms = gvo.SyntheticRecording("rooms", "rgbd", n_frames=700, seed=1, scale=0.5)
     odometry, _ = follow(rooms)

@@ -141,6 +141,15 @@ def test_where_most_loops_are_refused_none_leads_across_a_loss(n_twins: int) -> 
     assert reasons[:4] == [doubt] * 4
 
 
+@pytest.mark.parametrize(("status", "is_merged"), [(Status.COASTING, True), (Status.LOST, False)])
+def test_nothing_is_merged_across_a_loss(status: Status, is_merged: bool) -> None:
+    drive = lit_again(walk(500), dark=range(20, 25), status=status)
+    n_keyframes = len(drive.graph)
+    loops = [drive.loop(5, 5 * k) for k in range(10, 20)]
+    drive.graph._thin(loops, ())
+    assert (len(drive.graph) < n_keyframes) == is_merged
+
+
 def test_a_wrong_edge_across_the_dark_is_refused_as_a_loop_is() -> None:
     truth = block(1.3, n_per_lap=N_LAP)
     drive = Drive(truth)
