@@ -625,8 +625,9 @@ class RunGraph:
         """
         loops, far, refused = self._possible()
         if loops or self._guesses:
-            confirmed = (loop for loop in self.loops if not loop.reason)
-            refused |= self._outvoted(loop for loop in confirmed if _ends(loop) not in far)
+            if self._guesses:  # else all is one part
+                confirmed = (loop for loop in self.loops if not loop.reason)
+                refused |= self._outvoted(loop for loop in confirmed if _ends(loop) not in far)
             possible = [loop for loop in loops if _ends(loop) not in refused]
             drift = _DRIFT * np.sqrt(len(self._edges))
             graph = self._whole(possible, drift=drift, refused=refused)
