@@ -201,19 +201,18 @@ class KltFrontend:
     def _register_keyframe(
         self, prior: MotionPrior, reference: KltObservations, current: KltObservations
     ) -> RelativePose | Failure:
-        """Register by alignment alone, and by tracks too where that fails or confirms too little.
+        """Register by alignment alone, and by tracks too where that confirms few points in view.
 
         Patches that are aligned where they were expected cannot tell that the prediction is far
         off: then few come to rest, or they disagree. But the view may as well have changed: then
-        a sample of tracks is not found either. If the frames before could not be registered, few
-        points in view that agree are not enough.
+        a sample of tracks is not found either.
         """
         aligned = self._register_from(prior, reference, current, "aligned", is_step=False)
         if isinstance(aligned, Contradiction):
             return aligned
         if isinstance(aligned, RelativePose):
             n_confirmed = aligned.n_inliers**2 / (_MIN_SHARE_ALIGNED * aligned.n_matches)
-            if prior.is_confirmed or n_confirmed >= len(reference):
+            if n_confirmed >= len(reference):
                 return aligned
             _, in_view = self._predict(prior.T_predicted, reference, current)
             if n_confirmed >= len(in_view):
