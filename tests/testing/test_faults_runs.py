@@ -193,10 +193,14 @@ def _wrong_poses_are_told(fault: NamedFault, outcome: Outcome, source: FaultySou
         assert outcome.deviations.max() > _MIN_SILENT_DEVIATION
         return
     untouched = _untouched(source)
-    statuses = [row["status"] for row in outcome.rows if row["status"] != "skipped"]
+    rows = [row for row in outcome.rows if row["status"] != "skipped"]
+    # Until a segment is joined its place is a guess: that is told by a warning.
+    joined_at = {row["segment"]: k for k, row in enumerate(rows) if row["status"] == "resumed"}
     is_sound = np.array([
-        frame in untouched and status in ("ok", "resumed")
-        for frame, status in zip(outcome.frames.tolist(), statuses, strict=True)
+        frame in untouched
+        and row["status"] in ("ok", "resumed")
+        and (row["segment"] == "0" or k >= joined_at[row["segment"]])
+        for k, (frame, row) in enumerate(zip(outcome.frames.tolist(), rows, strict=True))
     ])  # fmt: skip
     assert outcome.errors_m[is_sound].max(initial=0.0) <= _MAX_ERROR_M
     assert outcome.deviations.max() <= _MAX_DEVIATION
