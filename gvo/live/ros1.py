@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from http.client import HTTPException
@@ -297,6 +297,7 @@ class _Reconfigure:
     def __init__(self, node: Ros1, parameters: Parameters, *, warn: Callable[[str], None]) -> None:
         self._parameters, self._warn = parameters, warn
         self._known = _known_parameters()
+        self._closed: set[str] = set()  # groups that a client shows folded
         self._tell_config = _opened(node, "~parameter_updates", "Config")
         _opened(node, "~parameter_descriptions", "ConfigDescription")(self._description())
         self._tell(parameters.config)
@@ -304,16 +305,22 @@ class _Reconfigure:
         node.serve(Service(name="~set_parameters", type=_RECONFIGURE, answer=self._set))
 
     def _tell(self, config: Config) -> None:
-        self._tell_config(_config(self._values(config), list_parameters()))
+        self._tell_config(self._state(config))
+
+    def _state(self, config: Config) -> Any:  # noqa: ANN401 - made at run time
+        return _config(self._values(config), list_parameters(), closed=self._closed)
 
     def _set(self, request: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run time
+        if groups := request.config.groups:
+            closed = {group.name for group in groups if not group.state}
+            self._closed = closed & {*list_parameters()}
         try:
             self._parameters.set(self._wanted(request.config))
         except ConfigurationError as error:
             _LOGGER.warning("dynamic_reconfigure: %s", error)
             self._warn(str(error))
             self._tell(self._parameters.config)
-        return {"config": _config(self._values(self._parameters.config), list_parameters())}
+        return {"config": self._state(self._parameters.config)}
 
     def _wanted(self, config: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run time
         """Return what is to be set, by `section.key`."""
@@ -388,15 +395,17 @@ def _enumeration(parameter: Parameter) -> str:
     return repr({"enum": choices, "enum_description": parameter.hint}) if choices else ""
 
 
-def _config(values: Mapping[str, Any], sections: Iterable[str] = ()) -> Any:  # noqa: ANN401
-    """Return a message of values, and of groups where sections are given."""
+def _config(
+    values: Mapping[str, Any], sections: Iterable[str] = (), *, closed: Container[str] = ()
+) -> Any:  # noqa: ANN401 - made at run time
+    """Return a message of values, and of groups, some closed, where sections are given."""
     lists: dict[str, list[Any]] = {f"{type_}s": [] for type_ in _TYPES.values()}
     for name, value in values.items():
         type_ = _TYPES[type(value)]
         item = _make(f"{type_.capitalize()}Parameter", name=name, value=value)
         lists[f"{type_}s"].append(item)
     groups = [
-        _make("GroupState", name=name, state=True, id=index, parent=0)
+        _make("GroupState", name=name, state=name not in closed, id=index, parent=0)
         for index, name in enumerate(["Default", *sections] if sections else [])
     ]
     return _make("Config", groups=groups, **lists)

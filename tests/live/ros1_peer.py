@@ -169,6 +169,7 @@ def parameters() -> dict[str, Any]:
     ]
     until(lambda: any("window.size" in line for line in logged), logged)
     log.unregister()
+    folded = client.update_configuration({"groups": client.update_groups({"klt": False})})
     return {
         "n": len(first) - 1,  # but the groups
         "groups": [*client.get_group_descriptions()["groups"]],
@@ -176,6 +177,7 @@ def parameters() -> dict[str, Any]:
         "readout": listed["camera__readout_ms"],
         "kind": listed["features__kind"]["edit_method"],
         "answers": answers,
+        "open": {name: one["state"] for name, one in folded["groups"]["groups"].items()},
     }
 
 
