@@ -300,20 +300,22 @@ class WindowGraph:
         """Add an edge between two poses of the window; return the new estimate of the frame."""
         pose, reference = self.poses[frame_id], self.poses[edge.reference_id]
         factor = self._factors.between(reference.key, pose.key, Measurement.of(edge))
-        estimate = self._hardened_on_error(partial(self._extend, frame_id, factor))
+        estimate = self._extend(frame_id, factor)
         pose.edges.append(AcceptedEdge(edge, self._factors, reference.key))
         return estimate
 
     def add_prior(self, frame_id: FrameId, prior: Prior) -> Estimate:
         """Add a prior to a pose of the window; return its new estimate."""
         pose = self.poses[frame_id]
-        factor = self._factors.prior(pose.key, prior)
-        estimate = self._hardened_on_error(partial(self._extend, frame_id, factor))
+        estimate = self._extend(frame_id, self._factors.prior(pose.key, prior))
         pose.priors.append((prior, self._factors))
         return estimate
 
     def _extend(self, frame_id: FrameId, factor: gtsam.NonlinearFactor) -> Estimate:
         """Add a factor on poses of the window."""
+        return self._hardened_on_error(partial(self._add_factor, frame_id, factor))
+
+    def _add_factor(self, frame_id: FrameId, factor: gtsam.NonlinearFactor) -> Estimate:
         factors = gtsam.NonlinearFactorGraph()
         factors.add(factor)
         key = self.poses[frame_id].key

@@ -188,7 +188,7 @@ class Odometry:
             step = self._chain.advance(
                 observations,
                 variance_factor=self._variance_factor(),
-                seeks_places=self._loops is not None and self._config.loops.enabled,
+                seeks_places=self._searching() is not None,
             )
             self._note_break(step)
         with watch.stage("links"):
@@ -507,6 +507,10 @@ class Odometry:
         kept_ns = self._keyframes.stamps_ns
         self._starts = {ns: each for ns, each in self._starts.items() if ns in kept_ns}
 
+    def _searching(self) -> LoopDetector | None:
+        """Return what searches places; None where that is switched off or cannot be done."""
+        return self._loops if self._config.loops.enabled else None
+
     def _look(
         self,
         observations: _Observations,
@@ -516,9 +520,10 @@ class Odometry:
         is_keyframe: bool,
     ) -> tuple[Loop, ...]:
         """Return the loops that are confirmed with a frame."""
-        if self._loops is None or not self._config.loops.enabled:
+        detector = self._searching()
+        if detector is None:
             return ()
-        return self._loops.look(
+        return detector.look(
             observations,
             T_world_frame,
             near=set(self._keyframes.stamps_ns).difference(self._unjoined()),
