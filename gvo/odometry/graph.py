@@ -270,6 +270,8 @@ class RunGraph:
         # Numbers of keyframes, merged ones too, at which the next one begins and is taken over.
         self._next = self._due = 0
         self._is_due = False
+        # The confirmed loops of keyframes that are not merged.
+        self._standing: dict[int, Loop] = {}
         self.loops: Sequence[Loop] = ()
         self.T_map_world: FloatArray = np.eye(4)
 
@@ -472,16 +474,18 @@ class RunGraph:
         """
         n_keyframes = len(self._known)
         self._is_due = self._is_due or bool(loops)
+        self._standing |= {loop.stamp_ns: loop for loop in loops if loop.stamp_ns in self}
         if self._running is not None and n_keyframes >= self._due:
             self._take_over(self._running, places)
             self._running = None
         if self._running is None and self._is_due and n_keyframes >= self._next:
-            self._is_due = False
+            self._is_due, self._began_with = False, self._last
             self._due = n_keyframes + max(_N_LATER, int(_SHARE_LATER * len(self)))
             self._next = n_keyframes + max(_N_APART, int(_GROWTH * len(self)))
-            self._began_with = self._last
-            pool = ThreadPoolExecutor(1)
-            self._running = pool.submit(self._copied()._solve)
+            graph, pool = self._copied(), ThreadPoolExecutor(1)
+            if not graph._guesses:  # else those of merged keyframes tell which part is where
+                graph.loops = [self._standing[ns] for ns in self._keyframes if ns in self._standing]
+            self._running = pool.submit(graph._solve)
             pool.shutdown(wait=False)
 
     def _take_over(self, running: Future[_Solution], places: Container[int]) -> None:
@@ -499,14 +503,12 @@ class RunGraph:
         Not across a loss: what is merged stays so, though its loop may be doubted later.
         """
         counting, lost = {loop.stamp_ns: loop for loop in loops}, self._losses()
-        references = {loop.reference_ns for loop in counting.values()}
+        references = {*self._guesses.values(), *(loop.reference_ns for loop in loops)}
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
-        references |= {*self._guesses, *self._guesses.values()}
         for ns in list(self._keyframes)[1:-_N_LATEST]:
             loop = counting.get(ns)
-            if ns in places or ns in references:
-                continue
-            if loop is not None and bisect(lost, ns) > bisect(lost, loop.reference_ns):
+            is_across = loop is not None and bisect(lost, ns) > bisect(lost, loop.reference_ns)
+            if is_across or ns in places or ns in references or ns in self._guesses:
                 continue
             if loop is not None and n_at[loop.reference_ns] > _N_PER_PLACE:
                 n_at[loop.reference_ns] -= 1
@@ -528,6 +530,7 @@ class RunGraph:
         hub_ns = min(edges, key=lambda ns: float(np.trace(edges[ns].covariance[3:, 3:])))
         hub_ns = hub_ns if loop is None else int(loop.reference_id)  # type: ignore[call-overload]
         del self._keyframes[stamp_ns]
+        self._standing.pop(stamp_ns, None)
         hub = edges.pop(hub_ns)
         self._merged_at[self._known.number(stamp_ns)] = len(self._merged)
         place = hub.T_reference_frame, hub.covariance, np.zeros((6, 6))
@@ -730,9 +733,7 @@ class RunGraph:
         equal rooms do; and of those whose keyframe was merged elsewhere, which were refused.
         """
         loops, far, elsewhere = [], set(), set()
-        for loop in self.loops:
-            if loop.reason:
-                continue
+        for loop in (each for each in self.loops if not each.reason):
             if loop.stamp_ns not in self._keyframes:
                 if self._home(loop.stamp_ns).reference_id != loop.reference_ns:
                     elsewhere.add(_ends(loop))

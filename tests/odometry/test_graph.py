@@ -244,6 +244,27 @@ def test_a_map_does_not_grow_with_laps_of_the_same_block(monkeypatch: pytest.Mon
     assert errors[1] < 1.3 * errors[0]
 
 
+def test_loops_of_merged_keyframes_are_not_read_again_on_the_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    solve = RunGraph._solve
+    n_standing: list[int] = []
+    merged: list[Loop] = []
+
+    def count(graph: RunGraph) -> object:
+        n_standing.append(sum(loop.stamp_ns in graph for loop in graph.loops))
+        merged.extend(loop for loop in graph.loops if loop.stamp_ns not in graph)
+        return solve(graph)
+
+    monkeypatch.setattr(graph_module, "_N_LATEST", 10)
+    monkeypatch.setattr(graph_module, "_N_PER_PLACE", 1)
+    monkeypatch.setattr(RunGraph, "_solve", count)
+    drive, detector = go_round(block(5, n_per_lap=N_LAP, side_m=25.0), N_LAP, n_links=1)
+    assert any(loop.stamp_ns not in drive.graph for loop in detector.loops)
+    assert max(n_standing) > 20
+    assert not merged
+
+
 def test_merged_keyframes_tell_no_more_than_they_did() -> None:
     drive = looped(3)
     before = drive.graph.optimize()
