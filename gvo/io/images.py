@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import stat
 import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from gvo.errors import RecordingError
@@ -513,7 +513,7 @@ def is_png_complete(data: NDArray[np.uint8]) -> bool:
 
 def _is_png_chunk_sound(chunk: memoryview) -> bool:
     check, name = int.from_bytes(chunk[-4:], "big"), chunk[4:8].tobytes()
-    return name != b"IDAT" or zlib.crc32(chunk[4:-4]) == check
+    return name != b"IDAT" or isal_zlib.crc32(chunk[4:-4]) == check
 
 
 def _png_chunks(data: NDArray[np.uint8]) -> Iterator[tuple[bytes, int, int]]:
@@ -543,10 +543,10 @@ def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
             parts.append(data[start:end].tobytes())
         elif name == b"IDAT":
             contents.append(data.data[start + 8 : end - 4])
-    stream, inflater = b"".join(contents), zlib.decompressobj()
+    stream, inflater = b"".join(contents), isal_zlib.decompressobj()
     try:
         rows = inflater.decompress(stream, n_bytes) if n_bytes else b""
-    except zlib.error:
+    except isal_zlib.error:
         rows = b""
     if not rows or len(rows) < n_bytes:
         return _decode_by_opencv(data)
@@ -554,7 +554,7 @@ def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     if pixels is not None:
         return pixels
     end = len(stream) - len(inflater.unused_data)
-    check = stream[end - 4 : end] if inflater.eof else struct.pack(">I", zlib.adler32(rows))
+    check = stream[end - 4 : end] if inflater.eof else struct.pack(">I", isal_zlib.adler32(rows))
     stored = [stream[:2], *_stored(rows), check]
     parts += [*_png_chunk(b"IDAT", stored), *_png_chunk(_PNG_END, [])]
     return _decode_by_opencv(np.frombuffer(b"".join(parts), dtype=np.uint8))
@@ -579,7 +579,7 @@ def _unfiltered(header: bytes | memoryview, rows: bytes) -> NDArray[Any] | None:
 
 
 def _stored(content: bytes) -> Iterator[bytes | memoryview]:
-    """Yield content as stored blocks of a stream, which `zlib` at level 0 copies twice."""
+    """Yield content as stored blocks of a stream, which a compressor at level 0 copies twice."""
     for first in range(0, len(content), _MAX_STORED):
         block = memoryview(content)[first : first + _MAX_STORED]
         is_last = first + _MAX_STORED >= len(content)
@@ -601,9 +601,9 @@ def _n_png_bytes(header: bytes) -> int:
 
 
 def _png_chunk(name: bytes, contents: Sequence[bytes | memoryview]) -> list[bytes | memoryview]:
-    check = zlib.crc32(name)
+    check = isal_zlib.crc32(name)
     for content in contents:
-        check = zlib.crc32(content, check)
+        check = isal_zlib.crc32(content, check)
     return [struct.pack(">I", sum(map(len, contents))), name, *contents, struct.pack(">I", check)]
 
 
