@@ -546,7 +546,7 @@ def _decode_png(data: NDArray[np.uint8]) -> NDArray[Any] | None:
     stream, inflater = b"".join(contents), isal_zlib.decompressobj()
     try:
         rows = inflater.decompress(stream, n_bytes) if n_bytes else b""
-    except isal_zlib.error:
+    except isal_zlib.error:  # type: ignore[misc]  # a class, the stub has an instance
         rows = b""
     if not rows or len(rows) < n_bytes:
         return _decode_by_opencv(data)
