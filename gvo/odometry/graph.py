@@ -479,12 +479,14 @@ class RunGraph:
             self._take_over(self._running, places)
             self._running = None
         if self._running is None and self._is_due and n_keyframes >= self._next:
-            self._is_due, self._began_with = False, self._last
+            self._is_due = False
             self._due = n_keyframes + max(_N_LATER, int(_SHARE_LATER * len(self)))
             self._next = n_keyframes + max(_N_APART, int(_GROWTH * len(self)))
-            graph, pool = self._copied(), ThreadPoolExecutor(1)
+            self._began_with = self._last
+            graph = self._copied()
             if not graph._guesses:  # else those of merged keyframes tell which part is where
                 graph.loops = [self._standing[ns] for ns in self._keyframes if ns in self._standing]
+            pool = ThreadPoolExecutor(1)
             self._running = pool.submit(graph._solve)
             pool.shutdown(wait=False)
 
@@ -507,8 +509,9 @@ class RunGraph:
         n_at = Counter(counting[ns].reference_ns for ns in self._keyframes if ns in counting)
         for ns in list(self._keyframes)[1:-_N_LATEST]:
             loop = counting.get(ns)
-            is_across = loop is not None and bisect(lost, ns) > bisect(lost, loop.reference_ns)
-            if is_across or ns in places or ns in references or ns in self._guesses:
+            if ns in places or ns in references or ns in self._guesses:
+                continue
+            if loop is not None and bisect(lost, ns) > bisect(lost, loop.reference_ns):
                 continue
             if loop is not None and n_at[loop.reference_ns] > _N_PER_PLACE:
                 n_at[loop.reference_ns] -= 1
@@ -733,7 +736,9 @@ class RunGraph:
         equal rooms do; and of those whose keyframe was merged elsewhere, which were refused.
         """
         loops, far, elsewhere = [], set(), set()
-        for loop in (each for each in self.loops if not each.reason):
+        for loop in self.loops:
+            if loop.reason:
+                continue
             if loop.stamp_ns not in self._keyframes:
                 if self._home(loop.stamp_ns).reference_id != loop.reference_ns:
                     elsewhere.add(_ends(loop))
