@@ -164,7 +164,7 @@ class DescriptorFrontend:
     def describe(self, observations: Observations) -> Observations:
         """Return a frame as a place: fewer points, without what only neighbours need."""
         chosen = thin(len(observations))
-        return replace(
+        place = replace(
             observations,
             keypoints=observations.keypoints[chosen],
             disparities=observations.disparities[chosen],
@@ -173,6 +173,8 @@ class DescriptorFrontend:
             descriptors_left=observations.descriptors_left[chosen],
             descriptors_right=None,
         )
+        self.rig_offsets.velocities.copy(observations, place)
+        return place
 
     def recognize(
         self, reference: Observations, current: Observations, observations: Observations
