@@ -16,10 +16,11 @@ doi:10.1109/CVPR.2012.6247831.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from gvo.geometry.camera import StereoCamera
 from gvo.geometry.correspondences import Correspondences
 from gvo.types import (
     ConstantError,
-    Contradiction,
     Failure,
     FloatArray,
     IntArray,
@@ -48,8 +48,10 @@ _DISPARITY_FACTOR = 3.0
 _READOUT_FACTOR = 5.0
 # What registrations are told to doubt besides.
 _VELOCITY = "velocity"
-# Sigma of the newest frame's velocity, relative to the change from the step before to the last one.
+# Sigma of the newest frame's velocity, relative to the change from the step before to the last one,
+# and of this change along each axis, relative to the last step, where the step before is unknown.
 _SIGMA_OF_CHANGE = 1.0
+_FIRST_CHANGE = 0.2
 # A row offset of the right image, the median of many measurements, that is worth a word.
 _LEAST_ROW_PX = 0.04
 # Stamps nearer to each other than this, in seconds, tell no velocity.
@@ -62,6 +64,9 @@ _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
 # Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms.
 _READOUT_PRIOR_S = 0.03
+_NO_DOUBTS = np.empty((0, 6))
+# No rolling shutter is faster, seconds.
+_LEAST_READOUT_S = 1e-3
 # Drift per frame: temperature, vibration.
 _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
@@ -169,6 +174,7 @@ class FrameVelocities:
         self._steps: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._velocities: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
         self._doubts: WeakKeyDictionary[Stamped, FloatArray] = WeakKeyDictionary()
+        self._starts: WeakKeyDictionary[Stamped, ref[Stamped]] = WeakKeyDictionary()
 
     def expect(
         self, reference: Stamped, current: Stamped, T_reference_current: FloatArray | None
@@ -176,8 +182,8 @@ class FrameVelocities:
         """Take over the step between two frames, or that it is unknown.
 
         The reference moves with the mean of the steps before and after; the current frame with
-        its step and half of its change. What an earlier step between the two left behind plays no
-        role.
+        its step and half of its change, which is in doubt, and so did the first frame of all. What
+        an earlier step between the two left behind plays no role.
         """
         elapsed_s = 1e-9 * (current.stamp_ns - reference.stamp_ns)
         if abs(elapsed_s) < _MIN_ELAPSED_S:
@@ -192,12 +198,20 @@ class FrameVelocities:
                 self._velocities[reference] = before
             return
         step = se3.log(T_reference_current) / elapsed_s
-        before = step if before is None else before
         self._steps[current] = step
+        if before is None:
+            self._velocities[reference] = self._velocities[current] = step
+            turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+            self._doubts[current] = _FIRST_CHANGE * np.diag([turn] * 3 + [shift] * 3)
+            self._starts[current] = ref(reference)
+            return
+        start = self._starts[reference]() if reference in self._starts else None
+        if start is not None:
+            self._velocities[start] = before - 0.5 * (step - before)
         self._velocities[reference] = 0.5 * (before + step)
         self._velocities[current] = step + 0.5 * (step - before)
         self._doubts.pop(reference, None)
-        self._doubts[current] = _SIGMA_OF_CHANGE * (step - before)
+        self._doubts[current] = _SIGMA_OF_CHANGE * (step - before)[np.newaxis]
 
     def of(self, observations: Stamped) -> FloatArray | None:
         """Return a twist per second (rad/s, m/s), right of the pose; None where it is unknown."""
@@ -209,12 +223,14 @@ class FrameVelocities:
         if velocity is not None:
             self._velocities[other] = velocity
 
-    def doubt(self, observations: Stamped) -> FloatArray | None:
-        """Return by how much the velocity may be off, one sigma; None where the next step is known.
+    def doubts(self, observations: Stamped) -> FloatArray:
+        """Return by how much the velocity may be off, shape (k, 6): k independent sigmas.
 
-        The newest frame's is extrapolated: the camera may go on changing its velocity, or not.
+        There are none where the next step is known. The newest frame's velocity is extrapolated:
+        the camera may go on changing it, or not. In a first step, of which no change is known, it
+        may do so along any axis.
         """
-        return self._doubts.get(observations)
+        return self._doubts.get(observations, _NO_DOUBTS)
 
 
 class RigOffsets:
@@ -290,6 +306,12 @@ class RigOffsets:
         A global shutter is not to be bent by what is left of the noise.
         """
         return self.readout.value if abs(self.readout.value) > self.readout.sigma else 0.0
+
+    @property
+    def possible_readout_s(self) -> float:
+        """How long the readout may be, seconds: zero where it is known to take no time."""
+        possible_s = math.hypot(self.readout_s, self.readout.sigma)
+        return possible_s if possible_s > _LEAST_READOUT_S else 0.0
 
     @property
     def is_learning(self) -> bool:
@@ -523,19 +545,19 @@ class CalibratedCamera:
         velocities = self._offsets.velocities
         first, second = measured.frames
         hints: dict[str, Any] = {"stamps_ns": (first.stamp_ns, second.stamp_ns), "prior": prior}
-        if is_step and self._offsets.readout_s != 0.0:
+        # A first step has no velocity yet to start from.
+        is_known = velocities.of(first) is not None
+        if is_step and is_known and self._offsets.possible_readout_s > 0.0:
             rough = estimate_roughly(self._corrected(measured), self._camera, config, **hints)
             # What fails is tried again as a whole, to tell why.
             if not isinstance(rough, Failure):
                 hints["T_start"] = rough
                 velocities.expect(first, second, se3.invert(rough))
-        corrected = self._with_sensitivities(self._corrected(measured), measured)
-        result = self._register(corrected, measured, config, hints)
-        if isinstance(result, Contradiction) and hints.pop("T_start", None) is not None:
-            # What was found roughly may be the other one of two motions.
+        result = self._register(measured, config, hints, is_step=is_step)
+        if isinstance(result, Failure) and hints.pop("T_start", None) is not None:
+            # What was found roughly may be the other one of two motions, or none.
             velocities.expect(first, second, (None if prior is None else prior.T_predicted))
-            corrected = self._with_sensitivities(self._corrected(measured), measured)
-            result = self._register(corrected, measured, config, hints)
+            result = self._register(measured, config, hints, is_step=is_step)
         if isinstance(result, Failure):
             return result
         if is_step:
@@ -543,15 +565,10 @@ class CalibratedCamera:
         return check_rows(result, self._camera)
 
     def _register(
-        self,
-        corrected: Correspondences,
-        measured: Measurements,
-        config: Config,
-        hints: Mapping[str, Any],
+        self, measured: Measurements, config: Config, hints: Mapping[str, Any], *, is_step: bool
     ) -> RelativePose | Failure:
-        result = register_correspondences(
-            corrected, measured.matches, self._camera, config, **hints
-        )
+        prepared = self._prepared(measured, is_step=is_step)
+        result = register_correspondences(prepared, measured.matches, self._camera, config, **hints)
         if isinstance(result, Failure):
             return result
         # In sigmas of what is known of each constant, as the sensitivities are.
@@ -577,31 +594,34 @@ class CalibratedCamera:
         note("rows.settled", measured=measured.uvd[1] - self._offset(), settled=current)
         return Correspondences.of_pixels((reference, current), measured.sigmas, self._camera)
 
-    def _with_sensitivities(
-        self, corrected: Correspondences, measured: Measurements
-    ) -> Correspondences:
+    def _prepared(self, measured: Measurements, *, is_step: bool) -> Correspondences:
+        """Return what was measured, corrected, with its derivatives by what is in doubt."""
         sensitivities = {
             name: self._sensitivity(name, measured) * constant.sigma
             for name, constant in self._offsets.learnt.items()
         }
-        if self._offsets.readout_s != 0.0:
-            # By how much they change if velocities are off by one sigma.
-            rates = self._settling_rates(measured, self._offsets.velocities.doubt)
-            sensitivities[_VELOCITY] = self._offsets.readout_s * rates
-        return replace(corrected, sensitivities=sensitivities)
+        # By how much they change if velocities are off by one sigma. The change of velocity that
+        # tells a step the readout is as large as its doubt: it counts before the readout is known.
+        readout_s = self._offsets.possible_readout_s if is_step else self._offsets.readout_s
+        if readout_s != 0.0:
+            doubts = [self._offsets.velocities.doubts(frame) for frame in measured.frames]
+            for i, each in enumerate(zip_longest(*doubts)):
+                sensitivities[f"{_VELOCITY}{i}"] = readout_s * self._settling_rates(measured, each)
+        return replace(self._corrected(measured), sensitivities=sensitivities)
 
     def _sensitivity(self, name: str, measured: Measurements) -> FloatArray:
         """Return the derivatives of corrected measurements by an error of a constant."""
         if name == DISPARITY:
             return np.tile([0.0, 0.0, 1.0], (2, len(measured.matches), 1))
-        return -self._settling_rates(measured, self._offsets.velocities.of)
+        velocities = [self._offsets.velocities.of(frame) for frame in measured.frames]
+        return -self._settling_rates(measured, velocities)
 
     def _settling_rates(
-        self, measured: Measurements, velocity_of: Callable[[Stamped], FloatArray | None]
+        self, measured: Measurements, velocities: Sequence[FloatArray | None]
     ) -> FloatArray:
         """Return the derivatives of corrected measurements by the readout time, (2, n, 3)."""
         rates = [
-            settling_rates(uvd - self._offset(), velocity_of(frame), self._camera)
-            for frame, uvd in zip(measured.frames, measured.uvd, strict=True)
+            settling_rates(uvd - self._offset(), velocity, self._camera)
+            for velocity, uvd in zip(velocities, measured.uvd, strict=True)
         ]
         return np.stack(rates)

@@ -236,7 +236,7 @@ STEPS = np.array([[0.01, -0.02, 0.005, 0.03, 0.01, 0.04], [0, 0.02, 0, 0.01, 0, 
 def assert_velocity(velocities: FrameVelocities, frame: Seen, expected: FloatArray) -> None:
     velocity = velocities.of(frame)
     assert velocity is not None
-    np.testing.assert_allclose(velocity, expected)
+    np.testing.assert_allclose(velocity, expected, atol=1e-12)
 
 
 def test_a_frame_moves_with_the_mean_of_the_steps_around_it() -> None:
@@ -250,7 +250,8 @@ def test_a_frame_moves_with_the_mean_of_the_steps_around_it() -> None:
         velocities.expect(second, third, se3.exp(STEPS[1]))
         mean = 0.5 * (10.0 * STEPS[0] + 20.0 * STEPS[1])
         assert_velocity(velocities, second, mean)
-        # The last step and half of its change.
+        # A step and half of its change, before the first and after the last.
+        assert_velocity(velocities, first, 15.0 * STEPS[0] - 10.0 * STEPS[1])
         assert_velocity(velocities, third, 30.0 * STEPS[1] - 5.0 * STEPS[0])
     # Neither a frame itself nor one a nanosecond later tells a velocity.
     for later in (third, Seen(third.stamp_ns + 1)):
@@ -268,6 +269,18 @@ def test_of_an_unknown_step_only_the_one_before_is_known() -> None:
     assert velocities.of(third) is None
     velocities.expect(first, third, None)
     assert velocities.of(first) is None
+
+
+def test_the_velocity_of_a_frame_is_in_doubt_until_the_next_step_is_known() -> None:
+    first, second, third = (Seen(stamp) for stamp in (0, 100_000_000, 200_000_000))
+    velocities = FrameVelocities()
+    assert velocities.doubts(first).shape == (0, 6)
+    velocities.expect(first, second, se3.exp(STEPS[0]))
+    # It may change along any axis.
+    assert np.linalg.matrix_rank(velocities.doubts(second)) == 6
+    velocities.expect(second, third, se3.exp(STEPS[1]))
+    assert len(velocities.doubts(second)) == 0
+    np.testing.assert_allclose(velocities.doubts(third), 10.0 * (STEPS[1:] - STEPS[:1]))
 
 
 def test_velocities_are_forgotten_with_their_frames() -> None:
@@ -405,6 +418,38 @@ def shaken(sensor: Sensor, readout_ms: float) -> gvo.Odometry:
     for frame in frames_of(recording):
         odometry.track(frame)
     return odometry
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_first_steps_claim_no_more_than_is_known_of_the_readout(seed: int) -> None:
+    recording = gvo.SyntheticRecording(
+        "turning", "rgbd", n_frames=9, scale=0.5, seed=seed, readout_ms=25.0
+    )
+    odometry = gvo.Odometry(recording.info.camera)
+    results = [odometry.track(frame) for frame in frames_of(recording)]
+    poses = recording.ground_truth().T_world_frame
+    nees = []
+    for (i, T_world_reference), T_world_current in zip(enumerate(poses), poses[1:], strict=False):
+        step = results[i + 1].registration
+        assert isinstance(step, RelativePose)
+        T_error = se3.invert(step.T_reference_current) @ se3.invert(T_world_reference)
+        error = se3.log(T_error @ T_world_current)
+        nees.append(error @ np.linalg.solve(step.covariance, error) / 6.0)
+    assert max(nees) < 1.5
+    assert np.mean(nees) > 0.1
+    offsets = odometry.rig_offsets
+    assert offsets is not None
+    assert offsets.readout.sigma < offsets.readout.value < READOUT_S + 2.0 * offsets.readout.sigma
+
+
+@pytest.mark.parametrize("readout_ms", [0.0, 0.5, 25.0, None])
+def test_a_readout_is_possible_until_it_is_known_to_take_no_time(readout_ms: float | None) -> None:
+    offsets = RigOffsets(config(readout_ms))
+    assert (offsets.possible_readout_s > 0.0) == (readout_ms in (25.0, None))
+    for _ in range(100):
+        offsets.readout.update(-offsets.readout.value, 1e-3)
+    if readout_ms is None:
+        assert offsets.possible_readout_s == 0.0
 
 
 @pytest.mark.acceptance

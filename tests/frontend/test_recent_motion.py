@@ -74,9 +74,8 @@ def test_the_recent_motion_counts_where_the_prediction_is_and_not_in_the_round_a
     kind: str, heeding: list[bool], n_rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = gvo.SyntheticRecording("handheld", "rgbd", n_frames=2, scale=0.25)
-    frontend: Any = make_frontend(
-        recording.info.camera, Config.model_validate({"frontend": {"kind": kind}})
-    )
+    sections = {"frontend": {"kind": kind}, "camera": {"readout_ms": 0.0}}
+    frontend: Any = make_frontend(recording.info.camera, Config.model_validate(sections))
     pair = [frontend.extract(frame) for frame in gvo.frames(recording, Config())]
     still, recent = np.eye(4), se3.exp(BUS)
     handed: list[bool] = []
