@@ -62,11 +62,11 @@ _FEIGNED_PX = 0.05
 # Sigmas of the row offset measured in one frame, and of its prior, pixels.
 _ROW_SIGMA_PX = 0.1
 _ROW_PRIOR_PX = 0.3
-# Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms.
-_READOUT_PRIOR_S = 0.03
 _NO_DOUBTS = np.empty((0, 6))
-# No rolling shutter is faster, seconds.
-_LEAST_READOUT_S = 1e-3
+# Sigma of the prior of the readout time, seconds: rolling shutters take 5 to 33 ms. Below the lower
+# one a readout that may be zero is taken for zero.
+_READOUT_PRIOR_S = 0.03
+_LEAST_READOUT_S = 0.005
 # Drift per frame: temperature, vibration.
 _DRIFT_PX = 5e-4
 _DRIFT_S = 1e-5
@@ -310,8 +310,8 @@ class RigOffsets:
     @property
     def possible_readout_s(self) -> float:
         """How long the readout may be, seconds: zero where it is known to take no time."""
-        possible_s = math.hypot(self.readout_s, self.readout.sigma)
-        return possible_s if possible_s > _LEAST_READOUT_S else 0.0
+        is_possible = self.readout_s != 0.0 or self.readout.sigma > _LEAST_READOUT_S
+        return math.hypot(self.readout_s, self.readout.sigma) if is_possible else 0.0
 
     @property
     def is_learning(self) -> bool:

@@ -442,10 +442,10 @@ def test_first_steps_claim_no_more_than_is_known_of_the_readout(seed: int) -> No
     assert offsets.readout.sigma < offsets.readout.value < READOUT_S + 2.0 * offsets.readout.sigma
 
 
-@pytest.mark.parametrize("readout_ms", [0.0, 0.5, 25.0, None])
+@pytest.mark.parametrize("readout_ms", [0.0, 0.5, None])
 def test_a_readout_is_possible_until_it_is_known_to_take_no_time(readout_ms: float | None) -> None:
     offsets = RigOffsets(config(readout_ms))
-    assert (offsets.possible_readout_s > 0.0) == (readout_ms in (25.0, None))
+    assert (offsets.possible_readout_s > 0.0) == (readout_ms != 0.0)
     for _ in range(100):
         offsets.readout.update(-offsets.readout.value, 1e-3)
     if readout_ms is None:
