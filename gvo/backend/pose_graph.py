@@ -231,16 +231,6 @@ class PoseGraph:
         """Return the marginal covariance of a pose, shape (6, 6), symmetric positive definite."""
         return definite(self._isam.marginalCovariance(key))
 
-    def covariances(self, keys: Sequence[int]) -> list[FloatArray]:
-        """Return the marginal covariances of poses, computed jointly."""
-        if len(keys) == 1:
-            return [self.covariance(keys[0])]
-        joint = _symmetric(self._isam.jointMarginalCovariance(keys).fullMatrix())
-        blocks = [joint[row : row + 6, row : row + 6] for row in range(0, len(joint), 6)]
-        if is_definite(joint):
-            return blocks
-        return [block if is_definite(block) else _repaired(block) for block in blocks]
-
     def joint_covariance(self, first: int, second: int) -> FloatArray:
         """Return the joint covariance of two poses, shape (12, 12), in the order asked for."""
         return np.asarray(self._isam.jointMarginalCovariance([first, second]).fullMatrix())

@@ -251,8 +251,7 @@ class WindowGraph:
         leaving_keys = [self.poses[frame_id].key for frame_id in leaving]
         with self._isam.restored_on_error():
             self._update(pose, key, edges, leaving_keys)
-            # The new pose first: GTSAM is faster in this order.
-            covariance, *others = self._isam.covariances([key, *leaving_keys])
+            covariance, *others = map(self._isam.covariance, [key, *leaving_keys])
             T_world_frame = self._isam.pose(key)
             _check_result(T_world_frame)
             finished = list(map(self._estimate, leaving, others))
