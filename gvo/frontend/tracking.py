@@ -32,8 +32,9 @@ _BACK_LEVELS = 0
 _REDUCTION = 2
 # Side of the square over which the gradients are summed, there.
 _BLOCK_PX = 3
-# Half size of the patches.
+# Half size of the patches, and the offsets of their pixels, homogeneous.
 RADIUS_PX = 4
+_STEPS = np.vstack([steps_around(RADIUS_PX, RADIUS_PX), np.ones((2 * RADIUS_PX + 1) ** 2, "f4")])
 # Variance of a gradient that is noise, grey values squared: keeps flat patches from dividing by
 # nothing.
 _NOISE = 1.0
@@ -354,31 +355,32 @@ class Templates:
         is_found : ndarray of bool, shape (n,)
             False where the search does not come to rest, or what it finds is unlike the patch.
         """
-        pixels = start.copy()
+        pixels, warps = start.copy(), warps.astype(np.float32)
         for _ in range(n_steps):
-            seen = sample_warped(image, pixels, warps)
-            seen -= seen.mean(axis=1, keepdims=True)
-            seen -= self.values
-            slopes = np.matmul(self.gradients, seen[:, :, np.newaxis])
-            steps = np.matmul(self.inverses, slopes)
+            # Its mean has no effect: that of the gradients is zero.
+            differences = sample_warped(image, pixels, warps) - self.values
+            slopes = np.einsum("nij,nj->ni", self.gradients, differences)
+            steps = np.einsum("nij,nj->ni", self.inverses, slopes)
             clipped = np.clip(steps, -_MAX_STEP_PX, _MAX_STEP_PX)
-            moves = np.matmul(warps, clipped)[:, :, 0]
+            moves = np.einsum("nij,nj->ni", warps, clipped)
             pixels -= moves
+        differences -= differences.mean(axis=1, keepdims=True)
         # What the last step explains of the difference is gone.
         n_pixels = self.values.shape[1]
-        left = np.einsum("ni,ni->n", seen, seen) - np.einsum("nij,nij->n", slopes, steps)
+        left = np.einsum("ni,ni->n", differences, differences)
+        left -= np.einsum("ni,ni->n", slopes, steps)
         variances = np.einsum("ni,ni->n", self.values, self.values) / n_pixels
         are_alike = left / n_pixels <= _MAX_UNLIKE * variances + _UNLIKE_NOISE
         return pixels, are_alike & (np.hypot(*moves.T) < _MAX_LAST_STEP_PX)
 
 
-def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.float32]:
+def sample_warped(image: ImageArray, pixels: FloatArray, warps: FloatArray) -> NDArray[np.uint8]:
     """Return warped patches around pixels, shape (n, s * s), interpolated."""
-    if len(pixels) == 0:  # refused by OpenCV
-        return np.zeros((0, (2 * RADIUS_PX + 1) ** 2), dtype=np.float32)
-    places = np.matmul(warps.astype(np.float32), steps_around(RADIUS_PX, RADIUS_PX))
-    places += pixels.astype(np.float32)[:, :, np.newaxis]
-    seen = cv2.remap(
-        image, places[:, 0], places[:, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return seen.astype(np.float32)
+    n = len(pixels)
+    if n == 0:  # refused by OpenCV
+        return np.zeros((0, _STEPS.shape[1]), dtype=np.uint8)
+    places = np.empty((2, n, 3), dtype=np.float32)
+    places[:, :, :2], places[:, :, 2] = np.swapaxes(warps, 0, 1), pixels.T
+    columns, rows = places @ _STEPS
+    seen = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(seen, dtype=np.uint8)
