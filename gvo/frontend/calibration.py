@@ -440,18 +440,19 @@ def settle_rows(
     """
     if velocity is None or readout_s == 0.0 or len(uvd) == 0:
         return uvd
-    dt = (readout_s * _row_times(uvd, camera))[:, np.newaxis]
-    points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
-    turn = se3.skew(velocity[:3]).T
-    rates = points @ turn + velocity[3:]
-    # The motion is small: its exponential to second order.
-    moved = points + dt * (rates + 0.5 * dt * (rates @ turn))
-    in_front = moved[:, 2] > _MIN_DEPTH_M
-    if in_front.all():
-        return camera.project_stereo(moved)
-    settled = uvd.copy()
-    settled[in_front] = camera.project_stereo(moved[in_front])
-    return settled
+    u, v, disparities = uvd.T
+    dt = readout_s * _row_times(v, camera)
+    rates = _ray_rates(uvd, velocity, camera)
+    # The motion is small: its exponential to second order. All is divided by the depth.
+    x, y, z = dt * (rates + 0.5 * dt * (se3.skew(velocity[:3]) @ rates))
+    z += 1.0
+    in_front = z > (_MIN_DEPTH_M / (camera.fx * camera.baseline)) * disparities
+    z[~in_front] = 1.0  # left as they are
+    settled = np.empty_like(uvd)
+    settled[:, 0] = (u - camera.cx + camera.fx * x) / z + camera.cx
+    settled[:, 1] = (v - camera.cy + camera.fy * y) / z + camera.cy
+    settled[:, 2] = disparities / z
+    return settled if in_front.all() else np.where(in_front[:, np.newaxis], settled, uvd)
 
 
 def settling_rates(
@@ -460,18 +461,34 @@ def settling_rates(
     """Return the derivatives of what `settle_rows` gives by the readout time, shape (n, 3)."""
     if velocity is None:
         return np.zeros_like(uvd)
-    points = camera.unproject_stereo(uvd[:, :2], uvd[:, 2])
-    moving = (points @ se3.skew(velocity[:3]).T + velocity[3:]) / points[:, 2:]
-    pixels = uvd[:, :2] - [camera.cx, camera.cy]
+    u, v, disparities = uvd.T
+    x, y, z = _row_times(v, camera) * _ray_rates(uvd, velocity, camera)
     rates = np.empty_like(uvd)
-    rates[:, :2] = moving[:, :2] * [camera.fx, camera.fy] - pixels * moving[:, 2:]
-    rates[:, 2] = -uvd[:, 2] * moving[:, 2]
-    return np.asarray(_row_times(uvd, camera)[:, np.newaxis] * rates)
+    rates[:, 0] = camera.fx * x - (u - camera.cx) * z
+    rates[:, 1] = camera.fy * y - (v - camera.cy) * z
+    rates[:, 2] = -disparities * z
+    return rates
 
 
-def _row_times(uvd: FloatArray, camera: StereoCamera) -> FloatArray:
+def _ray_rates(uvd: FloatArray, velocity: FloatArray, camera: StereoCamera) -> FloatArray:
+    """Return how fast points move in the camera's frame over their depth, shape (3, n), 1/s."""
+    wx, wy, wz, *shift = velocity.tolist()
+    x, y = camera.cx / camera.fx, camera.cy / camera.fy
+    # omega x ray + shift / depth, by (u, v, disparity) and one.
+    a, b, c = (each / (camera.fx * camera.baseline) for each in shift)
+    rates = np.array(
+        [
+            [0.0, -wz / camera.fy, a, wy + wz * y],
+            [wz / camera.fx, 0.0, b, -wx - wz * x],
+            [-wy / camera.fx, wx / camera.fy, c, wy * x - wx * y],
+        ]
+    )
+    return np.asarray(rates[:, :3] @ uvd.T + rates[:, 3:])
+
+
+def _row_times(v: FloatArray, camera: StereoCamera) -> FloatArray:
     """Return when rows are exposed, as a share of the readout time after its middle."""
-    return np.asarray(uvd[:, 1] / camera.height - 0.5)
+    return np.asarray(v / camera.height - 0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -301,13 +301,15 @@ def estimate_constants(
     alone = np.sum(J_alone**2, axis=(1, 2))
     told = np.flatnonzero(np.diagonal(information) > _MIN_SHARE * alone)
     scores = np.einsum("kin,in->kn", unexplained.reshape(J_constants.shape), at.r)
-    errors = {}
-    for k in told:
-        known = np.diag(np.arange(len(scores)) != k).astype(np.float64)
-        gain = np.linalg.solve(information + known, np.eye(len(scores))[k])
-        errors[residuals.constants[k]] = ConstantError(
-            value=float(gain @ np.sum(scores, axis=1)),
-            sigma=float(np.sqrt(gain @ (scores @ scores.T + known) @ gain)),
-            effect=motion[:, k],
+    # One at a time is free, the others are known.
+    free = np.eye(len(scores))[told]
+    known = np.eye(len(scores)) - free[:, np.newaxis] * free[:, :, np.newaxis]
+    gains = np.linalg.solve(information + known, free[:, :, np.newaxis])[:, :, 0]
+    values = gains @ np.sum(scores, axis=1)
+    variances = np.einsum("mi,mij,mj->m", gains, scores @ scores.T + known, gains)
+    return {
+        residuals.constants[k]: ConstantError(
+            value=float(value), sigma=float(np.sqrt(variance)), effect=motion[:, k]
         )
-    return errors
+        for k, value, variance in zip(told, values, variances, strict=True)
+    }
