@@ -251,17 +251,19 @@ def search_disparities(
 
 def _find_rivals(correlations: NDArray[np.float32], best: IntArray, n_steps: int) -> FloatArray:
     """Return the next peaks, in steps, where they are nearly as good as the best, else NaN."""
-    rows, around = np.arange(len(best)), np.arange(-_PEAK_STEPS, _PEAK_STEPS + 1)
-    elsewhere, peaks = correlations.copy(), best
+    around = np.arange(-_PEAK_STEPS, _PEAK_STEPS + 1)
+    rows, elsewhere, peaks = np.arange(len(best)), correlations.copy(), best
     least = correlations[rows, best] - _MAX_GAP
     rivals = np.full((len(best), _N_RIVALS), np.nan)
     for rank in range(_N_RIVALS):
-        peak = np.clip(peaks[:, np.newaxis] + around, 0, n_steps)
-        elsewhere[rows[:, np.newaxis], peak] = -1.0
+        near = np.clip(peaks[:, np.newaxis] + around, 0, n_steps)
+        np.put_along_axis(elsewhere, near, -1.0, axis=1)
         peaks = np.argmax(elsewhere, axis=1)
-        high = np.flatnonzero(elsewhere[rows, peaks] > least)
-        between, is_between = parabola_minimum(-elsewhere[high])
-        rivals[high, rank] = n_steps - np.where(is_between, between, peaks[high])
+        # Where one is too low, so are the next.
+        high = np.flatnonzero(elsewhere[np.arange(len(peaks)), peaks] > least[rows])
+        rows, elsewhere, peaks = rows[high], elsewhere[high], peaks[high]
+        between, is_between = parabola_minimum(-elsewhere)
+        rivals[rows, rank] = n_steps - np.where(is_between, between, peaks)
     return rivals
 
 
