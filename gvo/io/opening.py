@@ -16,7 +16,6 @@ from gvo.io.calibration.files import CalibrationPaths
 from gvo.io.datasets.euroc import EurocSource
 from gvo.io.datasets.kitti import KittiSource
 from gvo.io.datasets.tum import TumSource
-from gvo.io.images import GreyRange
 from gvo.io.recording import Source
 
 BAG_SUFFIXES = (".bag", *STORAGE_SUFFIXES)
@@ -108,15 +107,12 @@ def _open_folder(path: Path, config: Config, options: RecordingOptions) -> Sourc
     for name in _TOPICS:
         if getattr(options, name) is not None:
             raise RecordingError(f"{path}: --{name} names a topic of a bag, this is no bag")
-    calibration = options.calibration
-    grey_range = GreyRange(black=config.images.black, white=config.images.white)
     if _is_kitti(path):
-        return KittiSource(path, calibration=calibration, grey_range=grey_range)
+        return KittiSource(path, calibration=options.calibration, config=config)
     if (path / "mav0").is_dir() or (path / "cam0").is_dir():
-        return EurocSource(path, calibration=calibration, grey_range=grey_range)
+        return EurocSource(path, calibration=options.calibration, config=config)
     if (path / "rgb.txt").is_file():
-        scale = config.depth.scale
-        return TumSource(path, calibration=calibration, depth_scale=scale, grey_range=grey_range)
+        return TumSource(path, calibration=options.calibration, config=config)
     raise RecordingError(f"{path}: is no recording; {_KINDS}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from gvo.config import Config
 from gvo.errors import CalibrationError
 from gvo.geometry import se3
 from gvo.io.calibration.camera_info import stereo_baseline
@@ -17,7 +18,6 @@ from gvo.io.calibration.files import (
     read_cameras,
 )
 from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
-from gvo.io.images import FULL_RANGE, GreyRange
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -35,8 +35,8 @@ class EurocSource(FolderSource):
     calibration : Path or sequence of Path, optional
         Files of the pair that replace intrinsics and rectification, see `read_cameras`; where
         they say where the cameras are on the body, that counts, too.
-    grey_range : GreyRange
-        Of images with 16 bits.
+    config : Config, optional
+        Of images with 16 bits; the defaults when left out.
 
     Raises
     ------
@@ -45,11 +45,7 @@ class EurocSource(FolderSource):
     """
 
     def __init__(
-        self,
-        folder: Path,
-        *,
-        calibration: CalibrationPaths = None,
-        grey_range: GreyRange = FULL_RANGE,
+        self, folder: Path, *, calibration: CalibrationPaths = None, config: Config | None = None
     ) -> None:
         self._root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         images = {name: _list_images(self._root / name) for name in ("cam0", "cam1")}
@@ -65,13 +61,9 @@ class EurocSource(FolderSource):
             f"rectification: {rectification}",
             f"baseline: {stereo_baseline(cameras.pair, str(self._root)):.4f} m",
         ]
-        super().__init__(
-            folder.resolve().parent if folder.name == "mav0" else folder,
-            replace(cameras, T_body_cam=self._T_body_cam),
-            images,
-            decisions,
-            grey_range=grey_range,
-        )
+        cameras = replace(cameras, T_body_cam=self._T_body_cam)
+        named = folder.resolve().parent if folder.name == "mav0" else folder
+        super().__init__(named, cameras, images, decisions, config)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the rectified left camera.

@@ -6,19 +6,23 @@ import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from numpy.typing import NDArray
 
 from gvo._text import cut, text_lines
+from gvo.config import Config
 from gvo.errors import RecordingError
 from gvo.io.calibration.files import CameraSet
-from gvo.io.images import FULL_RANGE, GreyRange, read_image
+from gvo.io.images import GreyRange, read_image
 from gvo.io.recording import RecordingInfo, Sensor, StampedImage
 from gvo.trajectory.trajectory import parse_stamp
 
 StampedPath = tuple[int, str]
 """Stamp in nanoseconds, and a file, as text: it takes a third of a Path's memory."""
+
+Load: TypeAlias = Callable[[Path], NDArray[Any]]
+"""Reads an image file."""
 
 _MAX_ROWS = 1_000_000  # of images, nine hours at 30 Hz
 _MAX_REASON = 300  # characters
@@ -38,10 +42,10 @@ class FolderSource:
         images.
     decisions : sequence of str
         What was chosen beside the streams, a line each.
+    config : Config, optional
+        Of grey and colour images with 16 bits; the defaults when left out.
     load_second : callable, optional
         Reads a file of the second stream; as a colour or grey image when left out.
-    grey_range : GreyRange
-        Of images with 16 bits.
     """
 
     def __init__(
@@ -50,9 +54,9 @@ class FolderSource:
         cameras: CameraSet,
         streams: Mapping[str, Sequence[StampedPath]],
         decisions: Sequence[str],
+        config: Config | None,
         *,
-        load_second: Callable[[Path], NDArray[Any]] | None = None,
-        grey_range: GreyRange = FULL_RANGE,
+        load_second: Load | None = None,
     ) -> None:
         self._first, self._second = streams.values()
         sensor: Sensor = "stereo" if len(cameras.calibrations) == 2 else "rgbd"
@@ -65,7 +69,7 @@ class FolderSource:
             decisions=[f"{sensor}: {' + '.join(streams)} {n_images}", *decisions],
             T_body_cam=cameras.T_body_cam,
         )
-        self._load = partial(read_image, grey_range=grey_range)
+        self._load = loader(config)
         self._load_second = load_second or self._load
 
     def images(self) -> Iterator[StampedImage]:
@@ -77,9 +81,13 @@ class FolderSource:
         )
 
 
-def _stream(
-    stream: int, rows: Sequence[StampedPath], load: Callable[[Path], NDArray[Any]]
-) -> Iterator[StampedImage]:
+def loader(config: Config | None) -> Load:
+    """Return what loads a grey or colour image, its 16 bits reduced as configured."""
+    images = (config or Config()).images
+    return partial(read_image, grey_range=GreyRange(black=images.black, white=images.white))
+
+
+def _stream(stream: int, rows: Sequence[StampedPath], load: Load) -> Iterator[StampedImage]:
     for stamp_ns, path in rows:
         yield StampedImage(stream=stream, stamp_ns=stamp_ns, load=partial(load, Path(path)))
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from gvo._text import cut, plain_number
+from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry import se3
 from gvo.geometry.camera import Calibration
 from gvo.io.calibration.camera_info import check_camera, rectified_calibration, stereo_baseline
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
-from gvo.io.datasets.files import FolderSource, StampedPath, read_rows, read_stamped_rows
-from gvo.io.images import FULL_RANGE, GreyRange, read_image
+from gvo.io.datasets.files import FolderSource, StampedPath, loader, read_rows, read_stamped_rows
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 from gvo.types import FloatArray
@@ -36,8 +36,8 @@ class KittiSource(FolderSource):
         Such a folder.
     calibration : Path or sequence of Path, optional
         Files of the pair that replace `calib.txt`, see `read_cameras`.
-    grey_range : GreyRange
-        Of images with 16 bits.
+    config : Config, optional
+        Of images with 16 bits; the defaults when left out.
 
     Raises
     ------
@@ -46,11 +46,7 @@ class KittiSource(FolderSource):
     """
 
     def __init__(
-        self,
-        folder: Path,
-        *,
-        calibration: CalibrationPaths = None,
-        grey_range: GreyRange = FULL_RANGE,
+        self, folder: Path, *, calibration: CalibrationPaths = None, config: Config | None = None
     ) -> None:
         self._folder = folder
         times = read_stamped_rows(folder / "times.txt", unit_ns=10**9, n_fields=1)
@@ -62,7 +58,7 @@ class KittiSource(FolderSource):
             cameras = read_cameras(files, sensor="stereo", is_rectified=True)
         else:
             files = (folder / "calib.txt",)
-            size = _image_size([path for _, path in images[names[0]]], grey_range)
+            size = _image_size([path for _, path in images[names[0]]], config)
             cameras = _read_cameras(files[0], names, size)
         self._t_cam0_cam = _camera_offset(cameras.calibrations[0])
         state = "rectified" if cameras.calibrations[0].is_rectified else "raw"
@@ -73,7 +69,7 @@ class KittiSource(FolderSource):
         n_missing = len(self._stamps_ns) - len(images[names[0]])
         if n_missing:
             decisions.append(f"missing: {n_missing} rows of times.txt have no image {names[0]}")
-        super().__init__(folder, cameras, images, decisions, grey_range=grey_range)
+        super().__init__(folder, cameras, images, decisions, config)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the left camera; the world is the first grey left camera.
@@ -130,12 +126,12 @@ def _find_pair(folder: Path) -> tuple[str, str]:
     raise RecordingError(f"{folder}: expected image_0 and image_1, or image_2 and image_3")
 
 
-def _image_size(paths: Sequence[str], grey_range: GreyRange) -> tuple[int, int]:
+def _image_size(paths: Sequence[str], config: Config | None) -> tuple[int, int]:
     """Return width and height of the first image that can be read."""
     first_fault = ""
     for path in paths:
         try:
-            height, width = read_image(Path(path), grey_range).shape[:2]
+            height, width = loader(config)(Path(path)).shape[:2]
         except RecordingError as error:
             first_fault = first_fault or str(error)
             continue  # it becomes a faulty frame later

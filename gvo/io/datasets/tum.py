@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gvo.config import Config
 from gvo.errors import CalibrationError, RecordingError
 from gvo.geometry.camera import Calibration
 from gvo.io.calibration.files import CalibrationPaths, CameraSet, paths_of, read_cameras
 from gvo.io.datasets.files import FolderSource, StampedPath, read_stamped_rows
-from gvo.io.images import FULL_RANGE, MILLIMETRES, GreyRange, read_depth
+from gvo.io.images import MILLIMETRES, read_depth
 from gvo.trajectory.formats import read_trajectory
 from gvo.trajectory.trajectory import Trajectory
 
@@ -52,11 +53,10 @@ class TumSource(FolderSource):
         Such a folder.
     calibration : Path or sequence of Path, optional
         File of the colour camera, see `read_cameras`.
-    depth_scale : float, optional
-        Counts per metre; otherwise that of the calibration file; otherwise 5000 as TUM has it,
-        or 1000 where the first depth image only makes sense in millimetres.
-    grey_range : GreyRange
-        Of images with 16 bits.
+    config : Config, optional
+        Of images with 16 bits, and the counts per metre of depth; otherwise those of the
+        calibration file; otherwise 5000 as TUM has it, or 1000 where the first depth image only
+        makes sense in millimetres.
 
     Raises
     ------
@@ -65,30 +65,22 @@ class TumSource(FolderSource):
     """
 
     def __init__(
-        self,
-        folder: Path,
-        *,
-        calibration: CalibrationPaths = None,
-        depth_scale: float | None = None,
-        grey_range: GreyRange = FULL_RANGE,
+        self, folder: Path, *, calibration: CalibrationPaths = None, config: Config | None = None
     ) -> None:
         self._folder = folder
         images = {name: _list_images(folder / f"{name}.txt") for name in ("rgb", "depth")}
         cameras = _find_calibration(folder, paths_of(calibration))
-        if depth_scale is not None:
-            scale, reason = depth_scale, "by depth.scale"
+        configured = (config or Config()).depth.scale
+        if configured is not None:
+            scale, reason = configured, "by depth.scale"
         elif cameras.depth_scale is not None:
             scale, reason = cameras.depth_scale, "by the calibration"
         else:
             scale, reason = _assume_scale(path for _, path in images["depth"])
-        super().__init__(
-            folder,
-            cameras,
-            images,
-            [f"calibration: {cameras.origin}", f"depth: {scale:g} counts per metre, {reason}"],
-            load_second=partial(read_depth, scale=scale),
-            grey_range=grey_range,
-        )
+        depth = f"depth: {scale:g} counts per metre, {reason}"
+        decisions = [f"calibration: {cameras.origin}", depth]
+        load_depth = partial(read_depth, scale=scale)
+        super().__init__(folder, cameras, images, decisions, config, load_second=load_depth)
 
     def ground_truth(self) -> Trajectory | None:
         """Return T_world_cam of the colour camera.

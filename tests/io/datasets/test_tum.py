@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gvo.config import Config
+from gvo.config import Config, DepthConfig
 from gvo.errors import CalibrationError, RecordingError
 from gvo.io.datasets.tum import TumSource
 from gvo.io.frames import frames
@@ -93,7 +93,7 @@ def test_the_scale_is_the_users_then_the_files_then_5000(tmp_path: Path, tiny: A
     at_5000 = largest()
     (folder / "calibration.yaml").write_text(yaml.safe_dump(tiny.ros_camera(depth_scale=2500)))
     assert largest() == pytest.approx(2 * at_5000)
-    assert largest(depth_scale=10000.0) == pytest.approx(0.5 * at_5000)
+    assert largest(config=Config(depth=DepthConfig(scale=10000.0))) == pytest.approx(0.5 * at_5000)
 
 
 def test_a_camera_on_a_body_says_where(tmp_path: Path, tiny: Any) -> None:
@@ -134,7 +134,7 @@ def test_depth_that_only_makes_sense_in_millimetres_is_read_so(tmp_path: Path, t
     found = next(TumSource(folder).images()).load()
     is_known = np.isfinite(expected)
     np.testing.assert_allclose(found[is_known], expected[is_known], atol=2e-3)
-    insisted = TumSource(folder, depth_scale=5000.0)
+    insisted = TumSource(folder, config=Config(depth=DepthConfig(scale=5000.0)))
     assert _depth_decision(insisted) == "depth: 5000 counts per metre, by depth.scale"
 
 
