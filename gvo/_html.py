@@ -1,4 +1,4 @@
-"""Trajectories and estimates as HTML tables for notebooks."""
+"""HTML tables for notebooks, and estimates as such."""
 
 from __future__ import annotations
 
@@ -8,53 +8,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gvo._text import html_text
+from gvo._text import format_stamp, html_text
 
 _FloatArray = NDArray[np.float64]
 
 _LARGE = 1e9  # written with an exponent from here
 _CELL = "text-align:left;padding:0.1em 0.8em 0.1em 0"
-
-
-def trajectory_html(
-    stamps_ns: NDArray[np.int64],
-    poses: _FloatArray,
-    *,
-    has_rotations: bool,
-    has_covariances: bool,
-    stamps_from: str,
-) -> str:
-    """Return what a notebook shows of a trajectory.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (n,)
-        Nanoseconds.
-    poses : ndarray of float64, shape (n, 4, 4)
-        T_world_frame, metres.
-    has_rotations, has_covariances : bool
-        What is known beside the positions.
-    stamps_from : str
-        Where the stamps come from; those of "rows" tell no rate.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
-    n, positions = len(stamps_ns), poses[:, :3, 3]
-    rows = [("poses", f"{n:,}" if has_rotations else f"{n:,}, positions only")]
-    if n == 0:
-        return card("Trajectory", rows)
-    if stamps_from != "rows":
-        rows += _rows_of_stamps(int(stamps_ns[0]), int(stamps_ns[-1]), n)
-    with np.errstate(over="ignore"):
-        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-        extents = np.ptp(positions, axis=0)
-        rows.append(("path length", metres(float(np.sum(steps)))))
-    rows.append(("extent x, y, z", ", ".join(metres(float(extent)) for extent in extents)))
-    rows.append(("covariances", "yes" if has_covariances else "none"))
-    return card("Trajectory", rows)
 
 
 def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, status: str) -> str:
@@ -76,7 +35,7 @@ def estimate_html(stamp_ns: int, pose: _FloatArray, covariance: _FloatArray, *, 
     str
         HTML.
     """
-    rows = [("status", status), ("stamp", f"{_seconds(stamp_ns)} s")]
+    rows = [("status", status), ("stamp", f"{format_stamp(stamp_ns)} s")]
     if pose.shape != (4, 4) or covariance.shape != (6, 6):
         return card("Estimate", rows)
     R, positions = pose[:3, :3], pose[:3, 3]
@@ -144,23 +103,6 @@ def vector(values: Sequence[float] | _FloatArray, sigmas: Sequence[float] | _Flo
     return ", ".join(
         _with_sigma(float(value), float(sigma)) for value, sigma in zip(values, sigmas, strict=True)
     )
-
-
-def _rows_of_stamps(first_ns: int, last_ns: int, n: int) -> list[tuple[str, str]]:
-    duration_s = (last_ns - first_ns) / 1e9
-    rows = [
-        ("from", f"{_seconds(first_ns)} s"),
-        ("to", f"{_seconds(last_ns)} s"),
-        ("duration", f"{duration_s:,.3f} s"),
-    ]
-    if n > 1:
-        rows.append(("mean rate", f"{(n - 1) / duration_s:.3g} Hz"))
-    return rows
-
-
-def _seconds(stamp_ns: int) -> str:
-    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
-    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def _rotation_vector_deg(R: _FloatArray) -> _FloatArray:

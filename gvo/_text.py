@@ -38,14 +38,7 @@ _MAX_NUMBER = 250  # characters; no float needs more
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 
 # Raised by PyYAML for invalid dates, numbers that are too long, and tags of other types.
-_VALUE_FAULTS = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
+_FAULTS = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def shortened(value: object) -> str:
@@ -109,6 +102,23 @@ def plain_number(text: str) -> str:
     if not text.isascii() or "_" in text:
         raise ValueError(f"{shortened(text)} is no decimal number")
     return text
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Return a stamp in seconds with nine decimals, without loss.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Nanoseconds.
+
+    Examples
+    --------
+    >>> format_stamp(1403636579763555584)
+    '1403636579.763555584'
+    """
+    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def access_fault(path: Path) -> str:
@@ -274,7 +284,7 @@ def load_yaml(
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise YamlError(f"line {mark.line + 1}" if mark else _first_line(error)) from error
-    except _VALUE_FAULTS as error:
+    except _FAULTS as error:
         raise YamlError(_first_line(error)) from error
 
 

@@ -85,14 +85,8 @@ def _step(trajectory: Trajectory) -> float:
 
 def _interpolated(dense: Trajectory, sparse: Trajectory) -> tuple[Trajectory, Trajectory]:
     """Return both at the stamps of the sparse one that lie in no long gap of the dense one."""
-    stamps_ns = sparse.stamps_ns
-    after = np.clip(np.searchsorted(dense.stamps_ns, stamps_ns), 0, len(dense) - 1)
-    before = np.maximum(after - 1, 0)
-    is_inside = (stamps_ns >= dense.stamps_ns[0]) & (stamps_ns <= dense.stamps_ns[-1])
-    is_hit = dense.stamps_ns[after] == stamps_ns
-    is_near = dense.stamps_ns[after] - dense.stamps_ns[before] <= MAX_GAP_NS
-    chosen = sparse.select(is_inside & (is_hit | is_near))
-    return dense.interpolate(chosen.stamps_ns), chosen
+    between = dense.interpolate(sparse.stamps_ns, max_gap_ns=MAX_GAP_NS)
+    return between, sparse.select(np.isin(sparse.stamps_ns, between.stamps_ns))
 
 
 def associate(

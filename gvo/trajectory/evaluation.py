@@ -160,11 +160,9 @@ def evaluate(
             f"{_MIN_POSES}"
         )
     aligned = alignment(ref, est, align).apply(est)
-    is_long = _path_length(ref) >= KITTI_SEGMENTS_M[-1]
-    if segments is None:
-        segments = KITTI_SEGMENTS_M if is_long else SHORT_SEGMENTS_M
-    if segment_step is None:
-        segment_step = KITTI_STEP if is_long else SHORT_STEP
+    usual_segments, usual_step = _usual_segments(ref)
+    segments = usual_segments if segments is None else segments
+    segment_step = usual_step if segment_step is None else segment_step
     step_t, step_r = relative_errors(ref, aligned, delta=rpe_delta)
     shares, turns = segment_errors(ref, aligned, lengths_m=segments, step=segment_step)
     return Evaluation(
@@ -263,6 +261,12 @@ def _segments_of(
     return first[fits], last[fits], length[fits]
 
 
+def _usual_segments(path: Trajectory) -> tuple[tuple[float, ...], int]:
+    """Return KITTI's lengths and step for a path of its longest segment, else the short ones."""
+    is_long = _path_length(path) >= KITTI_SEGMENTS_M[-1]
+    return (KITTI_SEGMENTS_M, KITTI_STEP) if is_long else (SHORT_SEGMENTS_M, SHORT_STEP)
+
+
 def _have_rotations(reference: Trajectory, estimate: Trajectory) -> bool:
     return reference.has_rotations and estimate.has_rotations
 
@@ -358,9 +362,7 @@ def motions_of_chain(chain: Trajectory) -> list[Motions]:
         first = np.flatnonzero(last < len(chain))
         first = first[stamps_ns[last[first]] - stamps_ns[first] <= 1.5 * span_ns]
         found.append(Motions.of_chain(chain, first, last[first], name=f"raw over {span_s} s"))
-    is_long = _path_length(chain) >= KITTI_SEGMENTS_M[-1]
-    lengths = KITTI_SEGMENTS_M if is_long else SHORT_SEGMENTS_M
-    step = KITTI_STEP if is_long else SHORT_STEP
+    lengths, step = _usual_segments(chain)
     first, last, _ = _segments_of(chain, lengths, step)
     name = f"raw over {lengths[0]:g} to {lengths[-1]:g} m"
     return [*found, Motions.of_chain(chain, first, last, name=name)]
@@ -438,7 +440,8 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
     """
     if not truth.has_rotations:
         return None
-    true = _interpolated(truth, np.unique([motions.start_ns, motions.end_ns]))
+    stamps_ns = np.unique([motions.start_ns, motions.end_ns])
+    true = truth.interpolate(stamps_ns, max_gap_ns=MAX_GAP_NS)
     are_known = np.isin([motions.start_ns, motions.end_ns], true.stamps_ns).all(axis=0)
     are_known &= _is_positive(motions.covariances)
     if not are_known.any():
@@ -453,15 +456,6 @@ def consistency(truth: Trajectory, motions: Motions) -> Consistency | None:
         errors=se3.log(se3.invert(T_start_end) @ se3.invert(T_a) @ T_b),
         covariances=motions.covariances[are_known],
     )
-
-
-def _interpolated(truth: Trajectory, stamps_ns: IntArray) -> Trajectory:
-    """Return the truth at stamps, without those in its gaps."""
-    inside = truth.interpolate(stamps_ns)
-    true_ns = truth.stamps_ns
-    after = np.minimum(np.searchsorted(true_ns, inside.stamps_ns), len(true_ns) - 1)
-    gaps_ns = true_ns[after] - true_ns[np.maximum(after - 1, 0)]
-    return inside.select((true_ns[after] == inside.stamps_ns) | (gaps_ns <= MAX_GAP_NS))
 
 
 def _is_positive(covariances: FloatArray) -> BoolArray:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from gvo._html import trajectory_html
+from gvo._html import card, metres
+from gvo._text import format_stamp as format_stamp
 from gvo._text import plain_number, shortened
 from gvo.geometry import se3
 from gvo.types import Estimate, FloatArray, IntArray
@@ -131,13 +132,17 @@ class Trajectory:
 
     def _repr_html_(self) -> str:
         """Return a table for notebooks."""
-        return trajectory_html(
-            self.stamps_ns,
-            self.T_world_frame,
-            has_rotations=self.has_rotations,
-            has_covariances=self.covariances is not None,
-            stamps_from=self.stamps_from,
-        )
+        rows = [("poses", f"{len(self):,}{'' if self.has_rotations else ', positions only'}")]
+        if len(self) == 0:
+            return card("Trajectory", rows)
+        if self.stamps_from != "rows":
+            rows += _rows_of_stamps(int(self.stamps_ns[0]), int(self.stamps_ns[-1]), len(self))
+        with np.errstate(over="ignore"):
+            extents = np.ptp(self.positions, axis=0)
+            rows.append(("path length", metres(float(self.distances()[-1]))))
+        rows.append(("extent x, y, z", ", ".join(metres(float(extent)) for extent in extents)))
+        rows.append(("covariances", "none" if self.covariances is None else "yes"))
+        return card("Trajectory", rows)
 
     @property
     def positions(self) -> FloatArray:
@@ -223,7 +228,7 @@ class Trajectory:
             T_map_frame = _unrotated(T_map_frame[:, :3, 3])
         return replace(self, T_world_frame=T_map_frame)
 
-    def interpolate(self, stamps_ns: IntArray) -> Trajectory:
+    def interpolate(self, stamps_ns: IntArray, *, max_gap_ns: int | None = None) -> Trajectory:
         """Interpolate poses at given stamps: positions linearly, rotations by SLERP.
 
         Parameters
@@ -231,6 +236,8 @@ class Trajectory:
         stamps_ns : ndarray of int64, shape (m,)
             Strictly increasing, nanoseconds. Those before the first or after the last pose are
             dropped: nothing is extrapolated.
+        max_gap_ns : int, optional
+            Stamps between two poses that are farther apart are dropped, too.
 
         Returns
         -------
@@ -243,11 +250,27 @@ class Trajectory:
         wanted = wanted[(wanted >= self.stamps_ns[0]) & (wanted <= self.stamps_ns[-1])]
         after = np.searchsorted(self.stamps_ns, wanted)
         before = np.maximum(after - 1, 0)
+        if max_gap_ns is not None:
+            is_near = self.stamps_ns[after] - self.stamps_ns[before] <= max_gap_ns
+            is_kept = is_near | (self.stamps_ns[after] == wanted)
+            wanted, after, before = wanted[is_kept], after[is_kept], before[is_kept]
         # at the first pose both neighbours are that pose, their span zero
         spans = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         shares = ((wanted - self.stamps_ns[before]) / spans)[:, np.newaxis]
         poses = _between(self.T_world_frame[before], self.T_world_frame[after], shares)
         return replace(self, stamps_ns=wanted, T_world_frame=poses, covariances=None)
+
+
+def _rows_of_stamps(first_ns: int, last_ns: int, n: int) -> list[tuple[str, str]]:
+    duration_s = (last_ns - first_ns) / 1e9
+    rows = [
+        ("from", f"{format_stamp(first_ns)} s"),
+        ("to", f"{format_stamp(last_ns)} s"),
+        ("duration", f"{duration_s:,.3f} s"),
+    ]
+    if n > 1:
+        rows.append(("mean rate", f"{(n - 1) / duration_s:.3g} Hz"))
+    return rows
 
 
 def _checked_stamps(stamps_ns: IntArray) -> IntArray:
@@ -297,23 +320,6 @@ def _between(T_before: FloatArray, T_after: FloatArray, shares: FloatArray) -> F
     R = (start * Rotation.from_rotvec(shares * arcs)).as_matrix()
     t = (1.0 - shares) * T_before[:, :3, 3] + shares * T_after[:, :3, 3]
     return se3.make_transform(np.asarray(R), t)
-
-
-def format_stamp(stamp_ns: int) -> str:
-    """Return a stamp in seconds with nine decimals, without loss.
-
-    Parameters
-    ----------
-    stamp_ns : int
-        Nanoseconds.
-
-    Examples
-    --------
-    >>> format_stamp(1403636579763555584)
-    '1403636579.763555584'
-    """
-    seconds, nanoseconds = divmod(abs(int(stamp_ns)), 1_000_000_000)
-    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def parse_stamp(text: str, *, unit_ns: int) -> int:
